@@ -1,0 +1,1 @@
+"""dhtorch: a short-range depth sensor as a metric ruler."""

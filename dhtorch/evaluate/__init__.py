@@ -1,0 +1,1 @@
+"""Numbers from estimates and truth: no files, no method."""

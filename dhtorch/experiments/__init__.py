@@ -1,0 +1,1 @@
+"""One question per file; each ``run(...)`` returns rows, a summary and a verdict."""

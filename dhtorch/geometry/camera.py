@@ -1,0 +1,176 @@
+"""Pinhole camera with OpenCV's lens distortion, one value type and its functions.
+
+Alphabet: ``uv`` (…, 2) pixels, ``xyz`` (…, 3) metres in camera axes (x right, y down, z forward), ``xy`` (…, 2) ideal
+image-plane coordinates (z = 1), ``f``, ``c`` focal lengths and principal point in pixels.
+
+Pixel convention, once for the whole project: *integer coordinates are pixel centres*; the top-left pixel's centre is
+(0, 0) and the image spans [-0.5, W - 0.5] × [-0.5, H - 0.5].
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dhtorch.geometry.shapes import check
+from dhtorch.tree import Record, record
+
+
+@record
+class Camera(Record):
+    """Intrinsics of a batch of cameras."""
+
+    f: Tensor  # (B, 2) px
+    c: Tensor  # (B, 2) px
+    distortion: Tensor | None = None  # (B, k) k1 k2 p1 p2 [k3 [k4 k5 k6]], OpenCV's order; None = ideal pinhole
+    readout: Tensor | None = None  # (B,) s from first to last row (rolling shutter); None = global shutter
+
+
+def from_matrix(K: Tensor, distortion: Tensor | None = None, readout: Tensor | None = None) -> Camera:
+    """Camera of a (B, 3, 3) intrinsic matrix without skew."""
+    check("camera.from_matrix", K=(K, "B 3 3"), distortion=(distortion, "B k"))
+    return Camera(torch.stack((K[:, 0, 0], K[:, 1, 1]), -1), K[:, :2, 2], distortion, readout)
+
+
+def to_matrix(camera: Camera) -> Tensor:
+    """(B, 3, 3) intrinsic matrix."""
+    zero, one = torch.zeros_like(camera.f[:, 0]), torch.ones_like(camera.f[:, 0])
+    rows = (camera.f[:, 0], zero, camera.c[:, 0], zero, camera.f[:, 1], camera.c[:, 1], zero, zero, one)
+    return torch.stack(rows, -1).reshape(-1, 3, 3)
+
+
+def ideal(camera: Camera) -> Camera:
+    """The same camera without its distortion: what undistorted pixels belong to."""
+    return camera.replace(distortion=None)
+
+
+def resize(camera: Camera, hw: tuple[int, int], new_hw: tuple[int, int]) -> Camera:
+    """Camera of the image resampled from ``hw`` to ``new_hw`` (height, width); exact: c' = (c + ½) s − ½."""
+    s = torch.as_tensor([new_hw[1] / hw[1], new_hw[0] / hw[0]]).to(camera.f)
+    return camera.replace(f=camera.f * s, c=(camera.c + 0.5) * s - 0.5)
+
+
+def project(
+    camera: Camera,
+    xyz: Tensor,  # (B, N, 3) m
+) -> Tensor:
+    """Pixels (B, N, 2) of points; the sign of z is the caller's affair, |z| is kept away from zero.
+
+    Gradient: to points, intrinsics and distortion. Checked against ``kornia.geometry.PinholeCamera`` and cv2.
+    """
+    check("camera.project", f=(camera.f, "B 2"), xyz=(xyz, "B N 3"))
+    z = xyz[..., 2:]
+    z = torch.where(z.abs() < 1e-9, torch.full_like(z, 1e-9), z)
+    xy = xyz[..., :2] / z
+    if camera.distortion is not None:
+        xy = _distort(camera.distortion, xy)[0]
+    return xy * camera.f[:, None] + camera.c[:, None]
+
+
+def unproject(
+    camera: Camera,
+    uv: Tensor,  # (B, N, 2) px
+    depth: Tensor,  # (B, N) m, z-depth
+) -> Tensor:
+    """Points (B, N, 3) at z-depth ``depth`` seen at (distorted) pixels ``uv``."""
+    check("camera.unproject", f=(camera.f, "B 2"), uv=(uv, "B N 2"), depth=(depth, "B N"))
+    return rays(camera, uv) * depth[..., None]
+
+
+def rays(camera: Camera, uv: Tensor) -> Tensor:
+    """Viewing rays (B, N, 3) with z = 1 through (distorted) pixels ``uv`` (B, N, 2)."""
+    check("camera.rays", f=(camera.f, "B 2"), uv=(uv, "B N 2"))
+    xy = _normalised(camera, undistort(camera, uv))
+    return torch.cat((xy, torch.ones_like(xy[..., :1])), -1)
+
+
+def distort(camera: Camera, uv: Tensor) -> Tensor:
+    """Ideal pixels (B, N, 2) → pixels of the distorted image. The inverse of :func:`undistort`."""
+    check("camera.distort", f=(camera.f, "B 2"), uv=(uv, "B N 2"))
+    if camera.distortion is None:
+        return uv
+    return _distort(camera.distortion, _normalised(camera, uv))[0] * camera.f[:, None] + camera.c[:, None]
+
+
+def undistort(camera: Camera, uv: Tensor, *, iterations: int = 12) -> Tensor:
+    """Pixels of the distorted image → ideal pixels, (B, N, 2).
+
+    Newton's method on the distortion model, from the pixel itself. A pixel for which it does not converge (outside
+    the model's invertible field) becomes NaN.
+
+    Gradient: one Newton step from the detached solution, which is the implicit derivative, to ``uv``, intrinsics and
+    distortion. Checked against ``cv2.undistortPoints`` and ``kornia.geometry.calibration.undistort_points``.
+    """
+    check("camera.undistort", f=(camera.f, "B 2"), uv=(uv, "B N 2"))
+    if camera.distortion is None:
+        return uv
+    target = _normalised(camera, uv)
+    xy = target.detach()
+    with torch.no_grad():
+        for _ in range(iterations):
+            xy = _newton_step(camera.distortion, xy, target)
+        miss = (_distort(camera.distortion, xy)[0] - target).abs().amax(-1, keepdim=True)
+        # A pixel counts as solved when it returns to itself within a hundredth of a pixel, at any focal length.
+        solved = miss * camera.f.amax(-1)[:, None, None] < 0.01
+        start = torch.where(solved, xy, torch.zeros_like(xy))
+    xy = _newton_step(camera.distortion, start, torch.where(solved, target, torch.zeros_like(target)))
+    uv = xy * camera.f[:, None] + camera.c[:, None]
+    return torch.where(solved, uv, torch.full_like(uv, torch.nan))
+
+
+def undistort_jacobian(camera: Camera, uv_ideal: Tensor) -> Tensor:
+    """d(ideal pixel) / d(distorted pixel), (B, N, 2, 2), at ideal pixels (B, N, 2): carries covariances along."""
+    check("camera.undistort_jacobian", f=(camera.f, "B 2"), uv_ideal=(uv_ideal, "B N 2"))
+    if camera.distortion is None:
+        eye = torch.eye(2, dtype=uv_ideal.dtype, device=uv_ideal.device)
+        return eye.expand(*uv_ideal.shape, 2)
+    jacobian = _distort(camera.distortion, _normalised(camera, uv_ideal))[1]
+    f = camera.f[:, None]
+    return f[..., :, None] * _inverse_2x2(jacobian) / f[..., None, :]
+
+
+def _normalised(camera: Camera, uv: Tensor) -> Tensor:
+    return (uv - camera.c[:, None]) / camera.f[:, None]
+
+
+def _newton_step(distortion: Tensor, xy: Tensor, target: Tensor) -> Tensor:
+    value, jacobian = _distort(distortion, xy)
+    step = _inverse_2x2(jacobian.detach()) @ (target - value)[..., None]
+    return xy + step[..., 0]
+
+
+def _distort(distortion: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
+    """Brown's rational model and its Jacobian: ideal xy (B, N, 2) → distorted xy (B, N, 2), (B, N, 2, 2)."""
+    missing = 8 - distortion.shape[-1]
+    k1, k2, p1, p2, k3, k4, k5, k6 = torch.nn.functional.pad(distortion, (0, missing))[:, None].unbind(-1)
+    x, y = xy.unbind(-1)
+    r2 = x * x + y * y
+    top = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    bottom = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    radial = top / bottom
+    slope = (k1 + r2 * (2 * k2 + 3 * r2 * k3) - radial * (k4 + r2 * (2 * k5 + 3 * r2 * k6))) / bottom  # d radial / d r²
+    value = torch.stack(
+        (
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        ),
+        -1,
+    )
+    cross = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+    jacobian = torch.stack(
+        (
+            radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x,
+            cross,
+            cross,
+            radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x,
+        ),
+        -1,
+    )
+    return value, jacobian.unflatten(-1, (2, 2))
+
+
+def _inverse_2x2(m: Tensor) -> Tensor:
+    a, b, c, d = m[..., 0, 0], m[..., 0, 1], m[..., 1, 0], m[..., 1, 1]
+    det = a * d - b * c
+    det = torch.where(det.abs() < 1e-12, torch.full_like(det, 1e-12), det)
+    return torch.stack((d, -b, -c, a), -1).unflatten(-1, (2, 2)) / det[..., None, None]

@@ -1,0 +1,42 @@
+"""Shape contracts: named axes, bound across the arguments of one call.
+
+*Shapes raise, values flag*: a wrong shape is the caller's mistake and raises here, with the argument's name.
+"""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+
+def check(where: str, **args: tuple[Tensor | None, str]) -> dict[str, int]:
+    """Check tensors against axis patterns such as ``"B N 2"``; equal letters must have equal sizes.
+
+    Args:
+        where: name of the calling function, for the message.
+        args: ``name=(tensor, pattern)``. A pattern is axis names and integers separated by blanks; a leading ``*``
+            accepts any leading dimensions; a ``None`` tensor is skipped.
+
+    Returns:
+        The sizes bound to the axis names.
+
+    Raises:
+        ValueError: the number of axes, a fixed size or a shared axis differs from the pattern.
+    """
+    sizes: dict[str, int] = {}
+    for name, (x, pattern) in args.items():
+        if x is None:
+            continue
+        axes = pattern.split()
+        shape = tuple(x.shape)
+        if axes[0] == "*":
+            axes = axes[1:]
+            shape = shape[len(shape) - len(axes) :] if len(shape) >= len(axes) else shape
+        ok = len(axes) == len(shape)
+        for axis, size in zip(axes, shape, strict=False):
+            ok = ok and (int(axis) == size if axis.isdigit() else sizes.setdefault(axis, size) == size)
+        if not ok:
+            bound = ", ".join(f"{k}={v}" for k, v in sizes.items())
+            raise ValueError(
+                f"{where}: {name} has shape {tuple(x.shape)}, expected ({pattern}) with {bound or 'any sizes'}"
+            )
+    return sizes

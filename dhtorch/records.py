@@ -1,0 +1,112 @@
+"""The records that travel between stages. Everything is batched: B pairs (or frames), N samples each.
+
+Silent values: where there is no answer a field holds a defined value and a code says why. ``depth`` of a sample without
+a return is 0 and its ``xyz`` NaN; ``depth`` and ``sigma`` of an unanswered estimate are NaN and its ``score`` 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import field
+
+from torch import Tensor
+
+from dhtorch.codes import Gate, PoseCode
+from dhtorch.geometry.camera import Camera
+from dhtorch.geometry.se3 import Pose
+from dhtorch.tree import KEEP_DTYPE, Record, record
+
+__all__ = ["Camera", "Estimate", "Frame", "Map", "Pose", "PoseFit", "Samples", "Tracks"]
+
+
+@record
+class Frame(Record):
+    """One RGB-D view."""
+
+    image: Tensor  # (B, C, H, W) C 1 or 3; float in [0, 1] or uint8
+    depth: Tensor  # (B, h, w) m, 0 = no return; its own resolution is allowed
+    camera: Camera  # of the image
+    depth_camera: Camera | None = None  # of the depth map, same pose; None = `camera` scaled to the depth's size
+    conf: Tensor | None = None  # (B, h, w) uint8 sensor confidence 0 low, 1 medium, 2 high
+    time: Tensor | None = field(default=None, metadata=KEEP_DTYPE)  # (B,) s, float64
+    T_world_from_cam: Pose | None = None  # where the data set has one; stages never read it
+
+    @property
+    def hw(self) -> tuple[int, int]:
+        """(height, width) of the image."""
+        return self.image.shape[-2], self.image.shape[-1]
+
+
+@record
+class Samples(Record):
+    """Where we look and what the sensor says there."""
+
+    uv: Tensor  # (B, N, 2) px
+    depth: Tensor  # (B, N) m, the sensor's value; 0 = no return
+    sigma: Tensor  # (B, N) m, the sensor's noise at that value
+    xyz: Tensor  # (B, N, 3) m in camera 0; NaN where there is no usable return
+    confidence: Tensor  # (B, N) in [0, 1]
+    flag: Tensor  # (B, N) int32, bits of codes.Flag
+    trackability: Tensor  # (B, N) smaller eigenvalue of the local gradient matrix, image in [0, 1]
+    hole: Tensor  # (B, N) int32, codes.Hole
+
+
+@record
+class Tracks(Record):
+    """The samples found again in the other image."""
+
+    uv_0: Tensor  # (B, N, 2) px
+    uv_1: Tensor  # (B, N, 2) px; the last position where not valid
+    error: Tensor  # (B, N) px, forward-backward round trip
+    photometric: Tensor  # (B, N) rms grey residual of the patch, image in [0, 1]
+    cov: Tensor  # (B, N, 2, 2) px², of uv_1
+    valid: Tensor  # (B, N) bool
+
+
+@record
+class PoseFit(Record):
+    """Metric relative pose and how well it is known. Not ok: R, t and cov are NaN."""
+
+    T_1_from_0: Pose
+    cov: Tensor  # (B, 6, 6) of the left perturbation (rad, m)
+    inlier: Tensor  # (B, N) bool
+    n_inlier: Tensor  # (B,) int64
+    rms_px: Tensor  # (B,) reprojection rms of the inliers
+    sigma_px: Tensor  # (B,) estimated noise of one pixel coordinate
+    t_snr: Tensor  # (B,) translation over its standard deviation, sqrt(tᵀ Σ_t⁻¹ t)
+    code: Tensor  # (B,) int32, codes.PoseCode
+
+    @property
+    def ok(self) -> Tensor:
+        """(B,) bool: there is a pose."""
+        return (self.code == PoseCode.OK) | (self.code == PoseCode.KEPT_PNP)
+
+
+@record
+class Estimate(Record):
+    """Depth in view 0 for every sample, or the reason for silence."""
+
+    uv: Tensor  # (B, N, 2) px
+    depth: Tensor  # (B, N) m; NaN where silent
+    sigma: Tensor  # (B, N) m, standard deviation of depth, pose part included; NaN where silent
+    sigma_shared: Tensor  # (B, N) m, the part of sigma that the points of a pair share (the pose)
+    parallax_deg: Tensor  # (B, N) angle at the point between the rays to the two centres
+    residual_px: Tensor  # (B, N) reprojection error, the larger of the two views
+    n_views: Tensor  # (B, N) int32
+    score: Tensor  # (B, N) in [0, 1]; 0 where silent
+    gate: Tensor  # (B, N) int32, codes.Gate; 0 = answered
+
+    @property
+    def keep(self) -> Tensor:
+        """(B, N) bool: answered."""
+        return self.gate == Gate.ANSWER
+
+
+@record
+class Map(Record):
+    """Sensor and recovered depth side by side: what a user of the pipeline wants."""
+
+    uv: Tensor  # (B, N, 2) px
+    depth: Tensor  # (B, N) m; 0 where neither source answers
+    sigma: Tensor  # (B, N) m; 0 where neither source answers
+    score: Tensor  # (B, N) in [0, 1]: sensor confidence or selective score
+    source: Tensor  # (B, N) int32, codes.Source
