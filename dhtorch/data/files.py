@@ -1,0 +1,337 @@
+"""Decoding: the only place where bytes become arrays.
+
+Every function returns plain numpy arrays or Python values and checks lengths and headers *before* a decoder sees the
+bytes. Whatever is wrong with a file is a :class:`FormatError`: one line with the file, the field, what was found and
+what was expected.
+
+Alphabet: ``hw`` (height, width); depth and disparity maps are (h, w) float32.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import struct
+import zipfile
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+#: No camera of ours comes near this; a header that claims more is damaged or hostile.
+MAX_PIXELS = 64_000_000
+MAX_BYTES = 256_000_000  # of an array or a file
+MAX_TEXT_BYTES = 64_000_000  # of a table or a JSON document
+
+
+class FormatError(ValueError):
+    """A file is not what its format promises: ``file: field: found …, expected …`` in one line.
+
+    Survives pickling, so it arrives intact from a data-loader worker.
+    """
+
+    def __init__(self, file: str | Path, field: str = "", found: object = "", expected: object = "") -> None:
+        super().__init__(str(file), field, _short(found), _short(expected, 400))
+
+    def __str__(self) -> str:
+        file, field, found, expected = self.args
+        return f"{file}: {field}: found {found}, expected {expected}" if field else file
+
+
+class ImageHeader(NamedTuple):
+    """What an image file says about itself."""
+
+    hw: tuple[int, int]
+    channels: int
+    bits: int  # per channel
+    kind: str  # "png" or "jpeg"
+
+
+# ---------------------------------------------------------------------------------------------------------- images
+
+
+def read_image(file: Path, hw: tuple[int, int] | None = None) -> np.ndarray:
+    """Image (C, H, W) uint8, RGB or grey, as stored: an orientation tag is not applied, K belongs to these pixels.
+
+    Raises:
+        FormatError: missing, truncated or unknown file; not 8 bits; another size than ``hw``.
+    """
+    data = read_bytes(file)
+    header = _checked_header(file, data, hw)
+    if header.bits != 8:
+        raise FormatError(file, "bits per channel", header.bits, 8)
+    flag = cv2.IMREAD_GRAYSCALE if header.channels == 1 else cv2.IMREAD_COLOR
+    image = _decode(file, data, flag | cv2.IMREAD_IGNORE_ORIENTATION, header.hw)
+    if image.ndim == 2:
+        return image[None]
+    return np.ascontiguousarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB).transpose(2, 0, 1))
+
+
+def read_depth_png(
+    file: Path,
+    units_per_metre: float,
+    hw: tuple[int, int] | None = None,
+    invalid: Sequence[int] = (0,),
+) -> np.ndarray:
+    """Depth (h, w) in m from a 16-bit one-channel PNG; 0 where the code is one of ``invalid`` (0 always is).
+
+    Raises:
+        FormatError: missing, truncated or unknown file; not one channel of 16 bits; another size than ``hw``.
+    """
+    data = read_bytes(file)
+    header = _checked_header(file, data, hw)
+    if (header.kind, header.channels, header.bits) != ("png", 1, 16):
+        found = f"{header.kind} with {header.channels} channels of {header.bits} bits"
+        raise FormatError(file, "depth", found, "png with 1 channel of 16 bits")
+    code = _decode(file, data, cv2.IMREAD_UNCHANGED, header.hw)
+    depth = code.astype(np.float32) / np.float32(units_per_metre)
+    for value in invalid:
+        depth[code == value] = 0
+    return depth
+
+
+def image_header(file: Path) -> ImageHeader:
+    """Size and type of a PNG or JPEG file without decoding it.
+
+    Raises:
+        FormatError: missing, truncated or unknown file, or more than ``MAX_PIXELS`` pixels.
+    """
+    return _parse_header(file, read_bytes(file))
+
+
+def _checked_header(file: Path, data: bytes, hw: tuple[int, int] | None) -> ImageHeader:
+    header = _parse_header(file, data)
+    if hw is not None and header.hw != tuple(hw):
+        raise FormatError(file, "size", _size(header.hw), _size(hw))
+    whole = _png_is_whole(data) if header.kind == "png" else data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda")
+    if not whole:
+        raise FormatError(file, "data", f"a truncated or damaged {header.kind} file of {len(data)} bytes", "all of it")
+    return header
+
+
+def _parse_header(file: Path, data: bytes) -> ImageHeader:
+    if data.startswith(b"\x89PNG\r\n\x1a\n") and len(data) >= 33 and data[12:16] == b"IHDR":
+        w, h, bits, colour = struct.unpack(">IIBB", data[16:26])
+        header = ImageHeader((h, w), {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}.get(colour, 0), 8 if colour == 3 else bits, "png")
+    elif data.startswith(b"\xff\xd8"):
+        header = _jpeg_header(file, data)
+    else:
+        raise FormatError(file, "content", f"{data[:8]!r}", "a PNG or JPEG image")
+    if not 0 < header.hw[0] * header.hw[1] <= MAX_PIXELS:
+        raise FormatError(file, "size", _size(header.hw), f"1 to {MAX_PIXELS} pixels")
+    return header
+
+
+def _jpeg_header(file: Path, data: bytes) -> ImageHeader:
+    at = 2
+    while at + 9 < len(data) and data[at] == 0xFF:
+        marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            bits, h, w, channels = struct.unpack(">BHHB", data[at + 4 : at + 10])
+            return ImageHeader((h, w), channels, bits, "jpeg")
+        at += 1 if marker == 0xFF else 2 + length
+    raise FormatError(file, "content", f"a JPEG of {len(data)} bytes without a frame header", "a whole JPEG image")
+
+
+def _png_is_whole(data: bytes) -> bool:
+    """Walk the chunks: every length fits, every check sum holds, the last one is IEND."""
+    at = 8
+    while at + 12 <= len(data):
+        length = int.from_bytes(data[at : at + 4], "big")
+        end = at + 12 + length
+        if end > len(data) or zlib.crc32(data[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
+            return False
+        if data[at + 4 : at + 8] == b"IEND":
+            return True
+        at = end
+    return False
+
+
+def _decode(file: Path, data: bytes, flags: int, hw: tuple[int, int]) -> np.ndarray:
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error as error:
+        raise FormatError(file, "data", error.err, "a decodable image") from None
+    if image is None or image.shape[:2] != tuple(hw):
+        raise FormatError(file, "data", "pixels that do not decode", f"an image of {_size(hw)}")
+    return image
+
+
+# ---------------------------------------------------------------------------------------------------------- arrays
+
+
+def read_pfm(file: Path, hw: tuple[int, int] | None = None) -> np.ndarray:
+    """One-channel portable float map (h, w) float32, first row on top (the file stores the last row first).
+
+    Raises:
+        FormatError: missing or truncated file, colour map, another size than ``hw``.
+    """
+    data = read_bytes(file)
+    head = data[:128].split(b"\n", 3)
+    if len(head) < 4 or head[0].strip() != b"Pf":
+        raise FormatError(file, "header", repr(data[:16]), "'Pf', width and height, scale on three lines")
+    try:
+        w, h = (int(x) for x in head[1].split())
+        scale = float(head[2])
+    except ValueError:
+        raise FormatError(file, "header", repr(b" ".join(head[1:3])), "width, height and scale") from None
+    size = (h, w)
+    if hw is not None and size != tuple(hw):
+        raise FormatError(file, "size", _size(size), _size(hw))
+    start = sum(len(line) + 1 for line in head[:3])
+    if min(h, w) < 1 or h * w > MAX_PIXELS or len(data) - start != 4 * h * w:
+        raise FormatError(file, "data", f"{len(data) - start} bytes", f"4 for each of {_size(size)} pixels")
+    order = "<f4" if scale < 0 else ">f4"
+    return np.frombuffer(data, order, h * w, start).reshape(h, w)[::-1].astype(np.float32)
+
+
+def read_npz(file: Path, key: str) -> np.ndarray:
+    """Array ``key`` of an ``.npz`` archive as floating point; pickled objects are refused.
+
+    Raises:
+        FormatError: missing or damaged archive, no such key, not numeric, or larger than it says or than ``MAX_BYTES``.
+    """
+    data = read_bytes(file)
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            if f"{key}.npy" not in archive.namelist():
+                raise FormatError(file, "key", ", ".join(sorted(archive.namelist())[:8]) or "nothing", f"{key}.npy")
+            if archive.getinfo(f"{key}.npy").file_size > MAX_BYTES:
+                raise FormatError(file, key, "an array that unpacks beyond the limit", f"at most {MAX_BYTES} bytes")
+            raw = archive.read(f"{key}.npy")
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, OSError) as error:
+        raise FormatError(file, "archive", error, "a whole .npz archive") from None
+    return _npy(file, key, raw)
+
+
+def _npy(file: Path, key: str, raw: bytes) -> np.ndarray:
+    stream = io.BytesIO(raw)
+    try:
+        version = np.lib.format.read_magic(stream)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, fortran, dtype = read(stream)
+    except (ValueError, SyntaxError, TypeError, struct.error) as error:
+        raise FormatError(file, key, error, "a numpy array header") from None
+    if dtype.kind not in "fiu" or dtype.hasobject:
+        raise FormatError(file, f"{key} dtype", dtype, "real numbers")
+    count, left = math.prod(shape), len(raw) - stream.tell()
+    if min(shape, default=0) < 0 or count * dtype.itemsize != left:
+        raise FormatError(file, key, f"{left} bytes", f"{shape} of {dtype}")
+    array = np.frombuffer(raw, dtype, count, stream.tell()).reshape(shape, order="F" if fortran else "C")
+    return array.astype(np.float32 if dtype.itemsize <= 4 and dtype.kind == "f" else np.float64)
+
+
+# ------------------------------------------------------------------------------------------------------------ text
+
+
+def read_table(file: Path, columns: int | None = None) -> np.ndarray:
+    """Numbers (rows, columns) float64 of a white-space separated table; ``#`` starts a comment. NaN may occur.
+
+    Raises:
+        FormatError: missing file, something that is no number, or a row of another length.
+    """
+    rows = read_rows(file)
+    width = columns or (len(rows[0][1]) if rows else 0)
+    values = np.empty((len(rows), width))
+    for i, (line, words) in enumerate(rows):
+        if len(words) != width:
+            raise FormatError(file, f"line {line}", f"{len(words)} columns", f"{width} numbers")
+        try:
+            values[i] = [float(word) for word in words]
+        except ValueError:
+            raise FormatError(file, f"line {line}", " ".join(words), f"{width} numbers") from None
+    return values
+
+
+def read_rows(file: Path) -> list[tuple[int, list[str]]]:
+    """(line number, words) of every line of a text file that is neither blank nor a ``#`` comment."""
+    lines = enumerate(read_text(file).splitlines(), 1)
+    return [(i, line.split()) for i, line in lines if line.strip() and not line.lstrip().startswith("#")]
+
+
+def read_json(file: Path) -> dict[str, Any]:
+    """A JSON object.
+
+    Raises:
+        FormatError: missing file, no JSON, or something else than an object on top.
+    """
+    try:
+        value = json.loads(read_text(file))
+    except (ValueError, RecursionError) as error:
+        raise FormatError(file, "JSON", error, "a JSON object") from None
+    if not isinstance(value, dict):
+        raise FormatError(file, "JSON", type(value).__name__, "an object")
+    return value
+
+
+def get(value: Any, path: str, kind: type | tuple[type, ...], file: Path) -> Any:
+    """The entry ``"a.b.c"`` of nested JSON objects, of type ``kind``.
+
+    Raises:
+        FormatError: absent or of another type.
+    """
+    for part in path.split("."):
+        if not isinstance(value, dict) or part not in value:
+            raise FormatError(file, path, "nothing", _kind_name(kind))
+        value = value[part]
+    if not isinstance(value, kind) or isinstance(value, bool):
+        raise FormatError(file, path, repr(value), _kind_name(kind))
+    return value
+
+
+def to_array(value: Any, shape: tuple[int, ...], file: Path, field: str) -> np.ndarray:
+    """Numbers of a given shape, float64 and finite, from JSON lists, options or a table.
+
+    Raises:
+        FormatError: not numbers, another shape, or not finite.
+    """
+    expected = f"{'x'.join(map(str, shape)) or 'one'} finite numbers"
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise FormatError(file, field, repr(value), expected) from None
+    if array.shape != shape or not np.isfinite(array).all():
+        raise FormatError(file, field, array.tolist(), expected)
+    return array
+
+
+def read_text(file: Path) -> str:
+    """The UTF-8 text of a file of at most ``MAX_TEXT_BYTES``."""
+    try:
+        return read_bytes(file, MAX_TEXT_BYTES).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise FormatError(file, "text", error.reason, "UTF-8") from None
+
+
+def read_bytes(file: Path, limit: int = MAX_BYTES) -> bytes:
+    """All bytes of a file, at least one and at most ``limit``.
+
+    Raises:
+        FormatError: the file is missing, unreadable, empty or too large.
+    """
+    try:
+        size = file.stat().st_size
+        if not 0 < size <= limit:
+            raise FormatError(file, "file size", f"{size} bytes", f"1 to {limit} bytes")
+        return file.read_bytes()
+    except OSError as error:
+        found = "no such file" if isinstance(error, FileNotFoundError) else (error.strerror or "an error")
+        raise FormatError(file, "file", found, "a readable file") from None
+
+
+def _kind_name(kind: type | tuple[type, ...]) -> str:
+    kinds = kind if isinstance(kind, tuple) else (kind,)
+    return " or ".join({dict: "an object", list: "a list", str: "a text"}.get(k, "a number") for k in kinds)
+
+
+def _size(hw: tuple[int, int]) -> str:
+    return f"{hw[1]}x{hw[0]}"
+
+
+def _short(value: object, limit: int = 120) -> str:
+    text = " ".join(str(value).split())
+    return text if len(text) <= limit else text[: limit - 1] + "…"

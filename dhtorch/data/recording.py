@@ -1,0 +1,81 @@
+"""A recording: the frames of one camera through one scene, read when asked for.
+
+Opening a recording touches names, headers and text tables; pixels are decoded by ``recording[i]`` alone. So a large
+set opens at once and streams at constant memory, also from the workers of a data loader (a recording pickles).
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from dhtorch.records import Frame, Pose
+
+
+@dataclass(frozen=True, eq=False)
+class Recording(Sequence[Frame]):
+    """A lazy sequence of frames (B = 1) of one scene.
+
+    A reader supplies ``load``, which decodes image, depth and cameras of position ``i``; the recording adds what is
+    known for the whole sequence (time, pose). ``number`` keeps the place of every frame in the capture: where a frame
+    was skipped the numbers have a gap, so that pairs never shift silently.
+
+    Raises:
+        ValueError: no frame, or fields of unequal length.
+    """
+
+    name: str  # of the scene, for tables and figures
+    format: str  # the reader that made it
+    load: Callable[[int], Frame]  # picklable; position → frame without time and pose
+    number: Tensor  # (n,) int64, strictly increasing place of each frame in the capture
+    root: Path | None = None  # folder or file that was opened; None = not from disk
+    times: Tensor | None = None  # (n,) s, float64
+    poses: Pose | None = None  # (n) T_world_from_cam, float64
+    rate_hz: float | None = None  # nominal frame rate
+    sparse: bool = False  # depth is a projected LiDAR sweep: mostly empty between returns
+    near: float | None = None  # m, the cutoff to use for a range split on this scene
+    gap: int | None = None  # frame step that gives a usable baseline
+    levels: int | None = None  # pyramid levels that the motion in this scene asks for
+    role: str | None = None  # "rotation" = almost no baseline: never enters a mean
+    report: tuple[str, ...] = ()  # what was left out, and why
+
+    def __post_init__(self) -> None:
+        n = self.number.shape[0]
+        if n == 0:
+            raise ValueError(f"recording {self.name}: found no frame, expected at least one")
+        lengths = {
+            "times": n if self.times is None else self.times.shape[0],
+            "poses": n if self.poses is None else self.poses.t.shape[0],
+        }
+        for field, length in lengths.items():
+            if length != n:
+                raise ValueError(f"recording {self.name}: found {length} {field}, expected one for each of {n} frames")
+        if not bool((self.number.diff() > 0).all()):
+            raise ValueError(f"recording {self.name}: number must increase strictly from frame to frame")
+
+    def __len__(self) -> int:
+        return self.number.shape[0]
+
+    def __getitem__(self, index: int) -> Frame:  # type: ignore[override]  # one frame at a time: slices would decode
+        i, n = operator.index(index), len(self)
+        if not -n <= i < n:
+            raise IndexError(f"recording {self.name}: frame {i} of {n}")
+        i %= n
+        frame = self.load(i)
+        return frame.replace(
+            time=None if self.times is None else self.times[i : i + 1],
+            T_world_from_cam=None if self.poses is None else self.poses[i : i + 1],
+        )
+
+    def __repr__(self) -> str:
+        return f"Recording({self.name!r}, {self.format}, {len(self)} frames)"
+
+
+def numbers(n: int) -> Tensor:
+    """(n,) int64 0, 1, 2, …: the frame numbers of a capture without gaps."""
+    return torch.arange(n, dtype=torch.int64)
