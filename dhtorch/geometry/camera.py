@@ -118,6 +118,26 @@ def undistort(camera: Camera, uv: Tensor, *, iterations: int = 12) -> Tensor:
     return torch.where(solved, uv, torch.full_like(uv, torch.nan))
 
 
+def depth_pixels(
+    camera: Camera,
+    hw: tuple[int, int],
+    depth_camera: Camera | None,
+    depth_hw: tuple[int, int],
+    uv: Tensor,  # (B, N, 2) px of the image
+) -> Tensor:
+    """Where image pixels lie in a depth map taken from the same place: (B, N, 2) depth pixels.
+
+    With a camera of its own the map is reached along the viewing ray; without one it covers the same field as the
+    image of size ``hw`` and the exact scaling rule of :func:`resize` applies.
+    """
+    if depth_camera is not None:
+        return project(depth_camera, rays(camera, uv))
+    if depth_hw == hw:
+        return uv
+    s = torch.as_tensor([depth_hw[1] / hw[1], depth_hw[0] / hw[0]]).to(uv)
+    return (uv + 0.5) * s - 0.5
+
+
 def undistort_jacobian(camera: Camera, uv_ideal: Tensor) -> Tensor:
     """d(ideal pixel) / d(distorted pixel), (B, N, 2, 2), at ideal pixels (B, N, 2): carries covariances along."""
     check("camera.undistort_jacobian", f=(camera.f, "B 2"), uv_ideal=(uv_ideal, "B N 2"))

@@ -1,0 +1,46 @@
+"""A pose from elsewhere (a device trajectory, an oracle) in the shape of seat 5's answer, for ``extend(fit=...)``."""
+
+from __future__ import annotations
+
+import torch
+
+from dhtorch.codes import PoseCode
+from dhtorch.geometry import se3
+from dhtorch.records import Frame, Pose, PoseFit
+
+
+def given_pose(
+    T_1_from_0: Pose,
+    n: int,
+) -> PoseFit:
+    """Present a known relative pose of B pairs as a :class:`PoseFit` over ``n`` samples.
+
+    The pose is taken as exact: covariance, rms and pixel noise are zero and ``t_snr`` infinite; no sample counts as
+    an inlier because none took part. A non-finite pose gets the code TOO_FEW and is not ok.
+    """
+    R, t = T_1_from_0.R, T_1_from_0.t
+    batch = t.shape[0]
+    finite = R.isfinite().flatten(1).all(-1) & t.isfinite().all(-1)
+    zero = torch.zeros(batch, dtype=t.dtype, device=t.device)
+    return PoseFit(
+        T_1_from_0=T_1_from_0,
+        cov=torch.zeros(batch, 6, 6, dtype=t.dtype, device=t.device),
+        inlier=torch.zeros(batch, n, dtype=torch.bool, device=t.device),
+        n_inlier=torch.zeros(batch, dtype=torch.int64, device=t.device),
+        rms_px=zero,
+        sigma_px=zero,
+        t_snr=torch.full_like(zero, torch.inf),
+        code=torch.where(finite, PoseCode.OK, PoseCode.TOO_FEW).to(torch.int32),
+    )
+
+
+def device_pose(frame_0: Frame, frame_1: Frame, n: int) -> PoseFit:
+    """The data set's own trajectory as the pose of a pair.
+
+    Raises:
+        ValueError: a frame without ``T_world_from_cam``.
+    """
+    if frame_0.T_world_from_cam is None or frame_1.T_world_from_cam is None:
+        raise ValueError("device_pose: frame.T_world_from_cam is absent, expected the data set's camera-to-world pose")
+    T = se3.relative(frame_0.T_world_from_cam, frame_1.T_world_from_cam)
+    return given_pose(T.to(frame_0.camera.f.dtype), n)

@@ -1,0 +1,156 @@
+"""Two-view geometry of one point: closed-form depth, and how errors reach it.
+
+Alphabet: view 0 is the anchor and its pixel ``uv_0`` is exact; ``x`` = viewing ray of view 0 with z = 1; the point is
+X = depth · x in camera 0 and Y = R X + t in camera 1; ``uv_1`` is its measured pixel. Everything is ideal pinhole; the
+two cameras may differ. Coordinates travel as separate (B, N) planes: each operation is contiguous, and rounding cannot
+depend on the batch.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dhtorch.geometry import camera as cam
+from dhtorch.geometry import se3
+from dhtorch.geometry.camera import Camera
+from dhtorch.geometry.se3 import Pose
+from dhtorch.geometry.shapes import check
+
+
+class TwoView(NamedTuple):
+    """What :func:`triangulate` finds for B × N points; finite everywhere, meaningful where both depths are positive."""
+
+    depth: Tensor  # (B, N) m, z in camera 0
+    depth_1: Tensor  # (B, N) m, z in camera 1
+    parallax: Tensor  # (B, N) rad, angle at the point between the rays to the two centres
+    residual_px: Tensor  # (B, N) distance of uv_1 from the point's image in view 1
+    slope: Tensor  # (B, N, 2) px/m, d(pixel in view 1) / d(depth): the epipolar direction times the sensitivity
+    J_pose: Tensor  # (B, N, 2, 6) d(pixel in view 1) / d(left perturbation of T_1_from_0)
+
+
+def triangulate(
+    uv_0: Tensor,  # (B, N, 2) ideal px
+    uv_1: Tensor,  # (B, N, 2) ideal px
+    camera_0: Camera,
+    camera_1: Camera,
+    T_1_from_0: Pose,
+) -> TwoView:
+    """One-sided optimal triangulation: the anchor's pixel is exact, the other is moved onto its epipolar line.
+
+    ``uv_1`` drops perpendicularly (in pixels) onto the epipolar line of ``uv_0``, which is the maximum-likelihood
+    correction for isotropic noise in view 1; the two rays then meet and depth is a quotient of 2-vectors.
+
+    Returns:
+        :class:`TwoView`. Without a baseline, or where the rays are parallel, depth is 0 and the slope 0.
+
+    Gradient: to pixels, both cameras and the pose; smooth except at the epipole.
+    Checked against ``cv2.triangulatePoints`` and ``kornia.geometry.epipolar.triangulate_points``.
+    Source: R. Hartley, A. Zisserman, "Multiple View Geometry", section 12.3, with one noise-free view.
+    """
+    check("triangulate", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), f0=(camera_0.f, "B 2"), f1=(camera_1.f, "B 2"))
+    a0, a1, a2 = se3.rotate(T_1_from_0.R, cam.rays(cam.ideal(camera_0), uv_0)).unbind(-1)  # direction R x in camera 1
+    t0, t1, t2 = (T_1_from_0.t[:, None, k] for k in range(3))
+    f, c = camera_1.f[:, None], camera_1.c[:, None]
+    y0, y1 = ((uv_1 - c) / f).unbind(-1)
+    # Epipolar line l = t × R x in normalised coordinates; in pixels its normal is (l0 / fx, l1 / fy).
+    l0, l1, l2 = t1 * a2 - t2 * a1, t2 * a0 - t0 * a2, t0 * a1 - t1 * a0
+    n0, n1 = l0 / f[..., 0], l1 / f[..., 1]
+    lift = (l0 * y0 + l1 * y1 + l2) / _guard(n0 * n0 + n1 * n1)
+    y0, y1 = y0 - lift * n0 / f[..., 0], y1 - lift * n1 / f[..., 1]
+    # (R x − (R x)₃ y) depth = t₃ y − t on the first two rows.
+    p0, p1 = a0 - a2 * y0, a1 - a2 * y1
+    q0, q1 = t2 * y0 - t0, t2 * y1 - t1
+    depth = (p0 * q0 + p1 * q1) / _guard(p0 * p0 + p1 * p1)
+    return _describe(depth, torch.stack((a0, a1, a2), -1), uv_1, camera_1, T_1_from_0)
+
+
+def describe(
+    xyz_0: Tensor,  # (B, N, 3) m in camera 0
+    uv_0: Tensor,
+    uv_1: Tensor,
+    camera_0: Camera,
+    camera_1: Camera,
+    T_1_from_0: Pose,
+) -> TwoView:
+    """The same quantities for points found by another triangulation; the residual is the larger of the two views."""
+    check("describe", xyz_0=(xyz_0, "B N 3"), uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"))
+    z = xyz_0[..., 2]
+    x = xyz_0 / torch.where(z.abs() < 1e-9, torch.full_like(z, 1e-9), z)[..., None]
+    found = _describe(z, se3.rotate(T_1_from_0.R, x), uv_1, camera_1, T_1_from_0)
+    miss_0 = _length(uv_0 - cam.project(cam.ideal(camera_0), xyz_0))
+    return found._replace(residual_px=torch.maximum(found.residual_px, miss_0))
+
+
+def _describe(depth: Tensor, direction: Tensor, uv_1: Tensor, camera_1: Camera, T_1_from_0: Pose) -> TwoView:
+    """``direction`` (B, N, 3) = R x, the anchor's ray turned into camera 1."""
+    t = T_1_from_0.t[:, None]
+    Y = depth[..., None] * direction + t
+    miss = uv_1 - cam.project(cam.ideal(camera_1), Y)
+    J_point, J_pose = point_jacobians(camera_1, Y)
+    slope = (J_point * direction[..., None, :]).unbind(-1)
+    return TwoView(depth, Y[..., 2], _angle(Y, t), _length(miss), slope[0] + slope[1] + slope[2], J_pose)
+
+
+def point_jacobians(
+    camera: Camera,
+    xyz: Tensor,  # (B, N, 3) m in that camera
+) -> tuple[Tensor, Tensor]:
+    """d(pixel) / d(point) (B, N, 2, 3) and d(pixel) / d(left pose perturbation) (B, N, 2, 6), ideal pinhole.
+
+    |z| is kept away from zero. Checked against autograd.
+    """
+    check("point_jacobians", f=(camera.f, "B 2"), xyz=(xyz, "B N 3"))
+    x, y, z = xyz.unbind(-1)
+    inv_z = 1 / torch.where(z.abs() < 1e-9, torch.full_like(z, 1e-9), z)
+    zero = torch.zeros_like(z)
+    fx, fy = camera.f[:, None, 0] * inv_z, camera.f[:, None, 1] * inv_z
+    gx, gy = -fx * x * inv_z, -fy * y * inv_z
+    J_point = torch.stack((fx, zero, gx, zero, fy, gy), -1).unflatten(-1, (2, 3))
+    J_rotation = torch.stack((gx * y, fx * z - gx * x, -fx * y, gy * y - fy * z, -gy * x, fy * x), -1)
+    return J_point, torch.cat((J_rotation.unflatten(-1, (2, 3)), J_point), -1)
+
+
+def depth_variance(
+    geometry: TwoView,
+    cov_uv_1: Tensor,  # (B, N, 2, 2) px²
+    cov_pose: Tensor,  # (B, 6, 6)
+) -> tuple[Tensor, Tensor]:
+    """First-order variance of depth (B, N) m²: the point's own part (its track) and the part shared through the pose.
+
+    Along the epipolar direction d the depth obeys |slope| · dz = d · (δuv_1 − J_pose δξ), hence both parts.
+
+    Gradient: to covariances and geometry. Infinite where depth does not move the pixel.
+    """
+    slope = geometry.slope
+    steep = (slope * slope).sum(-1)
+    defined = steep > 1e-18
+    gain = slope / torch.where(defined, steep, torch.ones_like(steep))[..., None]  # d(depth) / d(uv_1), m/px
+    g0, g1 = gain.unbind(-1)
+    own = g0 * g0 * cov_uv_1[..., 0, 0] + 2 * g0 * g1 * cov_uv_1[..., 0, 1] + g1 * g1 * cov_uv_1[..., 1, 1]
+    row = g0[..., None] * geometry.J_pose[..., 0, :] + g1[..., None] * geometry.J_pose[..., 1, :]  # (B, N, 6)
+    carried = sum(row[..., k, None] * cov_pose[:, None, k] for k in range(6))
+    shared = (carried * row).sum(-1)
+    infinite = torch.full_like(own, torch.inf)
+    return torch.where(defined, own, infinite), torch.where(defined, shared.clamp_min(0), infinite)
+
+
+def _guard(x: Tensor) -> Tensor:
+    """A non-negative denominator kept away from zero."""
+    return torch.where(x < 1e-18, torch.full_like(x, 1e-18), x)
+
+
+def _length(v: Tensor) -> Tensor:
+    """Euclidean length over the last axis with a finite gradient at zero."""
+    square = (v * v).sum(-1)
+    positive = square > 0
+    return torch.where(positive, torch.where(positive, square, torch.ones_like(square)).sqrt(), square)
+
+
+def _angle(Y: Tensor, t: Tensor) -> Tensor:
+    """Angle (B, N) at points Y (camera 1) between the rays to camera 1's centre (the origin) and camera 0's (t)."""
+    (y0, y1, y2), (d0, d1, d2) = Y.unbind(-1), (Y - t).unbind(-1)
+    cross = torch.stack((y1 * d2 - y2 * d1, y2 * d0 - y0 * d2, y0 * d1 - y1 * d0), -1)
+    return torch.atan2(_length(cross), y0 * d0 + y1 * d1 + y2 * d2)

@@ -1,0 +1,96 @@
+"""Stage 3, why a return is missing: the hole taxonomy.
+
+A sample without a usable return falls into exactly one class (``codes.Hole``), and each class names what could be done
+about it (``codes.ROUTE_OF_HOLE``). The key class, TRACKABLE_NO_LIDAR, is a candidate for triangulation; it says nothing
+about why the sensor was silent.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dhtorch.codes import ROUTE_OF_HOLE, Flag, Hole
+from dhtorch.geometry.lookup import luma, patches, round_half_up
+from dhtorch.geometry.shapes import check
+from dhtorch.records import Frame, Samples
+
+
+def classify(
+    frame: Frame,
+    samples: Samples,
+    *,
+    block: int = 7,
+    min_trackability: float = 1e-5,
+) -> Samples:
+    """Measure the texture at every sample and name the class of every hole.
+
+    Asked in this order, the first that holds wins: AT_BORDER, TOO_DARK, TOO_BRIGHT, HIGHLIGHT, LOW_TEXTURE; what is
+    left is TRACKABLE_NO_LIDAR. A sample with a usable return is no hole.
+
+    Args:
+        frame: the B views the samples were taken from.
+        samples: from :func:`dhtorch.stages.backproject.backproject`.
+        block: side of the block the gradient matrix is averaged over, px.
+        min_trackability: smaller eigenvalue (image in [0, 1]) below which there is nothing to track.
+
+    Returns:
+        Samples with ``trackability`` and ``hole`` filled.
+
+    Raises:
+        ValueError: wrong shapes.
+
+    Gradient: ``trackability`` to the image; classes carry none.
+    Cost: reads (block + 2)² pixels per sample, whatever the image size.
+    Source: paper, "Hole taxonomy"; J. Shi, C. Tomasi, "Good features to track", 1994.
+    """
+    check("classify", image=(frame.image, "B C H W"), uv=(samples.uv, "B N 2"), flag=(samples.flag, "B N"))
+    trackability = min_eigenvalue(frame.image, samples.uv, block=block)
+    classes = (
+        (Flag.BORDER, Hole.AT_BORDER),
+        (Flag.UNDEREXPOSED, Hole.TOO_DARK),
+        (Flag.SATURATED, Hole.TOO_BRIGHT),
+        (Flag.SPECULAR, Hole.HIGHLIGHT),
+    )
+    textured = trackability.detach() >= min_trackability
+    hole = torch.where(textured, Hole.TRACKABLE_NO_LIDAR, Hole.LOW_TEXTURE).to(torch.int32)
+    for bit, name in reversed(classes):
+        hole = torch.where((samples.flag & bit) != 0, torch.full_like(hole, name), hole)
+    is_hole = samples.xyz.isnan().any(-1)
+    hole = torch.where(is_hole, hole, torch.full_like(hole, Hole.NONE))
+    return samples.replace(trackability=trackability.to(samples.depth.dtype), hole=hole)
+
+
+def min_eigenvalue(
+    image: Tensor,  # (B, C, H, W)
+    uv: Tensor,  # (B, N, 2) px
+    *,
+    block: int = 7,
+) -> Tensor:
+    """Smaller eigenvalue (B, N) of the mean gradient matrix around pixels: Shi–Tomasi trackability.
+
+    Equal to ``cv2.cornerMinEigenVal(grey, block, 3)`` at the nearest pixel wherever the block and the 3×3 Sobel
+    filter stay inside the image; nearer to the border the block is moved inside. The Sobel pair is the one of
+    ``kornia.filters.spatial_gradient(normalized=False)``, scaled by ¼.
+
+    Gradient: to the image; at equal eigenvalues the subgradient without the split is taken.
+    """
+    check("min_eigenvalue", image=(image, "B C H W"), uv=(uv, "B N 2"))
+    size = block + 2
+    corner = round_half_up(uv.nan_to_num(-1e6)).clamp(-1e6, 1e6).long() - size // 2
+    grey = luma(patches(image, corner, size), 2)[:, :, 0]  # (B, N, size, size)
+    across = grey[..., :, 2:] - grey[..., :, :-2]
+    down = grey[..., 2:, :] - grey[..., :-2, :]
+    gx = (across[..., :-2, :] + 2 * across[..., 1:-1, :] + across[..., 2:, :]).flatten(-2) / 4
+    gy = (down[..., :-2] + 2 * down[..., 1:-1] + down[..., 2:]).flatten(-2) / 4
+    a, b, c = (gx * gx).mean(-1), (gx * gy).mean(-1), (gy * gy).mean(-1)
+    split2 = (a - c) ** 2 / 4 + b * b
+    positive = split2 > 0
+    split = torch.where(positive, torch.where(positive, split2, torch.ones_like(split2)).sqrt(), split2)
+    return (a + c) / 2 - split
+
+
+def route(hole: Tensor) -> Tensor:
+    """What to try for each hole: ``codes.Hole`` (…) → ``codes.Route`` (…), for the user of the map."""
+    table = torch.tensor([ROUTE_OF_HOLE[k] for k in sorted(ROUTE_OF_HOLE)], dtype=hole.dtype, device=hole.device)
+    return table[hole.long()]

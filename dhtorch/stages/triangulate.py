@@ -1,0 +1,111 @@
+"""Stage 6, two views → depth with a sigma, and the gates that turn weak geometry into an explicit hole."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from dhtorch.codes import Gate
+from dhtorch.geometry import epipolar
+from dhtorch.geometry.shapes import check
+from dhtorch.records import Camera, Estimate, PoseFit, Samples, Tracks
+
+
+def two_view(
+    samples: Samples,
+    tracks: Tracks,
+    fit: PoseFit,
+    camera_0: Camera,
+    camera_1: Camera,
+    *,
+    min_parallax_deg: float | None = 0.3,
+    max_residual_px: float | None = 3.0,
+    solver: Callable[..., epipolar.TwoView] = epipolar.triangulate,
+) -> Estimate:
+    """Triangulate every track under the anchored pose and abstain where the geometry is weak.
+
+    Args:
+        samples: N samples of view 0 (their own depth is not used here).
+        tracks: where they were found, in ideal pixels.
+        fit: metric relative pose.
+        camera_0, camera_1: intrinsics of the two views, ideal; they may differ.
+        min_parallax_deg: rays closer to parallel than this are not answered; None asks nothing.
+        max_residual_px: reprojection error above which a point is not answered; None asks nothing. Triangulation is
+            one-sided, so the residual in view 0 is zero and the one in view 1 is the larger of the two.
+        solver: ``(uv_0, uv_1, camera_0, camera_1, T_1_from_0) -> TwoView``, how two rays become a depth.
+
+    Returns:
+        Estimate with score 1 where answered (the next stage ranks). ``sigma`` combines the track's covariance and
+        the pose's; ``sigma_shared`` is the pose's part, common to the pair's points.
+
+    Gates, first reason wins: NO_TRACK, NO_POSE, BEHIND, PARALLAX, RESIDUAL.
+
+    Raises:
+        ValueError: wrong shapes.
+
+    Gradient: depth, sigma, parallax and residual to pixels, cameras and pose; gates carry none. Points that are not
+    answered pass no gradient.
+    Source: paper, "Gated two-view triangulation and abstention".
+    """
+    check("two_view", uv_0=(tracks.uv_0, "B N 2"), uv=(samples.uv, "B N 2"), R=(fit.T_1_from_0.R, "B 3 3"))
+    posed = fit.ok[:, None]
+    tracked = tracks.valid & tracks.uv_0.isfinite().all(-1) & tracks.uv_1.isfinite().all(-1)
+    geometry = solver(
+        _silence(tracks.uv_0, tracked), _silence(tracks.uv_1, tracked), camera_0, camera_1, _stand_in(fit)
+    )
+    parallax_deg = geometry.parallax * (180 / math.pi)
+    behind = ~((geometry.depth > 0) & (geometry.depth_1 > 0))
+    reasons = (
+        (~tracked, Gate.NO_TRACK),
+        (~posed, Gate.NO_POSE),
+        (behind, Gate.BEHIND),
+        (parallax_deg <= (min_parallax_deg if min_parallax_deg is not None else -1.0), Gate.PARALLAX),
+        (geometry.residual_px >= (max_residual_px if max_residual_px is not None else torch.inf), Gate.RESIDUAL),
+    )
+    gate = first_reason(reasons)
+    own, shared = epipolar.depth_variance(geometry, tracks.cov, fit.cov.nan_to_num())
+    keep, measured = gate == Gate.ANSWER, tracked & posed
+    return Estimate(
+        uv=samples.uv,
+        depth=_where_or_nan(keep, geometry.depth),
+        sigma=_where_or_nan(keep, _root(own + shared, keep)),
+        sigma_shared=_where_or_nan(keep, _root(shared, keep)),
+        parallax_deg=torch.where(measured, parallax_deg, torch.zeros_like(parallax_deg)),
+        residual_px=torch.where(measured, geometry.residual_px, torch.zeros_like(geometry.residual_px)),
+        n_views=torch.where(measured, 2, 1).to(torch.int32),
+        score=keep.to(geometry.depth.dtype),
+        gate=gate,
+    )
+
+
+def first_reason(reasons: tuple[tuple[Tensor, int], ...]) -> Tensor:
+    """Gate codes (B, N) from (mask, code) pairs in the order asked; ANSWER where none holds."""
+    gate = torch.zeros_like(reasons[0][0], dtype=torch.int32) + Gate.ANSWER
+    for mask, code in reversed(reasons):
+        gate = torch.where(mask, torch.full_like(gate, code), gate)
+    return gate
+
+
+def _stand_in(fit: PoseFit) -> epipolar.Pose:
+    """The fitted pose, with a harmless one where there is none, so that arithmetic and gradients stay finite."""
+    ok = fit.ok
+    R, t = fit.T_1_from_0.R, fit.T_1_from_0.t
+    eye = torch.eye(3, dtype=R.dtype, device=R.device)
+    return epipolar.Pose(torch.where(ok[:, None, None], R, eye), torch.where(ok[:, None], t, eye[0]))
+
+
+def _silence(uv: Tensor, valid: Tensor) -> Tensor:
+    return torch.where(valid[..., None], uv, torch.zeros_like(uv))
+
+
+def _where_or_nan(keep: Tensor, x: Tensor) -> Tensor:
+    return torch.where(keep, x, torch.full_like(x, torch.nan))
+
+
+def _root(x: Tensor, keep: Tensor) -> Tensor:
+    """Square root whose gradient stays finite where the value is not used or zero."""
+    fine = keep & (x > 0)
+    return torch.where(fine, torch.where(fine, x, torch.ones_like(x)).sqrt(), torch.zeros_like(x))
