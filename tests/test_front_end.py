@@ -52,7 +52,7 @@ def test_spiral_is_densest_at_the_gaze_and_has_no_duplicates():
         shares = torch.histc(r, 5, 0, 100) / (torch.arange(5) * 2 + 1)  # per ring area
         assert (shares[:-1] > shares[1:]).all()
         distance = torch.cdist(uv.double(), uv.double()) + 1e9 * torch.eye(len(uv))
-        assert distance.min() > 0.5
+        assert distance.min() > (0.5 if gaze is None else 0.2)  # a gaze near the border squeezes one side
         assert len(torch.unique(uv.round(), dim=0)) > 0.97 * len(uv)
 
 
