@@ -1,0 +1,93 @@
+"""The floor plan: imports go down only, cv2 and hydra live where they should, and importing costs little."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import dhtorch
+
+ROOT = Path(dhtorch.__file__).parent
+LEVELS = [
+    {"tree", "codes", "archive"},
+    {"geometry"},
+    {"records"},
+    {"stages", "negative", "data", "evaluate", "baselines"},
+    {"pair", "window", "integrate"},
+    {"transform", "extract", "experiments"},
+    {"run", "report", "viewer", "capture", "__main__"},
+]
+LEVEL = {name: level for level, group in enumerate(LEVELS) for name in group}
+SIDEWAYS = {
+    ("window", "pair"),
+    ("extract", "transform"),
+    ("run", "report"),
+    ("run", "capture"),
+    ("run", "viewer"),
+    ("__main__", "run"),
+}
+FILES = sorted(ROOT.rglob("*.py"))
+
+
+def imported(path):
+    """Dotted names a file imports, `from a import b` as a.b, with whether the import runs when the module loads."""
+    tree = ast.parse(path.read_text())
+    inside = {id(n) for f in ast.walk(tree) if isinstance(f, ast.FunctionDef | ast.ClassDef) for n in ast.walk(f)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, id(node) not in inside) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            yield from ((f"{node.module}.{alias.name}", id(node) not in inside) for alias in node.names)
+
+
+def part(path):
+    relative = path.relative_to(ROOT)
+    return relative.parts[0] if len(relative.parts) > 1 else relative.stem
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_imports_go_down_only(path):
+    here = part(path)
+    if here == "__init__":
+        return
+    assert here in LEVEL, f"{path}: {here} has no floor"
+    for name, _ in imported(path):
+        pieces = name.split(".")
+        if pieces[0] != "dhtorch" or len(pieces) < 2:
+            continue
+        there = pieces[1]
+        assert there in LEVEL, f"{path}: imports {name}, which has no floor"
+        if there == here:
+            same_file = here in {"stages", "negative", "baselines", "experiments"} and len(pieces) > 2
+            assert not (same_file and here == "stages" and pieces[2] != path.stem), f"{path}: a stage imports a stage"
+            continue
+        allowed = LEVEL[there] < LEVEL[here] or (here, there) in SIDEWAYS
+        assert allowed, f"{path}: imports {name} from floor {LEVEL[there]}, stands on {LEVEL[here]}"
+
+
+@pytest.mark.parametrize(
+    ("library", "homes"),
+    [("cv2", {"data/files.py", "baselines/opencv.py"}), ("hydra", {"run.py"}), ("omegaconf", {"run.py"})],
+)
+def test_libraries_stay_at_home(library, homes):
+    users = {str(p.relative_to(ROOT)) for p in FILES if any(n.split(".")[0] == library for n, _ in imported(p))}
+    assert users <= homes
+
+
+def test_heavy_libraries_are_not_imported_with_the_package():
+    code = "import sys, dhtorch; print([m for m in ('matplotlib', 'rich', 'hydra', 'cv2', 'scipy', 'transformers') if m in sys.modules])"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "[]"
+
+
+def test_no_module_shadows_the_standard_library_or_its_own_function():
+    for path in FILES:
+        if path.stem in ("__init__", "__main__"):
+            continue
+        functions = {n.name for n in ast.parse(path.read_text()).body if isinstance(n, ast.FunctionDef)}
+        exported = {name for name in dir(dhtorch) if not name.startswith("_")}
+        assert path.stem not in sys.stdlib_module_names or path.parent != ROOT, path
+        assert not (path.stem in functions and path.stem in exported and path.parent == ROOT), path
