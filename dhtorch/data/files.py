@@ -325,7 +325,8 @@ def read_bytes(file: Path, limit: int = MAX_BYTES) -> bytes:
 
 def _kind_name(kind: type | tuple[type, ...]) -> str:
     kinds = kind if isinstance(kind, tuple) else (kind,)
-    return " or ".join({dict: "an object", list: "a list", str: "a text"}.get(k, "a number") for k in kinds)
+    words: dict[type, str] = {dict: "an object", list: "a list", str: "a text"}
+    return " or ".join(dict.fromkeys(words.get(k, "a number") for k in kinds))
 
 
 def _size(hw: tuple[int, int]) -> str:

@@ -1,0 +1,181 @@
+"""Units, axes and poses of foreign data → ours: metres, x right, y down, z forward, ``T_world_from_cam``.
+
+Alphabet: ``K`` 3×3 intrinsics; ``c2w`` camera-to-world 4×4 (maps camera points into the world); quaternions are
+(x, y, z, w); *GL* axes are x right, y up, z backward (ARKit, OpenGL). Numbers enter as numpy arrays and leave as
+records; a value that cannot be a camera or a rigid motion is a ``FormatError`` with the file it came from.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dhtorch.data.files import FormatError, to_array
+from dhtorch.geometry import camera as cameras
+from dhtorch.geometry import se3
+from dhtorch.geometry.lookup import round_half_up
+from dhtorch.records import Camera, Pose
+
+#: How far the determinant of a stored rotation may be from 1 before it is taken for damage instead of rounding.
+MAX_DET_ERROR = 0.01
+
+_GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def to_camera(
+    K: object,  # 3×3 numbers
+    hw: tuple[int, int],
+    file: Path,
+    field: str = "K",
+    distortion: object = None,  # OpenCV's order; all zero = None
+) -> Camera:
+    """Camera (B = 1, float32) of an intrinsic matrix that could belong to an image of size ``hw``.
+
+    Raises:
+        FormatError: not 3×3, not finite, last row not 0 0 1, skewed, focal length not positive, principal point more
+            than one image size outside the image, or distortion that is not 4, 5 or 8 finite numbers.
+    """
+    matrix = to_array(K, (3, 3), file, field)
+    f, c, wh = np.array([matrix[0, 0], matrix[1, 1]]), matrix[:2, 2], np.array([hw[1], hw[0]])
+    if not np.array_equal(matrix[2], [0, 0, 1]) or matrix[1, 0] != 0 or abs(matrix[0, 1]) > 1e-6 * abs(f[0]):
+        raise FormatError(file, field, matrix.tolist(), "fx 0 cx, 0 fy cy, 0 0 1 (no skew)")
+    if not (f > 0).all():
+        raise FormatError(file, f"{field} focal length", f.tolist(), "two positive numbers of pixels")
+    if not ((c > -wh) & (c < 2 * wh)).all():
+        raise FormatError(file, f"{field} principal point", c.tolist(), f"a place near the {hw[1]}x{hw[0]} image")
+    lens = None if distortion is None else _distortion(distortion, file)
+    return Camera(_float32(f)[None], _float32(c)[None], None if lens is None else _float32(lens)[None])
+
+
+def matrix_of(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+    """K of four numbers."""
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=np.float64)
+
+
+def to_poses(
+    c2w: np.ndarray,  # (n, 4, 4)
+    file: Path,
+    field: str = "pose",
+) -> Pose:
+    """Poses (n, float64) of camera-to-world matrices; rotations are moved to the nearest true rotation.
+
+    A matrix that is already a rotation to rounding of float64 is returned as it stands.
+
+    Raises:
+        FormatError: not finite, last row not 0 0 0 1, or determinant further than ``MAX_DET_ERROR`` from 1 (a
+            reflection, a scale, or damage).
+    """
+    if not np.isfinite(c2w).all():
+        raise FormatError(file, field, f"a non-finite number in matrix {_first(~np.isfinite(c2w))}", "finite numbers")
+    bad = np.abs(c2w[:, 3] - [0, 0, 0, 1]).max(-1, initial=0) > 1e-6
+    if bad.any():
+        raise FormatError(file, f"{field} {_first(bad)} last row", c2w[bad][0, 3].tolist(), "0 0 0 1")
+    R = c2w[:, :3, :3]
+    det = np.linalg.det(R)
+    bad = np.abs(det - 1) > MAX_DET_ERROR
+    if bad.any():
+        raise FormatError(file, f"{field} {_first(bad)} determinant", f"{det[bad][0]:.6g}", "1 (a rotation)")
+    off = np.abs(R @ R.swapaxes(-1, -2) - np.eye(3)).max((-1, -2), initial=0)
+    bad = off > 0.1
+    if bad.any():
+        raise FormatError(file, f"{field} {_first(bad)}", "axes that are not at right angles", "a rotation")
+    u, _, vt = np.linalg.svd(R)
+    R = np.where((off > 1e-14)[:, None, None], u @ vt, R)
+    return Pose(torch.from_numpy(R), torch.from_numpy(c2w[:, :3, 3].copy()))
+
+
+def to_c2w(
+    quaternion: np.ndarray,  # (n, 4) x y z w, any length
+    t: np.ndarray,  # (n, 3)
+    file: Path,
+    field: str = "quaternion",
+) -> np.ndarray:
+    """Matrices (n, 4, 4) of quaternions and translations.
+
+    Raises:
+        FormatError: a quaternion that is zero or not finite.
+    """
+    norm = np.linalg.norm(quaternion, axis=-1)
+    bad = ~((norm > 1e-6) & np.isfinite(norm))
+    if bad.any():
+        raise FormatError(file, f"{field} {_first(bad)}", quaternion[bad][0].tolist(), "four numbers, not all zero")
+    x, y, z, w = (quaternion / norm[:, None]).T
+    c2w = np.zeros((len(t), 4, 4))
+    c2w[:, 0, :3] = np.stack((1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)), -1)
+    c2w[:, 1, :3] = np.stack((2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)), -1)
+    c2w[:, 2, :3] = np.stack((2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)), -1)
+    c2w[:, :3, 3], c2w[:, 3, 3] = t, 1
+    return c2w
+
+
+def cv_from_gl(
+    c2w: np.ndarray,  # (n, 4, 4) pose of a camera with GL axes
+) -> np.ndarray:
+    """The same camera with our axes: the world stays, the camera's y and z turn round."""
+    return c2w @ _GL_FROM_CV
+
+
+def splat(
+    xyz_cam: Tensor,  # (M, 3) m, any point may be non-finite or behind the camera
+    camera: Camera,  # B = 1
+    hw: tuple[int, int],
+    hide_px: int = 0,
+) -> Tensor:
+    """Depth map (H, W) of points: each goes to its nearest pixel, the nearest point wins, nothing is filled in.
+
+    ``hide_px``: a point is also hidden by one that is more than 10 % nearer and lies within so many pixels. Needed
+    where the points were seen from another place than the camera and are sparse: the background then shines through
+    the gaps between the returns of the foreground.
+    """
+    h, w = hw
+    uv = round_half_up(cameras.project(camera, xyz_cam[None].to(camera.f.dtype))[0])
+    z = xyz_cam[:, 2]
+    inside = (uv >= 0).all(-1) & (uv[:, 0] <= w - 1) & (uv[:, 1] <= h - 1) & (z > 0) & torch.isfinite(z)
+    index = (uv[inside, 1] * w + uv[inside, 0]).long()
+    far = torch.full((h * w,), torch.inf)
+    depth = far.scatter_reduce(0, index, z[inside].to(far.dtype), "amin").view(h, w)
+    if hide_px > 0:
+        depth = torch.where(depth > 1.1 * _window_min(depth, hide_px), torch.inf, depth)
+    return torch.where(torch.isfinite(depth), depth, torch.zeros_like(depth))
+
+
+def register_depth(
+    depth: Tensor,  # (h, w) m, 0 = no return
+    depth_camera: Camera,  # B = 1
+    camera: Camera,  # B = 1
+    hw: tuple[int, int],
+    T_cam_from_depth: Pose | None = None,  # None = same place, same axes
+) -> Tensor:
+    """Depth map (H, W) as the colour camera sees it: forward warp with a z-buffer, holes stay holes."""
+    v, u = torch.nonzero(depth > 0, as_tuple=True)
+    uv = torch.stack((u, v), -1).to(depth_camera.f.dtype)
+    xyz = cameras.unproject(depth_camera, uv[None], depth[v, u][None])
+    if T_cam_from_depth is not None:
+        xyz = se3.apply(T_cam_from_depth, xyz)
+    return splat(xyz[0], camera, hw)
+
+
+def _window_min(depth: Tensor, reach: int) -> Tensor:
+    """Smallest value within ``reach`` rows and columns (a square window, one axis after the other)."""
+    size = 2 * reach + 1
+    least = -torch.nn.functional.max_pool2d(-depth[None, None], (1, size), 1, (0, reach))
+    return -torch.nn.functional.max_pool2d(-least, (size, 1), 1, (reach, 0))[0, 0]
+
+
+def _distortion(value: object, file: Path) -> np.ndarray | None:
+    count = len(value) if isinstance(value, (list, tuple, np.ndarray)) else -1
+    if count not in (4, 5, 8):
+        raise FormatError(file, "distortion", value, "4, 5 or 8 numbers k1 k2 p1 p2 [k3 [k4 k5 k6]]")
+    lens = to_array(value, (count,), file, "distortion")
+    return lens if lens.any() else None
+
+
+def _float32(x: np.ndarray) -> Tensor:
+    return torch.from_numpy(x.astype(np.float32))
+
+
+def _first(bad: np.ndarray) -> int:
+    return int(np.argwhere(bad)[0, 0])

@@ -1,0 +1,226 @@
+"""Folders of numbered RGB-D frames, in two layouts.
+
+- *named*: ``frame-XXXXXX.color.{jpg,png}``, ``.depth.png``, ``.pose.txt`` (4×4) side by side, as 7-Scenes and its
+  descendants, with or without ``camera-intrinsics.txt`` (3×3).
+- *counted*: ``images/*``, ``depth/*.png``, ``poses.txt`` (one row-major 4×4 a line), ``K.txt`` (3×3).
+
+Poses are camera-to-world with our axes. The intrinsics file holds for colour and depth unless ``K`` says otherwise:
+7-Scenes' depth (f = 585) is not registered to its colour (f = 525), and its file gives the depth camera's. A side-car
+``meta.json`` (keys ``K``, ``K_depth``, ``dist``, ``depth_scale``, ``invalid``, ``fps``) is read where present; options
+win over it, and it wins over the intrinsics file.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from dhtorch.data import convert, files
+from dhtorch.data.files import FormatError
+from dhtorch.data.recording import Recording
+from dhtorch.records import Camera, Frame, Pose
+
+_PART = re.compile(r"frame-(\d+)\.(color|depth|pose)\.(?:png|jpg|jpeg|txt)")
+_IMAGE = re.compile(r"(.+)\.(?:png|jpg|jpeg)")
+
+
+def recognise(root: Path) -> str | None:
+    """What makes ``root`` a recording of this format, in words; None if nothing does."""
+    if (root / "images").is_dir() and (root / "depth").is_dir() and (root / "poses.txt").is_file():
+        return "images/, depth/ and poses.txt"
+    if root.is_dir() and any(_PART.fullmatch(file.name) for file in root.iterdir()):
+        return "frame-XXXXXX.{color,depth,pose} files"
+    return None
+
+
+def read(
+    root: str | Path,
+    *,
+    K: Sequence[float] | None = None,
+    K_depth: Sequence[float] | None = None,
+    distortion: Sequence[float] | None = None,
+    units_per_metre: float | None = None,
+    invalid: Sequence[int] | None = None,
+    fps: float | None = None,
+    register: bool = True,
+) -> list[Recording]:
+    """Open a folder of numbered frames as one recording.
+
+    Args:
+        root: the folder.
+        K: fx, fy, cx, cy of the colour image. None = ``meta.json``, else the intrinsics file.
+        K_depth: the same of a depth map that is not registered to colour. None = ``meta.json``, else as colour.
+        distortion: of the colour image, OpenCV's order. None = ``meta.json``, else none.
+        units_per_metre: of the depth codes. None = ``meta.json``, else 1000 (millimetres).
+        invalid: depth codes that mean *no return* beside 0. None = ``meta.json``, else 65535.
+        fps: frame rate, for time stamps. None = ``meta.json`` if it has a number, else no time stamps.
+        register: warp depth that has its own intrinsics to the colour image (one z-buffer, holes stay). The places of
+            the two cameras are taken to coincide, since these sets give no extrinsics. False keeps the depth map and
+            sets ``Frame.depth_camera``.
+
+    Returns:
+        One recording. In the named layout a frame without depth, pose or colour is left out and reported.
+
+    Raises:
+        FormatError: no frame, counts that disagree, a damaged file, or values that no camera or pose can have.
+    """
+    root = Path(root)
+    side = root / "meta.json"
+    meta = files.read_json(side) if side.is_file() else {}
+    named = not (root / "images").is_dir()
+    frames, poses, report = _named_frames(root) if named else _counted_frames(root)
+    hw = files.image_header(frames[0].image).hw
+    depth_hw = files.image_header(frames[0].depth).hw
+    own = _intrinsics(root, "K", K, meta)
+    if own is None:
+        raise FormatError(root, "K", "neither meta.json nor an intrinsics file", "one of them, or option K")
+    colour = convert.to_camera(own[0], hw, *own[1:], distortion if distortion is not None else meta.get("dist"))
+    # Depth has a camera of its own only where someone says so: most sets of this layout are registered.
+    of_depth = _intrinsics(root, "K_depth", K_depth, meta) if K_depth is not None or "K_depth" in meta else None
+    rate = _rate(fps if fps is not None else meta.get("fps"), side)
+    number = torch.tensor([frame.number for frame in frames])
+    load = _Load(
+        frames=tuple(frames),
+        hw=hw,
+        depth_hw=depth_hw,
+        camera=colour,
+        depth_camera=convert.to_camera(of_depth[0], depth_hw, *of_depth[1:]) if of_depth else None,
+        units_per_metre=_positive(units_per_metre or meta.get("depth_scale", 1000.0), side, "depth_scale"),
+        invalid=_codes(invalid if invalid is not None else meta.get("invalid", (0, 65535)), side),
+        register=register,
+    )
+    return [
+        Recording(
+            name=root.resolve().name,
+            format="frames_dir",
+            load=load,
+            number=number,
+            root=root,
+            times=None if rate is None else number.double() / rate,
+            poses=poses,
+            rate_hz=rate,
+            report=tuple(report),
+        )
+    ]
+
+
+@dataclass(frozen=True)
+class _Files:
+    """The two pictures of one frame and its place in the capture."""
+
+    number: int
+    image: Path
+    depth: Path
+
+
+@dataclass(frozen=True, eq=False)
+class _Load:
+    """Position → frame."""
+
+    frames: tuple[_Files, ...]
+    hw: tuple[int, int]
+    depth_hw: tuple[int, int]
+    camera: Camera
+    depth_camera: Camera | None
+    units_per_metre: float
+    invalid: tuple[int, ...]
+    register: bool
+
+    def __call__(self, i: int) -> Frame:
+        frame = self.frames[i]
+        image = torch.from_numpy(files.read_image(frame.image, self.hw))
+        depth = torch.from_numpy(files.read_depth_png(frame.depth, self.units_per_metre, self.depth_hw, self.invalid))
+        depth_camera = self.depth_camera
+        if depth_camera is not None and self.register:
+            depth, depth_camera = convert.register_depth(depth, depth_camera, self.camera, self.hw), None
+        return Frame(image[None], depth[None], self.camera, depth_camera)
+
+
+def _named_frames(root: Path) -> tuple[list[_Files], Pose, list[str]]:
+    parts: dict[int, dict[str, Path]] = {}
+    for file in root.iterdir():
+        if match := _PART.fullmatch(file.name):
+            parts.setdefault(int(match[1]), {})[match[2]] = file
+    frames, poses, report = [], [], []
+    for number, found in sorted(parts.items()):
+        missing = [part for part in ("color", "depth", "pose") if part not in found]
+        matrix = files.read_table(found["pose"], 4) if not missing else None
+        if matrix is None:
+            report.append(f"frame {number}: no {' and no '.join(missing)}: left out")
+        elif not np.isfinite(matrix).all():
+            report.append(f"frame {number}: its pose is not finite (tracking lost): left out")
+        else:
+            if matrix.shape != (4, 4):
+                raise FormatError(found["pose"], "pose", f"{len(matrix)} rows", "4 rows of 4 numbers")
+            poses.append(convert.to_poses(matrix[None], found["pose"]))
+            frames.append(_Files(number, found["color"], found["depth"]))
+    if not frames:
+        found_instead = f"none complete among {len(parts)}" if parts else "none"
+        raise FormatError(root, "frames", found_instead, "frame-XXXXXX.color.{jpg,png}, .depth.png and .pose.txt")
+    return frames, Pose(torch.cat([p.R for p in poses]), torch.cat([p.t for p in poses])), report
+
+
+def _counted_frames(root: Path) -> tuple[list[_Files], Pose, list[str]]:
+    images, depths = _pictures(root / "images"), _pictures(root / "depth")
+    rows = files.read_table(root / "poses.txt", 16)
+    if not images:
+        raise FormatError(root / "images", "frames", "no image", "at least one .png or .jpg")
+    # Rows carry no name: unless all counts agree nobody knows which row belongs to which picture.
+    for field, count in (("depth", len(depths)), ("poses.txt", len(rows))):
+        if count != len(images):
+            raise FormatError(root, f"{field} count", count, f"{len(images)}, one for each file of images/")
+    if images.keys() != depths.keys():
+        odd = min(images.keys() ^ depths.keys())
+        raise FormatError(root, "file names", f"{odd} in one of images/ and depth/", "the same names in both")
+    stems = sorted(images, key=_sort_key)
+    digits = [re.search(r"(\d+)\D*$", stem) for stem in stems]
+    values = [int(m[1]) for m in digits if m]
+    counted = len(values) == len(stems) and all(a < b for a, b in itertools.pairwise(values))
+    numbers = values if counted else range(len(stems))
+    frames = [_Files(number, images[stem], depths[stem]) for number, stem in zip(numbers, stems, strict=True)]
+    return frames, convert.to_poses(rows.reshape(-1, 4, 4), root / "poses.txt"), []
+
+
+def _pictures(folder: Path) -> dict[str, Path]:
+    return {m[1]: file for file in folder.iterdir() if (m := _IMAGE.fullmatch(file.name))}
+
+
+def _sort_key(stem: str) -> tuple[object, ...]:
+    """1, 2, 10 in this order, with or without leading zeros."""
+    return tuple((not part.isdigit(), int(part) if part.isdigit() else part) for part in re.split(r"(\d+)", stem))
+
+
+def _intrinsics(
+    root: Path, key: str, option: Sequence[float] | None, meta: dict[str, object]
+) -> tuple[object, Path, str] | None:
+    """K with the file and the field it comes from: the option, else the side-car, else the layout's own file."""
+    if option is not None:
+        return convert.matrix_of(*files.to_array(option, (4,), root, f"option {key}")), root, f"option {key}"
+    if key in meta:
+        return meta[key], root / "meta.json", key
+    file = next((root / name for name in ("K.txt", "camera-intrinsics.txt") if (root / name).is_file()), None)
+    return (files.read_table(file, 3), file, "K") if file else None
+
+
+def _positive(value: object, file: Path, field: str) -> float:
+    number = float(files.to_array(value, (), file, field))
+    if number <= 0:
+        raise FormatError(file, field, number, "a positive number")
+    return number
+
+
+def _rate(value: object, file: Path) -> float | None:
+    """Frames per second where a number is given; a remark in words is no rate."""
+    return None if value is None or isinstance(value, str) else _positive(value, file, "fps")
+
+
+def _codes(value: object, file: Path) -> tuple[int, ...]:
+    if not isinstance(value, (list, tuple)) or not all(isinstance(code, int) for code in value):
+        raise FormatError(file, "invalid", value, "a list of depth codes")
+    return tuple(value)

@@ -1,0 +1,125 @@
+"""Which two frames make a pair: by frame gap, by time, or by baseline.
+
+A pair is (i, j), positions in the recording with i < j; i is the anchor whose depth is extended. Gaps are counted in
+the capture's own frame numbers: where a frame was lost the pairs that need it are missing, the others do not shift.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from dhtorch.data.recording import Recording
+
+#: From this many frames on, neighbouring anchors are nearly the same picture: take every other one.
+_MANY = 25
+
+
+def by_gap(recording: Recording, gap: int | None = None, stride: int | None = None) -> list[tuple[int, int]]:
+    """Pairs whose frame numbers differ by ``gap``.
+
+    Args:
+        recording: the frames.
+        gap: step in frames. None = the recording's own.
+        stride: step from anchor to anchor. None = 2 where there are 25 frames or more, else 1.
+
+    Raises:
+        ValueError: no gap given and none known, gap or stride below 1, or no two frames that far apart.
+    """
+    gap = recording.gap if gap is None else gap
+    if gap is None:
+        raise ValueError(f"pairs.gap: {recording.name} knows no gap of its own, expected a number of frames")
+    gap = _positive_int("pairs.gap", gap)
+    number = recording.number.tolist()
+    if gap > number[-1] - number[0]:
+        span = f"{len(number)} frames ({recording.name}, frame numbers {number[0]} to {number[-1]})"
+        raise ValueError(f"pairs.gap: found {gap} for {span}, expected at most {number[-1] - number[0]}")
+    place = {k: i for i, k in enumerate(number)}
+    anchors = range(0, len(number), _stride(recording, stride))
+    return _some([(i, place[number[i] + gap]) for i in anchors if number[i] + gap in place], recording, f"gap {gap}")
+
+
+def by_time(
+    recording: Recording, seconds: float, tolerance: float | None = None, stride: int | None = None
+) -> list[tuple[int, int]]:
+    """Pairs whose stamps differ by ``seconds``, give or take ``tolerance``; the closest frame counts.
+
+    Args:
+        recording: the frames; needs time stamps.
+        seconds: time from anchor to partner.
+        tolerance: s. None = half the median step from frame to frame.
+        stride: step from anchor to anchor. None = 2 where there are 25 frames or more, else 1.
+
+    Raises:
+        ValueError: no time stamps, seconds not positive, tolerance negative, or no two frames that far apart.
+    """
+    if recording.times is None:
+        raise ValueError(f"pairs.seconds: {recording.name} has no time stamps, expected a recording with them")
+    _positive("pairs.seconds", seconds)
+    step = float(recording.times.diff().median()) if len(recording) > 1 else 0.0
+    tolerance = _not_negative("pairs.tolerance", step / 2 if tolerance is None else tolerance)
+    pairs = []
+    for i in range(0, len(recording), _stride(recording, stride)):
+        miss = (recording.times[i + 1 :] - recording.times[i] - seconds).abs()
+        if miss.numel() and float(miss.min()) <= tolerance:
+            pairs.append((i, i + 1 + int(miss.argmin())))
+    return _some(pairs, recording, f"{seconds} s ± {tolerance:g} s")
+
+
+def by_baseline(
+    recording: Recording, metres: float, tolerance: float | None = None, stride: int | None = None
+) -> list[tuple[int, int]]:
+    """Pairs whose camera centres lie ``metres`` apart, give or take ``tolerance``; the earliest such frame counts.
+
+    The earliest, because a camera that comes back later has seldom the same view.
+
+    Args:
+        recording: the frames; needs poses.
+        metres: distance of the two camera centres.
+        tolerance: m. None = a quarter of ``metres``.
+        stride: step from anchor to anchor. None = 2 where there are 25 frames or more, else 1.
+
+    Raises:
+        ValueError: no poses, metres not positive, tolerance negative, or no two frames that far apart.
+    """
+    if recording.poses is None:
+        raise ValueError(f"pairs.metres: {recording.name} has no poses, expected a recording with them")
+    _positive("pairs.metres", metres)
+    tolerance = _not_negative("pairs.tolerance", metres / 4 if tolerance is None else tolerance)
+    centre = recording.poses.t
+    pairs = []
+    for i in range(0, len(recording), _stride(recording, stride)):
+        good = ((centre[i + 1 :] - centre[i]).norm(dim=-1) - metres).abs() <= tolerance
+        if bool(good.any()):
+            pairs.append((i, i + 1 + int(torch.nonzero(good)[0])))
+    return _some(pairs, recording, f"{metres} m ± {tolerance:g} m")
+
+
+def _stride(recording: Recording, stride: int | None) -> int:
+    if stride is None:
+        return 2 if len(recording) >= _MANY else 1
+    return _positive_int("pairs.stride", stride)
+
+
+def _some(pairs: list[tuple[int, int]], recording: Recording, wanted: str) -> list[tuple[int, int]]:
+    if not pairs:
+        found = f"no two of {len(recording)} frames of {recording.name}"
+        raise ValueError(f"pairs: found {found} at {wanted}, expected at least one pair")
+    return pairs
+
+
+def _positive_int(name: str, value: int) -> int:
+    if isinstance(value, bool) or int(value) != value or value < 1:
+        raise ValueError(f"{name}: found {value}, expected a whole number of at least 1")
+    return int(value)
+
+
+def _positive(name: str, value: float) -> float:
+    if not 0 < value < float("inf"):
+        raise ValueError(f"{name}: found {value}, expected a positive number")
+    return value
+
+
+def _not_negative(name: str, value: float) -> float:
+    if not 0 <= value < float("inf"):
+        raise ValueError(f"{name}: found {value}, expected 0 or more")
+    return value
