@@ -18,6 +18,7 @@ from dhtorch.geometry import se3
 from dhtorch.geometry.camera import Camera
 from dhtorch.geometry.se3 import Pose
 from dhtorch.geometry.shapes import check
+from dhtorch.geometry.steady import steady
 
 
 class TwoView(NamedTuple):
@@ -153,4 +154,4 @@ def _angle(Y: Tensor, t: Tensor) -> Tensor:
     """Angle (B, N) at points Y (camera 1) between the rays to camera 1's centre (the origin) and camera 0's (t)."""
     (y0, y1, y2), (d0, d1, d2) = Y.unbind(-1), (Y - t).unbind(-1)
     cross = torch.stack((y1 * d2 - y2 * d1, y2 * d0 - y0 * d2, y0 * d1 - y1 * d0), -1)
-    return torch.atan2(_length(cross), y0 * d0 + y1 * d1 + y2 * d2)
+    return steady(torch.atan2, _length(cross), y0 * d0 + y1 * d1 + y2 * d2)

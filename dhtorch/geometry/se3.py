@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.geometry.shapes import check
+from dhtorch.geometry.steady import steady
 from dhtorch.tree import Record, record
 
 
@@ -92,8 +93,10 @@ def exp(xi: Tensor) -> Pose:
     small = theta2 < 1e-2
     safe2 = torch.where(small, torch.ones_like(theta2), theta2)
     theta = safe2.sqrt()
-    a = torch.where(small, 1 - theta2 / 6 * (1 - theta2 / 20 * (1 - theta2 / 42)), theta.sin() / theta)
-    b = torch.where(small, 0.5 - theta2 / 24 * (1 - theta2 / 30 * (1 - theta2 / 56)), (1 - theta.cos()) / safe2)
+    a = torch.where(small, 1 - theta2 / 6 * (1 - theta2 / 20 * (1 - theta2 / 42)), steady(torch.sin, theta) / theta)
+    b = torch.where(
+        small, 0.5 - theta2 / 24 * (1 - theta2 / 30 * (1 - theta2 / 56)), (1 - steady(torch.cos, theta)) / safe2
+    )
     c = torch.where(small, (1 - theta2 / 20 * (1 - theta2 / 42 * (1 - theta2 / 72))) / 6, (1 - a) / safe2)
     W = hat(omega)
     # W² = ω ωᵀ − θ² I saves a product and keeps the result exactly symmetric.
@@ -112,4 +115,4 @@ def rotation_angle(R: Tensor) -> Tensor:
     """Angle (…,) in rad of rotation matrices (…, 3, 3); accurate at zero and at π."""
     axis = torch.stack((R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]), -1)
     trace = R.diagonal(dim1=-2, dim2=-1).sum(-1)
-    return torch.atan2(axis.norm(dim=-1), trace - 1)
+    return steady(torch.atan2, axis.norm(dim=-1), trace - 1)
