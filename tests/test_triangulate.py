@@ -110,7 +110,7 @@ def test_sigma_is_the_spread_of_the_depth():
 
 
 def test_shared_sigma_is_the_spread_over_poses():
-    samples, tracks, fit, camera_0, camera_1, depth = scene(n=50, batch=1)
+    samples, tracks, fit, camera_0, camera_1, _ = scene(n=50, batch=1)
     cov = torch.diag(torch.tensor([1e-3, 1e-3, 1e-3, 2e-3, 2e-3, 2e-3], dtype=torch.float64) ** 2)[None]
     estimate = two_view(samples, tracks.replace(cov=0 * tracks.cov), fit.replace(cov=cov), camera_0, camera_1)
     rng = torch.Generator().manual_seed(1)
