@@ -33,10 +33,20 @@ def patches(image: Tensor, corner: Tensor, size: int) -> Tensor:
     v = corner[..., 1].clamp(0, H - size)
     plane = torch.arange(B * C, device=image.device).view(B, 1, C) * (H * W)
     first = plane + (v * W + u)[..., None]  # (B, N, C) flat index of the top-left pixels
+    return windows(image, first, size)
+
+
+def windows(image: Tensor, first: Tensor, size: int) -> Tensor:
+    """Square windows (*first.shape, size, size) of a stack of planes (*, H, W), by flat index of their top-left pixels.
+
+    The fast and unchecked part of :func:`patches`: ``first`` counts pixels through the whole stack, and the caller
+    sees to it that every window lies inside its plane.
+    """
+    W = image.shape[-1]
     image = image.contiguous()
     if _view_is_safe(image):
-        windows = image.as_strided((max(image.numel() - (size - 1) * (W + 1), 0), size, size), (1, W, 1))
-        return windows.index_select(0, first.flatten()).view(*first.shape, size, size)
+        view = image.as_strided((max(image.numel() - (size - 1) * (W + 1), 0), size, size), (1, W, 1))
+        return view.index_select(0, first.flatten()).view(*first.shape, size, size)
     steps = torch.arange(size, device=image.device)
     index = first[..., None, None] + steps[:, None] * W + steps
     return image.flatten()[index]
