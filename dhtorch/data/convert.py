@@ -159,10 +159,16 @@ def register_depth(
 
 
 def _window_min(depth: Tensor, reach: int) -> Tensor:
-    """Smallest value within ``reach`` rows and columns (a square window, one axis after the other)."""
-    size = 2 * reach + 1
-    least = -torch.nn.functional.max_pool2d(-depth[None, None], (1, size), 1, (0, reach))
-    return -torch.nn.functional.max_pool2d(-least, (size, 1), 1, (reach, 0))[0, 0]
+    """Smallest value within ``reach`` rows and columns (a square window), by doubling the window along each axis."""
+    least = torch.nn.functional.pad(depth, (reach,) * 4, value=torch.inf)
+    for dim in (0, 1):
+        width = 1
+        while width < 2 * reach + 1:
+            step = min(width, 2 * reach + 1 - width)
+            count = least.shape[dim] - step
+            least = torch.minimum(least.narrow(dim, 0, count), least.narrow(dim, step, count))
+            width += step
+    return least
 
 
 def _distortion(value: object, file: Path) -> np.ndarray | None:

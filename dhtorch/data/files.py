@@ -289,7 +289,9 @@ def to_array(value: Any, shape: tuple[int, ...], file: Path, field: str) -> np.n
     Raises:
         FormatError: not numbers, another shape, or not finite.
     """
-    expected = f"{'x'.join(map(str, shape)) or 'one'} finite numbers"
+    expected = f"{'x'.join(map(str, shape))} finite numbers" if shape else "a finite number"
+    if value is None:
+        raise FormatError(file, field, "nothing", expected)
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):

@@ -1,0 +1,87 @@
+"""Which frames make a pair."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from dhtorch.data import pairs
+from dhtorch.data.recording import Recording, numbers
+from dhtorch.records import Frame, Pose
+
+
+def _no_frame(i: int) -> Frame:
+    raise AssertionError("choosing pairs must not read frames")
+
+
+def line(n: int, **fields: object) -> Recording:
+    """``n`` frames, 0.1 s and 0.05 m apart."""
+    t = torch.zeros(n, 3, dtype=torch.float64)
+    t[:, 0] = 0.05 * torch.arange(n)
+    poses = Pose(torch.eye(3, dtype=torch.float64).expand(n, 3, 3), t)
+    whole = Recording("line", "test", _no_frame, numbers(n), times=0.1 * torch.arange(n).double(), poses=poses)
+    return replace(whole, **fields)
+
+
+def test_by_gap_steps_by_two_from_25_frames_on() -> None:
+    assert pairs.by_gap(line(5), 3) == [(0, 3), (1, 4)]
+    assert pairs.by_gap(line(24), 20) == [(0, 20), (1, 21), (2, 22), (3, 23)]
+    assert pairs.by_gap(line(25), 20) == [(0, 20), (2, 22), (4, 24)]
+    assert pairs.by_gap(line(25), 20, stride=3) == [(0, 20), (3, 23)]
+    assert pairs.by_gap(line(5, gap=4)) == [(0, 4)]
+
+
+def test_a_lost_frame_does_not_shift_pairs() -> None:
+    lost = line(4, number=torch.tensor([0, 1, 3, 4]))
+    assert pairs.by_gap(lost, 1) == [(0, 1), (2, 3)]
+    assert pairs.by_gap(lost, 2) == [(1, 2)]
+    assert pairs.by_gap(lost, 4) == [(0, 3)]
+
+
+def test_by_time_takes_the_closest_within_tolerance() -> None:
+    assert pairs.by_time(line(5), 0.3) == [(0, 3), (1, 4)]
+    assert pairs.by_time(line(5), 0.34) == [(0, 3), (1, 4)]
+    lost = line(4, times=torch.tensor([0, 0.1, 0.3, 0.4], dtype=torch.float64))
+    assert pairs.by_time(lost, 0.2, tolerance=0.01) == [(1, 2)]
+    with pytest.raises(ValueError, match=r"found no two of 5 frames of line at 0.34 s ± 0.01 s, expected at least one"):
+        pairs.by_time(line(5), 0.34, tolerance=0.01)
+
+
+def test_by_baseline_takes_the_earliest_within_tolerance() -> None:
+    assert pairs.by_baseline(line(5), 0.15, tolerance=0.001) == [(0, 3), (1, 4)]
+    assert pairs.by_baseline(line(6), 0.18) == [(0, 3), (1, 4), (2, 5)]  # 0.15 m is within a quarter of 0.18 m
+    back = line(5)
+    back.poses.t[:, 0] = torch.tensor([0, 0.2, 0, 0.2, 0.2], dtype=torch.float64)
+    assert pairs.by_baseline(back, 0.2, tolerance=0.01) == [(0, 1), (1, 2), (2, 3)]
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda: pairs.by_gap(line(5), 5),
+            r"pairs.gap: found 5 for 5 frames \(line, frame numbers 0 to 4\), expected at most 4",
+        ),
+        (lambda: pairs.by_gap(line(5), -1), r"pairs.gap: found -1, expected a whole number of at least 1"),
+        (lambda: pairs.by_gap(line(5), 0), r"pairs.gap: found 0, expected a whole number"),
+        (lambda: pairs.by_gap(line(5), 1.5), r"pairs.gap: found 1.5, expected a whole number"),
+        (lambda: pairs.by_gap(line(5), 1, stride=0), r"pairs.stride: found 0"),
+        (lambda: pairs.by_gap(line(5)), r"pairs.gap: line knows no gap of its own, expected a number of frames"),
+        (lambda: pairs.by_gap(line(1), 1), r"pairs.gap: found 1 for 1 frames"),
+        (lambda: pairs.by_time(line(5), -1), r"pairs.seconds: found -1, expected a positive number"),
+        (lambda: pairs.by_time(line(5, times=None), 1), r"pairs.seconds: line has no time stamps"),
+        (lambda: pairs.by_time(line(5), 1, tolerance=-1), r"pairs.tolerance: found -1, expected 0 or more"),
+        (lambda: pairs.by_baseline(line(5, poses=None), 1), r"pairs.metres: line has no poses"),
+        (lambda: pairs.by_baseline(line(5), float("nan")), r"pairs.metres: found nan, expected a positive number"),
+        (lambda: pairs.by_baseline(line(5), 9), r"found no two of 5 frames of line at 9 m ± 2.25 m"),
+        (
+            lambda: pairs.by_gap(line(3, number=torch.tensor([0, 2, 4])), 3),
+            r"found no two of 3 frames of line at gap 3",
+        ),
+    ],
+)
+def test_impossible_pairs_say_why(call: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        call()
