@@ -1,0 +1,102 @@
+"""Where the viewer of the built-in room stands and looks, frame by frame.
+
+A path is a smooth closed form of the way gone (m) and the time (s): frame ``i`` is the same however many follow, and a
+long recording stays in the room by going to and fro. Sines are taken with Python's ``math``, one by one, so that poses
+do not depend on vector widths.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from random import Random
+
+import torch
+
+from dhtorch.geometry.se3 import Pose
+
+Place = tuple[float, float, float]  # x, height, z; m
+Angles = tuple[float, float, float]  # yaw (positive: right), pitch (positive: up), roll; degrees
+
+_PLACE, _YAW, _PITCH = (-0.45, 1.5, 0.45), 12.0, -11.0  # where the viewer stands and looks
+_AIM = (-0.1, 0.85, 1.9)  # what an orbit goes around
+
+
+def hand_held(path: str, n_frames: int, *, step_m: float, rate_hz: float, seed: int) -> Pose:
+    """``T_world_from_cam`` (n_frames), float64, of one of :data:`PATHS`."""
+    stations = [PATHS[path](_Hand(seed), step_m * i, i / rate_hz) for i in range(n_frames)]
+    return Pose(
+        torch.tensor([_rotation(*angles) for _, angles in stations], dtype=torch.float64),
+        torch.tensor([(x, -height, z) for (x, height, z), _ in stations], dtype=torch.float64),
+    )
+
+
+class _Hand:
+    """Seeded phases of the small movements that no hand can hold back."""
+
+    def __init__(self, seed: int):
+        draw = Random(f"hand {seed}")
+        self._phases = [draw.uniform(0, 2 * math.pi) for _ in range(12)]
+        self.start = draw.uniform(-0.6, -0.3)
+
+    def sway(self, k: int, phase: float) -> float:
+        """Smooth wander in [-1, 1]: two sines whose periods do not fit each other."""
+        a, b = self._phases[2 * k], self._phases[2 * k + 1]
+        return 0.65 * math.sin(phase + a) + 0.35 * math.sin(1.83 * phase + b)
+
+
+def _walk(hand: _Hand, way: float, time: float) -> tuple[Place, Angles]:
+    side = 0.55 * math.sin(way / 0.55 + hand.start)
+    x, height, z = _PLACE
+    place = (x + side, height + 0.03 * hand.sway(0, way / 0.25), z + 0.08 * hand.sway(1, way / 0.4))
+    tremor = [hand.sway(2 + k, 2 * math.pi * 0.9 * time) for k in range(3)]
+    return place, (_YAW - 11 * side + 0.6 * tremor[0], _PITCH + 0.6 * tremor[1], 0.8 * tremor[2])
+
+
+def _lateral(hand: _Hand, way: float, time: float) -> tuple[Place, Angles]:
+    x, height, z = _PLACE
+    return (x + 0.55 * math.sin(way / 0.55 + hand.start), height, z), (_YAW, _PITCH, 0.0)
+
+
+def _forward(hand: _Hand, way: float, time: float) -> tuple[Place, Angles]:
+    a, go = math.radians(_YAW), 0.35 * math.sin(way / 0.35 - 0.5)
+    x, height, z = _PLACE
+    return (x + math.sin(a) * go, height, z + math.cos(a) * go), (_YAW, _PITCH, 0.0)
+
+
+def _orbit(hand: _Hand, way: float, time: float) -> tuple[Place, Angles]:
+    radius = 1.45
+    a = 0.5 * math.sin(way / (0.5 * radius) + hand.start)
+    drop = math.degrees(math.atan2(_PLACE[1] - _AIM[1], radius))
+    place = (_AIM[0] - radius * math.sin(a), _PLACE[1], _AIM[2] - radius * math.cos(a))
+    return place, (math.degrees(a), -0.6 * drop, 0.0)
+
+
+def _turn(hand: _Hand, way: float, time: float) -> tuple[Place, Angles]:
+    yaw = _YAW + 20 * math.sin(way / 0.45 + hand.start)
+    return _PLACE, (yaw, _PITCH + 3 * hand.sway(0, way / 0.4), 1.5 * hand.sway(1, way / 0.4))
+
+
+def _static(hand: _Hand, way: float, time: float) -> tuple[Place, Angles]:
+    return _PLACE, (_YAW, _PITCH, 0.0)
+
+
+#: Kinds of path: place and angles after a way (m) and a time (s).
+PATHS: dict[str, Callable[[_Hand, float, float], tuple[Place, Angles]]] = {
+    "walk": _walk,
+    "lateral": _lateral,
+    "forward": _forward,
+    "orbit": _orbit,
+    "rotation": _turn,
+    "static": _static,
+}
+
+
+def _rotation(yaw: float, pitch: float, roll: float) -> list[list[float]]:
+    """World from camera: roll about z, then pitch about x (positive: up), then yaw about y (positive: right)."""
+    (ca, sa), (cb, sb), (cc, sc) = ((math.cos(math.radians(v)), math.sin(math.radians(v))) for v in (yaw, pitch, roll))
+    return [
+        [ca * cc + sa * sb * sc, -ca * sc + sa * sb * cc, sa * cb],
+        [cb * sc, cb * cc, -sb],
+        [-sa * cc + ca * sb * sc, sa * sc + ca * sb * cc, ca * cb],
+    ]
