@@ -1,0 +1,200 @@
+"""Pieces of nonlinear least squares over rigid motions: residuals with Jacobians, robust weights, safe solves, steps.
+
+Alphabet: ``x`` points of frame a and ``Y = R x + t`` in the camera; ``r`` residual = projected − measured, px; ``xi``
+the left perturbation ``T ← exp(xi) T`` = (rotation rad, translation m); ``H xi = −g`` the normal equations with
+H = Σ w Jᵀ J and g = Σ w Jᵀ r. Points are *planes* (B, 3, N) and (B, 2, N), components first, so that each operation
+is contiguous over points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dhtorch.geometry import se3
+from dhtorch.geometry.se3 import Pose
+from dhtorch.geometry.shapes import check
+
+#: Points nearer to the camera plane than this (m), or behind it, are not in front.
+MIN_DEPTH = 1e-6
+
+#: A matrix whose scaled Cholesky factor has a smaller pivot than this is called singular.
+MIN_PIVOT = 1e-6
+
+#: Matrix products over points round alike in any company when the number of points is a multiple of this.
+LANES = 16
+
+
+class Normal(NamedTuple):
+    """A cost and its normal equations at one pose per batch element."""
+
+    cost: Tensor  # (B,)
+    H: Tensor  # (B, 6, 6)
+    g: Tensor  # (B, 6)
+
+
+def linearise(
+    T: Pose,
+    f: Tensor,  # (B, 2) px
+    c: Tensor,  # (B, 2) px
+    xyz: Tensor,  # (B, 3, N) m, planes
+    uv: Tensor,  # (B, 2, N) ideal px, planes
+) -> tuple[Tensor, Tensor]:
+    """Reprojection residuals and their analytic Jacobian for a left perturbation of the pose.
+
+    Returns:
+        rows (B, 7, 2, N): six columns of the Jacobian, then the residual (px), each for u and v; and the depth (B, N)
+        of the points in the camera. Points not in front get finite rows without meaning: give them weight zero.
+
+    Raises:
+        ValueError: wrong shapes.
+
+    Gradient: to pose, f, c, xyz and uv. The Jacobian is checked against autograd.
+    """
+    check("linearise", R=(T.R, "B 3 3"), f=(f, "B 2"), c=(c, "B 2"), xyz=(xyz, "B 3 N"), uv=(uv, "B 2 N"))
+    # Multiply-adds instead of a matrix product: the rounding cannot depend on the batch.
+    x, y, z = _moved(T, xyz).unbind(1)
+    w = 1 / torch.where(z > MIN_DEPTH, z, torch.ones_like(z))
+    a, b = x * w, y * w
+    ab, zero, target = a * b, torch.zeros_like(a), (uv - c[..., None]) / f[..., None]
+    columns_u = (-ab, 1 + a * a, -b, w, zero, -a * w, a - target[:, 0])
+    columns_v = (-1 - b * b, ab, a, zero, w, -b * w, b - target[:, 1])
+    rows = torch.stack([plane for pair in zip(columns_u, columns_v, strict=True) for plane in pair], 1)
+    return rows.unflatten(1, (7, 2)) * f[:, None, :, None], z
+
+
+def _moved(T: Pose, xyz: Tensor) -> Tensor:
+    x, y, z = xyz[:, None].unbind(2)
+    R = T.R[..., None]
+    return R[:, :, 0] * x + R[:, :, 1] * y + R[:, :, 2] * z + T.t[..., None]
+
+
+def robust(square: Tensor, kernel: str | None, scale: float) -> tuple[Tensor, Tensor]:
+    """Cost and weight of squared residuals under a robust kernel, the weights of iteratively reweighted least squares.
+
+    Args:
+        square: squared residuals of any shape, ≥ 0.
+        kernel: None (plain squares), ``"huber"``, ``"cauchy"`` or ``"geman_mcclure"``.
+        scale: the residual at which the kernel starts to bend, in the residual's unit.
+
+    Returns:
+        ``rho`` with rho ≈ square for small residuals, and ``weight`` = d rho / d square, 1 at zero.
+
+    Raises:
+        ValueError: an unknown kernel.
+
+    Gradient: to ``square``, finite at zero.
+    """
+    if kernel is None:
+        return square, torch.ones_like(square)
+    k2 = scale * scale
+    if kernel == "huber":
+        outside = square > k2
+        size = torch.where(outside, square, torch.full_like(square, k2)).sqrt()
+        return torch.where(outside, 2 * scale * size - k2, square), scale / size
+    if kernel == "cauchy":
+        bend = 1 + square / k2
+        return k2 * bend.log(), 1 / bend
+    if kernel == "geman_mcclure":
+        bend = 1 + square / k2
+        return square / bend, 1 / (bend * bend)
+    raise ValueError(f"robust: kernel is {kernel!r}, expected None, 'huber', 'cauchy' or 'geman_mcclure'")
+
+
+def normal_equations(
+    rows: Tensor,  # (B, 7, 2, N) of linearise; N a multiple of LANES for answers that do not depend on the batch
+    weight: Tensor,  # (B, N) ≥ 0, one per point
+) -> tuple[Tensor, Tensor]:
+    """H = Σ w Jᵀ J (B, 6, 6) and g = Σ w Jᵀ r (B, 6).
+
+    Gradient: to rows and weights. Raises ValueError for wrong shapes.
+    """
+    check("normal_equations", rows=(rows, "B 7 2 N"), weight=(weight, "B N"))
+    weighted = (rows[:, :6] * weight[:, None, None]).flatten(2)
+    product = torch.bmm(weighted, rows.flatten(2).transpose(1, 2))
+    return product[..., :6], product[..., 6]
+
+
+def solve_spd(
+    H: Tensor,  # (B, n, n) symmetric
+    b: Tensor,  # (B, n, k)
+) -> tuple[Tensor, Tensor]:
+    """Solve H x = b for positive definite H, in float64 and back; a singular H is flagged, not raised.
+
+    The matrix is scaled to a unit diagonal, factored without a graph, and the solution refined once by its own
+    residual. The refinement carries the gradient, so no factorisation is ever differentiated.
+
+    Returns:
+        x (B, n, k), zero where not ok, and ``ok`` (B,).
+
+    Raises:
+        ValueError: wrong shapes.
+
+    Gradient: exact to H and b, first order only; zero where not ok.
+    """
+    check("solve_spd", H=(H, "B n n"), b=(b, "B n k"))
+    A, rhs = H.double(), b.double()
+    eye = torch.eye(H.shape[-1], dtype=A.dtype, device=A.device)
+    with torch.no_grad():
+        diagonal = A.diagonal(dim1=-2, dim2=-1)
+        positive = (diagonal > 0) & diagonal.isfinite()
+        s = torch.where(positive, diagonal, torch.ones_like(diagonal)).rsqrt()[..., None]
+        L, info = torch.linalg.cholesky_ex(A * s * s.transpose(1, 2))
+        pivot = L.diagonal(dim1=-2, dim2=-1).amin(-1)
+        ok = (info == 0) & (pivot > MIN_PIVOT) & positive.all(-1) & rhs.isfinite().flatten(1).all(1)
+        L = torch.where(ok[:, None, None], L, eye)
+    rhs = torch.where(ok[:, None, None], rhs, torch.zeros_like(rhs)) * s
+    A = torch.where(ok[:, None, None], A, eye) * s * s.transpose(1, 2)
+    start = torch.cholesky_solve(rhs.detach(), L)
+    x = start + torch.cholesky_solve(rhs - _product(A, start), L)
+    return (x * s).to(b.dtype), ok
+
+
+def _product(A: Tensor, x: Tensor) -> Tensor:
+    """Batched A x by multiply and add."""
+    return (A[..., None] * x[:, None]).sum(2)
+
+
+def gauss_newton_step(T: Pose, H: Tensor, g: Tensor) -> tuple[Pose, Tensor]:
+    """The pose after one Gauss–Newton step on its normal equations, and ``ok`` (B,); unchanged where H is singular.
+
+    From a detached optimum this step is the implicit derivative of the optimum up to terms of the size of the
+    residuals. Gradient: to T, H and g. Raises ValueError for wrong shapes.
+    """
+    xi, ok = solve_spd(H, -g[..., None])
+    return se3.retract(T, xi[..., 0]), ok
+
+
+def minimise(evaluate: Callable[[Pose], Normal], T: Pose, steps: int, *, damping: float = 1e-4) -> tuple[Pose, Tensor]:
+    """Levenberg–Marquardt with a fixed number of steps; each batch element accepts or rejects its own.
+
+    Args:
+        evaluate: cost and normal equations at a pose; its mask or weights may be recomputed there.
+        T: start.
+        steps: how many proposals.
+        damping: initial factor of the diagonal; ×0.1 after an accepted step, ×10 after a rejected one.
+
+    Returns:
+        The best pose seen and its cost (B,); the cost never rises above the start's.
+
+    Gradient: none is meant to flow here; take :func:`gauss_newton_step` from the detached result.
+    """
+    best = evaluate(T)
+    factor = torch.full_like(best.cost, damping)
+    for _ in range(steps):
+        diagonal = torch.diag_embed(best.H.diagonal(dim1=-2, dim2=-1))
+        proposal, ok = gauss_newton_step(T, best.H + factor[:, None, None] * diagonal, best.g)
+        found = evaluate(proposal)
+        better = ok & (found.cost < best.cost)
+        choose = better[:, None]
+        T = Pose(torch.where(choose[..., None], proposal.R, T.R), torch.where(choose, proposal.t, T.t))
+        best = Normal(
+            torch.where(better, found.cost, best.cost),
+            torch.where(choose[..., None], found.H, best.H),
+            torch.where(choose, found.g, best.g),
+        )
+        factor = torch.where(better, factor * 0.1, factor * 10)
+    return T, best.cost

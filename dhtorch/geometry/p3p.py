@@ -1,0 +1,200 @@
+"""Perspective from three points: every camera pose that sees three known points along three known rays.
+
+Alphabet: point i of a triple has world coordinates ``X_i``, unit ray ``j_i`` and range ``d_i``; ``Y_i = d_i j_i``
+is the point in the camera. ``m_ik = j_i · j_k`` and ``a_ik = |X_i − X_k|²``. Tensors inside this file are *planes*:
+component axes first, triples last, so that each operation is contiguous over triples.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dhtorch.geometry.shapes import check
+
+#: Triples flatter than this (height over longest side) count as collinear.
+MIN_HEIGHT = 1e-3
+
+
+def p3p(
+    rays: Tensor,  # (*, 3, 3) point, coordinate: viewing rays of any length
+    xyz: Tensor,  # (*, 3, 3) point, coordinate: the points, m
+) -> tuple[Tensor, Tensor, Tensor]:
+    """All poses under which three points lie on three rays.
+
+    The law of cosines gives one quadric cone in the ranges (d_1, d_2, d_3) per pair of points; eliminating the scale
+    leaves two cones. Some member of their pencil splits into two planes, found from one real root of a cubic; each
+    plane meets another cone in two lines, hence four solutions, all from homogeneous quadratics that stay regular for
+    symmetric triangles. A Newton step on the law of cosines restores digits lost on the way. Planar scenes are
+    nothing special to three points.
+
+    Returns:
+        R (*, 4, 3, 3) and t (*, 4, 3) with ``Y = R X + t``, and ``valid`` (*, 4): a real solution with all points in
+        front. Collinear or coincident points, or rays, give none. Where not valid R and t are finite but meaningless;
+        a double solution appears twice.
+
+    Raises:
+        ValueError: wrong shapes.
+
+    Gradient: none (choosing among roots); refine the pose instead. Ranges are solved in float64.
+    Source: the pencil of conics of M. Persson, K. Nordberg, "Lambda Twist" (ECCV 2018), with another way to split the
+    degenerate member. Checked against synthetic truth and PoseLib.
+    """
+    check("p3p", rays=(rays, "* 3 3"), xyz=(xyz, "* 3 3"))
+    if rays.shape != xyz.shape:
+        raise ValueError(f"p3p: rays have shape {tuple(rays.shape)}, xyz {tuple(xyz.shape)}, expected equal shapes")
+    with torch.no_grad():
+        j = rays.double().movedim((-2, -1), (0, 1)).contiguous()  # (point, coordinate, *)
+        X = xyz.double().movedim((-2, -1), (0, 1)).contiguous()
+        j = j / (j * j).sum(1, keepdim=True).sqrt()
+        m = torch.stack(((j[0] * j[1]).sum(0), (j[0] * j[2]).sum(0), (j[1] * j[2]).sum(0)))
+        sides = torch.stack((X[0] - X[1], X[0] - X[2], X[1] - X[2]))
+        a = (sides * sides).sum(1)
+        scale = a.amax(0)
+        a = a / scale
+        normal = torch.linalg.cross(sides[0], sides[1], dim=0)
+        height2 = (normal * normal).sum(0) / (scale * scale)
+        d = _ranges(m, a)
+        d, miss = _polish(d, m, a)
+        R, t = _align(j.to(xyz.dtype), X.to(xyz.dtype), (d * scale.sqrt()).to(xyz.dtype))
+        valid = (miss < 1e-6) & (d > 1e-9).all(0) & (height2 > MIN_HEIGHT**2) & (m < 1 - 1e-12).all(0)
+        valid = valid & R.isfinite().all(0).all(0) & t.isfinite().all(0)
+        R = torch.where(valid, R, torch.eye(3, dtype=R.dtype, device=R.device).view(3, 3, *[1] * valid.ndim))
+        t = torch.where(valid, t, torch.zeros_like(t))
+    # (row, column, root, *) → (*, root, row, column)
+    return R.movedim((2, 0, 1), (-3, -2, -1)), t.movedim((1, 0), (-2, -1)), valid.movedim(0, -1)
+
+
+def _ranges(m: Tensor, a: Tensor) -> Tensor:
+    """Ranges (3, 4, *) of the four intersections of the two cones, scaled to satisfy the sum of the three equations."""
+    D1, D2 = _cones(m, a)
+    gamma = _outer_root(*_pencil(m, a))
+    far = gamma.abs() > 1
+    weight = torch.where(far, 1 / torch.where(far, gamma, torch.ones_like(gamma)), gamma)
+    split = torch.where(far, D1 * weight + D2, D1 + D2 * weight)  # det(split) = 0
+    other = torch.where(far, D1, D2)
+    # The null vector is the steepest column of the adjugate; both planes contain it.
+    adjugate = torch.linalg.cross(split[[1, 2, 0]], split[[2, 0, 1]], dim=1)
+    size = (adjugate * adjugate).sum(1)
+    p = torch.where(size[0] >= size[1], adjugate[0], adjugate[1])
+    p = torch.where(torch.maximum(size[0], size[1]) >= size[2], p, adjugate[2])
+    p = p / (p * p).sum(0).sqrt()
+    u, v = _complement(p)
+    w = _null_directions(split, u, v)  # (3, 2, *) one direction per plane
+    d = _null_directions(other[:, :, None], p[:, None], w).flatten(1, 2)  # (3, root, plane, *) → (3, 4, *)
+    d = d * torch.where(d.sum(0) < 0, -1.0, 1.0)
+    m, a = m[:, None], a[:, None]
+    total = 2 * ((d * d).sum(0) - d[0] * d[1] * m[0] - d[0] * d[2] * m[1] - d[1] * d[2] * m[2])
+    return d * (a.sum(0) / total).sqrt()
+
+
+def _cones(m: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
+    """Symmetric (3, 3, *) matrices of a_23 × (equation 12) − a_12 × (equation 23), and of the same with 13 for 12."""
+    zero = torch.zeros_like(m[0])
+    xy, xz, yz1, yz2 = -a[2] * m[0], -a[2] * m[1], a[0] * m[2], a[1] * m[2]
+    first = (a[2], xy, zero, xy, a[2] - a[0], yz1, zero, yz1, -a[0])
+    second = (a[2], zero, xz, zero, -a[1], yz2, xz, yz2, a[2] - a[1])
+    return torch.stack(first).unflatten(0, (3, 3)), torch.stack(second).unflatten(0, (3, 3))
+
+
+def _pencil(m: Tensor, a: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Coefficients, cubic first, of det(D1 + γ D2) / a_23 as a polynomial in γ."""
+    s = 1 - m * m
+    volume = 2 * a[2] * (1 - m[0] * m[1] * m[2])
+    k3 = a[1] * (a[1] * s[2] - a[2] * s[1])
+    k2 = a[1] * s[2] * (a[1] + 2 * a[0]) + a[2] * s[1] * (a[2] - a[0]) - a[1] * volume
+    k1 = a[0] * s[2] * (a[0] + 2 * a[1]) + a[2] * s[0] * (a[2] - a[1]) - a[0] * volume
+    k0 = a[0] * (a[0] * s[2] - a[2] * s[0])
+    return k3, k2, k1, k0
+
+
+def _outer_root(k3: Tensor, k2: Tensor, k1: Tensor, k0: Tensor) -> Tensor:
+    """The real root of a cubic that lies farthest from the other two, hence the best conditioned one.
+
+    A vanishing leading coefficient sends that root to infinity; it is held at about 1e10 times the others' scale.
+    Only square roots and functions whose vector and scalar versions are one are used: see ``steady``.
+    """
+    tiny = 1e-10 * torch.maximum(k2.abs(), torch.maximum(k1.abs(), k0.abs())) + 1e-300
+    k3 = torch.where(k3.abs() < tiny, tiny, k3)
+    third, k1, k0 = k2 / (3 * k3), k1 / k3, k0 / k3
+    p, q = k1 / 3 - third * third, k0 / 2 + third * (third * third - k1 / 2)  # t³ + 3 p t + 2 q = 0, γ = t − third
+    s = p.abs().sqrt() + 1e-9 * third.abs() + 1e-100
+    h = q.abs() / (s * s * s)
+    sign = torch.where(p > 0, 1.0, -1.0).to(p)
+    w = ((h + (h * h + sign).clamp_min(0).sqrt()).log() / 3).exp()
+    one_real = w - sign / w
+    three_real = 2 * (h.clamp(max=1).acos() / 3).cos()
+    size = s * torch.where((p <= 0) & (h < 1), three_real, one_real)
+    t = torch.where(q > 0, -size, size)
+    for _ in range(2):
+        slope = 3 * (t * t + p)
+        t = t - torch.where(slope.abs() > 0, (t * (t * t + 3 * p) + 2 * q) / slope, torch.zeros_like(t))
+    return t - third
+
+
+def _complement(p: Tensor) -> tuple[Tensor, Tensor]:
+    """Two unit vectors (3, *) that complete unit vectors p to a right-handed frame, without a branch.
+
+    Source: T. Duff et al., "Building an Orthonormal Basis, Revisited" (JCGT 2017).
+    """
+    x, y, z = p.unbind(0)
+    s = torch.where(z < 0, -1.0, 1.0).to(z)
+    a = -1 / (s + z)
+    b = x * y * a
+    return torch.stack((1 + s * x * x * a, s * b, -s * x)), torch.stack((b, s + y * y * a, -y))
+
+
+def _null_directions(A: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """The two unit vectors α u + β v with xᵀ A x = 0: A (3, 3, …), u and v (3, …) → (3, 2, …).
+
+    A negative discriminant counts as zero; whether the solution exists shows when it is put back into the equations.
+    """
+    Au = (A * u).sum(1)
+    uu, uv, vv = (Au * u).sum(0), (Au * v).sum(0), ((A * v).sum(1) * v).sum(0)
+    root = (uv * uv - uu * vv).clamp_min(0).sqrt()
+    s = uv + torch.where(uv < 0, -root, root)
+    alpha, beta = torch.stack((-s, vv)), torch.stack((uu.expand_as(s), -s))  # α : β, each free of cancellation
+    x = alpha * u[:, None] + beta * v[:, None]
+    return x / (x * x).sum(0).sqrt()
+
+
+def _polish(d: Tensor, m: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
+    """A Newton step on d_i² + d_k² − 2 d_i d_k m_ik = a_ik; ranges (3, 4, *) and the largest remaining miss (4, *)."""
+    m, a = m[:, None], a[:, None]
+    x, y, z = d.unbind(0)
+    r0, r1, r2 = _miss(d, m, a).unbind(0)
+    xy, xz, yz = x - y * m[0], x - z * m[1], y - z * m[2]
+    yx, zx, zy = y - x * m[0], z - x * m[1], z - y * m[2]
+    # Rows of half the Jacobian: (xy, yx, 0), (xz, 0, zx), (0, yz, zy).
+    det = -2 * (xy * zx * yz + yx * xz * zy)
+    steps = (
+        r0 * (-zx * yz) + r1 * (-yx * zy) + r2 * (yx * zx),
+        r0 * (-xz * zy) + r1 * (xy * zy) + r2 * (-xy * zx),
+        r0 * (xz * yz) + r1 * (-xy * yz) + r2 * (-yx * xz),
+    )
+    regular = det.abs() > 1e-30
+    d = d - torch.stack(steps) * torch.where(regular, 1 / torch.where(regular, det, torch.ones_like(det)), 0.0)
+    return d, _miss(d, m, a).abs().amax(0)
+
+
+def _miss(d: Tensor, m: Tensor, a: Tensor) -> Tensor:
+    near, far = d[[0, 0, 1]], d[[1, 2, 2]]
+    return near * near + far * far - 2 * near * far * m - a
+
+
+def _align(j: Tensor, X: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
+    """Rotation (3, 3, 4, *) and translation (3, 4, *) that carry the triangle X onto Y = d j."""
+    Y = d[:, None] * j[:, :, None]  # (point, coordinate, root, *)
+    E_y, E_x = _frame(Y), _frame(X)[:, :, None]  # (axis, coordinate, …)
+    R = E_y[0][:, None] * E_x[0] + E_y[1][:, None] * E_x[1] + E_y[2][:, None] * E_x[2]
+    X0 = X[0][:, None]
+    return R, Y[0] - (R[:, 0] * X0[0] + R[:, 1] * X0[1] + R[:, 2] * X0[2])
+
+
+def _frame(P: Tensor) -> Tensor:
+    """Orthonormal axes (axis, coordinate, …) of triangles (point, coordinate, …)."""
+    e0 = P[1] - P[0]
+    e0 = e0 / (e0 * e0).sum(0).sqrt()
+    e2 = torch.linalg.cross(e0, P[2] - P[0], dim=0)
+    e2 = e2 / (e2 * e2).sum(0).sqrt()
+    return torch.stack((e0, torch.linalg.cross(e2, e0, dim=0), e2))

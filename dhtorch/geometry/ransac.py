@@ -1,0 +1,179 @@
+"""Random sample consensus over camera poses, all hypotheses of all pairs at once, with fixed sizes.
+
+Alphabet: B pairs, H drawn triples, K candidate poses, M points in M *slots*: the usable points of a pair come first, in
+order, ``count`` (B,) of them. Points are planes (B, 3, M) and (B, 2, M). Nothing here carries a gradient.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dhtorch.geometry.least_squares import MIN_DEPTH
+from dhtorch.geometry.p3p import p3p
+from dhtorch.geometry.se3 import Pose
+from dhtorch.geometry.shapes import check
+
+#: A point set counts as a line when its spread across is below this share of its spread along.
+MIN_SPREAD = 1e-3
+
+
+def usable_first(
+    usable: Tensor,  # (B, N) bool
+    size: int,
+) -> tuple[Tensor, Tensor]:
+    """Indices (B, size) of usable points in order, and how many there are (B,), at most ``size``.
+
+    Where a row has more than ``size`` usable points they are thinned evenly. Slots beyond the count repeat a point.
+
+    Raises:
+        ValueError: wrong shapes, or no point at all (N = 0).
+    """
+    N = check("usable_first", usable=(usable, "B N"))["N"]
+    if N == 0:
+        raise ValueError("usable_first: usable has no points, expected N > 0")
+    number = usable.sum(-1, keepdim=True)
+    rank = torch.where(usable, usable.cumsum(-1) - 1, torch.full_like(number, N))
+    position = torch.arange(N, device=usable.device).expand_as(rank)
+    order = torch.zeros_like(rank[:, :1]).expand(-1, N + 1).scatter(1, rank, position)
+    return order.gather(1, even_slots(number[:, 0], size)), number[:, 0].clamp(max=size)
+
+
+def even_slots(count: Tensor, size: int) -> Tensor:
+    """(B, size) slots below ``count`` (B,): 0, 1, 2, … while they last; evenly thinned where there are more."""
+    slot = torch.arange(size, device=count.device)
+    count = count[:, None]
+    return torch.where(count > size, slot * count // size, torch.minimum(slot, (count - 1).clamp_min(0)))
+
+
+def distinct_triples(
+    draws: Tensor,  # (B, H, 3) uniform in [0, 1)
+    count: Tensor,  # (B,) int64
+) -> Tensor:
+    """Three different slots below ``count`` per draw, uniformly: (B, H, 3) int64.
+
+    The second draw chooses among the slots left by the first, the third among those left by both. With fewer than
+    three slots the triples cannot be distinct (and stay in range).
+
+    Raises:
+        ValueError: wrong shapes.
+    """
+    check("distinct_triples", draws=(draws, "B H 3"), count=(count, "B"))
+    left = (count[:, None, None] - torch.arange(3, device=count.device)).clamp_min(1)
+    first, second, third = torch.minimum((draws * left).long(), left - 1).unbind(-1)
+    second = second + (second >= first)
+    low, high = torch.minimum(first, second), torch.maximum(first, second)
+    third = third + (third >= low)
+    third = third + (third >= high)
+    return torch.minimum(torch.stack((first, second, third), -1), (count - 1).clamp_min(0)[:, None, None])
+
+
+def msac_cost(
+    T: Pose,  # R (B, K, 3, 3), t (B, K, 3)
+    f: Tensor,  # (B, 2) px
+    xyz: Tensor,  # (B, 3, M) m
+    uv: Tensor,  # (B, 2, M) px relative to the principal point
+    used: Tensor,  # (B, M) bool
+    threshold_px: float,
+) -> Tensor:
+    """Truncated squared reprojection errors, summed over the used points: (B, K) px². Points behind count in full.
+
+    Source: P. Torr, A. Zisserman, "MLESAC" (CVIU 2000), the truncated score.
+    """
+    K = check("msac_cost", R=(T.R, "B K 3 3"), t=(T.t, "B K 3"), xyz=(xyz, "B 3 M"), uv=(uv, "B 2 M"))["K"]
+    limit = threshold_px * threshold_px
+    scale = torch.cat((f, torch.ones_like(f[:, :1])), 1)[:, :, None, None]
+    P = torch.cat((T.R, T.t[..., None]), -1).transpose(1, 2) * scale  # (B, 3, K, 4)
+    points = torch.cat((xyz, torch.ones_like(xyz[:, :1])), 1)
+    limits = used.to(xyz.dtype) * limit
+    costs = []
+    for b in range(T.R.shape[0]):  # one product per pair keeps the temporaries in cache
+        x, y, z = (P[b].flatten(0, 1) @ points[b]).unflatten(0, (3, K))
+        front = z > MIN_DEPTH
+        w = z.reciprocal_()
+        x = x.mul_(w).sub_(uv[b, 0])
+        y = y.mul_(w).sub_(uv[b, 1])
+        square = x.mul_(x).add_(y.mul_(y))
+        square = torch.where(front, square, limit)
+        costs.append(torch.minimum(square, limits[b]).sum(-1))
+    return torch.stack(costs)
+
+
+def search(
+    xyz: Tensor,  # (B, 3, M) m
+    uv: Tensor,  # (B, 2, M) px
+    count: Tensor,  # (B,) usable slots
+    f: Tensor,  # (B, 2) px
+    c: Tensor,  # (B, 2) px
+    draws: Tensor,  # (B, H, 3) uniform in [0, 1)
+    *,
+    threshold_px: float,
+    keep: int = 2,
+    preview: int = 32,
+    shortlist: int = 32,
+) -> tuple[Pose, Tensor]:
+    """The ``keep`` best poses among four solutions of each of H minimal triples.
+
+    All solutions are scored on ``preview`` evenly taken points; the ``shortlist`` best of them on all points.
+
+    Returns:
+        Pose with R (B, keep, 3, 3), t (B, keep, 3), best first, and their costs (B, keep), infinite where there was
+        no valid solution (the pose is then the identity).
+
+    Raises:
+        ValueError: wrong shapes, fewer hypotheses (4 H) than ``keep``.
+    """
+    sizes = check("search", xyz=(xyz, "B 3 M"), uv=(uv, "B 2 M"), f=(f, "B 2"), c=(c, "B 2"), draws=(draws, "B H 3"))
+    if 4 * sizes["H"] < keep:
+        raise ValueError(f"search: draws has shape {tuple(draws.shape)}, expected at least {keep} solutions")
+    uv = uv - c[..., None]
+    rays = torch.cat((uv / f[..., None], torch.ones_like(uv[:, :1])), 1)
+    triples = distinct_triples(draws, count)
+    R, t, valid = p3p(_pick(rays, triples), _pick(xyz, triples))
+    poses = Pose(R.flatten(1, 2), t.flatten(1, 2))
+    few = even_slots(count, preview)
+    used = torch.arange(preview, device=count.device) < count[:, None]
+    cost = msac_cost(poses, f, _take(xyz, few), _take(uv, few), used, threshold_px)
+    cost = torch.where(valid.flatten(1), cost, torch.inf)
+    poses, cost = _best(poses, cost, min(max(shortlist, keep), 4 * sizes["H"]))
+    used = torch.arange(sizes["M"], device=count.device) < count[:, None]
+    full = msac_cost(poses, f, xyz, uv, used, threshold_px)
+    return _best(poses, torch.where(cost.isfinite(), full, torch.inf), keep)
+
+
+def collinear(
+    xyz: Tensor,  # (B, 3, M) m
+    used: Tensor,  # (B, M) bool
+) -> Tensor:
+    """(B,) bool: the used points lie on one line (or in one point), and so leave a rotation undetermined.
+
+    The second largest eigenvalue of their scatter is compared with the largest through the matrix's invariants.
+
+    Raises:
+        ValueError: wrong shapes.
+    """
+    check("collinear", xyz=(xyz, "B 3 M"), used=(used, "B M"))
+    weight = used.double()[:, None]
+    x = torch.where(used[:, None], xyz.double(), torch.zeros_like(xyz, dtype=torch.float64))
+    x = (x - x.sum(-1, keepdim=True) / weight.sum(-1, keepdim=True).clamp_min(1)) * weight
+    scatter = torch.bmm(x, x.transpose(1, 2))
+    trace = scatter.diagonal(dim1=-2, dim2=-1).sum(-1)
+    minors = 0.5 * (trace * trace - (scatter * scatter).sum((-2, -1)))  # ≈ product of the two largest eigenvalues
+    return minors <= (MIN_SPREAD * trace) ** 2
+
+
+def _pick(planes: Tensor, triples: Tensor) -> Tensor:
+    """(B, 3, M) at (B, H, 3) slots → (B, H, 3, 3) point, coordinate."""
+    picked = _take(planes, triples.flatten(1))
+    return picked.unflatten(2, triples.shape[1:]).permute(0, 2, 3, 1)
+
+
+def _take(planes: Tensor, slots: Tensor) -> Tensor:
+    """(B, C, M) at (B, S) slots → (B, C, S)."""
+    return planes.gather(2, slots[:, None].expand(-1, planes.shape[1], -1))
+
+
+def _best(poses: Pose, cost: Tensor, keep: int) -> tuple[Pose, Tensor]:
+    cost, index = cost.topk(keep, dim=1, largest=False)
+    R = poses.R.gather(1, index[..., None, None].expand(-1, -1, 3, 3))
+    return Pose(R, poses.t.gather(1, index[..., None].expand(-1, -1, 3))), cost
