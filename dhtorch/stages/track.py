@@ -35,7 +35,10 @@ CHUNK = 256
 RADIUS, RADIUS_TOP = 1, 3
 
 #: Steps on the first and on the second map of a level; the third may use what is left of ``iterations``.
-STEPS = (4, 8)
+STEPS_PER_MAP = (10, 8)
+
+#: Steps that all points of a map make together, before those still moving are picked out.
+DENSE_STEPS = 4
 
 #: Variance of rounding grey values to 8 bits: no residual is believed to be smaller.
 QUANTISATION = 1 / (12 * 255**2)
@@ -59,13 +62,12 @@ class _Pair(NamedTuple):
     sub_pixel: bool  # whether the source's windows are read between pixels
 
 
-class _Maps(NamedTuple):
-    """What the steps of M points need to know of their windows. K = 2, or 3 where the gain is estimated."""
+class _Windows(NamedTuple):
+    """What is known of the windows of M points after a first look."""
 
-    C: Tensor  # (K, n, n, M) correlations with J of g, and of T, at the offsets (y, x)
-    at_rest: Tensor  # (2, M) sum g T: what C would be if J were T
+    at_rest: Tensor  # (2, M) sum g T: what the correlation of g would be if J were T
     A: Tensor  # (3, M) A_xx, A_xy, A_yy
-    energy: Tensor  # (M,) sum T²
+    energy: Tensor  # (M,) sum T²; only where the gain is estimated
 
 
 def lucas_kanade(
@@ -161,10 +163,9 @@ def refine(
     if min(*image_0.shape[-2:], *image_1.shape[-2:]) <= max(margin, window):
         raise ValueError(f"refine: an image of {sizes['H']}x{sizes['W']} pixels is too small for window {window}")
     start = _finite(uv_1.detach())
-    T, grad_x, grad_y = _template(image_0, uv_0, window)
     J = _between(*_window(image_1, start, window + 1, margin))
-    G = _project(torch.stack([T, grad_x, grad_y]).flatten(-2), normalise)
-    T, g = G[0], G[1:]  # (B, N, w²), (2, B, N, w²)
+    G = _project(torch.stack(_template(image_0, uv_0, window)).flatten(-2), normalise)
+    g, T = G[:2], G[2]  # (2, B, N, w²), (B, N, w²)
     J = J.flatten(-2)
     A = torch.stack([(g[0] * g[0]).sum(-1), (g[0] * g[1]).sum(-1), (g[1] * g[1]).sum(-1)])
     A_inv, textured = _inverse(A, min_eigenvalue * window**2)
@@ -231,78 +232,97 @@ def _search(source: Pyramid, target: Pyramid, x: Tensor, d: Tensor, batch: Tenso
 
 
 def _descend(pair: _Pair, x: Tensor, d: Tensor, batch: Tensor, alive: Tensor, radius: int, o: _Options):
-    """The Gauss-Newton steps of one level: all points on a first map, then those that need more on new ones."""
+    """The Gauss-Newton steps of one level: all points on a first map, then those that outran it on new ones."""
     live = alive & _within(x + d, pair.bounds)
-    rounds = _schedule(o.iterations)
-    d, live, A, textured = _steps(pair, x, d, batch, live, radius, rounds[0], o)
+    rounds = _split(o.iterations, STEPS_PER_MAP)
+    d, live, windows_ = _on_new_map(pair, x, d, batch, live, None, radius, rounds[0], o)
     for steps in rounds[1:]:
-        if _static(x):
-            d, live, _, _ = _steps(pair, x, d, batch, live, radius, steps, o)
-            continue
-        some = live.nonzero()[:, 0]
-        if not len(some):
-            break
-        some = torch.cat([some, some[:1].expand(-len(some) % CHUNK)])  # whole chunks; the copies agree
-        again = (y.index_select(-1, some) for y in (x, d, batch, live))
-        d_some, live_some, _, _ = _steps(pair, *again, radius, steps, o)
-        d, live = d.index_copy(1, some, d_some), live.index_copy(0, some, live_some)
-    return d, A, textured
+        columns = (x, d, batch, live, *windows_)
+        d, live = _for_some(
+            live,
+            (d, live),
+            columns,
+            lambda x, d, batch, live, *known, n=steps: _on_new_map(
+                pair, x, d, batch, live, _Windows(*known), radius, n, o
+            )[:2],
+        )
+    _, textured = _inverse(windows_.A, o.min_eigenvalue * o.window**2)
+    return d, windows_.A, textured
 
 
-def _steps(pair: _Pair, x: Tensor, d: Tensor, batch: Tensor, live: Tensor, radius: int, steps: int, o: _Options):
+def _for_some(wanted: Tensor, values: tuple[Tensor, ...], columns: tuple[Tensor, ...], fn) -> tuple[Tensor, ...]:
+    """``values`` (each (..., M)) with what ``fn(*columns)`` returns where ``wanted``.
+
+    Where shapes may depend on values ``fn`` sees only the wanted points, filled up to whole chunks.
+    """
+    if _static(wanted):
+        return tuple(torch.where(wanted, new, old) for new, old in zip(fn(*columns), values, strict=True))
+    some = wanted.nonzero()[:, 0]
+    if not len(some):
+        return values
+    some = torch.cat([some, some[:1].expand(-len(some) % CHUNK)])  # the copies of a point agree
+    new = fn(*(y.index_select(-1, some) for y in columns))
+    return tuple(old.index_copy(-1, some, n) for old, n in zip(values, new, strict=True))
+
+
+def _on_new_map(pair, x, d, batch, live, known, radius, steps, o: _Options):
     """At most ``steps`` steps on one map around where the points are. ``live`` marks those that want (more) steps.
 
     A point stops for good when its step is short or when it leaves image 1, and on this map when it leaves the map.
     """
     middle = _pixel(x + d, _hw(pair.target, pair.pad))
-    maps = _maps(pair, x, middle, batch, radius, o)
-    A_inv, textured = _inverse(maps.A, o.min_eigenvalue * o.window**2)
+    C, known = _correlations(pair, x, middle, batch, known, radius, o)
+    A_inv, textured = _inverse(known.A, o.min_eigenvalue * o.window**2)
     origin = middle - radius - x  # of the map, as a displacement
     low, high = (b - x - origin for b in pair.bounds)
-    n = maps.C.shape[1]
-    map_low, map_high = low.clamp_min(0), high.clamp_max(n - 1)
-    node = torch.arange(n, dtype=x.dtype, device=x.device)[:, None]
+    n = C.shape[1]
+    moving = live & textured
     p = d - origin
-    live = moving = live & textured
+    fixed = (C, A_inv, known.at_rest, known.energy, low.clamp_min(0), high.clamp_max(n - 1))
+    dense, rest = min(DENSE_STEPS, steps), max(steps - DENSE_STEPS, 0)
+    p_, moving_ = _walk(p, moving, *fixed, steps=dense, o=o)
+    if rest:
+        p_, moving_ = _for_some(moving_, (p_, moving_), (p_, moving_, *fixed), lambda *y: _walk(*y, steps=rest, o=o))
+    off_map = (p_ != p_.clamp(0, n - 1)).any(0)
+    return p_ + origin, live & textured & (moving_ | off_map) & _within(p_, (low, high)), known
+
+
+def _walk(p, moving, C, A_inv, at_rest, energy, low, high, *, steps: int, o: _Options) -> tuple[Tensor, Tensor]:
+    """Gauss-Newton steps of map positions ``p`` (2, M) where ``moving`` (M,): short steps and the map's end stop it."""
+    node = torch.arange(C.shape[1], dtype=p.dtype, device=p.device)[:, None]
     for _ in range(steps):
         hat = (p[:, None] - node).abs_().neg_().add_(1).clamp_min_(0)  # (2, n, M) bilinear weights
-        c = ((maps.C * hat[0]).sum(2) * hat[1]).sum(1)  # (K, M)
-        step = (A_inv * (c[:2] - maps.at_rest)).sum(1)
+        c = ((C * hat[0]).sum(2) * hat[1]).sum(1)  # (K, M)
+        step = (A_inv * (c[:2] - at_rest)).sum(1)
         if o.normalise == "gain_bias":
-            step = step / _gain(c[2], maps.energy)
+            step = step / _gain(c[2], energy)
         p = torch.where(moving, p - step, p)
-        moving = moving & ((step * step).sum(0) > o.epsilon_px**2) & (p == p.clamp(map_low, map_high)).all(0)
-        if not _static(x) and not moving.any():
-            break
-    off_map = (p != p.clamp(0, n - 1)).any(0)
-    return p + origin, live & (moving | off_map) & _within(p, (low, high)), maps.A, textured
+        moving = moving & ((step * step).sum(0) > o.epsilon_px**2) & (p == p.clamp(low, high)).all(0)
+    return p, moving
 
 
-def _maps(pair: _Pair, x: Tensor, middle: Tensor, batch: Tensor, radius: int, o: _Options) -> _Maps:
-    """Correlation maps of the windows at ``x`` (2, M) of the source around the pixels ``middle`` of the target."""
-    w, n, side = o.window, 2 * radius + 2, o.window + 2 * radius + 1
+def _correlations(pair: _Pair, x: Tensor, middle: Tensor, batch: Tensor, known, radius: int, o: _Options):
+    """Maps (K, n, n, M) of the windows at ``x`` (2, M) of the source around the pixels ``middle`` of the target."""
+    w, side = o.window, o.window + 2 * radius + 1
+    K = 3 if o.normalise == "gain_bias" else 2
     plane = pair.source.shape[-1] * pair.source.shape[-2]
+    planes = torch.tensor([1, 2, 0], device=x.device)[:, None] * plane
     first_0, fraction = _first(pair.source, pair.pad, x, batch, w // 2)
-    first_0 = first_0 + torch.arange(3, device=x.device)[:, None] * plane  # (3, M): grey, grad x, grad y
     first_1, _ = _first(pair.target, pair.pad, middle, batch, w // 2 + radius)
     C, moments = [], []
-    for i, j, f in zip(first_0.split(CHUNK, 1), first_1.split(CHUNK), fraction.split(CHUNK, 1), strict=True):
-        G = _project(_lookup(pair.source, i, f if pair.sub_pixel else None, w), o.normalise)
-        T, g = G[0], G[1:]
-        moments.append(torch.cat([(g * T).sum(-1), (g * g[0]).sum(-1), (g[1:] * g[1]).sum(-1)]))
-        J = windows(pair.target, j, side).view(1, CHUNK, side, side)
-        kernels = [g[0], g[1]]
-        if o.normalise == "gain_bias":
-            kernels.append(T)
-            moments[-1] = torch.cat([moments[-1], (T * T).sum(-1)[None]])
-        C.append(torch.stack([_correlate(J, k.view(CHUNK, 1, w, w)) for k in kernels]))
-    m = torch.cat(moments, 1)
-    return _Maps(torch.cat(C, -1).view(-1, n, n, x.shape[1]), m[:2], m[2:5], m[5:].sum(0))
-
-
-def _correlate(J: Tensor, kernel: Tensor) -> Tensor:
-    """(n², CHUNK) correlations of each point's window with its own kernel."""
-    return F.conv2d(J, kernel, groups=CHUNK)[0].flatten(1).t()
+    for i, j, f in zip((first_0 + planes).split(CHUNK, 1), first_1.split(CHUNK), fraction.split(CHUNK, 1), strict=True):
+        G = _project(_lookup(pair.source, i, f if pair.sub_pixel else None, w), o.normalise)  # g_x, g_y, T
+        if known is None:
+            g, T = G[:2], G[2]
+            squares = [(g * T).sum(-1), (g * G[0]).sum(-1), (G[1:K] * G[1:K]).sum(-1)]
+            moments.append(torch.cat(squares))
+        J = windows(pair.target, j.repeat(K), side).view(1, K * CHUNK, side, side)
+        c = F.conv2d(J, G[:K].reshape(K * CHUNK, 1, w, w), groups=K * CHUNK)
+        C.append(c.view(K, CHUNK, -1).transpose(1, 2))
+    if known is None:
+        m = torch.cat(moments, 1)
+        known = _Windows(m[:2], m[2:5], m[-1])
+    return torch.cat(C, -1).view(K, side - w + 1, side - w + 1, x.shape[1]), known
 
 
 def _residual(pair: _Pair, x: Tensor, d: Tensor, batch: Tensor, o: _Options) -> Tensor:
@@ -335,7 +355,7 @@ def _lookup(level: Tensor, first: Tensor, fraction: Tensor | None, w: int) -> Te
     # Shifting the flat window reads neighbours at full speed; what it carries over a row's end is in the last column.
     pixels = torch.lerp(pixels[..., :-1], pixels[..., 1:], fraction[0][:, None])
     pixels = torch.lerp(pixels[..., : w * s - 1], pixels[..., s : s + w * s - 1], fraction[1][:, None])
-    return F.pad(pixels, (0, 1)).unflatten(-1, (w, s))[..., :w].flatten(-2)
+    return pixels.unfold(-1, w, s).flatten(-2)
 
 
 def _template(image: Tensor, uv: Tensor, window: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -351,7 +371,7 @@ def _template(image: Tensor, uv: Tensor, window: int) -> tuple[Tensor, Tensor, T
     in_x, in_y = (pixel[..., 0, :] >= 0) & (pixel[..., 0, :] < W), (pixel[..., 1, :] >= 0) & (pixel[..., 1, :] < H)
     mask = (in_y[..., :, None] & in_x[..., None, :]).to(grey.dtype)
     T = grey[..., 1:-1, 1:-1]
-    return _between(T, fraction), _between(grad_x * mask, fraction), _between(grad_y * mask, fraction)
+    return _between(grad_x * mask, fraction), _between(grad_y * mask, fraction), _between(T, fraction)
 
 
 def _window(image: Tensor, uv: Tensor, size: int, margin: int) -> tuple[Tensor, Tensor]:
@@ -372,17 +392,17 @@ def _between(pixels: Tensor, fraction: Tensor) -> Tensor:
 
 
 def _project(G: Tensor, normalise: str) -> Tensor:
-    """Windows (3, ..., n) of T and g with what the normalisation makes free (bias, gain) taken out of them."""
+    """Windows (3, ..., n) of g_x, g_y and T with what the normalisation makes free (bias, gain) taken out of them."""
     if normalise == "none":
         return G
     G = G - G.mean(-1, keepdim=True)
     if normalise == "bias":
         return G
-    T, g = G[:1], G[1:]
+    g, T = G[:2], G[2:]
     energy = (T * T).sum(-1, keepdim=True)
     known = energy > 0
     share = (g * T).sum(-1, keepdim=True) / torch.where(known, energy, torch.ones_like(energy))
-    return torch.cat([T, g - share * T])
+    return torch.cat([g - share * T, T])
 
 
 def _gain(correlation: Tensor, energy: Tensor) -> Tensor:
@@ -417,11 +437,12 @@ def _small_eigenvalue(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
     return ((a + c) - ((a - c).square() + 4 * b.square()).sqrt()) / 2
 
 
-def _schedule(iterations: int) -> list[int]:
-    """Steps on each map of a level, in all ``iterations``."""
-    first = min(STEPS[0], iterations)
-    second = min(STEPS[1], iterations - first)
-    return [s for s in (first, second, iterations - first - second) if s]
+def _split(total: int, parts: tuple[int, ...]) -> list[int]:
+    """``total`` in at most len(parts) + 1 parts, the first ones not larger than ``parts``."""
+    sizes = []
+    for part in (*parts, total):
+        sizes.append(min(part, total - sum(sizes)))
+    return [size for size in sizes if size]
 
 
 def _first(level: Tensor, pad: int, x: Tensor, batch: Tensor, half: int) -> tuple[Tensor, Tensor]:
