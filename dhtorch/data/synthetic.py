@@ -55,6 +55,8 @@ class SyntheticRoom(Sequence[Frame]):
     near = 2.0  # m
     gap = 6  # frames; with the default step a way of 15 cm
     levels = None
+    surfaces = SURFACES  # values of ``truth(i)["surface"]``
+    odd_surfaces = ("mirror", "window")  # where triangulation rightly finds something else than the surface
     report: tuple[str, ...] = ()
 
     def __init__(
