@@ -1,0 +1,149 @@
+"""The same seats filled by OpenCV: oracle for the tests, peer in the benchmarks, ``method=opencv`` for the user.
+
+Everything loops over the batch and carries no gradient.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from dhtorch.codes import PoseCode
+from dhtorch.geometry import camera as cam
+from dhtorch.geometry import epipolar, se3
+from dhtorch.geometry.lookup import luma
+from dhtorch.records import Camera, Pose, PoseFit, Samples, Tracks
+
+
+def lucas_kanade(
+    image_0: Tensor,
+    image_1: Tensor,
+    uv_0: Tensor,  # (B, N, 2) px
+    *,
+    window: int = 21,
+    levels: int = 4,
+    iterations: int = 30,
+    epsilon_px: float = 0.01,
+    max_round_trip_px: float = 1.0,
+) -> Tracks:
+    """Seat 4 with ``cv2.calcOpticalFlowPyrLK`` forward and back; ``levels`` includes full resolution.
+
+    OpenCV reports no covariance: ``cov`` is NaN, and so is every sigma that would follow from it.
+    """
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, iterations, epsilon_px)
+    options = {"winSize": (window, window), "maxLevel": levels - 1, "criteria": criteria}
+    rows = []
+    for grey_0, grey_1, start in zip(_grey(image_0), _grey(image_1), _array(uv_0, np.float32), strict=True):
+        if len(start) == 0:
+            rows.append((start, np.zeros(0, np.float32), np.zeros(0, np.float32), np.zeros(0, bool)))
+            continue
+        there, found, residual = cv2.calcOpticalFlowPyrLK(grey_0, grey_1, start[:, None], None, **options)
+        back, returned, _ = cv2.calcOpticalFlowPyrLK(grey_1, grey_0, there, None, **options)
+        error = np.linalg.norm(back[:, 0] - start, axis=-1)
+        inside = ((there[:, 0] >= 0) & (there[:, 0] <= [grey_1.shape[1] - 1, grey_1.shape[0] - 1])).all(-1)
+        valid = (found[:, 0] > 0) & (returned[:, 0] > 0) & inside & (error < max_round_trip_px)
+        rows.append((there[:, 0], error, residual[:, 0] / 255, valid))
+    uv_1, error, photometric, valid = (
+        torch.from_numpy(np.stack(column)).to(uv_0.device) for column in zip(*rows, strict=True)
+    )
+    cov = torch.full((*uv_0.shape, 2), torch.nan, dtype=uv_0.dtype, device=uv_0.device)
+    return Tracks(uv_0, uv_1.to(uv_0), error.to(uv_0), photometric.to(uv_0), cov, valid)
+
+
+def pnp_ransac(
+    samples: Samples,
+    tracks: Tracks,
+    camera_0: Camera,
+    camera_1: Camera,
+    draws: Tensor,  # (B, H, 3): only H is used, OpenCV draws for itself
+    *,
+    threshold_px: float = 3.0,
+    min_inlier: int = 8,
+    confidence: float = 0.999,
+) -> PoseFit:
+    """Seat 5 with ``cv2.solvePnPRansac`` (EPnP) and ``cv2.solvePnPRefineLM`` on the inliers."""
+    near = tracks.valid & samples.xyz.isfinite().all(-1)
+    K = _array(cam.to_matrix(camera_1), np.float64)
+    R, t, inlier, code = [], [], [], []
+    for b in range(near.shape[0]):
+        index = near[b].nonzero()[:, 0].cpu().numpy()
+        xyz, uv = _array(samples.xyz[b], np.float64)[index], _array(tracks.uv_1[b], np.float64)[index]
+        solution = _solve(xyz, uv, K[b], draws.shape[1], threshold_px, confidence) if len(index) >= min_inlier else None
+        mask = np.zeros(near.shape[1], bool)
+        fine = solution is not None and len(solution[2]) >= min_inlier
+        if solution is not None and fine:
+            mask[index[solution[2]]] = True
+        R.append(solution[0] if solution is not None and fine else np.full((3, 3), np.nan))
+        t.append(solution[1] if solution is not None and fine else np.full(3, np.nan))
+        inlier.append(mask)
+        code.append(PoseCode.OK if fine else PoseCode.TOO_FEW)
+    like, device = samples.xyz, samples.xyz.device
+    pose = Pose(torch.from_numpy(np.stack(R)).to(like), torch.from_numpy(np.stack(t)).to(like))
+    codes = torch.tensor(code, dtype=torch.int32, device=device)
+    return _describe(samples, tracks, camera_1, pose, torch.from_numpy(np.stack(inlier)).to(device), codes)
+
+
+def triangulate(uv_0: Tensor, uv_1: Tensor, camera_0: Camera, camera_1: Camera, T_1_from_0: Pose) -> epipolar.TwoView:
+    """``cv2.triangulatePoints`` as the ``solver`` of :func:`dhtorch.stages.triangulate.two_view`."""
+    points = []
+    K_0, K_1 = _array(cam.to_matrix(camera_0), np.float64), _array(cam.to_matrix(camera_1), np.float64)
+    T = _array(se3.to_matrix(T_1_from_0), np.float64)
+    for b, (u, v) in enumerate(zip(_array(uv_0, np.float64), _array(uv_1, np.float64), strict=True)):
+        X = cv2.triangulatePoints(K_0[b] @ np.eye(3, 4), K_1[b] @ T[b, :3], u.T, v.T) if len(u) else np.ones((4, 0))
+        points.append((X[:3] / np.where(np.abs(X[3]) < 1e-12, 1e-12, X[3])).T)
+    xyz = torch.from_numpy(np.stack(points)).to(uv_0)
+    return epipolar.describe(xyz, uv_0, uv_1, camera_0, camera_1, T_1_from_0)
+
+
+def _solve(
+    xyz: np.ndarray, uv: np.ndarray, K: np.ndarray, hypotheses: int, threshold_px: float, confidence: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """R (3, 3), t (3,) and inlier indices of one pair, or None."""
+    options = {"reprojectionError": threshold_px, "iterationsCount": hypotheses, "confidence": confidence}
+    ok, rvec, tvec, inlier = cv2.solvePnPRansac(xyz, uv, K, None, flags=cv2.SOLVEPNP_EPNP, **options)
+    if not ok or inlier is None:
+        return None
+    inlier = inlier[:, 0]
+    rvec, tvec = cv2.solvePnPRefineLM(xyz[inlier], uv[inlier], K, None, rvec, tvec)
+    R, t = cv2.Rodrigues(rvec)[0], tvec[:, 0]
+    return (R, t, inlier) if np.isfinite(R).all() and np.isfinite(t).all() else None
+
+
+def _describe(samples: Samples, tracks: Tracks, camera_1: Camera, pose: Pose, inlier: Tensor, code: Tensor) -> PoseFit:
+    """Residuals, covariance and signal-to-noise ratio of OpenCV's pose, by the formulas of our own seat."""
+    R, t = pose.R.nan_to_num().double(), pose.t.nan_to_num().double()
+    xyz = se3.apply(Pose(R, t), torch.where(inlier[..., None], samples.xyz, torch.ones_like(samples.xyz)).double())
+    camera = camera_1.to(torch.float64)
+    weight = inlier.double()
+    miss = (cam.project(camera, xyz) - tracks.uv_1.nan_to_num().double()) * weight[..., None]
+    J = (epipolar.point_jacobians(camera, xyz)[1] * weight[..., None, None]).flatten(1, 2)  # (B, 2N, 6)
+    count = inlier.sum(-1)
+    squares = (miss * miss).sum((-1, -2))
+    sigma2 = squares / (2 * count - 6).clamp_min(1)
+    eye = torch.eye(6, dtype=torch.float64, device=J.device)
+    bad = (code != PoseCode.OK)[:, None, None]
+    cov = sigma2[:, None, None] * torch.linalg.inv(torch.where(bad, eye, J.mT @ J))
+    cov = torch.where(bad, torch.nan, cov)
+    snr = (t * torch.linalg.solve(torch.where(bad, eye, cov)[:, 3:, 3:], t)).sum(-1).sqrt()
+    like = samples.xyz.dtype
+    lost = bad[:, 0, 0]
+    rms = torch.where(lost, torch.nan, (squares / count.clamp_min(1)).sqrt())
+    sigma = torch.where(lost, torch.nan, sigma2.sqrt())
+    numbers = (x.to(like) for x in (rms, sigma, torch.where(lost, torch.nan, snr)))
+    return PoseFit(pose, cov.to(like), inlier, count, *numbers, code)
+
+
+def _grey(image: Tensor) -> list[np.ndarray]:
+    """uint8 grey images, as OpenCV's own conversion makes them."""
+    if image.dtype == torch.uint8 and image.shape[1] == 3:
+        return [
+            cv2.cvtColor(np.ascontiguousarray(x), cv2.COLOR_RGB2GRAY) for x in image.permute(0, 2, 3, 1).cpu().numpy()
+        ]
+    grey = image if image.dtype == torch.uint8 else (luma(image, 1) * 255).round().clamp(0, 255).to(torch.uint8)
+    return list(grey[:, 0].cpu().numpy())
+
+
+def _array(x: Tensor, dtype: type) -> np.ndarray:
+    return np.ascontiguousarray(x.detach().cpu().numpy(), dtype=dtype)

@@ -1,0 +1,119 @@
+"""Settings name functions and repeat their options: every key exists, every option is listed, defaults are equal."""
+
+import functools
+import importlib
+import inspect
+import math
+from pathlib import Path
+
+import hydra
+import pytest
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from dhtorch.run import config_dir
+
+CONF = config_dir()
+#: Options that a caller passes at run time, never a setting.
+AT_RUN_TIME = {
+    "seed",
+    "fit",
+    "trace",
+    "device",
+    "dtype",
+    "uv_1_init",
+    "pyramid_0",
+    "format",
+    "progress",
+    "example",
+    "settings",
+}
+GROUPS = {
+    g: sorted(p.stem for p in (CONF / g).glob("*.yaml")) for g in ("method", "data", "pairs", "holdout", "experiment")
+}
+
+
+def compose(*overrides):
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        return hydra.compose("run", list(overrides))
+
+
+def target(name):
+    module, _, attribute = name.rpartition(".")
+    return getattr(importlib.import_module(module), attribute)
+
+
+def nodes(cfg, path=""):
+    """(path, node) of everything with a _target_."""
+    if isinstance(cfg, dict):
+        if "_target_" in cfg:
+            yield path, cfg
+        for key, value in cfg.items():
+            yield from nodes(value, f"{path}.{key}")
+
+
+def options(fn):
+    signature = inspect.signature(fn.__init__ if inspect.isclass(fn) else fn)
+    return {
+        k: p
+        for k, p in signature.parameters.items()
+        if k != "self" and p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)
+    }
+
+
+def same(a, b):
+    if isinstance(a, list | tuple) and isinstance(b, list | tuple):
+        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
+    return a == b or (isinstance(a, float) and isinstance(b, int | float) and math.isclose(a, b))
+
+
+CHOICES = [f"{g}={name}" for g, names in GROUPS.items() for name in names]
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+def test_every_setting_composes_and_names_real_options(choice):
+    cfg = compose(choice)
+    group = choice.split("=")[0]
+    part = OmegaConf.to_container(cfg[group], resolve=True)
+    for path, node in nodes(part):
+        known = options(target(node["_target_"]))
+        keys = {k for k in node if not k.startswith("_")}
+        assert keys <= set(known), f"{choice}{path}: {keys - set(known)} are no options of {node['_target_']}"
+
+
+@pytest.mark.parametrize("choice", [c for c in CHOICES if c.startswith(("method=", "pairs=", "data=synthetic"))])
+def test_settings_list_every_option(choice):
+    cfg = compose(choice)
+    group = choice.split("=")[0]
+    for path, node in nodes(OmegaConf.to_container(cfg[group], resolve=True)):
+        fn = target(node["_target_"])
+        wanted = {k for k, p in options(fn).items() if p.default is not p.empty} - AT_RUN_TIME
+        assert wanted <= set(node), f"{choice}{path}: {wanted - set(node)} of {node['_target_']} are not listed"
+
+
+@pytest.mark.parametrize("choice", ["method=paper", "method=opencv", "data=synthetic", "pairs=gap"])
+def test_values_equal_the_signatures_defaults(choice):
+    cfg = compose(choice)
+    group = choice.split("=")[0]
+    for path, node in nodes(OmegaConf.to_container(cfg[group], resolve=True)):
+        for key, parameter in options(target(node["_target_"])).items():
+            value = node.get(key)
+            if key in node and not isinstance(value, dict) and parameter.default is not parameter.empty:
+                assert same(value, parameter.default), f"{choice}{path}.{key}: {value} against {parameter.default}"
+
+
+def test_methods_become_partials_of_extend():
+    for name in GROUPS["method"]:
+        method = instantiate(compose(f"method={name}").method)
+        assert isinstance(method, functools.partial) and method.func is target("dhtorch.pair.extend")
+        assert all(isinstance(method.keywords[s], functools.partial) for s in ("sample", "track", "pose", "score"))
+
+
+def test_misspelt_options_fail():
+    for wrong in ("sede=1", "method.track.windw=3", "method=papr", "data.n_frame=3"):
+        with pytest.raises(Exception, match=wrong.split("=")[0].split(".")[-1]):
+            compose(wrong)
+
+
+def test_the_settings_folder_travels_with_the_package():
+    assert (CONF / "run.yaml").is_file() and Path(CONF).is_absolute()
