@@ -7,6 +7,7 @@ records; a value that cannot be a camera or a rigid motion is a ``FormatError`` 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -172,7 +173,7 @@ def _window_min(depth: Tensor, reach: int) -> Tensor:
 
 
 def _distortion(value: object, file: Path) -> np.ndarray | None:
-    count = len(value) if isinstance(value, (list, tuple, np.ndarray)) else -1
+    count = len(value) if isinstance(value, (Sequence, np.ndarray)) else -1
     if count not in (4, 5, 8):
         raise FormatError(file, "distortion", value, "4, 5 or 8 numbers k1 k2 p1 p2 [k3 [k4 k5 k6]]")
     lens = to_array(value, (count,), file, "distortion")

@@ -195,15 +195,19 @@ def read_npz(file: Path, key: str) -> np.ndarray:
     Raises:
         FormatError: missing or damaged archive, no such key, not numeric, or larger than it says or than ``MAX_BYTES``.
     """
-    data = read_bytes(file)
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        with zipfile.ZipFile(io.BytesIO(read_bytes(file))) as archive:
             if f"{key}.npy" not in archive.namelist():
                 raise FormatError(file, "key", ", ".join(sorted(archive.namelist())[:8]) or "nothing", f"{key}.npy")
-            if archive.getinfo(f"{key}.npy").file_size > MAX_BYTES:
+            member = archive.getinfo(f"{key}.npy")
+            if member.file_size > MAX_BYTES:
                 raise FormatError(file, key, "an array that unpacks beyond the limit", f"at most {MAX_BYTES} bytes")
-            raw = archive.read(f"{key}.npy")
-    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, OSError) as error:
+            if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise FormatError(file, key, f"compression {member.compress_type}", "none or deflate, as numpy writes")
+            raw = archive.read(member)
+    except FormatError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, struct.error, ValueError, RuntimeError, EOFError, OSError) as error:
         raise FormatError(file, "archive", error, "a whole .npz archive") from None
     return _npy(file, key, raw)
 
@@ -301,6 +305,18 @@ def to_array(value: Any, shape: tuple[int, ...], file: Path, field: str) -> np.n
     return array
 
 
+def to_positive(value: object, file: Path, field: str) -> float:
+    """A positive number that may sensibly scale something, 1e-6 to 1e6.
+
+    Raises:
+        FormatError: anything else.
+    """
+    number = float(to_array(value, (), file, field))
+    if not 1e-6 <= number <= 1e6:
+        raise FormatError(file, field, number, "a positive number, 1e-6 to 1e6")
+    return number
+
+
 def read_text(file: Path) -> str:
     """The UTF-8 text of a file of at most ``MAX_TEXT_BYTES``."""
     try:
@@ -320,8 +336,10 @@ def read_bytes(file: Path, limit: int = MAX_BYTES) -> bytes:
         if not 0 < size <= limit:
             raise FormatError(file, "file size", f"{size} bytes", f"1 to {limit} bytes")
         return file.read_bytes()
-    except OSError as error:
-        found = "no such file" if isinstance(error, FileNotFoundError) else (error.strerror or "an error")
+    except FormatError:
+        raise
+    except (OSError, ValueError) as error:  # ValueError: a name that no file can have
+        found = "no such file" if isinstance(error, FileNotFoundError) else error
         raise FormatError(file, "file", found, "a readable file") from None
 
 

@@ -83,6 +83,7 @@ def read(
     colour = convert.to_camera(own[0], hw, *own[1:], distortion if distortion is not None else meta.get("dist"))
     # Depth has a camera of its own only where someone says so: most sets of this layout are registered.
     of_depth = _intrinsics(root, "K_depth", K_depth, meta) if K_depth is not None or "K_depth" in meta else None
+    units = units_per_metre if units_per_metre is not None else meta.get("depth_scale", 1000.0)
     rate = _rate(fps if fps is not None else meta.get("fps"), side)
     number = torch.tensor([frame.number for frame in frames])
     load = _Load(
@@ -91,7 +92,7 @@ def read(
         depth_hw=depth_hw,
         camera=colour,
         depth_camera=convert.to_camera(of_depth[0], depth_hw, *of_depth[1:]) if of_depth else None,
-        units_per_metre=_positive(units_per_metre or meta.get("depth_scale", 1000.0), side, "depth_scale"),
+        units_per_metre=files.to_positive(units, side, "depth_scale"),
         invalid=_codes(invalid if invalid is not None else meta.get("invalid", (0, 65535)), side),
         register=register,
     )
@@ -208,19 +209,12 @@ def _intrinsics(
     return (files.read_table(file, 3), file, "K") if file else None
 
 
-def _positive(value: object, file: Path, field: str) -> float:
-    number = float(files.to_array(value, (), file, field))
-    if number <= 0:
-        raise FormatError(file, field, number, "a positive number")
-    return number
-
-
 def _rate(value: object, file: Path) -> float | None:
     """Frames per second where a number is given; a remark in words is no rate."""
-    return None if value is None or isinstance(value, str) else _positive(value, file, "fps")
+    return None if value is None or isinstance(value, str) else files.to_positive(value, file, "fps")
 
 
 def _codes(value: object, file: Path) -> tuple[int, ...]:
-    if not isinstance(value, (list, tuple)) or not all(isinstance(code, int) for code in value):
+    if not isinstance(value, Sequence) or not all(isinstance(code, int) for code in value):
         raise FormatError(file, "invalid", value, "a list of depth codes")
     return tuple(value)

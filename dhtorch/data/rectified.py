@@ -24,6 +24,10 @@ from dhtorch.data.recording import Recording, numbers
 from dhtorch.records import Camera, Frame, Pose
 
 
+#: px; a smaller difference of directions has never been measured, its depth would be any number.
+_MIN_DISPARITY = 1e-3
+
+
 def recognise(root: Path) -> str | None:
     """What makes ``root`` a recording of this format, in words; None if nothing does."""
     if (root / "calib.txt").is_file() and (root / "im0.png").is_file():
@@ -75,7 +79,7 @@ class _Pair:
         depth = np.zeros(self.hw, np.float32)
         if file is not None:
             disparity = _disparity(file, self.hw).astype(np.float64) + self.doffs
-            usable = np.isfinite(disparity) & (disparity > 0)
+            usable = np.isfinite(disparity) & (disparity > _MIN_DISPARITY)
             f = camera.f[0, 0].double().item()
             depth = np.where(usable, f * self.baseline / np.where(usable, disparity, 1), 0).astype(np.float32)
         return Frame(image[None], torch.from_numpy(depth)[None], camera)

@@ -89,7 +89,7 @@ def read(
         depths=tuple(depth[j][1] for _, j in pairs),
         hw=hw,
         camera=_camera(root, intrinsics, camera, hw),
-        units_per_metre=units_per_metre,
+        units_per_metre=files.to_positive(units_per_metre, root, "option units_per_metre"),
     )
     return [
         Recording(
