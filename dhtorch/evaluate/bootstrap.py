@@ -1,0 +1,83 @@
+"""How much a number over scenes would change with other scenes: intervals by resampling scenes, never points.
+
+Points of one scene share its truth, its camera and its poses; treated as independent they would promise an interval
+many times too narrow.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+#: How scenes are joined to one number.
+STATISTICS = ("median", "mean")
+
+
+class Interval(NamedTuple):
+    """A statistic over scenes with its interval; None where undefined."""
+
+    value: float | None
+    low: float | None
+    high: float | None
+    n: int  # scenes in which the number is defined
+
+
+def interval(
+    values: Sequence[float | None],
+    *,
+    statistic: str = "median",
+    level: float = 0.95,
+    draws: int = 2000,
+    seed: int = 0,
+) -> Interval:
+    """Median or mean over scenes with its percentile bootstrap interval.
+
+    Args:
+        values: one number a scene; None and non-finite ones are undefined and left out.
+        statistic: ``median`` or ``mean``.
+        level: probability content of the interval.
+        draws: resamples.
+        seed: of the resamples; the same seed gives the same interval.
+
+    Returns:
+        Interval. One scene has a value but no interval.
+
+    Raises:
+        ValueError: another statistic, or a level outside (0, 1).
+
+    Source: B. Efron, "Bootstrap methods: another look at the jackknife", 1979.
+    """
+    if statistic not in STATISTICS:
+        raise ValueError(f"bootstrap.statistic: found {statistic!r}, expected one of {', '.join(STATISTICS)}")
+    if not 0 < level < 1:
+        raise ValueError(f"bootstrap.level: found {level}, expected a number between 0 and 1")
+    defined = torch.tensor([v for v in values if v is not None and math.isfinite(v)], dtype=torch.float64)
+    n = defined.numel()
+    if n == 0:
+        return Interval(None, None, None, 0)
+    join = _mean if statistic == "mean" else _median
+    value = float(join(defined[None])[0])
+    if n == 1:
+        return Interval(value, None, None, 1)
+    spread = join(defined[resample(n, draws, seed=seed)])
+    edges = torch.tensor([(1 - level) / 2, (1 + level) / 2], dtype=torch.float64)
+    low, high = torch.quantile(spread, edges).tolist()
+    return Interval(value, low, high, n)
+
+
+def resample(n: int, draws: int, *, seed: int = 0) -> Tensor:
+    """Indices (draws, n) of scenes drawn with replacement: for numbers that are no mean or median of scene values."""
+    return torch.randint(n, (draws, n), generator=torch.Generator().manual_seed(seed))
+
+
+def _median(x: Tensor) -> Tensor:
+    ordered, n = x.sort(-1).values, x.shape[-1]
+    return (ordered[:, (n - 1) // 2] + ordered[:, n // 2]) / 2
+
+
+def _mean(x: Tensor) -> Tensor:
+    return x.mean(-1)

@@ -1,0 +1,107 @@
+"""What a score is worth: error among the surest answers, as more and more of them are accepted.
+
+Answers are taken in the order of falling score; the *risk* at k is the mean loss of the first k, where the loss is the
+relative error, at most 1. Answers of equal score cannot be told apart, so each counts as the mean of its group: the
+curve is then the expectation over all orders of the tied ones and does not depend on how they happen to be listed.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dhtorch.evaluate.errors import Numbers, Points
+from dhtorch.geometry.shapes import check
+
+#: Fewest answers that a coverage at some risk may rest on.
+MIN_POINTS = 10
+
+#: Coverages, as tenths of the answers, between which the curve is asked whether it rises.
+STEPS = 10
+
+
+def curve(
+    loss: Tensor,  # (n,)
+    score: Tensor,  # (n,)
+) -> Tensor:
+    """Risk (n,) of the surest 1, 2, … n answers: running mean of the loss by falling score, ties by their mean.
+
+    Any numbers that order the answers will do as a score; infinities are allowed. Works in float64.
+
+    Raises:
+        ValueError: unequal lengths.
+    """
+    return _running_sum(loss, score) / _count(loss)
+
+
+def measure(pooled: Points, *, min_points: int = MIN_POINTS) -> Numbers:
+    """How well the score of a pair or scene orders its answers by error.
+
+    Returns:
+        ``aurc``: mean of the risk over the answered candidates. ``aurc_excess``: what remains after subtracting the
+        best possible order's. ``aurc_full``: over all candidates, silent ones last with loss 1. ``augrc``: mean over
+        the answered candidates of their running *sum* of loss over their number (an early error is not counted over
+        and over). ``coverage_at_5``, ``_10``, ``_20``: largest share of the candidates, at least ``min_points``, that a
+        threshold on the score can accept at a risk of at most 5, 10, 20 %; 0 where none can. ``monotonicity``: share
+        of the nine steps between the tenths of the answers over which the risk does not fall. None where undefined
+        (no candidate; for all but ``aurc_full`` and the coverages also no answer).
+
+    Source: J. Traub et al., "Overcoming common flaws in the evaluation of selective classification systems", 2024
+    (AUGRC); Y. Geifman, G. Uziel, R. El-Yaniv, "Bias-reduced uncertainty estimation", 2019 (excess AURC).
+    """
+    n, answered = pooled.keep.numel(), pooled.answered()
+    loss, score = capped(answered.error), answered.score
+    risk = curve(loss, score)
+    some = bool(risk.numel())
+    last = torch.where(pooled.keep, pooled.score, -torch.inf)
+    full = curve(torch.where(pooled.keep, capped(pooled.error), 1.0), last)
+    numbers: Numbers = {
+        "aurc": _mean(risk),
+        "aurc_excess": _mean(risk - curve(loss, -loss)),
+        "aurc_full": _mean(full),
+        "augrc": _mean(_running_sum(loss, score) / max(loss.numel(), 1)),
+    }
+    cuts = _ends_of_ties(score)
+    for percent in (5, 10, 20):
+        fits = cuts & (risk <= percent / 100) & (_count(loss) >= min_points)
+        most = int((_count(loss) * fits).max()) if some else 0
+        numbers[f"coverage_at_{percent}"] = most / n if n else None
+    numbers["monotonicity"] = _monotonicity(risk)
+    return numbers
+
+
+def capped(error: Tensor) -> Tensor:
+    """Loss of a relative error: the error itself, at most 1; 1 where it is not a number."""
+    return error.nan_to_num(nan=1.0).clamp(max=1.0)
+
+
+def _running_sum(loss: Tensor, score: Tensor) -> Tensor:
+    check("curve", loss=(loss, "n"), score=(score, "n"))
+    order = score.argsort(descending=True, stable=True)
+    _, group, size = score[order].unique_consecutive(return_inverse=True, return_counts=True)
+    total = torch.zeros(size.numel(), dtype=torch.float64, device=loss.device)
+    total = total.index_add(0, group, loss[order].double())
+    return (total / size)[group].cumsum(0)
+
+
+def _count(loss: Tensor) -> Tensor:
+    return torch.arange(1, loss.numel() + 1, dtype=torch.float64, device=loss.device)
+
+
+def _ends_of_ties(score: Tensor) -> Tensor:
+    """(n,) bool, by falling score: a threshold can cut here, because the next answer has a smaller score."""
+    ordered = score.sort(descending=True).values
+    return torch.cat((ordered[1:] < ordered[:-1], ordered.new_ones(min(1, ordered.numel()), dtype=torch.bool)))
+
+
+def _monotonicity(risk: Tensor) -> float | None:
+    n = risk.numel()
+    if n < STEPS:
+        return None
+    at = torch.tensor([n * k // STEPS - 1 for k in range(1, STEPS + 1)], device=risk.device)
+    steps = risk[at].diff()
+    return float((steps >= -1e-12).double().mean())
+
+
+def _mean(x: Tensor) -> float | None:
+    return float(x.mean()) if x.numel() else None
