@@ -1,0 +1,365 @@
+"""Result files: one strict JSON per job, written whole or not at all, and recognised when it need not be redone.
+
+A result answers three questions: what was asked (``experiment``, ``config``, ``data``), what came out (``summary``,
+``rows``, ``verdict``) and whether the same question would give the same answer today (``key``).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import math
+import os
+import platform
+import subprocess
+import tempfile
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+SCHEMA = 1
+
+VERDICTS = ("supported", "refuted", "undecided")
+
+#: Options that do not change what is computed: where files lie, what else is written, on which machine part it runs.
+UNKEYED = frozenset(
+    {"root", "path", "folder", "cache", "output", "figures", "device", "resume", "traceback", "workers", "hydra"}
+)
+
+#: Bytes of a data file's head and tail that enter a digest: enough to tell recordings apart, cheap for large ones.
+EDGE_BYTES = 64 * 1024
+
+_PACKAGES = ("dhtorch", "torch", "kornia", "numpy", "opencv-python-headless", "hydra-core")
+
+#: Field → type, for the result and for its parts.
+_TEXT = (str, None)
+_NUMBER = (float, None)
+_TOP: dict[str, Any] = {
+    **{"schema": int, "experiment": str, "question": _TEXT, "expectation": _TEXT, "verdict": _TEXT, "why": _TEXT},
+    **{"key": str, "meta": dict, "config": dict, "data": dict, "summary": dict, "rows": list},
+}
+_META: dict[str, Any] = {"utc": str, "git": _TEXT, "versions": dict}
+_META |= {"device": str, "dtype": str, "threads": int, "seed": int}
+_DATA: dict[str, Any] = {"name": str, "scenes": list, "n_pairs": int, "digest": str}
+_SUMMARY: dict[str, Any] = {"value": _NUMBER, "low": _NUMBER, "high": _NUMBER, "n": int, "unit": str}
+_ROW: dict[str, Any] = {"scene": str, "pair": (list, None), "method": str}
+
+
+def build(
+    *,
+    experiment: str,
+    key: str,
+    meta: Mapping[str, Any],
+    config: Mapping[str, Any],
+    data: Mapping[str, Any],
+    summary: Mapping[str, Any],
+    rows: list[Any],
+    question: str | None = None,
+    expectation: str | None = None,
+    verdict: str | None = None,
+    why: str | None = None,
+) -> dict[str, Any]:
+    """A valid result, made strict: what is not finite becomes null, tuples and tensors become lists.
+
+    Args:
+        experiment: its name; ``pair`` for the main job, which asks no question.
+        key: from :func:`result_key`.
+        meta: from :func:`meta`.
+        config: resolved settings; file names are shortened as by :func:`portable`.
+        data: ``{name, scenes, n_pairs, digest}``.
+        summary: metric → ``{value, low, high, n, unit}``.
+        rows: one per pair and, with pair null, one per scene.
+        question, expectation, verdict, why: of an experiment that asks something.
+
+    Raises:
+        ValueError: a field is missing, unknown or of the wrong kind; the message names it.
+    """
+    fields = {"question": question, "expectation": expectation, "verdict": verdict, "why": why, "key": key}
+    parts = {"meta": meta, "config": portable(config), "data": data, "summary": summary, "rows": rows}
+    result = strict({"schema": SCHEMA, "experiment": experiment, **fields, **parts})
+    validate(result)
+    return result
+
+
+def validate(result: Any, where: str = "result") -> None:
+    """Check a result against schema 1.
+
+    Raises:
+        ValueError: names the first field that is missing, unknown, of the wrong kind or out of range.
+    """
+    _fields(result, _TOP, where)
+    _expect(result["schema"] == SCHEMA, f"{where}.schema", result["schema"], str(SCHEMA))
+    _verdict(result, where)
+    key = result["key"]
+    _expect(len(key) == 64 and set(key) <= set("0123456789abcdef"), f"{where}.key", key, "64 hexadecimal digits")
+    _fields(result["meta"], _META, f"{where}.meta")
+    _fields(result["data"], _DATA, f"{where}.data")
+    for name, entry in result["summary"].items():
+        _fields(entry, _SUMMARY, f"{where}.summary.{name}")
+    for k, row in enumerate(result["rows"]):
+        _fields(row, _ROW, f"{where}.rows.{k}", more=True)
+        pair = row["pair"]
+        pairs = pair is None or (len(pair) == 2 and all(_is(v, int) for v in pair))
+        _expect(pairs, f"{where}.rows.{k}.pair", pair, "[i, j] or null")
+    _finite(result, where)
+
+
+def strict(value: Any) -> Any:
+    """The same value in what strict JSON can hold: finite numbers, strings, lists, objects with string keys, null.
+
+    Non-finite numbers become null; numpy and torch values become numbers and lists, paths become strings.
+
+    Raises:
+        TypeError: a value that has no counterpart.
+    """
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(k): strict(v) for k, v in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [strict(v) for v in (sorted(value) if isinstance(value, set | frozenset) else value)]
+    if isinstance(value, Path):
+        return str(value)
+    if hasattr(value, "tolist"):  # torch.Tensor, numpy.ndarray and numpy scalars
+        return strict(value.tolist())
+    raise TypeError(f"result: found a {type(value).__name__}, expected something that JSON can hold")
+
+
+def write(path: str | Path, result: Mapping[str, Any]) -> Path:
+    """Write a result so that, whatever happens, ``path`` holds either the old file or the whole new one.
+
+    Raises:
+        ValueError: the result is not valid; nothing is written.
+    """
+    path = Path(path)
+    validate(result, str(path))
+    text = json.dumps(result, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        Path(name).chmod(0o644)
+        Path(name).replace(path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+    _sync_folder(path.parent)
+    return path
+
+
+def read(path: str | Path) -> dict[str, Any]:
+    """Read and check a result; a folder stands for the ``result.json`` in it.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: not JSON, not strict JSON, or not a valid result; the message names file and field.
+    """
+    path = Path(path)
+    path = path / "result.json" if path.is_dir() else path
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: found no file, expected a result.json or a folder with one")
+    try:
+        result = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
+    except ValueError as error:
+        raise ValueError(f"{path}: found no strict JSON ({error}), expected a result") from error
+    validate(result, str(path))
+    return result
+
+
+def finished(path: str | Path, key: str) -> bool:
+    """Whether ``path`` holds a valid result of this key, so that the job need not run again."""
+    try:
+        return bool(read(path)["key"] == key)
+    except (OSError, ValueError):
+        return False
+
+
+def result_key(config: Mapping[str, Any], digest: str, *, code_dir: str | Path | None = None) -> str:
+    """SHA-256 over everything that decides a result: the settings, the code and the data.
+
+    Args:
+        config: resolved settings; the options in ``UNKEYED`` are left out at every depth.
+        digest: of the data, from :func:`data_digest`.
+        code_dir: the folder whose ``**/*.py`` count; None = this package.
+    """
+    settings = json.dumps(_keyed(config), sort_keys=True, default=str)
+    total = hashlib.sha256()
+    for part in (settings.encode(), digest.encode()):
+        _add(total, part)
+    folder = Path(__file__).parent if code_dir is None else Path(code_dir)
+    for file in sorted(folder.rglob("*.py"), key=lambda f: f.relative_to(folder).as_posix()):
+        _add(total, file.relative_to(folder).as_posix().encode())
+        _add(total, file.read_bytes())
+    return total.hexdigest()
+
+
+def data_digest(files: Mapping[str, str | Path]) -> str:
+    """SHA-256 over data files: their relative names, sizes, first and last 64 KiB. No file: data made by the code.
+
+    Args:
+        files: relative name → where the file lies now; the place itself does not count.
+    """
+    total = hashlib.sha256()
+    for name in sorted(files):
+        path = Path(files[name])
+        size = path.stat().st_size
+        _add(total, f"{name} {size}".encode())
+        with path.open("rb") as file:
+            _add(total, file.read(EDGE_BYTES))
+            file.seek(max(0, size - EDGE_BYTES))
+            _add(total, file.read(EDGE_BYTES))
+    return total.hexdigest()
+
+
+def meta(*, device: str, dtype: str, threads: int, seed: int) -> dict[str, Any]:
+    """When, with which code and on what a job runs."""
+    versions = {"python": platform.python_version(), **{name: _version(name) for name in _PACKAGES}}
+    return {
+        "utc": datetime.now(UTC).isoformat(timespec="seconds"),
+        "git": _git(Path(__file__).parent),
+        "versions": versions,
+        "device": str(device),
+        "dtype": str(dtype).removeprefix("torch."),
+        "threads": threads,
+        "seed": seed,
+    }
+
+
+def portable(config: Mapping[str, Any], base: str | Path | None = None) -> dict[str, Any]:
+    """Settings without what belongs to one machine.
+
+    An absolute file name, and any ``root``, is written relative to ``base`` (None: the environment variable
+    DHTORCH_DATA) where it lies below it, else as its last component; ``hydra`` is left out.
+    """
+    base = os.environ.get("DHTORCH_DATA") if base is None else base
+
+    def shorten(name: str, value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {str(k): shorten(str(k), v) for k, v in value.items() if k != "hydra"}
+        if isinstance(value, list | tuple):
+            return [shorten(name, v) for v in value]
+        is_place = isinstance(value, str | Path) and str(value) and (name == "root" or Path(value).is_absolute())
+        return _shorter(Path(value), base) if is_place else value
+
+    return {str(k): shorten(str(k), v) for k, v in config.items() if k != "hydra"}
+
+
+def _fields(value: Any, kinds: Mapping[str, Any], where: str, more: bool = False) -> None:
+    _expect(isinstance(value, dict), where, value, "an object")
+    for name, kind in kinds.items():
+        if name not in value:
+            raise ValueError(f"{where}.{name}: found nothing, expected {_say(kind)}")
+        allowed = kind if isinstance(kind, tuple) else (kind,)
+        _expect(any(_is(value[name], k) for k in allowed), f"{where}.{name}", value[name], _say(kind))
+    unknown = sorted(set(value) - set(kinds))
+    if unknown and not more:
+        raise ValueError(f"{where}.{unknown[0]}: found an unknown field, expected {', '.join(kinds)}")
+
+
+def _verdict(result: Mapping[str, Any], where: str) -> None:
+    for name in ("question", "expectation", "verdict", "why"):
+        if result["experiment"] == "pair":
+            _expect(result[name] is None, f"{where}.{name}", result[name], "null, the main job asks no question")
+        else:
+            _expect(bool(result[name]), f"{where}.{name}", result[name], "a text")
+    if result["experiment"] != "pair":
+        _expect(result["verdict"] in VERDICTS, f"{where}.verdict", result["verdict"], ", ".join(VERDICTS))
+
+
+def _is(value: Any, kind: Any) -> bool:
+    if kind is None:
+        return value is None
+    if isinstance(value, bool):
+        return False
+    return isinstance(value, int | float) if kind is float else isinstance(value, kind)
+
+
+def _say(kind: Any) -> str:
+    words = {int: "a whole number", float: "a number", str: "a text", dict: "an object", list: "a list", None: "null"}
+    return " or ".join(words[k] for k in (kind if isinstance(kind, tuple) else (kind,)))
+
+
+def _expect(condition: bool, where: str, found: Any, expected: str) -> None:
+    if not condition:
+        shown = repr(found)
+        raise ValueError(f"{where}: found {shown if len(shown) <= 60 else shown[:57] + '...'}, expected {expected}")
+
+
+def _finite(value: Any, where: str) -> None:
+    if isinstance(value, dict):
+        for k, v in value.items():
+            _finite(v, f"{where}.{k}")
+    elif isinstance(value, list):
+        for k, v in enumerate(value):
+            _finite(v, f"{where}.{k}")
+    elif isinstance(value, float):
+        _expect(math.isfinite(value), where, value, "a finite number or null")
+
+
+def _refuse_constant(word: str) -> None:
+    raise ValueError(f"the constant {word}")
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a rename durable, where the system lets a folder be opened."""
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError:
+        return
+    try:
+        os.fsync(handle)
+    except OSError:
+        pass
+    finally:
+        os.close(handle)
+
+
+def _add(total: Any, part: bytes) -> None:
+    """Length first, so that no two sequences of parts make the same stream."""
+    total.update(len(part).to_bytes(8, "big"))
+    total.update(part)
+
+
+def _keyed(config: Any) -> Any:
+    if isinstance(config, Mapping):
+        return {str(k): _keyed(v) for k, v in config.items() if str(k) not in UNKEYED}
+    return [_keyed(v) for v in config] if isinstance(config, list | tuple) else config
+
+
+def _shorter(path: Path, base: str | Path | None) -> str:
+    place = path.expanduser().resolve()
+    if base is not None:
+        home = Path(base).expanduser().resolve()
+        if place != home and place.is_relative_to(home):
+            return place.relative_to(home).as_posix()
+    return place.name
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _git(folder: Path) -> str | None:
+    """What ``git describe`` calls the code in ``folder``, None where it is not under version control."""
+
+    def ask(*words: str) -> str | None:
+        try:
+            command = ["git", "-C", str(folder), *words]
+            done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=10)
+        except (OSError, subprocess.SubprocessError):
+            return None
+        return done.stdout.strip() if done.returncode == 0 else None
+
+    if ask("ls-files", "--error-unmatch", "__init__.py") is None:
+        return None
+    return ask("describe", "--always", "--dirty", "--tags") or None
