@@ -120,17 +120,37 @@ def check_same(got: Recording, frames: list[Frame], step: float) -> None:
 
 
 def test_tum_gives_back_the_scene(tmp_path: Path) -> None:
-    values, lens = tum._CALIBRATION[1]
-    camera = convert.to_camera(convert.matrix_of(*values), (480, 640), tmp_path, "K", lens)
-    frames = walk(3, camera, (480, 640))
+    lens = torch.tensor([tum._CALIBRATION[1][1]])
+    frames = walk(3, CAMERA.replace(distortion=lens))
     writers.write_tum(tmp_path, frames)
     recording = data.open(tmp_path)
     assert recording.format == "tum" and recording.report == ()
-    assert torch.equal(recording[0].camera.distortion, camera.distortion)
+    assert torch.equal(recording[0].camera.distortion, lens)
     torch.testing.assert_close(recording.times, torch.cat([f.time for f in frames]), atol=1e-6, rtol=0)
     check_same(recording, frames, 1 / 5000)
+
+
+def blank(n: int) -> list[Frame]:
+    """Frames of the size that the published TUM calibration belongs to, with nothing to see."""
+    image, depth = torch.zeros(1, 3, 480, 640, dtype=torch.uint8), torch.ones(1, 480, 640)
+    stamps = [torch.tensor([100 + i / 30], dtype=torch.float64) for i in range(n)]
+    return [Frame(image, depth, CAMERA, time=t, T_world_from_cam=pose(i)) for i, t in enumerate(stamps)]
+
+
+@pytest.mark.parametrize(
+    ("number", "fx", "k1"), [(1, 517.306408, 0.262383), (2, 520.908620, 0.231222), (3, 535.4, None)]
+)
+def test_tum_takes_the_calibration_of_its_camera(tmp_path: Path, number: int, fx: float, k1: float | None) -> None:
+    writers.write_tum(tmp_path, blank(1), camera=number)
+    camera = data.open(tmp_path)[0].camera
+    assert float(camera.f[0, 0]) == pytest.approx(fx)
+    assert camera.distortion is None if k1 is None else float(camera.distortion[0, 0]) == pytest.approx(k1)
     ros = data.open(tmp_path, intrinsics="ros")[0].camera
     assert ros.distortion is None and ros.f.tolist() == [[525, 525]] and ros.c.tolist() == [[319.5, 239.5]]
+    (tmp_path / "groundtruth.txt").unlink()
+    named = tmp_path.rename(tmp_path.parent / f"rgbd_dataset_freiburg{number}_xyz")
+    assert torch.equal(data.open(named)[0].camera.f, camera.f)
+    assert torch.equal(data.open(named, camera=1)[0].camera.f, torch.tensor([[517.306408, 516.469215]]))
 
 
 def test_named_frames_give_back_the_scene(tmp_path: Path) -> None:
@@ -320,7 +340,7 @@ def test_association_is_one_to_one_and_closest_first() -> None:
 
 
 def test_tum_bridges_no_gap_of_the_trajectory(tmp_path: Path) -> None:
-    frames = walk(4, hw=(480, 640))
+    frames = walk(4)
     frames = [f.replace(time=torch.tensor([100.0 + 0.5 * i], dtype=torch.float64)) for i, f in enumerate(frames)]
     writers.write_tum(tmp_path, frames)
     lines = (tmp_path / "groundtruth.txt").read_text().splitlines()
@@ -334,15 +354,15 @@ def test_tum_bridges_no_gap_of_the_trajectory(tmp_path: Path) -> None:
 
 
 def test_tum_interpolates_between_neighbouring_poses(tmp_path: Path) -> None:
-    writers.write_tum(tmp_path, walk(2, hw=(480, 640)))
+    writers.write_tum(tmp_path, walk(2))
     a, b = pose(0), pose(1)
     rows = [
         f"{100 + s:.4f} " + writers._row([*T.t[0], *(q * writers._quaternion(T.R[0].numpy()))])
         for s, T, q in ((-0.004, a, 1), (0.012, b, -1))
     ]
-    (tmp_path / "groundtruth.txt").write_text("# freiburg3\n" + "\n".join(rows))
+    (tmp_path / "groundtruth.txt").write_text("# no camera named\n" + "\n".join(rows))
     recording = data.open(tmp_path)
-    assert len(recording) == 1 and recording[0].camera.distortion is None
+    assert len(recording) == 1
     torch.testing.assert_close(recording.poses.t[0], 0.75 * a.t[0] + 0.25 * b.t[0], atol=1e-9, rtol=0)
     full = se3.rotation_angle(a.R.mT @ b.R)
     assert float(se3.rotation_angle(a.R.mT @ recording.poses.R) / full) == pytest.approx(0.25, abs=0.002)
@@ -378,6 +398,8 @@ def test_nothing_there_or_unknown(tmp_path: Path, named: Path) -> None:
     fails(r"format: found an empty folder, expected one of tum, driving, rectified, frames_dir", tmp_path / "empty")
     (tmp_path / "scan.xyz").write_text("1 2 3")
     fails(r"scan.xyz: format: found a .xyz file, expected one of", tmp_path / "scan.xyz")
+    for format in data.FORMATS:  # also where the reader is named and the path is a file
+        fails(r"scan.xyz", tmp_path / "scan.xyz", format)
     fails(r"format: found kitti, expected auto, tum, driving, rectified, frames_dir", named, "kitti")
     fails(r"data: format frames_dir has no option 'unit', expected one of K, K_depth, distortion", named, unit=3)
     fails(r"scene_\*.json: found 0 such files, expected exactly one", named, "driving")
@@ -539,7 +561,7 @@ def test_bad_intrinsics(counted: Path) -> None:
 
 
 def test_bad_tum(tmp_path: Path) -> None:
-    writers.write_tum(tmp_path, walk(3, hw=(480, 640)))
+    writers.write_tum(tmp_path, blank(3), camera=1)
     good = {name: (tmp_path / name).read_text() for name in ("rgb.txt", "depth.txt", "groundtruth.txt")}
 
     def restore() -> None:
@@ -677,8 +699,6 @@ def _written(name: str, root: Path) -> Path:
         writers.write_driving(root, {"FRONT": walk(2)}, Pose(torch.cat([pose(0).R] * 2), torch.cat([pose(0).t] * 2)))
     elif name == "tum":
         writers.write_tum(root, walk(2))
-        (root / "groundtruth.txt").write_text((root / "groundtruth.txt").read_text().replace("freiburg1", "mine"))
-        (root / "meta.json").write_text(json.dumps({"K": writers._K(CAMERA).tolist(), "dist": [0.1, 0, 0, 0, 0]}))
     else:
         left, right = render(CAMERA, pose(0), HW), render(CAMERA, pose(0), HW)
         f = CAMERA.f[:, :1].expand(1, 2)

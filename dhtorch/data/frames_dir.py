@@ -145,7 +145,7 @@ class _Load:
 
 def _named_frames(root: Path) -> tuple[list[_Files], Pose, list[str]]:
     parts: dict[int, dict[str, Path]] = {}
-    for file in root.iterdir():
+    for file in root.iterdir() if root.is_dir() else ():
         if match := _PART.fullmatch(file.name):
             parts.setdefault(int(match[1]), {})[match[2]] = file
     frames, poses, report = [], [], []

@@ -23,7 +23,6 @@ from dhtorch.data.files import FormatError
 from dhtorch.data.recording import Recording, numbers
 from dhtorch.records import Camera, Frame, Pose
 
-
 #: px; a smaller difference of directions has never been measured, its depth would be any number.
 _MIN_DISPARITY = 1e-3
 

@@ -27,14 +27,17 @@ from dhtorch.records import Camera, Frame, Pose
 _TUM_LAG = 0.0125  # s
 
 
-def write_tum(root: Path, frames: Sequence[Frame], *, camera: int = 1, units_per_metre: float = 5000.0) -> None:
+def write_tum(
+    root: Path, frames: Sequence[Frame], *, camera: int | None = None, units_per_metre: float = 5000.0
+) -> None:
     """A TUM RGB-D sequence: ``rgb/``, ``depth/``, their lists and ``groundtruth.txt``.
 
-    The format has no place for K: the reader takes that of freiburg ``camera``, named in the trajectory's header. The
+    The format has no place for K. ``camera`` 1, 2 or 3 names the freiburg camera in the trajectory's header, so that a
+    reader takes the published calibration (frames of 640×480); None puts the frames' own into ``meta.json``. The
     trajectory ticks at the colour stamps.
     """
     lists: dict[str, list[str]] = {"rgb": ["# color images"], "depth": ["# depth maps"]}
-    poses = ["# ground truth trajectory", f"# file: 'rgbd_dataset_freiburg{camera}_written.bag'"]
+    poses = ["# ground truth trajectory", f"# file: 'rgbd_dataset_{f'freiburg{camera}' if camera else 'own'}.bag'"]
     poses.append("# timestamp tx ty tz qx qy qz qw")
     for frame in frames:
         time = _time(frame)
@@ -46,6 +49,10 @@ def write_tum(root: Path, frames: Sequence[Frame], *, camera: int = 1, units_per
         poses.append(f"{time:.6f} " + _row([*pose[:3, 3], *_quaternion(pose[:3, :3])]))
     for name, lines in (("rgb", lists["rgb"]), ("depth", lists["depth"]), ("groundtruth", poses)):
         _write(root / f"{name}.txt", "\n".join(lines) + "\n")
+    if camera is None:
+        lens = frames[0].camera.distortion
+        meta = {"K": _K(frames[0].camera).tolist(), "dist": [0.0] * 5 if lens is None else lens[0].tolist()}
+        _write(root / "meta.json", json.dumps(meta))
 
 
 def write_named_frames(
