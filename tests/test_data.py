@@ -10,6 +10,7 @@ import pickle
 import random
 import shutil
 import zipfile
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,6 +35,15 @@ real = pytest.mark.skipif(not ROOT, reason="DHTORCH_DATA is not set")
 BOX = torch.tensor([2.0, 1.5, 3.0], dtype=torch.float64)  # half sizes of the room, m
 HW = (48, 64)
 CAMERA = Camera(torch.tensor([[61.5, 58.25]]), torch.tensor([[33.5, 21.75]]))  # nothing about it is symmetric
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _one_thread() -> Iterator[None]:
+    """Many tiny operations: a second thread only waits, for long on a busy machine."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 # -------------------------------------------------------------------------------------- a room known to the last digit
