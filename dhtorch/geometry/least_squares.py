@@ -162,10 +162,18 @@ def gauss_newton_step(T: Pose, H: Tensor, g: Tensor) -> tuple[Pose, Tensor]:
     """The pose after one Gauss–Newton step on its normal equations, and ``ok`` (B,); unchanged where H is singular.
 
     From a detached optimum this step is the implicit derivative of the optimum up to terms of the size of the
-    residuals. Gradient: to T, H and g. Raises ValueError for wrong shapes.
+    residuals. The step moves the pose by Cayley's map, a rotation that agrees with exp to second order and needs
+    no transcendental function.
+
+    Gradient: to T, H and g. Raises ValueError for wrong shapes.
     """
     xi, ok = solve_spd(H, -g[..., None])
-    return se3.retract(T, xi[..., 0]), ok
+    omega, upsilon = xi[:, :3, 0], xi[:, 3:]
+    W = se3.hat(omega)
+    M = torch.cat((T.R, T.t[..., None]), -1)
+    WM = W @ M
+    M = M + (WM + 0.5 * (W @ WM)) / (1 + 0.25 * (omega * omega).sum(-1))[:, None, None]
+    return Pose(M[..., :3], M[..., 3] + upsilon[..., 0]), ok
 
 
 def minimise(evaluate: Callable[[Pose], Normal], T: Pose, steps: int, *, damping: float = 1e-4) -> tuple[Pose, Tensor]:

@@ -46,23 +46,32 @@ def p3p(
     with torch.no_grad():
         j = rays.double().movedim((-2, -1), (0, 1)).contiguous()  # (point, coordinate, *)
         X = xyz.double().movedim((-2, -1), (0, 1)).contiguous()
-        j = j / (j * j).sum(1, keepdim=True).sqrt()
+        j, X, sound = _sound(j, X)
         m = torch.stack(((j[0] * j[1]).sum(0), (j[0] * j[2]).sum(0), (j[1] * j[2]).sum(0)))
         sides = torch.stack((X[0] - X[1], X[0] - X[2], X[1] - X[2]))
         a = (sides * sides).sum(1)
         scale = a.amax(0)
         a = a / scale
-        normal = torch.linalg.cross(sides[0], sides[1], dim=0)
-        height2 = (normal * normal).sum(0) / (scale * scale)
-        d = _ranges(m, a)
-        d, miss = _polish(d, m, a)
-        R, t = _align(j.to(xyz.dtype), X.to(xyz.dtype), (d * scale.sqrt()).to(xyz.dtype))
-        valid = (miss < 1e-6) & (d > 1e-9).all(0) & (height2 > MIN_HEIGHT**2) & (m < 1 - 1e-12).all(0)
-        valid = valid & R.isfinite().all(0).all(0) & t.isfinite().all(0)
-        R = torch.where(valid, R, torch.eye(3, dtype=R.dtype, device=R.device).view(3, 3, *[1] * valid.ndim))
-        t = torch.where(valid, t, torch.zeros_like(t))
+        d, step = _polish(_ranges(m, a), m, a)
+        # Newton's method squares the error: a short step has arrived.
+        valid = sound & (step < 1e-3) & (d.amin(0) > 1e-9)
+        d = torch.where(valid, d, 1.0) * scale.sqrt()
+        R, t = _align(j.to(xyz.dtype), X.to(xyz.dtype), d.to(xyz.dtype))
     # (row, column, root, *) → (*, root, row, column)
     return R.movedim((2, 0, 1), (-3, -2, -1)), t.movedim((1, 0), (-2, -1)), valid.movedim(0, -1)
+
+
+def _sound(j: Tensor, X: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Unit rays and points with a harmless triple in place of degenerate ones, and the mask (*) of the others."""
+    j = j / (j * j).sum(1, keepdim=True).sqrt()
+    e, h = X[1] - X[0], X[2] - X[0]
+    ee, eh, hh = (e * e).sum(0), (e * h).sum(0), (h * h).sum(0)
+    longest = torch.maximum(torch.maximum(ee, hh), ee + hh - 2 * eh)
+    far = 1 - 1e-12  # cosine of the smallest angle between two rays, a microradian
+    apart = ((j[0] * j[1]).sum(0) < far) & ((j[0] * j[2]).sum(0) < far) & ((j[1] * j[2]).sum(0) < far)
+    sound = apart & (ee * hh - eh * eh > (MIN_HEIGHT * longest) ** 2) & longest.isfinite()
+    spare = torch.eye(3, dtype=X.dtype, device=X.device).view(3, 3, *[1] * sound.ndim)
+    return torch.where(sound, j, spare), torch.where(sound, X, spare), sound
 
 
 def _ranges(m: Tensor, a: Tensor) -> Tensor:
@@ -74,10 +83,10 @@ def _ranges(m: Tensor, a: Tensor) -> Tensor:
     split = torch.where(far, D1 * weight + D2, D1 + D2 * weight)  # det(split) = 0
     other = torch.where(far, D1, D2)
     # The null vector is the steepest column of the adjugate; both planes contain it.
-    adjugate = torch.linalg.cross(split[[1, 2, 0]], split[[2, 0, 1]], dim=1)
-    size = (adjugate * adjugate).sum(1)
-    p = torch.where(size[0] >= size[1], adjugate[0], adjugate[1])
-    p = torch.where(torch.maximum(size[0], size[1]) >= size[2], p, adjugate[2])
+    columns = (_cross(split[1], split[2]), _cross(split[2], split[0]), _cross(split[0], split[1]))
+    size = [(x * x).sum(0) for x in columns]
+    p = torch.where(size[0] >= size[1], columns[0], columns[1])
+    p = torch.where(torch.maximum(size[0], size[1]) >= size[2], p, columns[2])
     p = p / (p * p).sum(0).sqrt()
     u, v = _complement(p)
     w = _null_directions(split, u, v)  # (3, 2, *) one direction per plane
@@ -159,42 +168,45 @@ def _null_directions(A: Tensor, u: Tensor, v: Tensor) -> Tensor:
 
 
 def _polish(d: Tensor, m: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
-    """A Newton step on d_i² + d_k² − 2 d_i d_k m_ik = a_ik; ranges (3, 4, *) and the largest remaining miss (4, *)."""
+    """A Newton step on d_i² + d_k² − 2 d_i d_k m_ik = a_ik; ranges (3, 4, *) and the longest of the steps (4, *)."""
     m, a = m[:, None], a[:, None]
     x, y, z = d.unbind(0)
-    r0, r1, r2 = _miss(d, m, a).unbind(0)
     xy, xz, yz = x - y * m[0], x - z * m[1], y - z * m[2]
     yx, zx, zy = y - x * m[0], z - x * m[1], z - y * m[2]
-    # Rows of half the Jacobian: (xy, yx, 0), (xz, 0, zx), (0, yz, zy).
-    det = -2 * (xy * zx * yz + yx * xz * zy)
-    steps = (
-        r0 * (-zx * yz) + r1 * (-yx * zy) + r2 * (yx * zx),
-        r0 * (-xz * zy) + r1 * (xy * zy) + r2 * (-xy * zx),
-        r0 * (xz * yz) + r1 * (-xy * yz) + r2 * (-yx * xz),
-    )
-    regular = det.abs() > 1e-30
-    d = d - torch.stack(steps) * torch.where(regular, 1 / torch.where(regular, det, torch.ones_like(det)), 0.0)
-    return d, _miss(d, m, a).abs().amax(0)
-
-
-def _miss(d: Tensor, m: Tensor, a: Tensor) -> Tensor:
-    near, far = d[[0, 0, 1]], d[[1, 2, 2]]
-    return near * near + far * far - 2 * near * far * m - a
+    # Half the Jacobian has the rows (xy, yx, 0), (xz, 0, zx), (0, yz, zy).
+    r0, r1, r2 = x * xy + y * yx - a[0], x * xz + z * zx - a[1], y * yz + z * zy - a[2]
+    p, q = zx * yz, yx * xz
+    det = -2 * (xy * p + q * zy)
+    step_x = r2 * (yx * zx) - r0 * p - r1 * (yx * zy)
+    step_y = r1 * (xy * zy) - r2 * (xy * zx) - r0 * (xz * zy)
+    step_z = r0 * (xz * yz) - r1 * (xy * yz) - r2 * q
+    step = torch.stack((step_x, step_y, step_z)) / torch.where(det.abs() > 1e-30, det, torch.inf)
+    return d - step, step.abs().amax(0)
 
 
 def _align(j: Tensor, X: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
     """Rotation (3, 3, 4, *) and translation (3, 4, *) that carry the triangle X onto Y = d j."""
     Y = d[:, None] * j[:, :, None]  # (point, coordinate, root, *)
-    E_y, E_x = _frame(Y), _frame(X)[:, :, None]  # (axis, coordinate, …)
-    R = E_y[0][:, None] * E_x[0] + E_y[1][:, None] * E_x[1] + E_y[2][:, None] * E_x[2]
-    X0 = X[0][:, None]
-    return R, Y[0] - (R[:, 0] * X0[0] + R[:, 1] * X0[1] + R[:, 2] * X0[2])
+    E_y, E_x = _frame(Y), _frame(X)  # axes, each (coordinate, …)
+    R = sum(y[:, None] * x[:, None] for y, x in zip(E_y, E_x, strict=True))
+    return R, Y[0] - sum(y * (x * X[0]).sum(0) for y, x in zip(E_y, E_x, strict=True))
 
 
-def _frame(P: Tensor) -> Tensor:
-    """Orthonormal axes (axis, coordinate, …) of triangles (point, coordinate, …)."""
+def _frame(P: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Orthonormal axes (coordinate, …) of triangles (point, coordinate, …)."""
     e0 = P[1] - P[0]
     e0 = e0 / (e0 * e0).sum(0).sqrt()
-    e2 = torch.linalg.cross(e0, P[2] - P[0], dim=0)
+    e2 = _cross(e0, P[2] - P[0])
     e2 = e2 / (e2 * e2).sum(0).sqrt()
-    return torch.stack((e0, torch.linalg.cross(e2, e0, dim=0), e2))
+    return e0, _cross(e2, e0), e2
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    """a × b along the first axis, whole planes at a time."""
+    turned = a * _turn(b) - _turn(a) * b  # component k of it is component k + 2 of the product
+    return _turn(turned)
+
+
+def _turn(a: Tensor) -> Tensor:
+    """Components (1, 2, 0)."""
+    return torch.cat((a[1:], a[:1]))

@@ -25,10 +25,10 @@ from dhtorch.records import Camera, Pose, PoseFit, Samples, Tracks
 from dhtorch.tree import collate
 
 #: Pairs solved together: few enough for their temporaries to stay in cache.
-PAIRS = 8
+PAIRS = 16
 
 #: Points the search looks at; a pair with more is thinned evenly. The last steps see all points.
-SEARCH_POINTS = 512
+SEARCH_POINTS = 256
 
 #: Noise below this is not believed (px): residuals of exact data are rounding.
 MIN_SIGMA_PX = 1e-6
@@ -43,8 +43,8 @@ def pnp_ransac(
     *,
     threshold_px: float = 3.0,
     min_inlier: int = 8,
-    local_optimisation: int = 4,
-    polish_steps: int = 3,
+    local_optimisation: int = 2,
+    polish_steps: int = 2,
     kernel: str | None = None,
     kernel_px: float = 1.0,
 ) -> PoseFit:

@@ -1,0 +1,349 @@
+"""Seat 5: the metric pose from near points, against truth, OpenCV and PoseLib, and what it refuses."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from dhtorch.codes import PoseCode
+from dhtorch.geometry import covariance, se3
+from dhtorch.records import Camera, Samples, Tracks
+from dhtorch.stages.pose import SEARCH_POINTS, pnp_ransac
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def pairs(batch, n, *, noise=0.0, outliers=0.0, planar=False, seed=0, dtype=torch.float64):
+    """Near points seen by two different cameras; arguments of the seat, and the true pose."""
+    g = torch.Generator().manual_seed(seed)
+
+    def rand(*shape):
+        return torch.rand(*shape, generator=g, dtype=torch.float64)
+
+    f_0, f_1 = 450 + 100 * rand(batch, 2), 450 + 100 * rand(batch, 2)
+    c = torch.tensor([320.0, 240.0], dtype=torch.float64) + 10 * rand(batch, 2)
+    uv_0 = rand(batch, n, 2) * torch.tensor([640.0, 480.0], dtype=torch.float64)
+    ray = torch.cat(((uv_0 - c[:, None]) / f_0[:, None], torch.ones_like(uv_0[..., :1])), -1)
+    depth = 2.0 / (1 + 0.3 * ray[..., 0] - 0.4 * ray[..., 1]) if planar else 0.8 + 2.2 * rand(batch, n)
+    xyz = ray * depth[..., None]
+    xi = 0.05 * torch.randn(batch, 6, generator=g, dtype=torch.float64)
+    T = se3.exp(xi + torch.tensor([0, 0, 0, 0.1, 0, 0], dtype=torch.float64))
+    Y = se3.apply(T, xyz)
+    uv_1 = Y[..., :2] / Y[..., 2:] * f_1[:, None] + c[:, None]
+    uv_1 = uv_1 + noise * torch.randn(uv_1.shape, generator=g, dtype=torch.float64)
+    wrong = torch.arange(n) < round(outliers * n)
+    anywhere = rand(batch, n, 2) * torch.tensor([640.0, 480.0], dtype=torch.float64)
+    uv_1 = torch.where(wrong[:, None], anywhere, uv_1)
+    draws = rand(batch, 200, 3).float()
+    args = (*_records(uv_0, depth, xyz, uv_1), Camera(f_0, c), Camera(f_1, c))
+    return (*(x.to(dtype) for x in args), draws), T
+
+
+def _records(uv_0, depth, xyz, uv_1):
+    zero = torch.zeros_like(depth)
+    code = zero.to(torch.int32)
+    cov = torch.eye(2, dtype=depth.dtype).expand(*depth.shape, 2, 2).clone()
+    samples = Samples(uv_0, depth, 0.01 * depth, xyz, zero + 1, code, zero + 1, code)
+    return samples, Tracks(uv_0, uv_1, zero, zero, cov, zero == 0)
+
+
+def with_points(args, *, xyz=None, uv_1=None, valid=None, camera_1=None):
+    samples, tracks, camera_0, old_1, draws = args
+    samples = samples if xyz is None else samples.replace(xyz=xyz)
+    tracks = tracks if uv_1 is None else tracks.replace(uv_1=uv_1)
+    tracks = tracks if valid is None else tracks.replace(valid=valid)
+    return samples, tracks, camera_0, old_1 if camera_1 is None else camera_1, draws
+
+
+def errors(fit, T):
+    """Rotation (deg) and translation (m) errors."""
+    R = fit.T_1_from_0.R.double() @ T.R.transpose(1, 2)
+    return torch.rad2deg(se3.rotation_angle(R)), (fit.T_1_from_0.t.double() - T.t).norm(dim=-1)
+
+
+def same(a, b):
+    """Bit for bit, NaN equal to NaN."""
+    return torch.equal(a.isnan(), b.isnan()) and torch.equal(a.nan_to_num(), b.nan_to_num())
+
+
+def fields(fit):
+    T = fit.T_1_from_0
+    return (T.R, T.t, fit.cov, fit.rms_px, fit.sigma_px, fit.t_snr, fit.inlier, fit.n_inlier, fit.code)
+
+
+# -------------------------------------------------------------------------------------------------- accuracy
+
+
+@pytest.mark.parametrize("planar", [False, True])
+@pytest.mark.parametrize("n", [8, 40, 1500])
+def test_exact_points_give_the_exact_pose(n, planar):
+    args, T = pairs(6, n, planar=planar)
+    fit = pnp_ransac(*args)
+    assert fit.ok.all() and (fit.code == PoseCode.OK).all()
+    assert fit.inlier.all() and (fit.n_inlier == n).all()
+    rotation, translation = errors(fit, T)
+    assert rotation.max() < 1e-8 and translation.max() < 1e-9
+    assert fit.rms_px.max() < 1e-6
+
+
+def test_outliers_are_named():
+    args, _ = pairs(8, 200, noise=0.3, outliers=0.4)
+    fit = pnp_ransac(*args)
+    assert fit.inlier[:, 80:].double().mean() > 0.995
+    assert fit.inlier[:, :80].double().mean() < 0.02  # a random pixel is within 3 px of the right one now and then
+    assert torch.equal(fit.inlier.sum(-1), fit.n_inlier)
+    assert ((fit.sigma_px - 0.3).abs() < 0.05).all() and ((fit.rms_px - 0.3 * 2**0.5).abs() < 0.07).all()
+
+
+def by_opencv(xyz, uv, K):
+    _, r, t, inlier = cv2.solvePnPRansac(
+        xyz, uv, K, None, flags=cv2.SOLVEPNP_AP3P, reprojectionError=3.0, iterationsCount=200, confidence=0.999
+    )
+    index = inlier[:, 0]
+    r, t = cv2.solvePnPRefineLM(xyz[index], uv[index], K, None, r, t)
+    return cv2.Rodrigues(r)[0], t[:, 0]
+
+
+def by_poselib(xyz, uv, K):
+    poselib = pytest.importorskip("poselib")
+    camera = {"model": "PINHOLE", "width": 640, "height": 480, "params": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]}
+    options = {"max_reproj_error": 3.0, "min_iterations": 100, "max_iterations": 1000}
+    pose, _ = poselib.estimate_absolute_pose(uv, xyz, camera, options, {})
+    return getattr(pose, "pose", pose).R, getattr(pose, "pose", pose).t
+
+
+@pytest.mark.parametrize("peer", [by_opencv, by_poselib])
+@pytest.mark.parametrize("planar", [False, True])
+def test_no_less_accurate_than(peer, planar):
+    """500 points, 30 % outliers, 0.5 px: mean errors over 100 pairs, both sides near the statistical limit."""
+    args, T = pairs(100, 500, noise=0.5, outliers=0.3, planar=planar, dtype=torch.float32)
+    rotation, translation = errors(pnp_ransac(*args), T)
+    samples, tracks, _, camera_1, _ = args
+    theirs = []
+    for b in range(100):
+        K = np.eye(3)
+        K[[0, 1], [0, 1]], K[:2, 2] = camera_1.f[b].numpy(), camera_1.c[b].numpy()
+        theirs.append(peer(samples.xyz[b].double().numpy(), tracks.uv_1[b].double().numpy(), K))
+    R, t = (torch.tensor(np.stack(x)) for x in zip(*theirs, strict=True))
+    their_rotation = torch.rad2deg(se3.rotation_angle(R @ T.R.transpose(1, 2)))
+    their_translation = (t - T.t).norm(dim=-1)
+    # Both find the same optimum up to which points within a hair of 3 px count as inliers: 2 % of slack.
+    assert rotation.mean() <= 1.02 * their_rotation.mean()
+    assert translation.mean() <= 1.02 * their_translation.mean()
+
+
+def test_covariance_is_that_of_the_errors():
+    """Normalised squared error over 300 trials: its mean over 6 lies within the 95 % band of chi² with 6 × 300."""
+    args, T = pairs(300, 60, noise=0.5, seed=5)
+    fit = pnp_ransac(*args)
+    assert fit.ok.all()
+    delta = se3.compose(fit.T_1_from_0, se3.invert(T))
+    R = delta.R
+    omega = 0.5 * torch.stack((R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]), -1)
+    xi = torch.cat((omega, delta.t), -1)
+    nees = covariance.mahalanobis(xi, fit.cov) ** 2 / 6
+    band = 1.96 * (2 / (6 * 300)) ** 0.5
+    assert abs(nees.mean() - 1) < band
+    snr = covariance.mahalanobis(fit.T_1_from_0.t, fit.cov[:, 3:, 3:])
+    torch.testing.assert_close(fit.t_snr, snr)
+
+
+@pytest.mark.parametrize("kernel", ["huber", "cauchy", "geman_mcclure"])
+def test_kernels_resist_small_mistakes(kernel):
+    """A fifth of the points off by 2 px in the same direction, inside the inlier threshold."""
+    args, T = pairs(40, 120, noise=0.2)
+    uv = args[1].uv_1.clone()
+    uv[:, :24, 0] += 2.0
+    args = with_points(args, uv_1=uv)
+    plain, _ = errors(pnp_ransac(*args), T)
+    kept, _ = errors(pnp_ransac(*args, kernel=kernel, kernel_px=0.5, polish_steps=6), T)
+    assert kept.mean() < 0.8 * plain.mean()
+
+
+def test_many_points_are_thinned_for_the_search_only():
+    args, T = pairs(4, 4 * SEARCH_POINTS, noise=0.5, outliers=0.3, dtype=torch.float32)
+    fit = pnp_ransac(*args)
+    assert (fit.n_inlier > 2.7 * SEARCH_POINTS).all()
+    rotation, translation = errors(fit, T)
+    assert rotation.max() < 0.02 and translation.max() < 1e-3
+
+
+# -------------------------------------------------------------------------------------------------- refusals
+
+
+def refused(fit, code):
+    assert fit.code.tolist() == code
+    assert not fit.ok.any() and not fit.inlier.any()
+    for x in (fit.T_1_from_0.R, fit.T_1_from_0.t, fit.cov, fit.rms_px, fit.sigma_px, fit.t_snr):
+        assert x.isnan().all()
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 3, 7])
+def test_too_few_points(n):
+    args, _ = pairs(2, n)
+    fit = pnp_ransac(*args)
+    refused(fit, [PoseCode.TOO_FEW] * 2)
+    assert fit.inlier.shape == (2, n)
+
+
+def test_too_few_inliers():
+    args, _ = pairs(3, 60, outliers=1.0)
+    fit = pnp_ransac(*args)
+    refused(fit, [PoseCode.TOO_FEW] * 3)
+    assert (fit.n_inlier < 8).all()
+
+
+def test_lines_and_single_points_are_degenerate():
+    args, T = pairs(3, 30)
+    samples, _, _, camera_1, _ = args
+    along = torch.linspace(-1, 1, 30, dtype=torch.float64)
+    line = torch.stack((along, 0.5 * along, 2 + 0.3 * along), -1)
+    point = torch.tensor([0.2, 0.1, 1.5], dtype=torch.float64).expand(30, 3)
+    xyz = torch.stack((line, point, samples.xyz[2]))
+    Y = se3.apply(T, xyz)
+    uv_1 = Y[..., :2] / Y[..., 2:] * camera_1.f[:, None] + camera_1.c[:, None]
+    noisy = uv_1 + 0.5 * torch.randn(uv_1.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    for pixels in (uv_1, noisy):
+        for dtype in (torch.float32, torch.float64):
+            moved = tuple(x.to(dtype) for x in with_points(args, xyz=xyz, uv_1=pixels)[:4])
+            fit = pnp_ransac(*moved, args[4])
+            assert fit.code.tolist() == [PoseCode.DEGENERATE, PoseCode.DEGENERATE, PoseCode.OK]
+            refused(fit[:2], [PoseCode.DEGENERATE] * 2)
+
+
+def test_points_behind_the_camera_are_no_inliers():
+    args, T = pairs(2, 60)
+    xyz = args[0].xyz.clone()
+    # The mirror image of a point through camera 1's centre projects to the same pixel.
+    mirrored = se3.apply(se3.invert(T), -se3.apply(T, xyz))
+    xyz[:, :20] = mirrored[:, :20]
+    fit = pnp_ransac(*with_points(args, xyz=xyz))
+    assert fit.ok.all() and not fit.inlier[:, :20].any() and fit.inlier[:, 20:].all()
+
+
+def test_values_that_cannot_be_used_do_not_matter():
+    args, _ = pairs(2, 50, noise=0.3, outliers=0.2, dtype=torch.float32)
+    bad = torch.arange(50) % 3 == 0
+    hidden = with_points(args, valid=~bad.expand(2, 50))
+    xyz, uv_1 = args[0].xyz.clone(), args[1].uv_1.clone()
+    xyz[0, bad], uv_1[1, bad] = torch.nan, torch.inf
+    fit, poisoned = pnp_ransac(*hidden), pnp_ransac(*with_points(args, xyz=xyz, uv_1=uv_1))
+    assert fit.ok.all()
+    for x, y in zip(fields(fit), fields(poisoned), strict=True):
+        assert same(x, y)
+    wide = with_points(args, xyz=torch.nn.functional.pad(xyz, (0, 0, 0, 30), value=torch.nan))
+    wide = (
+        wide[0],
+        args[1].replace(
+            uv_1=torch.nn.functional.pad(args[1].uv_1, (0, 0, 0, 30)), valid=torch.ones(2, 80, dtype=torch.bool)
+        ),
+        *wide[2:],
+    )
+    padded = pnp_ransac(*wide)
+    torch.testing.assert_close(padded.T_1_from_0.t[0], fit.T_1_from_0.t[0])
+    assert torch.equal(padded.inlier[0, :50], fit.inlier[0]) and not padded.inlier[0, 50:].any()
+
+
+def test_hopeless_intrinsics_are_flagged():
+    args, _ = pairs(3, 30)
+    f = args[3].f.clone()
+    f[0], f[1] = torch.nan, 0.0
+    fit = pnp_ransac(*with_points(args, camera_1=args[3].replace(f=f)))
+    assert (fit.code[:2] != PoseCode.OK).all() and fit.code[2] == PoseCode.OK
+    assert fit.T_1_from_0.R[:2].isnan().all() and fit.T_1_from_0.R[2].isfinite().all()
+
+
+def test_wrong_shapes_raise():
+    args, _ = pairs(2, 10)
+    for k, bad in ((4, args[4][:1]), (4, args[4][..., :2]), (4, args[4][:, :0]), (0, args[0][:, :5])):
+        with pytest.raises(ValueError):
+            pnp_ransac(*(bad if i == k else x for i, x in enumerate(args)))
+    with pytest.raises(ValueError, match="kernel"):
+        pnp_ransac(*args, kernel="tukey")
+
+
+# ------------------------------------------------------------------------------------------ company, gradients
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("n", "hypotheses"), [(37, 37), (300, 200), (5, 1)])
+def test_an_answer_does_not_depend_on_company(n, hypotheses, dtype):
+    args, _ = pairs(20, n, noise=0.4, outliers=0.3, dtype=dtype)
+    args = (*args[:4], args[4][:, :hypotheses])
+    args[1].valid[3, ::2] = False
+    together = pnp_ransac(*args, min_inlier=4)
+    order = torch.randperm(20, generator=torch.Generator().manual_seed(1))
+    shuffled = pnp_ransac(*(x[order] for x in args), min_inlier=4)
+    eight = pnp_ransac(*(x[5:13] for x in args), min_inlier=4)
+    for whole, mixed, part in zip(fields(together), fields(shuffled), fields(eight), strict=True):
+        assert same(whole[order], mixed) and same(whole[5:13], part)
+    for b in (0, 3, 15, 19):
+        for whole, alone in zip(
+            fields(together), fields(pnp_ransac(*(x[b : b + 1] for x in args), min_inlier=4)), strict=True
+        ):
+            assert same(whole[b : b + 1], alone)
+
+
+def test_gradient_of_the_whole_stage_at_exact_data():
+    args, _ = pairs(2, 9)
+    xyz, uv_1, f, c = (x.clone().requires_grad_() for x in (args[0].xyz, args[1].uv_1, args[3].f, args[3].c))
+
+    def pose(xyz, uv_1, f, c):
+        fit = pnp_ransac(*with_points(args, xyz=xyz, uv_1=uv_1, camera_1=Camera(f, c)))
+        return fit.T_1_from_0.R, fit.T_1_from_0.t
+
+    assert torch.autograd.gradcheck(pose, (xyz, uv_1, f, c), eps=1e-5, atol=1e-5, rtol=1e-4)
+
+
+def test_gradient_with_noise_is_that_of_the_optimum_to_first_order():
+    args, _ = pairs(1, 40, noise=0.3)
+    uv_1 = args[1].uv_1.clone().requires_grad_()
+    fit = pnp_ransac(*with_points(args, uv_1=uv_1))
+    (analytic,) = torch.autograd.grad(fit.T_1_from_0.t[0, 0], uv_1)
+    direction = torch.randn(uv_1.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    def moved(step):
+        with torch.no_grad():
+            return pnp_ransac(*with_points(args, uv_1=uv_1 + step * direction), polish_steps=8).T_1_from_0.t[0, 0]
+
+    numeric = (moved(1e-4) - moved(-1e-4)) / 2e-4
+    torch.testing.assert_close((analytic * direction).sum(), numeric, rtol=0.02, atol=0)
+
+
+def test_gradients_stay_finite_whatever_the_input():
+    args, _ = pairs(4, 24, noise=0.3, outliers=0.2)
+    xyz, uv_1, valid = args[0].xyz.clone(), args[1].uv_1.clone(), args[1].valid.clone()
+    xyz[0, ::2], uv_1[1, ::3], valid[2] = torch.nan, torch.nan, False
+    xyz[3] = xyz[3, :1]
+    leaves = [x.requires_grad_() for x in (xyz, uv_1, args[3].f.clone(), args[3].c.clone())]
+    fit = pnp_ransac(*with_points(args, xyz=xyz, uv_1=uv_1, valid=valid, camera_1=Camera(*leaves[2:])))
+    assert fit.code.tolist() == [0, 0, PoseCode.TOO_FEW, PoseCode.DEGENERATE]
+    (fit.T_1_from_0.R.nan_to_num().sum() + fit.T_1_from_0.t.nan_to_num().sum()).backward()
+    for x in leaves:
+        assert x.grad.isfinite().all()
+    assert (leaves[0].grad[2:] == 0).all() and (leaves[0].grad[0, 1::2][fit.inlier[0, 1::2]] != 0).any()
+    assert not fit.cov.requires_grad and not fit.rms_px.requires_grad
+
+
+def test_it_captures_as_one_graph():
+    args, _ = pairs(2, 40, noise=0.3, outliers=0.2)
+    torch._dynamo.reset()
+    captured = torch.compile(pnp_ransac, fullgraph=True, backend="eager")
+    for x, y in zip(fields(captured(*args)), fields(pnp_ransac(*args)), strict=True):
+        assert same(x, y)
+
+
+def test_it_maps_over_a_leading_dimension():
+    args, _ = pairs(6, 40, noise=0.3, outliers=0.2)
+    nested = tuple(
+        x.map(lambda v: v.unflatten(0, (3, 2))) if hasattr(x, "map") else x.unflatten(0, (3, 2)) for x in args
+    )
+    mapped = torch.func.vmap(lambda *a: fields(pnp_ransac(*a)))(*nested)
+    for x, y in zip(mapped, fields(pnp_ransac(*args)), strict=True):
+        torch.testing.assert_close(x.flatten(0, 1), y)
