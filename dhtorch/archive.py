@@ -25,7 +25,7 @@ VERDICTS = ("supported", "refuted", "undecided")
 
 #: Options that do not change what is computed: where files lie, what else is written, on which machine part it runs.
 UNKEYED = frozenset(
-    {"root", "path", "folder", "cache", "output", "figures", "device", "resume", "traceback", "workers", "hydra"}
+    {"root", "folder", "cache", "output", "figures", "device", "resume", "traceback", "workers", "hydra"}
 )
 
 #: Bytes of a data file's head and tail that enter a digest: enough to tell recordings apart, cheap for large ones.

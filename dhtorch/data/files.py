@@ -51,6 +51,11 @@ class ImageHeader(NamedTuple):
     kind: str  # "png" or "jpeg"
 
 
+def set_opencv_threads(threads: int) -> None:
+    """Threads of OpenCV in this process; torch has its own count, and a data-loader worker should have one of each."""
+    cv2.setNumThreads(threads)
+
+
 # ---------------------------------------------------------------------------------------------------------- images
 
 

@@ -16,8 +16,9 @@ from torch.utils.data import DataLoader, Dataset
 
 from dhtorch import tree
 from dhtorch.codes import Gate, Hole, names
+from dhtorch.data.files import set_opencv_threads
 from dhtorch.evaluate import calibrate, errors, holdout, risk
-from dhtorch.geometry.lookup import nearest
+from dhtorch.geometry.lookup import nearest, patches, round_half_up
 from dhtorch.pair import Trace
 from dhtorch.records import Estimate, Frame, Samples
 
@@ -29,6 +30,10 @@ MIN_CANDIDATES = 20
 
 #: Search radius in a sparse depth map, px: the truth test reads sparse returns in 7×7 windows, so do the samples.
 SPARSE_SEARCH_PX = 3
+
+
+#: A track looks at this many pixels across (LK window and a margin): what lies within may pull at it.
+REACH_PX = 25
 
 
 @dataclass(frozen=True)
@@ -193,10 +198,10 @@ class _Scene:
             with torch.no_grad():
                 estimate = method(near, seen, seed=self.settings.seed, trace=trace)
             samples: Samples = trace["samples"]
-            classes = nearest(surface, samples.uv)[0].int() if surface.shape[-1] > 1 else None
+            kinds = self._kinds(surface, samples.uv) if surface.shape[-1] > 1 else None
             if name == next(iter(self.methods)):
                 self._count_holes(method, anchor, samples.uv)
-                truths = {test: self._truth(test, exact, samples, classes) for test in self.settings.truth}
+                truths = {test: self._truth(test, exact, samples, kinds) for test in self.settings.truth}
                 enough = [
                     int(t.ok.sum()) >= MIN_CANDIDATES or not self._has_truth for t in self._each(truths, len(pairs))
                 ]
@@ -205,7 +210,7 @@ class _Scene:
                     self.dropped[test] += [truth[b : b + 1].dropped() for b in range(len(pairs)) if enough[b]]
             for b, pair in enumerate(pairs):
                 if enough[b]:
-                    self._add_pair(name, pair, b, len(pairs), estimate, trace, truths, classes)
+                    self._add_pair(name, pair, b, len(pairs), estimate, trace, truths, kinds)
             if not self.examples:
                 last = truths[self.settings.truth[-1]]
                 self.examples.append(Example(self.recording.name, name, near[:1], samples[:1], estimate[:1], last[:1]))
@@ -248,14 +253,27 @@ class _Scene:
     def _has_truth(self) -> bool:
         return self.cutoff is not None and self.cutoff != float("inf")
 
-    def _truth(self, test: str, exact: Frame, samples: Samples, classes: Tensor | None) -> holdout.Truth:
+    def _truth(self, test: str, exact: Frame, samples: Samples, kinds: Tensor | None) -> holdout.Truth:
         found = holdout.truth_at(exact, samples.uv, truth=test, sparse=self.recording.sparse)
-        odd = None if classes is None else self._is_odd(classes)
+        odd = (
+            None
+            if kinds is None
+            else torch.isin(kinds, torch.tensor(self._odd, dtype=kinds.dtype, device=kinds.device))
+        )
         return holdout.candidates(samples, found, self.cutoff if self._has_truth else None, excluded=odd)
 
-    def _is_odd(self, classes: Tensor) -> Tensor:
-        odd = [k for k, name in self.recording.surfaces.items() if name in self.recording.odd_surfaces]
-        return torch.isin(classes, torch.tensor(odd, dtype=classes.dtype, device=classes.device))
+    def _kinds(self, surface: Tensor, uv: Tensor) -> Tensor:
+        """Kind of surface at each sample; one whose track window touches an odd surface counts with that."""
+        kind = nearest(surface, uv)[0]
+        corner = (round_half_up(uv) - REACH_PX // 2).long()
+        around = patches(surface[:, None], corner, min(REACH_PX, *surface.shape[-2:]))[:, :, 0].flatten(-2)
+        for code in self._odd:
+            kind = torch.where((around == code).any(-1), torch.full_like(kind, code), kind)
+        return kind
+
+    @property
+    def _odd(self) -> list[int]:
+        return [k for k, name in self.recording.surfaces.items() if name in self.recording.odd_surfaces]
 
     def _each(self, truths: Mapping[str, holdout.Truth], n: int) -> list[holdout.Truth]:
         strictest = truths[self.settings.truth[-1]]
@@ -277,7 +295,7 @@ class _Scene:
         estimate: Estimate,
         trace: Trace,
         truths: Mapping[str, holdout.Truth],
-        classes: Tensor | None,
+        kinds: Tensor | None,
     ) -> None:
         one, samples = estimate[b : b + 1], trace["samples"][b : b + 1]
         hole = samples.xyz.isnan().any(-1)
@@ -291,12 +309,9 @@ class _Scene:
             row |= {"n_holes": int(hole.sum()), "n_recovered": int((one.keep & hole).sum())}
             row |= {"gate_share": share, "ms": {k: v / size for k, v in trace["ms"].items()}}
             self.pair_rows.append(row)
-            for kind in self.recording.odd_surfaces if classes is not None else ():
-                code = next(k for k, v in self.recording.surfaces.items() if v == kind)
-                there = truth[b : b + 1]
-                there = there.replace(
-                    code=torch.where(classes[b : b + 1] == code, _reopen(there), holdout.Rule.EXCLUDED)
-                )
+            for code in self._odd if kinds is not None else ():
+                kind, there = self.recording.surfaces[code], truth[b : b + 1]
+                there = there.replace(code=torch.where(kinds[b : b + 1] == code, _reopen(there), holdout.Rule.EXCLUDED))
                 self.apart.setdefault((name, test, kind), []).append(errors.select(one, there))
 
 
@@ -312,6 +327,7 @@ def _collate(items: list[tuple[Frame, Frame, Frame, Tensor]]) -> tuple[Frame, Fr
 
 def _one_thread(_worker: int) -> None:
     torch.set_num_threads(1)
+    set_opencv_threads(1)
 
 
 def _mean(values: Sequence[float]) -> float | None:
