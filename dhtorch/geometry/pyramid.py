@@ -1,7 +1,7 @@
-"""Image pyramids that are ready for window searches: padded levels with their gradients beside them.
+"""Image pyramids ready for window searches: padded levels with their gradients beside them.
 
-Alphabet: ``image`` (B, C, H, W); ``level`` (B, 3, H_l + 2 pad, W_l + 2 pad), its planes are the grey value, the gradient
-along x and the gradient along y. Pixel i of a level lies at pixel 2 i of the level below it.
+Alphabet: ``image`` (B, C, H, W); ``level`` (B, 3, H_l + 2 pad, W_l + 2 pad), whose planes are the gradient along x, the
+gradient along y and the grey value. Pixel i of a level lies at pixel 2 i of the level below it.
 """
 
 from __future__ import annotations
@@ -9,25 +9,76 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from dhtorch.geometry.lookup import luma
+from dhtorch.geometry.lookup import luma, round_half_up, windows
 from dhtorch.geometry.shapes import check
 
-#: Farthest a search window is looked up away from the pixel it started at, on one map of one level.
-REACH = 4
+#: Padding beyond half a window: how far from a pixel of the image (or of ``MARGIN`` around it) a search may look.
+REACH = 8
+
+#: How far outside the image the middle of a window may lie, px of the level.
+MARGIN = 4
+
+#: Planes of a level.
+GRAD_X, GRAD_Y, GREY = 0, 1, 2
 
 
 class Pyramid(NamedTuple):
-    """Padded levels of a batch of images, finest first; a plain pytree, so it may be kept, compiled and moved."""
+    """Padded levels of a batch of images, finest first. A plain pytree: it may be kept, moved and compiled."""
 
-    levels: tuple[Tensor, ...]  # each (B, 3, H_l + 2 pad, W_l + 2 pad): grey, grad x, grad y
+    levels: tuple[Tensor, ...]  # each (B, 3, H_l + 2 pad, W_l + 2 pad)
     pad: int
 
     def hw(self, level: int = 0) -> tuple[int, int]:
         """(height, width) of a level without its padding."""
-        H, W = self.levels[level].shape[-2:]
-        return H - 2 * self.pad, W - 2 * self.pad
+        rows, width = self.levels[level].shape[-2:]
+        return rows - 2 * self.pad, width - 2 * self.pad
+
+    def bounds(self, level: int = 0) -> tuple[Tensor, Tensor]:
+        """Lowest and highest position (2, 1) of a point on a level: its pixels' area, and coarsely the margin as well.
+
+        A coarse step that overshoots the border may come back; on the finest level it is lost.
+        """
+        H, W = self.hw()
+        high = self.levels[0].new_tensor([[W - 0.5], [H - 0.5]])
+        slack = MARGIN if level else 0
+        return torch.full_like(high, -0.5) * 0.5**level - slack, high * 0.5**level + slack
+
+    def pixel(self, level: int, x: Tensor) -> Tensor:
+        """Nearest pixel (2, M) of a level or of the margin around it to ``x`` (2, M)."""
+        H, W = self.hw(level)
+        return torch.minimum(round_half_up(x).clamp_min(-MARGIN), x.new_tensor([[W - 1], [H - 1]]) + MARGIN)
+
+    def locate(self, level: int, x: Tensor, batch: Tensor, before: int, planes: tuple[int, ...]):
+        """Where windows begin that reach ``before`` pixels left of and above floor(x), and the fraction of x.
+
+        ``x`` (2, M) px of the level, ``batch`` (M,); returns flat indices (P, M), one row per plane, and (2, M).
+        """
+        rows, width = self.levels[level].shape[-2:]
+        limit = x.new_tensor([[width], [rows]]) - (2 * self.pad + 1 - MARGIN)
+        whole = torch.minimum(x.detach().floor().clamp_min(-MARGIN), limit)
+        u, v = whole.long() + (self.pad - before)
+        plane = 3 * batch + torch.tensor(planes, device=x.device)[:, None]
+        return (plane * rows + v) * width + u, x - whole
+
+    def read(self, level: int, first: Tensor, size: int, fraction: Tensor | None = None) -> Tensor:
+        """Windows (P, M, size²) that begin at ``first`` (P, M), or (bilinear) ``fraction`` (2, M) right and below."""
+        if fraction is None:
+            return windows(self.levels[level], first, size).flatten(-2)
+        # Between neighbours by shifting the window as one long row, which runs at full speed; what the shift carries
+        # over a row's end lands in the last column, which is left out.
+        side = size + 1
+        w = windows(self.levels[level], first, side).flatten(-2)
+        w = torch.lerp(w[..., :-1], w[..., 1:], fraction[0][:, None])
+        w = torch.lerp(w[..., :-side], w[..., side:], fraction[1][:, None])
+        return w.unfold(-1, size, side).flatten(-2)
+
+    def windows(self, level: int, x: Tensor, batch: Tensor, size: int, planes=(GRAD_X, GRAD_Y, GREY)) -> Tensor:
+        """Windows (P, M, size²) around ``x`` (2, M), between pixels."""
+        first, fraction = self.locate(level, x, batch, size // 2, planes)
+        return self.read(level, first, size, fraction)
 
 
 def build_pyramid(
@@ -37,18 +88,18 @@ def build_pyramid(
 ) -> Pyramid:
     """Grey pyramid with gradients, padded for searches with windows of ``window`` pixels.
 
-    Each level is the one below, smoothed by the binomial filter (1 4 6 4 1) / 16 and sampled at even pixels; gradients
-    are Scharr's, per pixel. Outside the image the grey value is mirrored about the border pixel, the gradient is zero
-    (a mirrored gradient would pull a window back inside). As ``cv2.buildOpticalFlowPyramid`` does, it stops early,
-    before a level would be no larger than the window.
+    Each level is the one below, smoothed by the binomial filter (1 4 6 4 1) / 16 and taken at even pixels; gradients
+    are Scharr's, per pixel. Outside the image the grey value is mirrored about the border pixel and the gradient is
+    zero (a mirrored gradient would hold a window back at the border). As in ``cv2.buildOpticalFlowPyramid``, a level
+    that would be no larger than the window is not made.
 
     Returns:
-        At most ``levels`` levels (the full resolution counts), in the image's dtype, float32 for uint8 images.
+        1 to ``levels`` levels (full resolution included) in the image's dtype, float32 for narrower ones.
 
     Raises:
-        ValueError: not an image batch, ``levels`` < 1, an even or too small window, or an image no larger than it.
+        ValueError: not an image batch, ``levels`` < 1, a window that is even or < 3, or an image no larger than it.
 
-    Gradient: none; the search that reads a pyramid has none either (see ``stages.track.refine``).
+    Gradient: to the image.
     """
     sizes = check("build_pyramid", image=(image, "B C H W"))
     if sizes["C"] not in (1, 3):
@@ -59,51 +110,42 @@ def build_pyramid(
     smallest = max(window, pad)
     if min(sizes["H"], sizes["W"]) <= smallest:
         raise ValueError(f"build_pyramid: image of {sizes['H']}x{sizes['W']} pixels is too small for window {window}")
-    with torch.no_grad():
-        chain = [_padded(luma(image, dim=1)[:, 0], pad)]
-        while len(chain) < levels:
-            half = _half(chain[-1], pad)
-            if min(half.shape[-2:]) <= smallest:
-                break
-            chain.append(_padded(half, pad))
-        return Pyramid(tuple(_add_gradients(level, pad) for level in chain), pad)
+    grey = luma(image, dim=1)
+    grey = grey.to(torch.promote_types(grey.dtype, torch.float32))
+    chain: list[Tensor] = []
+    while len(chain) < levels and min(grey.shape[-2:]) > smallest:
+        padded = F.pad(grey, (pad,) * 4, mode="reflect")
+        chain.append(_with_gradients(padded, pad))
+        grey = _half(padded, pad)
+    return Pyramid(tuple(chain), pad)
 
 
-def _padded(grey: Tensor, pad: int) -> Tensor:
-    """A level whose first plane is ``grey`` (B, H, W), mirrored about its border pixels; the other planes are zero."""
-    B, H, W = grey.shape
-    level = grey.new_zeros(B, 3, H + 2 * pad, W + 2 * pad)
-    plane = level[:, 0]
-    plane[:, pad : pad + H, pad : pad + W] = grey
-    plane[:, :pad] = plane[:, pad + 1 : 2 * pad + 1].flip(-2)
-    plane[:, pad + H :] = plane[:, H - 1 : H - 1 + pad].flip(-2)
-    plane[..., :pad] = plane[..., pad + 1 : 2 * pad + 1].flip(-1)
-    plane[..., pad + W :] = plane[..., W - 1 : W - 1 + pad].flip(-1)
-    return level
-
-
-def _half(level: Tensor, pad: int) -> Tensor:
-    """The image of a padded level at half size: ``cv2.pyrDown`` (kornia's ``pyrdown`` resamples at other places).
+def _half(padded: Tensor, pad: int) -> Tensor:
+    """Half-size image of a padded one (B, 1, rows, width), as ``cv2.pyrDown`` (kornia's samples at other places).
 
     Rows first, because their slices are contiguous; then even and odd columns are taken apart once.
     """
-    H, W = level.shape[-2] - 2 * pad, level.shape[-1] - 2 * pad
-    h, w = (H + 1) // 2, (W + 1) // 2
-    plane = level[:, 0, :, pad - 2 : pad + 2 * w + 1]
-    rows = [plane[:, pad + k : pad + k + 2 * h - 1 : 2] for k in (-2, -1, 0, 1, 2)]
-    smooth = (rows[1] + rows[3]).mul_(4).add_(rows[0]).add_(rows[4]).add_(rows[2], alpha=6)
+    h, w = ((size - 2 * pad + 1) // 2 for size in padded.shape[-2:])
+    rows = [padded[..., pad + k : pad + k + 2 * h - 1 : 2, pad - 2 : pad + 2 * w + 1] for k in (-2, -1, 0, 1, 2)]
+    smooth = _binomial(*rows)
     even, odd = smooth[..., ::2].contiguous(), smooth[..., 1::2].contiguous()
-    smooth = (odd[..., :w] + odd[..., 1 : w + 1]).mul_(4).add_(even[..., :w]).add_(even[..., 2 : w + 2])
-    return smooth.add_(even[..., 1 : w + 1], alpha=6).mul_(1 / 256)
+    return _binomial(even[..., :w], odd[..., :w], even[..., 1 : w + 1], odd[..., 1:], even[..., 2:])
 
 
-def _add_gradients(level: Tensor, pad: int) -> Tensor:
-    """Fill the gradient planes inside the image by Scharr's filter (3 10 3) x (-1 0 1) / 32."""
-    H, W = level.shape[-2] - 2 * pad, level.shape[-1] - 2 * pad
-    grey, grad_x, grad_y = (level[:, k, pad - 1 : pad + H + 1, pad - 1 : pad + W + 1] for k in range(3))
-    smooth = (grey[:, :-2] + grey[:, 2:]).mul_(3 / 32).add_(grey[:, 1:-1], alpha=10 / 32)
-    torch.sub(smooth[..., 2:], smooth[..., :-2], out=grad_x[:, 1:-1, 1:-1])
-    slope = grey[:, 2:] - grey[:, :-2]
-    smooth = (slope[..., :-2] + slope[..., 2:]).mul_(3 / 32)
-    torch.add(smooth, slope[..., 1:-1], alpha=10 / 32, out=grad_y[:, 1:-1, 1:-1])
+def _binomial(a: Tensor, b: Tensor, c: Tensor, d: Tensor, e: Tensor) -> Tensor:
+    return torch.add(torch.add(a + e, b + d, alpha=4), c, alpha=6) * (1 / 16)
+
+
+def _with_gradients(padded: Tensor, pad: int) -> Tensor:
+    """A level (B, 3, rows, width) from its mirrored grey plane: Scharr's filter (3 10 3) x (-1 0 1) / 32 beside it."""
+    inner = padded[..., pad - 1 : padded.shape[-2] - pad + 1, pad - 1 : padded.shape[-1] - pad + 1]
+    across = torch.add(inner[..., 1:-1, :] * (10 / 32), inner[..., :-2, :] + inner[..., 2:, :], alpha=3 / 32)
+    slope = inner[..., 2:, :] - inner[..., :-2, :]
+    # Written into one new buffer: fresh memory costs more than the arithmetic.
+    level = padded.new_zeros(padded.shape[0], 3, *padded.shape[-2:])
+    level[:, GREY:] = padded
+    level[:, GRAD_X : GRAD_X + 1, pad:-pad, pad:-pad] = across[..., 2:] - across[..., :-2]
+    level[:, GRAD_Y : GRAD_Y + 1, pad:-pad, pad:-pad] = torch.add(
+        slope[..., 1:-1] * (10 / 32), slope[..., :-2] + slope[..., 2:], alpha=3 / 32
+    )
     return level
