@@ -57,7 +57,7 @@ def linearise(
     check("linearise", R=(T.R, "B 3 3"), f=(f, "B 2"), c=(c, "B 2"), xyz=(xyz, "B 3 N"), uv=(uv, "B 2 N"))
     # Multiply-adds instead of a matrix product: the rounding cannot depend on the batch.
     x, y, z = _moved(T, xyz).unbind(1)
-    w = 1 / torch.where(z > MIN_DEPTH, z, torch.ones_like(z))
+    w = 1 / z.masked_fill(~(z > MIN_DEPTH), 1.0)
     a, b = x * w, y * w
     ab, zero, target = a * b, torch.zeros_like(a), (uv - c[..., None]) / f[..., None]
     columns_u = (-ab, 1 + a * a, -b, w, zero, -a * w, a - target[:, 0])
@@ -138,16 +138,16 @@ def solve_spd(
     check("solve_spd", H=(H, "B n n"), b=(b, "B n k"))
     A, rhs = H.double(), b.double()
     eye = torch.eye(H.shape[-1], dtype=A.dtype, device=A.device)
+    diagonal = A.detach().diagonal(dim1=-2, dim2=-1)
+    s = diagonal.masked_fill(~(diagonal > 0), 1.0).rsqrt()[..., None]
+    A, rhs = A * (s * s.transpose(1, 2)), rhs * s
     with torch.no_grad():
-        diagonal = A.diagonal(dim1=-2, dim2=-1)
-        positive = (diagonal > 0) & diagonal.isfinite()
-        s = torch.where(positive, diagonal, torch.ones_like(diagonal)).rsqrt()[..., None]
-        L, info = torch.linalg.cholesky_ex(A * s * s.transpose(1, 2))
-        pivot = L.diagonal(dim1=-2, dim2=-1).amin(-1)
-        ok = (info == 0) & (pivot > MIN_PIVOT) & positive.all(-1) & rhs.isfinite().flatten(1).all(1)
-        L = torch.where(ok[:, None, None], L, eye)
-    rhs = torch.where(ok[:, None, None], rhs, torch.zeros_like(rhs)) * s
-    A = torch.where(ok[:, None, None], A, eye) * s * s.transpose(1, 2)
+        L, info = torch.linalg.cholesky_ex(A)
+        pivot = L.diagonal(dim1=-2, dim2=-1).amin(-1)  # NaN for a NaN matrix, and so not above the limit
+        ok = (info == 0) & (pivot > MIN_PIVOT) & (rhs * 0 == 0).flatten(1).all(1)
+        bad = ~ok[:, None, None]
+        L = torch.where(bad, eye, L)
+    A, rhs = torch.where(bad, eye, A), rhs.masked_fill(bad, 0.0)
     start = torch.cholesky_solve(rhs.detach(), L)
     x = start + torch.cholesky_solve(rhs - _product(A, start), L)
     return (x * s).to(b.dtype), ok

@@ -55,7 +55,7 @@ def p3p(
         d, step = _polish(_ranges(m, a), m, a)
         # Newton's method squares the error: a short step has arrived.
         valid = sound & (step < 1e-3) & (d.amin(0) > 1e-9)
-        d = torch.where(valid, d, 1.0) * scale.sqrt()
+        d = d.masked_fill(~valid, 1.0) * scale.sqrt()
         R, t = _align(j.to(xyz.dtype), X.to(xyz.dtype), d.to(xyz.dtype))
     # (row, column, root, *) → (*, root, row, column)
     return R.movedim((2, 0, 1), (-3, -2, -1)), t.movedim((1, 0), (-2, -1)), valid.movedim(0, -1)
@@ -79,7 +79,7 @@ def _ranges(m: Tensor, a: Tensor) -> Tensor:
     D1, D2 = _cones(m, a)
     gamma = _outer_root(*_pencil(m, a))
     far = gamma.abs() > 1
-    weight = torch.where(far, 1 / torch.where(far, gamma, torch.ones_like(gamma)), gamma)
+    weight = torch.where(far, 1 / gamma, gamma)
     split = torch.where(far, D1 * weight + D2, D1 + D2 * weight)  # det(split) = 0
     other = torch.where(far, D1, D2)
     # The null vector is the steepest column of the adjugate; both planes contain it.
@@ -91,7 +91,7 @@ def _ranges(m: Tensor, a: Tensor) -> Tensor:
     u, v = _complement(p)
     w = _null_directions(split, u, v)  # (3, 2, *) one direction per plane
     d = _null_directions(other[:, :, None], p[:, None], w).flatten(1, 2)  # (3, root, plane, *) → (3, 4, *)
-    d = d * torch.where(d.sum(0) < 0, -1.0, 1.0)
+    d = d * d.sum(0).sign()
     m, a = m[:, None], a[:, None]
     total = 2 * ((d * d).sum(0) - d[0] * d[1] * m[0] - d[0] * d[2] * m[1] - d[1] * d[2] * m[2])
     return d * (a.sum(0) / total).sqrt()
@@ -121,23 +121,23 @@ def _outer_root(k3: Tensor, k2: Tensor, k1: Tensor, k0: Tensor) -> Tensor:
     """The real root of a cubic that lies farthest from the other two, hence the best conditioned one.
 
     A vanishing leading coefficient sends that root to infinity; it is held at about 1e10 times the others' scale.
-    Only square roots and functions whose vector and scalar versions are one are used: see ``steady``.
+    It is made of functions that torch rounds alike wherever an element stands; sinh and pow are not among them.
     """
     tiny = 1e-10 * torch.maximum(k2.abs(), torch.maximum(k1.abs(), k0.abs())) + 1e-300
     k3 = torch.where(k3.abs() < tiny, tiny, k3)
     third, k1, k0 = k2 / (3 * k3), k1 / k3, k0 / k3
     p, q = k1 / 3 - third * third, k0 / 2 + third * (third * third - k1 / 2)  # t³ + 3 p t + 2 q = 0, γ = t − third
-    s = p.abs().sqrt() + 1e-9 * third.abs() + 1e-100
+    s = p.abs().sqrt() + 1e-9 * third.abs() + 1e-40
     h = q.abs() / (s * s * s)
-    sign = torch.where(p > 0, 1.0, -1.0).to(p)
+    sign = p.sign()
     w = ((h + (h * h + sign).clamp_min(0).sqrt()).log() / 3).exp()
     one_real = w - sign / w
     three_real = 2 * (h.clamp(max=1).acos() / 3).cos()
     size = s * torch.where((p <= 0) & (h < 1), three_real, one_real)
-    t = torch.where(q > 0, -size, size)
+    t = -size.copysign(q)
     for _ in range(2):
         slope = 3 * (t * t + p)
-        t = t - torch.where(slope.abs() > 0, (t * (t * t + 3 * p) + 2 * q) / slope, torch.zeros_like(t))
+        t = t - (t * (t * t + 3 * p) + 2 * q) / slope.masked_fill(slope == 0, torch.inf)
     return t - third
 
 
@@ -147,7 +147,7 @@ def _complement(p: Tensor) -> tuple[Tensor, Tensor]:
     Source: T. Duff et al., "Building an Orthonormal Basis, Revisited" (JCGT 2017).
     """
     x, y, z = p.unbind(0)
-    s = torch.where(z < 0, -1.0, 1.0).to(z)
+    s = torch.ones_like(z).copysign(z)
     a = -1 / (s + z)
     b = x * y * a
     return torch.stack((1 + s * x * x * a, s * b, -s * x)), torch.stack((b, s + y * y * a, -y))
@@ -161,7 +161,7 @@ def _null_directions(A: Tensor, u: Tensor, v: Tensor) -> Tensor:
     Au = (A * u).sum(1)
     uu, uv, vv = (Au * u).sum(0), (Au * v).sum(0), ((A * v).sum(1) * v).sum(0)
     root = (uv * uv - uu * vv).clamp_min(0).sqrt()
-    s = uv + torch.where(uv < 0, -root, root)
+    s = uv + root.copysign(uv)
     alpha, beta = torch.stack((-s, vv)), torch.stack((uu.expand_as(s), -s))  # α : β, each free of cancellation
     x = alpha * u[:, None] + beta * v[:, None]
     return x / (x * x).sum(0).sqrt()
@@ -180,16 +180,18 @@ def _polish(d: Tensor, m: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
     step_x = r2 * (yx * zx) - r0 * p - r1 * (yx * zy)
     step_y = r1 * (xy * zy) - r2 * (xy * zx) - r0 * (xz * zy)
     step_z = r0 * (xz * yz) - r1 * (xy * yz) - r2 * q
-    step = torch.stack((step_x, step_y, step_z)) / torch.where(det.abs() > 1e-30, det, torch.inf)
+    step = torch.stack((step_x, step_y, step_z)) / det.masked_fill(det.abs() < 1e-30, torch.inf)
     return d - step, step.abs().amax(0)
 
 
 def _align(j: Tensor, X: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
     """Rotation (3, 3, 4, *) and translation (3, 4, *) that carry the triangle X onto Y = d j."""
     Y = d[:, None] * j[:, :, None]  # (point, coordinate, root, *)
-    E_y, E_x = _frame(Y), _frame(X)  # axes, each (coordinate, …)
-    R = sum(y[:, None] * x[:, None] for y, x in zip(E_y, E_x, strict=True))
-    return R, Y[0] - sum(y * (x * X[0]).sum(0) for y, x in zip(E_y, E_x, strict=True))
+    y0, y1, y2 = _frame(Y)
+    x0, x1, x2 = _frame(X)
+    R = y0[:, None] * x0[:, None] + y1[:, None] * x1[:, None] + y2[:, None] * x2[:, None]
+    turned = y0 * (x0 * X[0]).sum(0) + y1 * (x1 * X[0]).sum(0) + y2 * (x2 * X[0]).sum(0)
+    return R, Y[0] - turned
 
 
 def _frame(P: Tensor) -> tuple[Tensor, Tensor, Tensor]:

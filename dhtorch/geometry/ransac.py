@@ -68,6 +68,7 @@ def distinct_triples(
     return torch.minimum(torch.stack((first, second, third), -1), (count - 1).clamp_min(0)[:, None, None])
 
 
+@torch.no_grad()
 def msac_cost(
     T: Pose,  # R (B, K, 3, 3), t (B, K, 3)
     f: Tensor,  # (B, 2) px
@@ -76,7 +77,10 @@ def msac_cost(
     used: Tensor,  # (B, M) bool
     threshold_px: float,
 ) -> Tensor:
-    """Truncated squared reprojection errors, summed over the used points: (B, K) px². Points behind count in full.
+    """Truncated squared reprojection errors, summed over the used points: (B, K) px².
+
+    Points behind the camera count in full, save one exactly on its axis: refinement, not this ranking, decides on
+    inliers.
 
     Source: P. Torr, A. Zisserman, "MLESAC" (CVIU 2000), the truncated score.
     """
@@ -89,16 +93,14 @@ def msac_cost(
     costs = []
     for b in range(T.R.shape[0]):  # one product per pair keeps the temporaries in cache
         x, y, z = (P[b].flatten(0, 1) @ points[b]).unflatten(0, (3, K))
-        front = z > MIN_DEPTH
-        w = z.reciprocal_()
+        w = z.clamp_min_(MIN_DEPTH).reciprocal_()  # points behind the camera land far outside the image
         x = x.mul_(w).sub_(uv[b, 0])
         y = y.mul_(w).sub_(uv[b, 1])
-        square = x.mul_(x).add_(y.mul_(y))
-        square = torch.where(front, square, limit)
-        costs.append(torch.minimum(square, limits[b]).sum(-1))
+        costs.append(torch.minimum(x.mul_(x).add_(y.mul_(y)), limits[b]).sum(-1))
     return torch.stack(costs)
 
 
+@torch.no_grad()
 def search(
     xyz: Tensor,  # (B, 3, M) m
     uv: Tensor,  # (B, 2, M) px
@@ -118,7 +120,7 @@ def search(
 
     Returns:
         Pose with R (B, keep, 3, 3), t (B, keep, 3), best first, and their costs (B, keep), infinite where there was
-        no valid solution (the pose is then the identity).
+        no valid solution (the pose is then finite but meaningless).
 
     Raises:
         ValueError: wrong shapes, fewer hypotheses (4 H) than ``keep``.
@@ -134,11 +136,11 @@ def search(
     few = even_slots(count, preview)
     used = torch.arange(preview, device=count.device) < count[:, None]
     cost = msac_cost(poses, f, _take(xyz, few), _take(uv, few), used, threshold_px)
-    cost = torch.where(valid.flatten(1), cost, torch.inf)
+    cost = cost.masked_fill(~valid.flatten(1), torch.inf)
     poses, cost = _best(poses, cost, min(max(shortlist, keep), 4 * sizes["H"]))
     used = torch.arange(sizes["M"], device=count.device) < count[:, None]
     full = msac_cost(poses, f, xyz, uv, used, threshold_px)
-    return _best(poses, torch.where(cost.isfinite(), full, torch.inf), keep)
+    return _best(poses, full.masked_fill(cost == torch.inf, torch.inf), keep)
 
 
 def collinear(

@@ -204,8 +204,8 @@ def _truncated(
     def evaluate(T: Pose) -> Normal:
         rows, depth = linearise(T, f, c, xyz, uv)
         square = (rows[:, 6] * rows[:, 6]).sum(1)
-        square = torch.where(depth > MIN_DEPTH, square, limit)
-        rho, weight = robust(square.clamp(max=limit), kernel, kernel_px)
+        square = square.masked_fill(depth <= MIN_DEPTH, limit).clamp(max=limit)
+        rho, weight = robust(square, kernel, kernel_px)
         H, g = normal_equations(rows, weight * (usable & (square < limit)))
         return Normal((rho * usable).sum(-1), H, g)
 
