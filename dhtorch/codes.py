@@ -87,6 +87,11 @@ def names(table: type) -> dict[int, str]:
     return dict(sorted(pairs.items()))
 
 
+def words(name: str) -> str:
+    """A code's name as people read it: TRACKABLE_NO_LIDAR → trackable, no LiDAR."""
+    return name.lower().replace("_no_lidar", ", no LiDAR").replace("_", " ")
+
+
 #: What to try for each class of hole.
 ROUTE_OF_HOLE: Final[dict[int, int]] = {
     Hole.NONE: Route.NOTHING,

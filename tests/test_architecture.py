@@ -16,7 +16,7 @@ LEVELS = [
     {"records"},
     {"stages", "negative", "data", "evaluate", "baselines"},
     {"pair", "window", "integrate"},
-    {"transform", "extract", "experiments"},
+    {"transform", "extract", "experiments", "figures"},
     {"run", "report", "viewer", "capture", "__main__"},
 ]
 LEVEL = {name: level for level, group in enumerate(LEVELS) for name in group}

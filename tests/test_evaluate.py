@@ -317,6 +317,14 @@ def test_a_perfect_order_has_no_excess_and_a_reversed_one_falls():
         risk.curve(torch.ones(3), torch.ones(2))
 
 
+def test_the_curve_ends_at_the_coverage_and_never_beats_the_oracle():
+    p = random_points(200)
+    coverage, found = risk.risk_coverage(p)
+    best = risk.risk_coverage(p, oracle=True)[1]
+    assert coverage[-1] == pytest.approx(errors.measure(p)["coverage"]) and coverage[0] == 1 / 200
+    assert found[-1] == pytest.approx(best[-1]) and (best <= found + 1e-12).all() and (best < found - 0.05).any()
+
+
 def test_coverage_counts_silent_candidates_and_needs_ten_points():
     true = torch.ones(40)
     depth = torch.where(torch.arange(40) < 20, 1.01, math.nan)

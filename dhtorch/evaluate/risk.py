@@ -34,6 +34,18 @@ def curve(
     return _running_sum(loss, score) / _count(loss)
 
 
+def risk_coverage(pooled: Points, *, oracle: bool = False) -> tuple[Tensor, Tensor]:
+    """Coverage (share of the candidates) and risk (n,) as the answers are accepted by falling score.
+
+    Args:
+        pooled: candidates of a pair or scene.
+        oracle: by rising error instead, the best possible order.
+    """
+    answered = pooled.answered()
+    loss = capped(answered.error)
+    return _count(loss) / max(pooled.keep.numel(), 1), curve(loss, -loss if oracle else answered.score)
+
+
 def measure(pooled: Points, *, min_points: int = MIN_POINTS) -> Numbers:
     """How well the score of a pair or scene orders its answers by error.
 

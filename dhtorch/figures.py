@@ -1,0 +1,267 @@
+"""Pictures and point clouds: arrays → PNG and PLY.
+
+Arrays may be torch tensors or numpy arrays, on any device, of one pair (no batch dimension). matplotlib is imported
+when first needed and only through its figure objects, so no global state, window or font setting is touched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dhtorch.codes import ROUTE_OF_HOLE, Gate, Hole, Route, Source, names, words
+
+#: Colours that stay apart for the colour-blind (Okabe and Ito); what was silent is paler than what was answered.
+SENSOR, RECOVERED, SILENT, INK = "#0072B2", "#E69F00", "#B4B4B4", "#333333"
+GATE_COLOURS = {
+    Gate.NO_TRACK: "#9A9A9A",
+    Gate.NO_TEXTURE: "#5E5E5E",
+    Gate.NO_POSE: "#000000",
+    Gate.NO_BASELINE: "#4B0082",
+    Gate.BEHIND: "#F0E442",
+    Gate.PARALLAX: "#CC79A7",
+    Gate.RESIDUAL: "#D55E00",
+    Gate.INCONSISTENT: "#882255",
+    Gate.UNCERTAIN: "#44AA99",
+    Gate.LOW_SCORE: "#999933",
+}
+HOLE_COLOURS = {
+    Hole.TRACKABLE_NO_LIDAR: "#E69F00",
+    Hole.LOW_TEXTURE: "#5E5E5E",
+    Hole.TOO_BRIGHT: "#F0E442",
+    Hole.TOO_DARK: "#000000",
+    Hole.HIGHLIGHT: "#CC79A7",
+    Hole.AT_BORDER: "#009E73",
+}
+#: Fewest answers whose mean error is drawn.
+FEWEST = 10
+MARKERS: dict[str, dict[str, Any]] = {
+    "sensor": {"marker": "o", "s": 6, "linewidth": 0},
+    "silent": {"marker": "x", "s": 8, "linewidth": 0.8},
+    "answer": {"marker": "o", "s": 14, "linewidth": 0.3, "edgecolor": "white"},
+}
+LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+
+
+def write_ply(
+    path: str | Path,
+    xyz: Any,  # (P, 3) m
+    rgb: Any = None,  # (P, 3) uint8, or float in [0, 1]
+    *,
+    source: Any = None,  # (P,) codes.Source
+    sigma: Any = None,  # (P,) m
+    score: Any = None,  # (P,) in [0, 1]
+    colour_by: str = "source",
+) -> int:
+    """Write points as a binary little-endian PLY: x y z, red green blue, sigma, score, source.
+
+    Args:
+        path: of the file.
+        xyz: points, camera axes (x right, y down, z forward); non-finite ones are left out.
+        rgb: colours of the image.
+        source: where each point comes from; None = recovered.
+        sigma, score: of each point; None = 0.
+        colour_by: ``source`` (sensor blue, recovered orange) or ``image`` (``rgb``).
+
+    Returns:
+        Number of points written.
+
+    Raises:
+        ValueError: another word for ``colour_by``, or ``image`` without ``rgb``.
+    """
+    if colour_by not in ("source", "image") or (colour_by == "image" and rgb is None):
+        raise ValueError(f"write_ply: found colour_by={colour_by!r}, expected 'source', or 'image' together with rgb")
+    points = _array(xyz).reshape(-1, 3)
+    n = len(points)
+    source = np.full(n, Source.RECOVERED) if source is None else _array(source).reshape(n)
+    if colour_by == "source":
+        colours = np.where((source == Source.SENSOR)[:, None], _rgb(SENSOR), _rgb(RECOVERED))
+    else:
+        colours = _array(rgb).reshape(n, 3)
+        colours = colours if colours.dtype == np.uint8 else np.round(255 * np.clip(colours, 0, 1))
+    layout = [(axis, "<f4") for axis in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
+    vertex = np.zeros(n, [*layout, ("sigma", "<f4"), ("score", "<f4"), ("source", "u1")])
+    for k, (axis, channel) in enumerate(zip("xyz", ("red", "green", "blue"), strict=True)):
+        vertex[axis], vertex[channel] = points[:, k], colours[:, k]
+    vertex["source"] = source
+    vertex["sigma"] = 0 if sigma is None else _array(sigma).reshape(n)
+    vertex["score"] = 0 if score is None else _array(score).reshape(n)
+    vertex = vertex[np.isfinite(points).all(1)]
+    words = {"<f4": "float", "|u1": "uchar"}
+    head = ["ply", "format binary_little_endian 1.0", "comment metres; x right, y down, z forward"]
+    head += ["comment source 1 sensor, 2 recovered", f"element vertex {len(vertex)}"]
+    head += [f"property {words[vertex.dtype[name].str]} {name}" for name in vertex.dtype.names or ()]
+    Path(path).write_bytes("\n".join([*head, "end_header\n"]).encode("ascii") + vertex.tobytes())
+    return len(vertex)
+
+
+def draw_samples(
+    path: str | Path,
+    image: Any,  # (C, H, W) float in [0, 1] or uint8
+    uv: Any,  # (N, 2) px
+    source: Any,  # (N,) codes.Source of the merged map
+    gate: Any,  # (N,) codes.Gate
+    *,
+    title: str = "",
+) -> None:
+    """Draw what became of every sample: a sensor return, a recovered depth, or the reason for silence."""
+    source, gate = _array(source), _array(gate)
+    layers = [
+        (words(name), (source == Source.NONE) & (gate == code), GATE_COLOURS[code], "silent")
+        for code, name in names(Gate).items()
+        if code != Gate.ANSWER
+    ]
+    layers += [
+        ("sensor", source == Source.SENSOR, SENSOR, "sensor"),
+        ("recovered", source == Source.RECOVERED, RECOVERED, "answer"),
+    ]
+    _overlay(path, image, uv, layers, title or "What became of the samples")
+
+
+def draw_holes(
+    path: str | Path,
+    image: Any,  # (C, H, W) float in [0, 1] or uint8
+    uv: Any,  # (N, 2) px
+    hole: Any,  # (N,) codes.Hole
+    *,
+    title: str = "",
+) -> None:
+    """Draw where the sensor is silent and why, with what could be done about it."""
+    hole = _array(hole)
+    routes = names(Route)
+    layers = [("sensor", hole == Hole.NONE, SENSOR, "sensor")]
+    for code, name in reversed(names(Hole).items()):
+        if code != Hole.NONE:
+            label = f"{words(name)} → {words(routes[ROUTE_OF_HOLE[code]])}"
+            layers.append((label, hole == code, HOLE_COLOURS[code], "answer"))
+    _overlay(path, image, uv, layers, title or "Why there is no return")
+
+
+def draw_depth(
+    path: str | Path,
+    true_depth: Any,  # (P,) m
+    depth: Any,  # (P,) m
+    score: Any = None,  # (P,) in [0, 1]
+    *,
+    title: str = "",
+) -> None:
+    """Draw recovered against true depth on logarithmic axes, with the ±10 % band; NaN is silence and left out."""
+    from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter  # noqa: PLC0415
+
+    true, found = _array(true_depth).ravel(), _array(depth).ravel()
+    good = np.isfinite(true) & np.isfinite(found) & (true > 0) & (found > 0)
+    shade = np.full(true.shape, 1.0) if score is None else _array(score).ravel()
+    true, found, shade = true[good], found[good], shade[good]
+    figure, axes = _axes(5.4, 5.0, title or "Recovered against true depth")
+    both = np.concatenate((true, found)) if len(true) else np.array([1.0, 10.0])
+    low, high = np.quantile(both, 0.002) / 1.15, np.quantile(both, 0.998) * 1.15
+    line = np.array([low, high])
+    axes.fill_between(line, 0.9 * line, 1.1 * line, color=SILENT, alpha=0.35, linewidth=0, label="± 10 %")
+    axes.plot(line, line, color=INK, linewidth=1, label="no error")
+    order = np.argsort(shade, kind="stable")
+    options = {"c": shade[order], "cmap": "viridis", "vmin": 0, "vmax": 1} if score is not None else {"color": SENSOR}
+    dots = axes.scatter(true[order], found[order], s=9, alpha=0.75, linewidth=0, rasterized=True, **options)
+    if score is not None and len(true):
+        figure.colorbar(dots, ax=axes, label="score", shrink=0.85, pad=0.02).outline.set_visible(False)
+    axes.set(xscale="log", yscale="log", xlim=(low, high), ylim=(low, high), xlabel="true depth, m")
+    axes.set(ylabel="recovered depth, m", aspect="equal")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(LogLocator(10, subs=(1, 2, 3, 5, 7)))
+        axis.set_major_formatter(ScalarFormatter())
+        axis.set_minor_formatter(NullFormatter())
+    if len(true):
+        error = np.abs(found / true - 1)
+        share, typical = 100 * (error < 0.1).mean(), 100 * np.median(error)
+        said = f"{len(true)} answers\nmedian error {typical:.1f} %\nwithin 10 %: {share:.0f} %"
+        axes.text(0.04, 0.96, said, transform=axes.transAxes, va="top", linespacing=1.4)
+    axes.legend(loc="lower right", frameon=False)
+    _save(figure, path)
+
+
+def draw_risk_coverage(
+    path: str | Path,
+    curves: Mapping[str, tuple[Any, Any]],  # name → coverage (n,), risk (n,)
+    *,
+    oracle: tuple[Any, Any] | None = None,
+    title: str = "",
+) -> None:
+    """Draw risk against coverage, as from :func:`dhtorch.evaluate.risk.risk_coverage`; the best order is dashed.
+
+    A mean over fewer than ten answers is not drawn.
+    """
+    figure, axes = _axes(5.8, 4.2, title or "Error of the surest answers")
+    for percent in (5, 10):
+        axes.axhline(percent, color=SILENT, linewidth=0.8, zorder=0)
+    top, right = 12.0, 10.0
+    for k, (name, (coverage, risk)) in enumerate(curves.items()):
+        x, y = 100 * _array(coverage)[FEWEST - 1 :], 100 * _array(risk)[FEWEST - 1 :]
+        if len(x):
+            axes.plot(
+                x, y, color=LINES[k % len(LINES)], linewidth=1.8, label=name, marker="o", markevery=[-1], markersize=4
+            )
+            top, right = max(top, 1.08 * y.max()), max(right, x[-1])
+    if oracle is not None:
+        axes.plot(100 * _array(oracle[0]), 100 * _array(oracle[1]), "--", color=INK, linewidth=1, label="best order")
+    axes.set(xlim=(0, min(100, 1.04 * right)), ylim=(0, min(100, top)))
+    axes.set(xlabel="answered share of the candidates, %", ylabel="mean relative error (at most 1), %")
+    _legend(axes, *axes.get_legend_handles_labels())
+    _save(figure, path)
+
+
+def _array(x: Any) -> np.ndarray:
+    return x.detach().cpu().numpy() if hasattr(x, "detach") else np.asarray(x)
+
+
+def _rgb(colour: str) -> np.ndarray:
+    return np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)])
+
+
+def _grey(image: Any) -> np.ndarray:
+    """Picture (H, W) in [0, 1] to draw on: colourless and of little contrast, so that what is drawn stands out."""
+    pixels = _array(image)
+    pixels = pixels / 255.0 if pixels.dtype == np.uint8 else pixels
+    return 0.45 + 0.5 * np.clip(pixels.mean(0), 0, 1)
+
+
+def _axes(width: float, height: float, title: str) -> tuple[Any, Any]:
+    """A figure with one plain pair of axes; no global state is touched."""
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    figure = Figure((width, height), dpi=160, layout="constrained")
+    axes = figure.add_subplot()
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.set_title(title, loc="left", fontsize=11)
+    return figure, axes
+
+
+def _overlay(
+    path: str | Path, image: Any, uv: Any, layers: Sequence[tuple[str, np.ndarray, str, str]], title: str
+) -> None:
+    """Draw groups of pixels (label, mask, colour, marker) over a picture, with their counts in a legend beside it."""
+    grey, uv = _grey(image), _array(uv)
+    H, W = grey.shape
+    figure, axes = _axes(8.0, 0.3 + 8.0 * H / W, title)
+    axes.imshow(grey, cmap="gray", vmin=0, vmax=1, interpolation="antialiased")
+    for label, mask, colour, marker in layers:
+        if mask.any():
+            axes.scatter(*uv[mask].T, c=colour, label=f"{label}  {int(mask.sum())}", **MARKERS[marker])
+    axes.set(xlim=(-0.5, W - 0.5), ylim=(H - 0.5, -0.5))
+    axes.set_axis_off()
+    handles, labels = axes.get_legend_handles_labels()
+    _legend(axes, handles[::-1], labels[::-1], markerscale=1.8)
+    _save(figure, path)
+
+
+def _legend(axes: Any, handles: Sequence[Any], labels: Sequence[str], **options: Any) -> None:
+    """A legend beside the axes, where it covers nothing."""
+    if handles:
+        place: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.01)}
+        legend = axes.legend(handles, labels, frameon=False, fontsize=9, **place, **options)
+        legend.set_in_layout(False)  # the axes keep their size, the saved picture grows
+
+
+def _save(figure: Any, path: str | Path) -> None:
+    figure.savefig(path, bbox_inches="tight", pad_inches=0.1)
