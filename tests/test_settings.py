@@ -11,11 +11,13 @@ import pytest
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
+from dhtorch.data import FORMATS
 from dhtorch.run import config_dir
 
 CONF = config_dir()
 #: Options that a caller passes at run time, never a setting.
 AT_RUN_TIME = {
+    "n",
     "seed",
     "fit",
     "trace",
@@ -77,6 +79,8 @@ def test_every_setting_composes_and_names_real_options(choice):
     part = OmegaConf.to_container(cfg[group], resolve=True)
     for path, node in nodes(part):
         known = options(target(node["_target_"]))
+        if node.get("format", "auto") != "auto":  # open_all hands further options to the reader of that name
+            known |= options(FORMATS[node["format"]].read)
         keys = {k for k in node if not k.startswith("_")}
         assert keys <= set(known), f"{choice}{path}: {keys - set(known)} are no options of {node['_target_']}"
 
