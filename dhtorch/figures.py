@@ -148,22 +148,26 @@ def draw_depth(
     *,
     title: str = "",
 ) -> None:
-    """Draw recovered against true depth on logarithmic axes, with the ±10 % band; NaN is silence and left out."""
+    """Draw recovered against true depth on logarithmic axes, with the ±10 % band.
+
+    NaN is silence and left out; answers beyond the axes are drawn on their edge and counted.
+    """
     from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter  # noqa: PLC0415
 
     true, found = _array(true_depth).ravel(), _array(depth).ravel()
     good = np.isfinite(true) & np.isfinite(found) & (true > 0) & (found > 0)
     shade = np.full(true.shape, 1.0) if score is None else _array(score).ravel()
     true, found, shade = true[good], found[good], shade[good]
-    figure, axes = _axes(5.4, 5.0, title or "Recovered against true depth")
-    both = np.concatenate((true, found)) if len(true) else np.array([1.0, 10.0])
-    low, high = np.quantile(both, 0.002) / 1.15, np.quantile(both, 0.998) * 1.15
+    figure, axes = _axes(4.4, 4.4, title or "Recovered against true depth")
+    low, high = (true.min() / 1.5, true.max() * 1.5) if len(true) else (1.0, 10.0)
     line = np.array([low, high])
     axes.fill_between(line, 0.9 * line, 1.1 * line, color=SILENT, alpha=0.35, linewidth=0, label="± 10 %")
     axes.plot(line, line, color=INK, linewidth=1, label="no error")
     order = np.argsort(shade, kind="stable")
     options = {"c": shade[order], "cmap": "viridis", "vmin": 0, "vmax": 1} if score is not None else {"color": SENSOR}
-    dots = axes.scatter(true[order], found[order], s=9, alpha=0.75, linewidth=0, rasterized=True, **options)
+    dots = axes.scatter(
+        true[order], found[order].clip(low, high), s=9, alpha=0.75, linewidth=0, clip_on=False, zorder=3, **options
+    )
     if score is not None and len(true):
         figure.colorbar(dots, ax=axes, label="score", shrink=0.85, pad=0.02).outline.set_visible(False)
     axes.set(xscale="log", yscale="log", xlim=(low, high), ylim=(low, high), xlabel="true depth, m")
@@ -176,6 +180,8 @@ def draw_depth(
         error = np.abs(found / true - 1)
         share, typical = 100 * (error < 0.1).mean(), 100 * np.median(error)
         said = f"{len(true)} answers\nmedian error {typical:.1f} %\nwithin 10 %: {share:.0f} %"
+        outside = int(((found < low) | (found > high)).sum())
+        said += f"\n{outside} beyond the axes" if outside else ""
         axes.text(0.04, 0.96, said, transform=axes.transAxes, va="top", linespacing=1.4)
     axes.legend(loc="lower right", frameon=False)
     _save(figure, path)
@@ -192,7 +198,7 @@ def draw_risk_coverage(
 
     A mean over fewer than ten answers is not drawn.
     """
-    figure, axes = _axes(5.8, 4.2, title or "Error of the surest answers")
+    figure, axes = _axes(4.8, 3.4, title or "Error of the surest answers")
     for percent in (5, 10):
         axes.axhline(percent, color=SILENT, linewidth=0.8, zorder=0)
     top, right = 12.0, 10.0
@@ -227,11 +233,11 @@ def _grey(image: Any) -> np.ndarray:
 
 
 def _axes(width: float, height: float, title: str) -> tuple[Any, Any]:
-    """A figure with one plain pair of axes; no global state is touched."""
+    """A figure whose axes measure width × height inches; labels and legend lie around them and are not cut off."""
     from matplotlib.figure import Figure  # noqa: PLC0415
 
-    figure = Figure((width, height), dpi=160, layout="constrained")
-    axes = figure.add_subplot()
+    figure = Figure((width, height), dpi=160)
+    axes = figure.add_axes((0, 0, 1, 1))
     axes.spines[["top", "right"]].set_visible(False)
     axes.set_title(title, loc="left", fontsize=11)
     return figure, axes
@@ -243,7 +249,7 @@ def _overlay(
     """Draw groups of pixels (label, mask, colour, marker) over a picture, with their counts in a legend beside it."""
     grey, uv = _grey(image), _array(uv)
     H, W = grey.shape
-    figure, axes = _axes(8.0, 0.3 + 8.0 * H / W, title)
+    figure, axes = _axes(7.2, 7.2 * H / W, title)
     axes.imshow(grey, cmap="gray", vmin=0, vmax=1, interpolation="antialiased")
     for label, mask, colour, marker in layers:
         if mask.any():
@@ -258,9 +264,7 @@ def _overlay(
 def _legend(axes: Any, handles: Sequence[Any], labels: Sequence[str], **options: Any) -> None:
     """A legend beside the axes, where it covers nothing."""
     if handles:
-        place: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.01)}
-        legend = axes.legend(handles, labels, frameon=False, fontsize=9, **place, **options)
-        legend.set_in_layout(False)  # the axes keep their size, the saved picture grows
+        axes.legend(handles, labels, loc="upper left", bbox_to_anchor=(1.0, 1.01), frameon=False, fontsize=9, **options)
 
 
 def _save(figure: Any, path: str | Path) -> None:

@@ -194,7 +194,9 @@ def test_samples_are_drawn_in_the_colour_of_what_became_of_them(tmp_path):
         assert share_of(pixels, colour) > 4e-4
     assert share_of(pixels, figures.GATE_COLOURS[Gate.RESIDUAL]) < 1e-4
     figures.draw_samples(tmp_path / "b.png", (255 * image).to(torch.uint8), uv, 0 * source, 0 * source)
-    assert share_of(picture(tmp_path / "b.png"), figures.SENSOR) < 1e-4
+    without = picture(tmp_path / "b.png")
+    assert share_of(without, figures.SENSOR) < 1e-4
+    assert pixels.shape[1] > 1.1 * without.shape[1], "the legend stands beside the picture and is not cut off"
 
 
 def test_holes_are_drawn_by_class(tmp_path):
