@@ -1,15 +1,8 @@
-"""Writers: every format we read, tiny and complete, from given frames.
-
-They exist so that a reader can be held against a scene whose geometry is known exactly, and so that a notebook can show
-a format without a download. Nothing is compressed cleverly and no decoder of ours is used: the PNG bytes are put
-together here. Frames have B = 1; those with poses carry them in ``T_world_from_cam``.
-"""
+"""Writers of the plain layouts: TUM RGB-D, numbered frames, rectified pairs, LiDAR with cameras."""
 
 from __future__ import annotations
 
 import json
-import struct
-import zlib
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,8 +10,19 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
+from dhtorch.data.writers.parts import (
+    K_matrix,
+    depth_codes,
+    pixels,
+    png,
+    pose_matrix,
+    quaternion,
+    seconds,
+    text_row,
+    text_rows,
+    write,
+)
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame, Pose
@@ -40,19 +44,19 @@ def write_tum(
     poses = ["# ground truth trajectory", f"# file: 'rgbd_dataset_{f'freiburg{camera}' if camera else 'own'}.bag'"]
     poses.append("# timestamp tx ty tz qx qy qz qw")
     for frame in frames:
-        time = _time(frame)
+        time = seconds(frame)
         for kind, stamp in (("rgb", f"{time:.6f}"), ("depth", f"{time + _TUM_LAG:.6f}")):
             lists[kind].append(f"{stamp} {kind}/{stamp}.png")
-            picture = _pixels(frame) if kind == "rgb" else _codes(frame.depth, units_per_metre)
-            _write(root / kind / f"{stamp}.png", _png(picture))
-        pose = _pose(frame)
-        poses.append(f"{time:.6f} " + _row([*pose[:3, 3], *_quaternion(pose[:3, :3])]))
+            picture = pixels(frame) if kind == "rgb" else depth_codes(frame.depth, units_per_metre)
+            write(root / kind / f"{stamp}.png", png(picture))
+        pose = pose_matrix(frame)
+        poses.append(f"{time:.6f} " + text_row([*pose[:3, 3], *quaternion(pose[:3, :3])]))
     for name, lines in (("rgb", lists["rgb"]), ("depth", lists["depth"]), ("groundtruth", poses)):
-        _write(root / f"{name}.txt", "\n".join(lines) + "\n")
+        write(root / f"{name}.txt", "\n".join(lines) + "\n")
     if camera is None:
         lens = frames[0].camera.distortion
-        meta = {"K": _K(frames[0].camera).tolist(), "dist": [0.0] * 5 if lens is None else lens[0].tolist()}
-        _write(root / "meta.json", json.dumps(meta))
+        meta = {"K": K_matrix(frames[0].camera).tolist(), "dist": [0.0] * 5 if lens is None else lens[0].tolist()}
+        write(root / "meta.json", json.dumps(meta))
 
 
 def write_named_frames(
@@ -64,46 +68,46 @@ def write_named_frames(
     """
     meta: dict[str, Any] = {} if fps is None else {"fps": fps}
     if frames[0].depth_camera is not None:
-        meta |= {"K": _K(frames[0].camera).tolist(), "K_depth": _K(frames[0].depth_camera).tolist()}
+        meta |= {"K": K_matrix(frames[0].camera).tolist(), "K_depth": K_matrix(frames[0].depth_camera).tolist()}
     for i, frame in enumerate(frames):
-        _write(root / f"frame-{i:06d}.color.png", _png(_pixels(frame)))
-        _write(root / f"frame-{i:06d}.depth.png", _png(_codes(frame.depth, units_per_metre)))
-        _write(root / f"frame-{i:06d}.pose.txt", _rows(_pose(frame)))
-    _write(root / "camera-intrinsics.txt", _rows(_K(frames[0].depth_camera or frames[0].camera)))
+        write(root / f"frame-{i:06d}.color.png", png(pixels(frame)))
+        write(root / f"frame-{i:06d}.depth.png", png(depth_codes(frame.depth, units_per_metre)))
+        write(root / f"frame-{i:06d}.pose.txt", text_rows(pose_matrix(frame)))
+    write(root / "camera-intrinsics.txt", text_rows(K_matrix(frames[0].depth_camera or frames[0].camera)))
     if meta:
-        _write(root / "meta.json", json.dumps(meta))
+        write(root / "meta.json", json.dumps(meta))
 
 
 def write_counted_frames(root: Path, frames: Sequence[Frame], *, units_per_metre: float = 1000.0) -> None:
     """``images/``, ``depth/``, ``poses.txt`` (a row-major matrix a line) and ``K.txt``."""
     for i, frame in enumerate(frames):
-        _write(root / "images" / f"{i:05d}.png", _png(_pixels(frame)))
-        _write(root / "depth" / f"{i:05d}.png", _png(_codes(frame.depth, units_per_metre)))
-    _write(root / "poses.txt", "".join(_row(_pose(frame).ravel()) + "\n" for frame in frames))
-    _write(root / "K.txt", _rows(_K(frames[0].camera)))
+        write(root / "images" / f"{i:05d}.png", png(pixels(frame)))
+        write(root / "depth" / f"{i:05d}.png", png(depth_codes(frame.depth, units_per_metre)))
+    write(root / "poses.txt", "".join(text_row(pose_matrix(frame).ravel()) + "\n" for frame in frames))
+    write(root / "K.txt", text_rows(K_matrix(frames[0].camera)))
 
 
 def write_calib_pair(root: Path, left: Frame, right: Frame) -> None:
     """A rectified pair as Middlebury and ETH3D write it: ``calib.txt``, ``im0.png``, ``im1.png``, ``disp0.pfm``."""
     baseline, doffs = _rectification(left, right)
     h, w = left.hw
-    lines = [f"cam{i}={_matlab(_K(frame.camera))}" for i, frame in enumerate((left, right))]
+    lines = [f"cam{i}={_matlab(K_matrix(frame.camera))}" for i, frame in enumerate((left, right))]
     lines += [f"doffs={doffs!r}", f"baseline={baseline * 1000!r}", f"width={w}", f"height={h}", f"ndisp={w}"]
-    _write(root / "calib.txt", "\n".join(lines) + "\n")
+    write(root / "calib.txt", "\n".join(lines) + "\n")
     for i, frame in enumerate((left, right)):
-        _write(root / f"im{i}.png", _png(_pixels(frame)))
+        write(root / f"im{i}.png", png(pixels(frame)))
     disparity = _disparity(left, baseline, doffs)
-    _write(root / "disp0.pfm", f"Pf\n{w} {h}\n-1\n".encode() + disparity[::-1].astype("<f4").tobytes())
+    write(root / "disp0.pfm", f"Pf\n{w} {h}\n-1\n".encode() + disparity[::-1].astype("<f4").tobytes())
 
 
 def write_npz_pair(root: Path, left: Frame, right: Frame, *, name: str = "scene") -> None:
     """A rectified pair as scikit-image ships one: ``*_left.png``, ``*_right.png``, ``*_disp.npz``, ``meta.json``."""
     baseline, doffs = _rectification(left, right)
-    _write(root / f"{name}_left.png", _png(_pixels(left)))
-    _write(root / f"{name}_right.png", _png(_pixels(right)))
+    write(root / f"{name}_left.png", png(pixels(left)))
+    write(root / f"{name}_right.png", png(pixels(right)))
     np.savez_compressed(root / f"{name}_disp.npz", _disparity(left, baseline, doffs).astype(np.float32))
-    meta = {"K_left": _K(left.camera).tolist(), "K_right": _K(right.camera).tolist()}
-    _write(root / "meta.json", json.dumps(meta | {"baseline_m": baseline, "doffs": doffs}))
+    meta = {"K_left": K_matrix(left.camera).tolist(), "K_right": K_matrix(right.camera).tolist()}
+    write(root / "meta.json", json.dumps(meta | {"baseline_m": baseline, "doffs": doffs}))
 
 
 def write_driving(
@@ -121,18 +125,18 @@ def write_driving(
     data, samples = [], []
     for i in range(T_world_from_lidar.t.shape[0]):
         shots = {name: list_[i] for name, list_ in frames.items()}
-        stamp = max(_time(frame) for frame in shots.values()) + lidar_lag
+        stamp = max(seconds(frame) for frame in shots.values()) + lidar_lag
         data.append(_datum(f"{i}L", "LIDAR", stamp, _write_sweep(root, i, shots, T_world_from_lidar[i : i + 1])))
         for name, frame in shots.items():
             file, (h, w) = f"rgb/{name}/{i:06d}.png", frame.hw
-            _write(root / file, _png(_pixels(frame)))
-            image = {"filename": file, "channels": 3, "height": h, "width": w, "pose": _pose_json(_pose(frame))}
-            data.append(_datum(f"{i}{name}", name, _time(frame), {"image": image}))
+            write(root / file, png(pixels(frame)))
+            image = {"filename": file, "channels": 3, "height": h, "width": w, "pose": _pose_json(pose_matrix(frame))}
+            data.append(_datum(f"{i}{name}", name, seconds(frame), {"image": image}))
         samples.append({"calibration_key": key, "datum_keys": [f"{i}L", *(f"{i}{name}" for name in shots)]})
-    _write(root / f"scene_{key}.json", json.dumps({"data": data, "samples": samples, "name": "written"}))
+    write(root / f"scene_{key}.json", json.dumps({"data": data, "samples": samples, "name": "written"}))
     zero = dict.fromkeys(("fx", "fy", "cx", "cy", "skew"), 0.0)  # the LiDAR has an entry too
     intrinsics = [zero, *(_intrinsics_json(list_[0].camera) for list_ in frames.values())]
-    _write(root / "calibration" / f"{key}.json", json.dumps({"names": ["LIDAR", *frames], "intrinsics": intrinsics}))
+    write(root / "calibration" / f"{key}.json", json.dumps({"names": ["LIDAR", *frames], "intrinsics": intrinsics}))
 
 
 def _write_sweep(root: Path, i: int, shots: Mapping[str, Frame], T_world_from_lidar: Pose) -> dict[str, Any]:
@@ -141,7 +145,7 @@ def _write_sweep(root: Path, i: int, shots: Mapping[str, Frame], T_world_from_li
         v, u = torch.nonzero(frame.depth[0] > 0, as_tuple=True)
         uv = torch.stack((u, v), -1).double()
         xyz = cameras.unproject(frame.camera.to(torch.float64), uv[None], frame.depth[0, v, u].double()[None])
-        T_world_from_cam = se3.from_matrix(torch.from_numpy(_pose(frame))[None])
+        T_world_from_cam = se3.from_matrix(torch.from_numpy(pose_matrix(frame))[None])
         points.append(se3.apply(se3.relative(T_world_from_cam, T_world_from_lidar), xyz)[0])
     xyz_lidar = torch.cat(points).numpy()
     file = f"point_cloud/LIDAR/{i:06d}.npz"
@@ -157,7 +161,7 @@ def _datum(key: str, name: str, stamp: float, datum: dict[str, Any]) -> dict[str
 
 
 def _pose_json(pose: np.ndarray) -> dict[str, dict[str, float]]:
-    rotation = dict(zip(("qx", "qy", "qz", "qw"), map(float, _quaternion(pose[:3, :3])), strict=True))
+    rotation = dict(zip(("qx", "qy", "qz", "qw"), map(float, quaternion(pose[:3, :3])), strict=True))
     return {"rotation": rotation, "translation": dict(zip("xyz", map(float, pose[:3, 3]), strict=True))}
 
 
@@ -168,8 +172,8 @@ def _intrinsics_json(camera: Camera) -> dict[str, float]:
 
 def _rectification(left: Frame, right: Frame) -> tuple[float, float]:
     """Baseline (m) and difference of the principal points (px)."""
-    baseline = (_pose(right)[:3, 3] - _pose(left)[:3, 3])[0]
-    return float(baseline), float(_K(right.camera)[0, 2] - _K(left.camera)[0, 2])
+    baseline = (pose_matrix(right)[:3, 3] - pose_matrix(left)[:3, 3])[0]
+    return float(baseline), float(K_matrix(right.camera)[0, 2] - K_matrix(left.camera)[0, 2])
 
 
 def _disparity(left: Frame, baseline: float, doffs: float) -> np.ndarray:
@@ -179,70 +183,5 @@ def _disparity(left: Frame, baseline: float, doffs: float) -> np.ndarray:
     return np.where(depth > 0, scale / np.where(depth > 0, depth, 1) - doffs, np.inf)
 
 
-def _pixels(frame: Frame) -> np.ndarray:
-    """(H, W, C) uint8."""
-    image = frame.image[0]
-    if image.dtype != torch.uint8:
-        image = (image.clamp(0, 1) * 255).round().to(torch.uint8)
-    return image.permute(1, 2, 0).numpy()
-
-
-def _codes(depth: Tensor, units_per_metre: float) -> np.ndarray:
-    """(h, w) uint16."""
-    return (depth[0].double() * units_per_metre).round().clamp(0, 65534).numpy().astype(np.uint16)
-
-
-def _png(picture: np.ndarray) -> bytes:
-    """PNG of (H, W, 1 or 3) uint8 or (H, W) uint16, rows unfiltered."""
-    h, w = picture.shape[:2]
-    bits = 8 * picture.dtype.itemsize
-    colour = 2 if picture.ndim == 3 and picture.shape[2] == 3 else 0
-    rows = picture.astype(picture.dtype.newbyteorder(">")).reshape(h, -1).view(np.uint8)
-    raw = np.concatenate((np.zeros((h, 1), np.uint8), rows), 1).tobytes()
-    chunks = (b"IHDR" + struct.pack(">IIBBBBB", w, h, bits, colour, 0, 0, 0), b"IDAT" + zlib.compress(raw, 1), b"IEND")
-    framed = (struct.pack(">I", len(c) - 4) + c + struct.pack(">I", zlib.crc32(c)) for c in chunks)
-    return b"\x89PNG\r\n\x1a\n" + b"".join(framed)
-
-
-def _quaternion(R: np.ndarray) -> np.ndarray:
-    """x y z w of a rotation: the dominant eigenvector of a symmetric 4×4 matrix, exact to rounding at every angle."""
-    d, s = R - R.T, R + R.T
-    Q = np.empty((4, 4))
-    Q[:3, :3] = s - np.trace(R) * np.eye(3)
-    Q[:3, 3] = Q[3, :3] = [d[2, 1], d[0, 2], d[1, 0]]
-    Q[3, 3] = np.trace(R)
-    return np.linalg.eigh(Q)[1][:, -1]
-
-
-def _pose(frame: Frame) -> np.ndarray:
-    """4×4 camera-to-world."""
-    if frame.T_world_from_cam is None:
-        raise ValueError("writers: found a frame without T_world_from_cam, expected a pose to write")
-    return se3.to_matrix(frame.T_world_from_cam)[0].double().numpy()
-
-
-def _time(frame: Frame) -> float:
-    if frame.time is None:
-        raise ValueError("writers: found a frame without time, expected a stamp to write")
-    return float(frame.time[0])
-
-
-def _K(camera: Camera) -> np.ndarray:
-    return cameras.to_matrix(camera)[0].double().numpy()
-
-
 def _matlab(K: np.ndarray) -> str:
     return "[" + "; ".join(" ".join(f"{x!r}" for x in row) for row in K.tolist()) + "]"
-
-
-def _row(values: Any) -> str:
-    return " ".join(f"{float(x):.17g}" for x in values)
-
-
-def _rows(matrix: np.ndarray) -> str:
-    return "".join(_row(row) + "\n" for row in matrix)
-
-
-def _write(file: Path, content: bytes | str) -> None:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_bytes(content.encode() if isinstance(content, str) else content)

@@ -1,0 +1,24 @@
+"""Writers: every format we read, tiny and complete, from given frames.
+
+They exist so that a reader can be held against a scene whose geometry is known exactly, and so that a notebook can show
+a format without a download. Nothing is compressed cleverly and no decoder of ours is used: the PNG bytes are put
+together here. Frames have B = 1; those with poses carry them in ``T_world_from_cam``.
+"""
+
+from dhtorch.data.writers.layouts import (
+    write_calib_pair,
+    write_counted_frames,
+    write_driving,
+    write_named_frames,
+    write_npz_pair,
+    write_tum,
+)
+
+__all__ = [
+    "write_calib_pair",
+    "write_counted_frames",
+    "write_driving",
+    "write_named_frames",
+    "write_npz_pair",
+    "write_tum",
+]

@@ -1,0 +1,86 @@
+"""What every writer needs: pixels, depth codes and matrices of a frame, PNG bytes, and files written below a root."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dhtorch.geometry import camera as cameras
+from dhtorch.geometry import se3
+from dhtorch.records import Camera, Frame
+
+
+def pixels(frame: Frame) -> np.ndarray:
+    """(H, W, C) uint8."""
+    image = frame.image[0]
+    if image.dtype != torch.uint8:
+        image = (image.clamp(0, 1) * 255).round().to(torch.uint8)
+    return image.permute(1, 2, 0).numpy()
+
+
+def depth_codes(depth: Tensor, units_per_metre: float) -> np.ndarray:
+    """(h, w) uint16."""
+    return (depth[0].double() * units_per_metre).round().clamp(0, 65534).numpy().astype(np.uint16)
+
+
+def png(picture: np.ndarray) -> bytes:
+    """PNG of (H, W, 1 or 3) uint8 or (H, W) uint16, rows unfiltered."""
+    h, w = picture.shape[:2]
+    bits = 8 * picture.dtype.itemsize
+    colour = 2 if picture.ndim == 3 and picture.shape[2] == 3 else 0
+    rows = picture.astype(picture.dtype.newbyteorder(">")).reshape(h, -1).view(np.uint8)
+    raw = np.concatenate((np.zeros((h, 1), np.uint8), rows), 1).tobytes()
+    chunks = (b"IHDR" + struct.pack(">IIBBBBB", w, h, bits, colour, 0, 0, 0), b"IDAT" + zlib.compress(raw, 1), b"IEND")
+    framed = (struct.pack(">I", len(c) - 4) + c + struct.pack(">I", zlib.crc32(c)) for c in chunks)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(framed)
+
+
+def quaternion(R: np.ndarray) -> np.ndarray:
+    """x y z w of a rotation: the dominant eigenvector of a symmetric 4×4 matrix, exact to rounding at every angle."""
+    d, s = R - R.T, R + R.T
+    Q = np.empty((4, 4))
+    Q[:3, :3] = s - np.trace(R) * np.eye(3)
+    Q[:3, 3] = Q[3, :3] = [d[2, 1], d[0, 2], d[1, 0]]
+    Q[3, 3] = np.trace(R)
+    return np.linalg.eigh(Q)[1][:, -1]
+
+
+def pose_matrix(frame: Frame) -> np.ndarray:
+    """4×4 camera-to-world."""
+    if frame.T_world_from_cam is None:
+        raise ValueError("writers: found a frame without T_world_from_cam, expected a pose to write")
+    return se3.to_matrix(frame.T_world_from_cam)[0].double().numpy()
+
+
+def seconds(frame: Frame) -> float:
+    """Time stamp of a frame."""
+    if frame.time is None:
+        raise ValueError("writers: found a frame without time, expected a stamp to write")
+    return float(frame.time[0])
+
+
+def K_matrix(camera: Camera) -> np.ndarray:
+    """(3, 3) float64."""
+    return cameras.to_matrix(camera)[0].double().numpy()
+
+
+def text_row(values: Any) -> str:
+    """Numbers on one line, every digit kept."""
+    return " ".join(f"{float(x):.17g}" for x in values)
+
+
+def text_rows(matrix: np.ndarray) -> str:
+    """A matrix, one row a line."""
+    return "".join(text_row(row) + "\n" for row in matrix)
+
+
+def write(file: Path, content: bytes | str) -> None:
+    """Write a file, its folder included."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_bytes(content.encode() if isinstance(content, str) else content)
