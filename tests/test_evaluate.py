@@ -1,15 +1,20 @@
 """Evaluation: the truth test on maps whose answer is known by hand, the metrics against plain loops."""
 
 import math
+import os
 import statistics
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from dhtorch import data
 from dhtorch.evaluate import bootstrap, calibrate, errors, holdout, risk
 from dhtorch.evaluate.holdout import Rule
 from dhtorch.records import Camera, Estimate, Frame, Samples
+
+ROOT = os.environ.get("DHTORCH_DATA")
 
 
 def frame_of(depth, hw=None, depth_camera=None):
@@ -158,6 +163,27 @@ def test_the_texture_limit_is_a_share_of_the_median():
 def test_no_samples():
     truth = holdout.truth_at(frame_of(torch.ones(30, 30)), torch.zeros(1, 0, 2))
     assert holdout.candidates(samples_of(torch.zeros(1, 0)), truth, 0.5).code.shape == (1, 0)
+
+
+@pytest.mark.data
+@pytest.mark.skipif(not ROOT, reason="DHTORCH_DATA is not set")
+@pytest.mark.parametrize(("name", "cutoff"), [("holo_a", 2.5), ("7s_redkitchen_600", 2.0), ("dgp_drive6cam", 20.0)])
+def test_every_held_back_return_of_a_real_frame_is_accounted_for(name, cutoff):
+    recording = data.open_all(Path(ROOT) / name)[0]
+    frame = recording[0]
+    v, u = torch.meshgrid(torch.arange(4, frame.hw[0], 11.0), torch.arange(4, frame.hw[1], 11.0), indexing="ij")
+    uv = torch.stack((u, v), -1).flatten(0, 1)[None]
+    textured = samples_of(torch.rand(1, uv.shape[1], generator=torch.Generator().manual_seed(0)))
+    kept = []
+    for rule in holdout.TESTS:
+        truth = holdout.truth_at(frame, uv, truth=rule, sparse=recording.sparse)
+        found = holdout.candidates(textured, truth, cutoff)
+        assert int(found.ok.sum()) + sum(found.dropped().values()) == int((truth.depth > cutoff).sum())
+        kept.append(found.ok)
+    assert (kept[0] >= kept[1]).all() and (kept[1] >= kept[2]).all()
+    assert kept[0].sum() > kept[2].sum() > 0.2 * kept[0].sum()
+    near = holdout.range_split(frame, cutoff)
+    assert near.depth.max() <= cutoff and torch.equal(near.depth > 0, (frame.depth > 0) & (frame.depth <= cutoff))
 
 
 # ---------------------------------------------------------------------------------------------------- errors

@@ -114,15 +114,15 @@ def truth_at(
         raise ValueError(f"holdout.truth: found {truth!r}, expected one of {', '.join(TESTS)}")
     scale = sizes["w"] / sizes["W"]
     place = cam.depth_pixels(frame.camera, frame.hw, frame.depth_camera, (sizes["h"], sizes["w"]), uv)
-    close, distance = _window(frame.depth, place, _side(CLOSE_SPARSE if sparse else CLOSE, scale))
-    depth = _nearest_return(close, distance) if sparse else _nearest_pixel(frame.depth, place)
+    close, u, v = _window(frame.depth, place, _side(CLOSE_SPARSE if sparse else CLOSE, scale))
+    depth = _nearest_return(close, u, v, place) if sparse else _nearest_pixel(frame.depth, place)
     fails_close, fails_wide = torch.zeros_like(depth, dtype=torch.bool), torch.zeros_like(depth, dtype=torch.bool)
     if truth != "raw":
         fails_close = _spreads(close, CLOSE_SPREAD)
         if not sparse:
-            fails_close = fails_close | (close <= 0).any(-1)
+            fails_close = fails_close | (close <= 0).flatten(-2).any(-1)
     if truth == "full":
-        wide, _ = _window(frame.depth, place, _side(WIDE_SPARSE if sparse else window, scale))
+        wide, _, _ = _window(frame.depth, place, _side(WIDE_SPARSE if sparse else window, scale))
         fails_wide = _spreads(wide, WIDE_SPREAD)
     code = _first((depth <= 0, Rule.NO_RETURN), (fails_close, Rule.CLOSE), (fails_wide, Rule.WIDE))
     return Truth(depth, code)
@@ -174,8 +174,9 @@ def _side(size: int, scale: float) -> int:
     return max(3, 2 * int(size * scale / 2) + 1)
 
 
-def _window(depth: Tensor, place: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Returns (B, N, size²) around depth pixels ``place`` (B, N, 2), 0 = none, and their squared distance from it.
+def _window(depth: Tensor, place: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Returns (B, N, size, size) around depth pixels ``place`` (B, N, 2), 0 = none, and the u and v (B, N, size) of
+    the window's columns and rows.
 
     Pixels that do not exist are no returns.
     """
@@ -183,15 +184,14 @@ def _window(depth: Tensor, place: Tensor, size: int) -> tuple[Tensor, Tensor]:
     size = min(size, h, w)
     centre = round_half_up(place.nan_to_num(-1e6)).clamp(-1e6, 1e6)
     corner = centre.long() - size // 2
-    value = patches(depth[:, None], corner, size)[:, :, 0]  # (B, N, size, size), moved inside at the edge
+    value = patches(depth[:, None], corner, size)[:, :, 0]  # moved inside at the edge of the map
     steps = torch.arange(size, device=depth.device)
     u = corner[..., 0, None].clamp(0, w - size) + steps
     v = corner[..., 1, None].clamp(0, h - size) + steps
     wanted_u = (u - centre[..., 0, None]).abs() <= size // 2
     wanted_v = (v - centre[..., 1, None]).abs() <= size // 2
     wanted = wanted_u[..., None, :] & wanted_v[..., :, None] & value.isfinite() & (value > 0)
-    du, dv = (u - place[..., 0, None].detach())[..., None, :], (v - place[..., 1, None].detach())[..., :, None]
-    return torch.where(wanted, value, torch.zeros_like(value)).flatten(-2), (du * du + dv * dv).flatten(-2)
+    return torch.where(wanted, value, torch.zeros_like(value)), u, v
 
 
 def _nearest_pixel(depth: Tensor, place: Tensor) -> Tensor:
@@ -199,16 +199,19 @@ def _nearest_pixel(depth: Tensor, place: Tensor) -> Tensor:
     return torch.where(inside & value.isfinite() & (value > 0), value, torch.zeros_like(value))
 
 
-def _nearest_return(window: Tensor, distance: Tensor) -> Tensor:
-    """The return (B, N) of a window (B, N, P) that lies nearest, 0 where there is none."""
-    far = torch.where(window > 0, distance, torch.full_like(distance, torch.inf))
-    return window.gather(-1, far.argmin(-1, keepdim=True))[..., 0]
+def _nearest_return(window: Tensor, u: Tensor, v: Tensor, place: Tensor) -> Tensor:
+    """The return (B, N) of a window that lies nearest to ``place``, 0 where there is none."""
+    du, dv = u - place[..., 0, None].detach(), v - place[..., 1, None].detach()
+    distance = ((du * du)[..., None, :] + (dv * dv)[..., :, None]).flatten(-2)
+    returns = window.flatten(-2)
+    far = torch.where(returns > 0, distance, torch.full_like(distance, torch.inf))
+    return returns.gather(-1, far.argmin(-1, keepdim=True))[..., 0]
 
 
 def _spreads(window: Tensor, limit: float) -> Tensor:
-    """Whether the returns of a window (B, N, P) spread by ``limit`` or more; no return does not."""
-    high = window.amax(-1)
-    low = torch.where(window > 0, window, torch.full_like(window, torch.inf)).amin(-1)
+    """Whether the returns of a window (B, N, s, s) spread by ``limit`` or more; no return does not."""
+    high = window.amax((-2, -1))
+    low = torch.where(window > 0, window, torch.full_like(window, torch.inf)).amin((-2, -1))
     return (high > 0) & (high >= low * (1 + limit))
 
 
