@@ -9,11 +9,21 @@ import torch
 from dhtorch.data.paths import PATHS
 from dhtorch.data.raycast import DARK, MIRROR, ORDINARY, WINDOW
 from dhtorch.data.room import BACK, FRONT, HEIGHT, LEFT, RIGHT, furnished_room
+from dhtorch.data.shading import Light, Scene
 from dhtorch.data.synthetic import SURFACES, SyntheticRoom, phone_lidar
 from dhtorch.geometry import camera, se3
 from dhtorch.tree import collate
 
 SMALL = {"hw": (120, 160), "depth_hw": (48, 64)}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Many small operations: on a busy machine threads that wait for one another cost more than they save."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")
@@ -110,24 +120,39 @@ def test_exact_and_absent_sensor():
     assert (none[0].depth == 0).all() and (none[0].conf == 0).all()
 
 
-def test_same_seed_same_bits_in_any_order_process_and_number_of_threads():
+def test_same_seed_same_bits_in_any_order_and_process():
     first = SyntheticRoom(n_frames=4, **SMALL)
     frames = [first[i] for i in range(4)]
+    furnished_room.cache_clear()
     again = SyntheticRoom(n_frames=9, **SMALL)
-    threads = torch.get_num_threads()
-    try:
-        torch.set_num_threads(3 - min(threads, 2))
-        furnished_room.cache_clear()
-        for i in (3, 0):
-            frame = again[i]
-            assert torch.equal(frame.image, frames[i].image)
-            assert torch.equal(frame.depth, frames[i].depth) and torch.equal(frame.conf, frames[i].conf)
-            assert torch.equal(again.truth(i)["depth"], first.truth(i)["depth"])
-            assert torch.equal(again.poses.R[i], first.poses.R[i]) and torch.equal(again.poses.t[i], first.poses.t[i])
-    finally:
-        torch.set_num_threads(threads)
+    for i in (3, 0):
+        frame = again[i]
+        assert torch.equal(frame.image, frames[i].image)
+        assert torch.equal(frame.depth, frames[i].depth) and torch.equal(frame.conf, frames[i].conf)
+        assert torch.equal(again.truth(i)["depth"], first.truth(i)["depth"])
+        assert torch.equal(again.poses.R[i], first.poses.R[i]) and torch.equal(again.poses.t[i], first.poses.t[i])
     carried = pickle.loads(pickle.dumps(first))
     assert not carried._frames and torch.equal(carried[-1].image, frames[3].image)
+
+
+def test_number_of_threads_changes_no_bit():
+    """A picture large enough to be shared out, and the light of a small scene."""
+    whole = furnished_room(0).solids.each
+    light = Light((0.0, -2.5, 2.0), (0.3, 0, 0), (0, 0, 0.3), (0, 1, 0), (1.0, 1.0, 1.0))
+    seen = []
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        try:
+            scene = Scene([whole[0], whole[1], next(s for s in whole if s.ball)], [light], ambient=0.4, seed=0)
+            room = SyntheticRoom(n_frames=1, **SMALL)
+            seen.append([scene._light.values, room[0].image, room[0].depth, room[0].conf, room.truth(0)["depth"]])
+        finally:
+            torch.set_num_threads(1)
+    shared_out = 1 << 15  # elements from which torch shares an operation out
+    assert 9 * len(seen[0][0]) > shared_out, "light: nine rays from every node at a time"
+    assert 4 * seen[0][1][0, 0].numel() > shared_out, "picture: four rays in every pixel at a time"
+    for one, two in zip(*seen, strict=True):
+        assert torch.equal(one, two)
 
 
 def test_another_seed_is_another_room():

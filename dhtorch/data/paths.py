@@ -18,8 +18,8 @@ from dhtorch.geometry.se3 import Pose
 Place = tuple[float, float, float]  # x, height, z; m
 Angles = tuple[float, float, float]  # yaw (positive: right), pitch (positive: up), roll; degrees
 
-_PLACE, _YAW, _PITCH = (-0.45, 1.5, 0.45), 12.0, -11.0  # where the viewer stands and looks
-_AIM = (-0.1, 0.85, 1.9)  # what an orbit goes around
+_PLACE, _YAW, _PITCH = (-0.45, 1.3, 0.2), 12.0, -9.0  # where the viewer stands and looks
+_AIM = (-0.1, 0.9, 2.0)  # what an orbit goes around
 
 
 def hand_held(path: str, n_frames: int, *, step_m: float, rate_hz: float, seed: int) -> Pose:
@@ -61,11 +61,11 @@ def _lateral(hand: _Hand, way: float, time: float) -> tuple[Place, Angles]:
 def _forward(hand: _Hand, way: float, time: float) -> tuple[Place, Angles]:
     a, go = math.radians(_YAW), 0.35 * math.sin(way / 0.35 - 0.5)
     x, height, z = _PLACE
-    return (x + math.sin(a) * go, height, z + math.cos(a) * go), (_YAW, _PITCH, 0.0)
+    return (x + math.sin(a) * go, height, z + 0.2 + math.cos(a) * go), (_YAW, _PITCH, 0.0)
 
 
 def _orbit(hand: _Hand, way: float, time: float) -> tuple[Place, Angles]:
-    radius = 1.45
+    radius = 1.75
     a = 0.5 * math.sin(way / (0.5 * radius) + hand.start)
     drop = math.degrees(math.atan2(_PLACE[1] - _AIM[1], radius))
     place = (_AIM[0] - radius * math.sin(a), _PLACE[1], _AIM[2] - radius * math.cos(a))

@@ -53,7 +53,7 @@ class SyntheticRoom(Sequence[Frame]):
     root = None
     sparse = False
     near = 2.0  # m
-    gap = 6  # frames; with the default step a way of 15 cm
+    gap = 6  # frames; with the default step a way of 12 cm
     levels = None
     surfaces = SURFACES  # values of ``truth(i)["surface"]``
     odd_surfaces = ("mirror", "window")  # where triangulation rightly finds something else than the surface
@@ -66,7 +66,7 @@ class SyntheticRoom(Sequence[Frame]):
         n_frames: int = 12,
         hw: tuple[int, int] = (480, 640),
         path: str = "walk",
-        step_m: float = 0.025,
+        step_m: float = 0.02,
         rate_hz: float = 30.0,
         lidar: str | None = "phone",
         depth_hw: tuple[int, int] = (192, 256),
@@ -203,15 +203,15 @@ def phone_lidar(
         0.85 * (kind == MIRROR),
         0.9 * (kind == WINDOW),
         0.9 * ((0.25 - cosine) / 0.25).clamp(0, 1),
-        0.9 * (1 - returned / 0.002).clamp(0, 1),
+        0.9 * (1 - returned / 0.001).clamp(0, 1),
     ):
         lost = 1 - (1 - lost) * (1 - why)
     answered = (_patchy_uniform(hw, generator) >= lost) & (distance <= range_limit)
 
-    sigma = (0.002 + 0.0025 * distance * distance) * (0.015 / returned.clamp(min=1e-6)).sqrt().clamp(1, 2.5)
+    sigma = (0.002 + 0.0025 * distance * distance) * (0.025 / returned.clamp(min=1e-6)).sqrt().clamp(1, 2.5)
     error = noise_factor * sigma * _shared_normal(hw, generator)
     reported = ((distance + error) / per_depth).clamp(min=0.05)
-    level = (returned > 0.002).int() + ((returned > 0.015) & (far == 0)).int()
+    level = (returned > 0.001).int() + ((returned > 0.025) & (far == 0)).int()
     level = torch.where(edge | (kind == MIRROR) | (kind == WINDOW), 0, level)
     depth = torch.where(answered, reported, torch.zeros_like(reported))
     conf = torch.where(answered, level, 0).to(torch.uint8)

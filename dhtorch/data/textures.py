@@ -188,7 +188,7 @@ def _poster(g: Generator) -> Tensor:
         x, y = (du + slant * dv) / rx, (dv - slant * du) / ry
         edge = (x * x + y * y).sqrt() if k % 2 else torch.maximum(x.abs(), y.abs())
         picture[part] = _mix(picture[part], _pigment(g), 0.92 * _step(1 - edge, 0.004 / min(rx, ry)))
-    picture = picture * (0.82 + 0.3 * _fractal(g, 48, 2))[..., None]
+    picture = picture * (0.55 + 0.85 * _fractal(g, 12, 4))[..., None]
     return _mix((0.93, 0.92, 0.88), picture, _step(torch.minimum(_triangle(u), _triangle(v)) * 0.5 - 0.035, 0.003))
 
 
@@ -269,10 +269,13 @@ def _speckle(g: Generator) -> Tensor:
     return _mix(_mix((0.82, 0.78, 0.72), (0.95, 0.92, 0.88), _fractal(g, 4, 3)), (0.32, 0.28, 0.26), dots)
 
 
-def _cloth(g: Generator) -> Tensor:
-    u, v = _uv()
-    check = 0.5 * _step(_triangle(u * 8) - 0.5, 0.06) + 0.5 * _step(_triangle(v * 8) - 0.5, 0.06)
-    return _mix((0.93, 0.91, 0.86), (0.22, 0.36, 0.58), check) * (0.82 + 0.25 * _fractal(g, 96, 2))[..., None]
+def _print(g: Generator) -> Tensor:
+    """Printed cloth: patches of paint on cream, large and small, nowhere the same."""
+    cloth = _mix((0.86, 0.82, 0.72), (0.76, 0.72, 0.62), _fractal(g, 5, 3))
+    for cells, share in ((6, 0.60), (6, 0.62), (10, 0.64), (16, 0.66), (28, 0.68)):
+        patch = _step(noise(g, (SIZE, SIZE), (cells, cells)) - share, 0.5 / cells)
+        cloth = _mix(cloth, _pigment(g), patch * 0.7)
+    return cloth * (0.60 + 0.75 * _fractal(g, 20, 4))[..., None]
 
 
 def _plain(g: Generator) -> Tensor:
@@ -295,6 +298,6 @@ _PAINTERS: dict[str, Painter] = {
     "globe": _globe,
     "leaves": _leaves,
     "speckle": _speckle,
-    "cloth": _cloth,
+    "print": _print,
     "plain": _plain,
 }
