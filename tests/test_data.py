@@ -25,6 +25,7 @@ from dhtorch import data, tree
 from dhtorch.data import convert, driving, files, frames_dir, rectified, tum, writers
 from dhtorch.data.files import FormatError
 from dhtorch.data.recording import Recording, numbers
+from dhtorch.data.writers import parts
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import lookup, se3
 from dhtorch.records import Camera, Frame, Pose
@@ -291,7 +292,7 @@ def test_quaternions_and_axes() -> None:
         q = np.append(np.sin(angle / 2) * axis / angle, np.cos(angle / 2))
         c2w = convert.to_c2w(3 * q[None], np.ones((1, 3)), Path("x"))[0]
         np.testing.assert_allclose(c2w[:3, :3], cv2.Rodrigues(axis)[0], atol=1e-12)
-        assert abs(writers._quaternion(c2w[:3, :3]) @ q) == pytest.approx(1, abs=1e-12)
+        assert abs(parts.quaternion(c2w[:3, :3]) @ q) == pytest.approx(1, abs=1e-12)
     looking = convert.cv_from_gl(np.eye(4)[None])[0]
     np.testing.assert_array_equal(looking @ [0, 0, 1, 0], [0, 0, -1, 0])  # forward is −z in GL axes
     np.testing.assert_array_equal(looking @ [0, 1, 0, 0], [0, -1, 0, 0])  # down is −y
@@ -367,7 +368,7 @@ def test_tum_interpolates_between_neighbouring_poses(tmp_path: Path) -> None:
     writers.write_tum(tmp_path, walk(2))
     a, b = pose(0), pose(1)
     rows = [
-        f"{100 + s:.4f} " + writers._row([*T.t[0], *(q * writers._quaternion(T.R[0].numpy()))])
+        f"{100 + s:.4f} " + parts.text_row([*T.t[0], *(q * parts.quaternion(T.R[0].numpy()))])
         for s, T, q in ((-0.004, a, 1), (0.012, b, -1))
     ]
     (tmp_path / "groundtruth.txt").write_text("# no camera named\n" + "\n".join(rows))
@@ -449,16 +450,16 @@ def test_damaged_pictures(named: Path) -> None:
     fails(r"color.png: file size: found 0 bytes", named)
     colour.write_bytes(b"GIF89a" + bytes(40))
     fails(r"color.png: content: found b'GIF89a.*expected a PNG or JPEG image", named)
-    colour.write_bytes(writers._png(np.zeros((10, 12, 3), np.uint8)))
+    colour.write_bytes(parts.png(np.zeros((10, 12, 3), np.uint8)))
     fails(r"color.png: size: found 12x10, expected 64x48", named)
-    colour.write_bytes(writers._png(np.zeros(HW, np.uint16)))
+    colour.write_bytes(parts.png(np.zeros(HW, np.uint16)))
     fails(r"color.png: bits per channel: found 16, expected 8", named)
     colour.write_bytes(good_colour)
-    depth.write_bytes(writers._png(np.zeros((*HW, 1), np.uint8)))
+    depth.write_bytes(parts.png(np.zeros((*HW, 1), np.uint8)))
     fails(r"depth.png: depth: found png with 1 channels of 8 bits, expected png with 1 channel of 16 bits", named)
     depth.write_bytes(good_colour)
     fails(r"depth.png: depth: found png with 3 channels of 8 bits", named)
-    depth.write_bytes(writers._png(np.zeros((24, 32), np.uint16)))
+    depth.write_bytes(parts.png(np.zeros((24, 32), np.uint16)))
     fails(r"depth.png: size: found 32x24, expected 64x48", named)
     depth.write_bytes(good_depth)
     assert len(list(data.open(named))) == 3
@@ -491,9 +492,9 @@ def test_jpeg_must_be_whole(tmp_path: Path) -> None:
 def test_colours_are_red_green_blue_and_depth_codes_are_masked(tmp_path: Path) -> None:
     picture = np.zeros((2, 3, 3), np.uint8)
     picture[0, 1] = (250, 100, 3)
-    (tmp_path / "c.png").write_bytes(writers._png(picture))
+    (tmp_path / "c.png").write_bytes(parts.png(picture))
     assert files.read_image(tmp_path / "c.png")[:, 0, 1].tolist() == [250, 100, 3]
-    (tmp_path / "d.png").write_bytes(writers._png(np.array([[0, 65535, 1234]], np.uint16)))
+    (tmp_path / "d.png").write_bytes(parts.png(np.array([[0, 65535, 1234]], np.uint16)))
     depth = files.read_depth_png(tmp_path / "d.png", 1000, invalid=(65535,))
     np.testing.assert_allclose(depth, [[0, 0, 1.234]])
 
