@@ -21,6 +21,9 @@ REACH = 8
 #: How far outside the image the middle of a window may lie, px of the level.
 MARGIN = 4
 
+#: Rows whose gradients are computed at once.
+BAND = 64
+
 #: Planes of a level.
 GRAD_X, GRAD_Y, GREY = 0, 1, 2
 
@@ -137,15 +140,21 @@ def _binomial(a: Tensor, b: Tensor, c: Tensor, d: Tensor, e: Tensor) -> Tensor:
 
 
 def _with_gradients(padded: Tensor, pad: int) -> Tensor:
-    """A level (B, 3, rows, width) from its mirrored grey plane: Scharr's filter (3 10 3) x (-1 0 1) / 32 beside it."""
-    inner = padded[..., pad - 1 : padded.shape[-2] - pad + 1, pad - 1 : padded.shape[-1] - pad + 1]
-    across = torch.add(inner[..., 1:-1, :] * (10 / 32), inner[..., :-2, :] + inner[..., 2:, :], alpha=3 / 32)
-    slope = inner[..., 2:, :] - inner[..., :-2, :]
-    # Written into one new buffer: fresh memory costs more than the arithmetic.
+    """A level (B, 3, rows, width) from its mirrored grey plane: Scharr's filter (3 10 3) x (-1 0 1) / 32 beside it.
+
+    Written into one new buffer, a band of rows at a time: fresh memory costs more than the arithmetic.
+    """
     level = padded.new_zeros(padded.shape[0], 3, *padded.shape[-2:])
     level[:, GREY:] = padded
-    level[:, GRAD_X : GRAD_X + 1, pad:-pad, pad:-pad] = across[..., 2:] - across[..., :-2]
-    level[:, GRAD_Y : GRAD_Y + 1, pad:-pad, pad:-pad] = torch.add(
-        slope[..., 1:-1] * (10 / 32), slope[..., :-2] + slope[..., 2:], alpha=3 / 32
-    )
+    end, columns = padded.shape[-2] - pad, slice(pad, -pad)
+    for top in range(pad, end, BAND):
+        bottom = min(top + BAND, end)
+        above, here, below = (
+            padded[..., top + k : bottom + k, pad - 1 : padded.shape[-1] - pad + 1] for k in (-1, 0, 1)
+        )
+        across = torch.add(here * (10 / 32), above + below, alpha=3 / 32)
+        slope = below - above
+        down = torch.add(slope[..., 1:-1] * (10 / 32), slope[..., :-2] + slope[..., 2:], alpha=3 / 32)
+        level[:, GRAD_X : GRAD_X + 1, top:bottom, columns] = across[..., 2:] - across[..., :-2]
+        level[:, GRAD_Y : GRAD_Y + 1, top:bottom, columns] = down
     return level

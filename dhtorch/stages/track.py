@@ -29,15 +29,18 @@ from dhtorch.records import Tracks
 #: of 8-bit images scaled by 2^-5.
 MIN_EIGENVALUE = 1e-4 * 2**10 / 255**2
 
-#: Points convolved at once. Always this number, so that the kernel, and with it the rounding of a point's answer, does
-#: not depend on how many other points there are; small, so that their windows stay in the cache.
+#: Points whose windows are read at once: few enough for the windows to stay in the cache.
 CHUNK = 256
+
+#: Rows of points are filled up to multiples of this, so that vector instructions leave no remainder and a point's
+#: rounding does not depend on how many others there are.
+LANES = 64
 
 #: A map covers the offsets from -radius to radius + 1; larger on the coarsest level, where nothing is known yet.
 RADIUS, RADIUS_TOP = 1, 3
 
-#: Steps on the first maps of a level; one more map may use what is left of ``iterations``.
-STEPS_PER_MAP = (8, 4, 4, 4)
+#: Steps on the first maps of a level; one more map may use what is left of ``iterations``. Coarse, fine.
+STEPS_PER_MAP = ((8,), (8, 4, 4))
 
 #: Steps that all points of a map take together, before those that still move are picked out.
 STEPS_TOGETHER = 4
@@ -93,7 +96,8 @@ def lucas_kanade(
         pyramid_0: ``build_pyramid(image_0, levels, window)``, made once for an anchor tracked into many views.
         window: width in pixels, odd.
         levels: pyramid levels, full resolution included; fewer where a level would be no larger than the window.
-        iterations: most Gauss-Newton steps per level. A point that outruns five maps of a level stops there earlier.
+        iterations: most Gauss-Newton steps per level. A point that outruns its maps (two on a coarse level, four on the
+            finest) stops earlier.
         epsilon_px: a shorter step has converged; on coarse levels, which only provide a start, four times that.
         normalise: ``none``; ``bias`` removes the means of both windows; ``gain_bias`` also their ratio of contrast.
         min_eigenvalue: of A / window² (grey values in [0, 1]); a window with less has too little texture.
@@ -173,7 +177,7 @@ def refine(
 def _there_and_back(source: Pyramid, target: Pyramid, uv_0: Tensor, init: Tensor | None, limit_px: float, o: _Options):
     """Tracks of all points, laid out in one row (2, M), filled up to whole chunks by points outside the image."""
     B, N, _ = uv_0.shape
-    fill = -(B * N) % CHUNK if N else CHUNK
+    fill = -(B * N) % LANES if N else LANES
 
     def row(uv: Tensor) -> Tensor:
         return F.pad(uv.to(source.levels[0].dtype).permute(2, 0, 1).reshape(2, B * N), (0, fill), value=-2.0)
@@ -222,66 +226,70 @@ def _search(source: Pyramid, target: Pyramid, x: Tensor, d: Tensor, batch: Tenso
 
 def _descend(pair: _Pair, o: _Options, radius: int, x: Tensor, d: Tensor, batch: Tensor, known: Tensor):
     """One level: all points on a first map, then those that outran it on further ones. Displacement and moments."""
-    first, *rest = _split(o.iterations, STEPS_PER_MAP)
+    first, *rest = _split(o.iterations, STEPS_PER_MAP[pair.level == 0])
     live = known & _within(x + d, pair.low, pair.high)
-    d, live, moments = _on_a_map(pair, o, radius, first, x, d, batch, live)
+    middle = pair.target.pixel(pair.level, x + d)
+    C, moments = _map(pair, o, radius, x, middle, batch)
+    A_inv, textured = _inverse(moments[2:5], o.min_eigenvalue * o.window**2)
+    d, live = _on_map(pair, o, first, C, middle - radius, x, d, live & textured, moments, A_inv)
     for steps in rest:
-        again = partial(_on_a_map, pair, o, radius, steps)
-        d, live, moments = _for_some(live, again, (d, live, moments), (x, d, batch, live, moments))
+        again = partial(_on_new_map, pair, o, radius, steps)
+        d, live = _for_some(live, again, (d, live), (x, d, batch, live, moments, A_inv))
     return d, moments
 
 
 def _for_some(wanted: Tensor, fn: Callable, values: tuple[Tensor, ...], columns: tuple[Tensor, ...]):
     """``values`` (each (..., M)), replaced where ``wanted`` (M,) by what ``fn(*columns)`` returns.
 
-    Where shapes may depend on values, ``fn`` sees only the wanted points, filled up to whole chunks.
+    Where shapes may depend on values, ``fn`` sees only the wanted points, filled up by copies of the first.
     """
     if _static(wanted):
         return tuple(torch.where(wanted, new, old) for new, old in zip(fn(*columns), values, strict=True))
     some = wanted.nonzero()[:, 0]
     if not len(some):
         return values
-    some = torch.cat([some, some[:1].expand(-len(some) % CHUNK)])  # copies of a point agree
+    some = torch.cat([some, some[:1].expand(-len(some) % LANES)])
     new = fn(*(column.index_select(-1, some) for column in columns))
     return tuple(old.index_copy(-1, some, n) for old, n in zip(values, new, strict=True))
 
 
-def _on_a_map(  # noqa: PLR0917
+def _on_new_map(pair: _Pair, o: _Options, radius: int, steps: int, x, d, batch, live, moments, A_inv):  # noqa: PLR0917
+    """:func:`_on_map` with a map around where the points are; windows known by their ``moments``."""
+    middle = pair.target.pixel(pair.level, x + d)
+    C, _ = _map(pair, o, radius, x, middle, batch, moments)
+    return _on_map(pair, o, steps, C, middle - radius, x, d, live, moments, A_inv)
+
+
+def _on_map(  # noqa: PLR0917
     pair: _Pair,
     o: _Options,
-    radius: int,
     steps: int,
+    C: Tensor,  # (K, n, n, M)
+    corner: Tensor,  # (2, M) the target's pixel where the map begins
     x: Tensor,  # (2, M)
     d: Tensor,  # (2, M)
-    batch: Tensor,  # (M,)
     live: Tensor,  # (M,) wants to move
-    moments: Tensor | None = None,  # (5 or 6, M)
-) -> tuple[Tensor, Tensor, Tensor]:
-    """At most ``steps`` steps on one map around where the points are: displacement, who wants more, moments.
+    moments: Tensor,  # (5 or 6, M)
+    A_inv: Tensor,  # (2, 2, M)
+) -> tuple[Tensor, Tensor]:
+    """At most ``steps`` steps on one map: the displacement, and who wants more.
 
     A point stops for good at a short step or when it leaves the level's bounds, and on this map when it leaves the map.
     """
-    middle = pair.target.pixel(pair.level, x + d)
-    C, moments = _map(pair, o, radius, x, middle, batch, moments)
-    A_inv, textured = _inverse(moments[2:5], o.min_eigenvalue * o.window**2)
-    live = live & textured
-    end = C.shape[1] - 1.0
-    origin = middle - radius - x  # of the map, as a displacement
-    low, high = pair.low - x - origin, pair.high - x - origin  # the level's bounds, on the map
-    start = d - origin
+    low, high, end = pair.low - corner, pair.high - corner, C.shape[1] - 1.0  # all positions are on the map now
+    start = x + d - corner
     still = (C, A_inv, moments, low.clamp_min(0), high.clamp_max(end))
-    p, moving = _walk(o, min(steps, STEPS_TOGETHER), start, live, *still)
-    if steps > STEPS_TOGETHER:
-        further = partial(_walk, o, steps - STEPS_TOGETHER)
+    together = steps if x.shape[1] <= CHUNK else min(steps, STEPS_TOGETHER)
+    p, moving = _walk(o, together, start, live, *still)
+    if steps > together:
+        further = partial(_walk, o, steps - together)
         p, moving = _for_some(moving, further, (p, moving), (p, moving, *still))
     p = torch.where(p.isfinite(), p, start)
     off_the_map = (p != p.clamp(0, end)).any(0)
-    return p + origin, live & (moving | off_the_map) & _within(p, low, high), moments
+    return p + corner - x, live & (moving | off_the_map) & _within(p, low, high)
 
 
-def _walk(  # noqa: PLR0917
-    o: _Options, steps: int, p: Tensor, moving: Tensor, C, A_inv, moments, low, high
-) -> tuple[Tensor, Tensor]:
+def _walk(o: _Options, steps: int, p: Tensor, moving: Tensor, C, A_inv, moments, low, high):  # noqa: PLR0917
     """Gauss-Newton steps of map positions ``p`` (2, M) while ``moving`` (M,); a short step or a bound ends it."""
     node = torch.arange(C.shape[1], dtype=p.dtype, device=p.device)[:, None]
     for _ in range(steps):
@@ -289,10 +297,14 @@ def _walk(  # noqa: PLR0917
         step = _step(((C * hat[0]).sum(2) * hat[1]).sum(1), A_inv, moments)
         p = torch.where(moving, p - step, p)
         moving = moving & ((step * step).sum(0) > o.epsilon_px**2) & (p == p.clamp(low, high)).all(0)
+        if not _static(p) and not moving.any():
+            break
     return p, moving
 
 
-def _map(pair: _Pair, o: _Options, radius: int, x: Tensor, middle: Tensor, batch: Tensor, moments: Tensor | None):
+def _map(
+    pair: _Pair, o: _Options, radius: int, x: Tensor, middle: Tensor, batch: Tensor, moments: Tensor | None = None
+):
     """Map (K, n, n, M) of the windows at ``x`` around the target's pixels ``middle`` (both (2, M)), and the moments."""
     w, side = o.window, o.window + 2 * radius + 1
     first_0, fraction = pair.source.locate(pair.level, x, batch, w // 2, (GRAD_X, GRAD_Y, GREY))
@@ -302,9 +314,10 @@ def _map(pair: _Pair, o: _Options, radius: int, x: Tensor, middle: Tensor, batch
         G = _project(pair.source.read(pair.level, i, w, None if pair.level else f), o.normalise)
         if moments is None:
             sums.append(_moments(G, o.normalise))
-        kernel = _kernels(G, o.normalise).reshape(-1, 1, w, w)
-        J = pair.target.read(pair.level, j.expand(len(kernel) // CHUNK, -1), side).view(1, -1, side, side)
-        maps.append(F.conv2d(J, kernel, groups=len(kernel)).view(-1, CHUNK, 2 * radius + 2, 2 * radius + 2))
+        kernel = _kernels(G, o.normalise)
+        K, m = kernel.shape[:2]
+        J = pair.target.read(pair.level, j.expand(K, m), side).view(1, K * m, side, side)
+        maps.append(F.conv2d(J, kernel.reshape(K * m, 1, w, w), groups=K * m).view(K, m, side - w + 1, side - w + 1))
     C = torch.cat(maps, 1).permute(0, 2, 3, 1).contiguous()
     return C, torch.cat(sums, -1) if moments is None else moments
 
