@@ -128,7 +128,7 @@ def _execute(settings: dict[str, Any], parts: dict[str, Any], choices: Mapping[s
         experiment=choices["experiment"],
         key=key,
         meta=meta,
-        config=archive.portable(settings),
+        config=settings,
         data={
             "name": choices["data"],
             "scenes": scenes,
@@ -197,31 +197,30 @@ def _progress(items: Iterable[Any], text: str, total: int) -> Iterator[Any]:
 
 def _draw(examples: Iterable[Any], folder: Path) -> list[Path]:
     """Figures and the point cloud of the first pair of every scene."""
-    from dhtorch import report  # noqa: PLC0415
+    from dhtorch import figures  # noqa: PLC0415
     from dhtorch.codes import Source  # noqa: PLC0415
     from dhtorch.evaluate import errors, risk  # noqa: PLC0415
     from dhtorch.geometry.camera import unproject  # noqa: PLC0415
     from dhtorch.pair import merge  # noqa: PLC0415
 
     written = []
-    for e in examples:
-        here = folder / e.scene
+    for example in examples:
+        e, here = example.cpu(), folder / example.scene
         here.mkdir(parents=True, exist_ok=True)
-        whole = merge(e.samples, e.estimate)
-        image, uv = e.frame.image[0].cpu(), e.samples.uv[0].cpu()
-        report.figure_samples(here / "samples.png", image, uv, whole.source[0].cpu(), e.estimate.gate[0].cpu())
-        report.figure_holes(here / "holes.png", image, uv, e.samples.hole[0].cpu())
+        whole, image, uv = merge(e.samples, e.estimate), e.frame.image[0], e.samples.uv[0]
+        figures.draw_samples(here / "samples.png", image, uv, whole.source[0], e.estimate.gate[0])
+        figures.draw_holes(here / "holes.png", image, uv, e.samples.hole[0])
         pooled = errors.select(e.estimate, e.truth)
-        report.figure_depth(here / "depth.png", pooled.true_depth.cpu(), pooled.depth.cpu(), pooled.score.cpu())
-        report.figure_risk_coverage(
-            here / "risk_coverage.png",
-            {e.method: risk.risk_coverage(pooled)},
-            oracle=risk.risk_coverage(pooled, oracle=True),
-        )
+        if pooled.keep.any():
+            figures.draw_depth(here / "depth.png", pooled.true_depth, pooled.depth, pooled.score)
+            curves = {e.method: risk.risk_coverage(pooled)}
+            figures.draw_risk_coverage(
+                here / "risk_coverage.png", curves, oracle=risk.risk_coverage(pooled, oracle=True)
+            )
         filled = whole.source[0] != Source.NONE
         xyz = unproject(e.frame.camera, whole.uv, whole.depth)[0][filled]
-        columns = {name: getattr(whole, name)[0][filled].cpu() for name in ("source", "sigma", "score")}
-        report.write_ply(here / "points.ply", xyz.cpu(), **columns)
+        columns = {name: getattr(whole, name)[0][filled] for name in ("source", "sigma", "score")}
+        figures.write_ply(here / "points.ply", xyz, **columns)
         written += sorted(here.iterdir())
     return written
 

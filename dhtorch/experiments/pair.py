@@ -6,7 +6,7 @@ It asks no question (its question, expectation and verdict are null); the experi
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -59,6 +59,11 @@ class Example:
     samples: Samples
     estimate: Estimate
     truth: holdout.Truth
+
+    def cpu(self) -> Example:
+        """The same on the CPU, for figures."""
+        moved = {k: getattr(self, k).to("cpu") for k in ("frame", "samples", "estimate", "truth")}
+        return replace(self, **moved)
 
 
 @dataclass
