@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dhtorch.geometry.lookup import luma, round_half_up, windows
+from dhtorch.geometry.lookup import luma, windows
 from dhtorch.geometry.shapes import check
 
 #: Padding beyond half a window: how far from a pixel of the image (or of ``MARGIN`` around it) a search may look.
@@ -49,10 +49,10 @@ class Pyramid(NamedTuple):
         slack = MARGIN if level else 0
         return torch.full_like(high, -0.5) * 0.5**level - slack, high * 0.5**level + slack
 
-    def pixel(self, level: int, x: Tensor) -> Tensor:
-        """Nearest pixel (2, M) of a level or of the margin around it to ``x`` (2, M)."""
+    def corner(self, level: int, x: Tensor) -> Tensor:
+        """The pixel (2, M) left of and above ``x`` (2, M), on a level or in the margin around it."""
         H, W = self.hw(level)
-        return torch.minimum(round_half_up(x).clamp_min(-MARGIN), x.new_tensor([[W - 1], [H - 1]]) + MARGIN)
+        return torch.minimum(x.detach().floor().clamp_min(-MARGIN), x.new_tensor([[W - 1], [H - 1]]) + MARGIN)
 
     def locate(self, level: int, x: Tensor, batch: Tensor, before: int, planes: tuple[int, ...]):
         """Where windows begin that reach ``before`` pixels left of and above floor(x), and the fraction of x.
@@ -60,8 +60,7 @@ class Pyramid(NamedTuple):
         ``x`` (2, M) px of the level, ``batch`` (M,); returns flat indices (P, M), one row per plane, and (2, M).
         """
         rows, width = self.levels[level].shape[-2:]
-        limit = x.new_tensor([[width], [rows]]) - (2 * self.pad + 1 - MARGIN)
-        whole = torch.minimum(x.detach().floor().clamp_min(-MARGIN), limit)
+        whole = self.corner(level, x)
         u, v = whole.long() + (self.pad - before)
         plane = 3 * batch + torch.tensor(planes, device=x.device)[:, None]
         return (plane * rows + v) * width + u, x - whole

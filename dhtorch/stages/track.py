@@ -48,6 +48,9 @@ STEPS_TOGETHER = 4
 #: Coarse levels only provide a start: there a step has converged at so many times ``epsilon_px``.
 COARSE_EPSILON = 4.0
 
+#: A ratio of contrasts beyond these limits is not believed.
+GAIN = (0.2, 5.0)
+
 #: Variance of rounding grey values to 8 bits; no residual is believed to be smaller.
 QUANTISATION = 1 / (12 * 255**2)
 
@@ -169,7 +172,9 @@ def refine(
     J = target.windows(0, x_1, batch, window, (GREY,))
     moments = _moments(G, normalise)
     A_inv, textured = _inverse(moments[2:5], min_eigenvalue * window**2)
-    step = _step((_kernels(G, normalise) * J).sum(-1), A_inv, moments)
+    step = _steps((_kernels(G, normalise) * J).sum(-1), moments, A_inv)
+    if normalise == "gain_bias":
+        step = step[:2] / step[2].clamp(*GAIN)
     found = start - torch.where(usable & textured, step, torch.zeros_like(step))
     return found.reshape(2, B, N).permute(1, 2, 0).to(uv_0.dtype)
 
@@ -215,27 +220,29 @@ def _search(source: Pyramid, target: Pyramid, x: Tensor, d: Tensor, batch: Tenso
     d = d * 0.5**top
     for level in range(top, 0, -1):
         pair = _Pair(source, target, level, *target.bounds(level))
-        pixel = source.pixel(level, x * 0.5**level)  # read between pixels only where it decides the answer
-        d, _ = _descend(pair, coarse, RADIUS_TOP if level == top else RADIUS, pixel, d, batch, known)
+        pixel = source.corner(level, x * 0.5**level + 0.5)  # read between pixels only where it decides the answer
+        d, _, _ = _descend(pair, coarse, RADIUS_TOP if level == top else RADIUS, pixel, d, batch, known)
         d = d * 2
     pair = _Pair(source, target, 0, *target.bounds(0))
-    d, moments = _descend(pair, o, RADIUS if top else RADIUS_TOP, x, d, batch, known)
-    textured = _inverse(moments[2:5], o.min_eigenvalue * o.window**2)[1]
-    return d, known & textured & _within(x + d, pair.low, pair.high), moments[2:5]
+    d, textured, A = _descend(pair, o, RADIUS if top else RADIUS_TOP, x, d, batch, known)
+    return d, known & textured & _within(x + d, pair.low, pair.high), A
 
 
 def _descend(pair: _Pair, o: _Options, radius: int, x: Tensor, d: Tensor, batch: Tensor, known: Tensor):
-    """One level: all points on a first map, then those that outran it on further ones. Displacement and moments."""
+    """One level: all points on a first map, then those that outran it on further ones.
+
+    Returns the displacement, whether the window is textured (M,), and A (3, M).
+    """
     first, *rest = _split(o.iterations, STEPS_PER_MAP[pair.level == 0])
-    live = known & _within(x + d, pair.low, pair.high)
-    middle = pair.target.pixel(pair.level, x + d)
-    C, moments = _map(pair, o, radius, x, middle, batch)
+    corner = pair.target.corner(pair.level, x + d) - radius
+    C, moments = _map(pair, o, radius, x, corner, batch)
     A_inv, textured = _inverse(moments[2:5], o.min_eigenvalue * o.window**2)
-    d, live = _on_map(pair, o, first, C, middle - radius, x, d, live & textured, moments, A_inv)
+    live = known & textured & _within(x + d, pair.low, pair.high)
+    d, live = _on_map(pair, o, first, _steps(C, moments, A_inv), corner, x, d, live)
     for steps in rest:
         again = partial(_on_new_map, pair, o, radius, steps)
         d, live = _for_some(live, again, (d, live), (x, d, batch, live, moments, A_inv))
-    return d, moments
+    return d, textured, moments[2:5]
 
 
 def _for_some(wanted: Tensor, fn: Callable, values: tuple[Tensor, ...], columns: tuple[Tensor, ...]):
@@ -254,31 +261,29 @@ def _for_some(wanted: Tensor, fn: Callable, values: tuple[Tensor, ...], columns:
 
 
 def _on_new_map(pair: _Pair, o: _Options, radius: int, steps: int, x, d, batch, live, moments, A_inv):  # noqa: PLR0917
-    """:func:`_on_map` with a map around where the points are; windows known by their ``moments``."""
-    middle = pair.target.pixel(pair.level, x + d)
-    C, _ = _map(pair, o, radius, x, middle, batch, moments)
-    return _on_map(pair, o, steps, C, middle - radius, x, d, live, moments, A_inv)
+    """:func:`_on_map` with a map around where the points are, of windows whose moments are known."""
+    corner = pair.target.corner(pair.level, x + d) - radius
+    C, _ = _map(pair, o, radius, x, corner, batch, moments)
+    return _on_map(pair, o, steps, _steps(C, moments, A_inv), corner, x, d, live)
 
 
-def _on_map(  # noqa: PLR0917
+def _on_map(
     pair: _Pair,
     o: _Options,
     steps: int,
-    C: Tensor,  # (K, n, n, M)
+    field: Tensor,  # (2 or 3, n, n, M) see _steps
     corner: Tensor,  # (2, M) the target's pixel where the map begins
     x: Tensor,  # (2, M)
     d: Tensor,  # (2, M)
     live: Tensor,  # (M,) wants to move
-    moments: Tensor,  # (5 or 6, M)
-    A_inv: Tensor,  # (2, 2, M)
 ) -> tuple[Tensor, Tensor]:
     """At most ``steps`` steps on one map: the displacement, and who wants more.
 
     A point stops for good at a short step or when it leaves the level's bounds, and on this map when it leaves the map.
     """
-    low, high, end = pair.low - corner, pair.high - corner, C.shape[1] - 1.0  # all positions are on the map now
+    low, high, end = pair.low - corner, pair.high - corner, field.shape[1] - 1.0  # all positions are on the map now
     start = x + d - corner
-    still = (C, A_inv, moments, low.clamp_min(0), high.clamp_max(end))
+    still = (field, low.clamp_min(0), high.clamp_max(end))
     together = steps if x.shape[1] <= CHUNK else min(steps, STEPS_TOGETHER)
     p, moving = _walk(o, together, start, live, *still)
     if steps > together:
@@ -289,12 +294,14 @@ def _on_map(  # noqa: PLR0917
     return p + corner - x, live & (moving | off_the_map) & _within(p, low, high)
 
 
-def _walk(o: _Options, steps: int, p: Tensor, moving: Tensor, C, A_inv, moments, low, high):  # noqa: PLR0917
+def _walk(o: _Options, steps: int, p: Tensor, moving: Tensor, field: Tensor, low: Tensor, high: Tensor):
     """Gauss-Newton steps of map positions ``p`` (2, M) while ``moving`` (M,); a short step or a bound ends it."""
-    node = torch.arange(C.shape[1], dtype=p.dtype, device=p.device)[:, None]
+    node = torch.arange(field.shape[1], dtype=p.dtype, device=p.device)[:, None]
     for _ in range(steps):
         hat = (1 - (p[:, None] - node).abs()).clamp_min(0)  # (2, n, M) bilinear weights
-        step = _step(((C * hat[0]).sum(2) * hat[1]).sum(1), A_inv, moments)
+        step = ((field * hat[0]).sum(2) * hat[1]).sum(1)
+        if len(field) == 3:
+            step = step[:2] / step[2].clamp(*GAIN)
         p = torch.where(moving, p - step, p)
         moving = moving & ((step * step).sum(0) > o.epsilon_px**2) & (p == p.clamp(low, high)).all(0)
         if not _static(p) and not moving.any():
@@ -302,13 +309,24 @@ def _walk(o: _Options, steps: int, p: Tensor, moving: Tensor, C, A_inv, moments,
     return p, moving
 
 
+def _steps(C: Tensor, moments: Tensor, A_inv: Tensor) -> Tensor:
+    """Gauss-Newton steps (2, ..., M) from correlations (K, ..., M), as linear in them as a map is between its nodes.
+
+    With K = 3 the steps are those for equal contrast, and a third plane is the gain they are to be divided by.
+    """
+    shape = (2, *(1,) * (C.ndim - 2), C.shape[-1])
+    change = C[:2] - moments[:2].view(shape)
+    steps = A_inv[:, 0].view(shape) * change[0] + A_inv[:, 1].view(shape) * change[1]
+    return steps if len(C) == 2 else torch.cat([steps, _gain(C[2:], moments[5])])
+
+
 def _map(
-    pair: _Pair, o: _Options, radius: int, x: Tensor, middle: Tensor, batch: Tensor, moments: Tensor | None = None
+    pair: _Pair, o: _Options, radius: int, x: Tensor, corner: Tensor, batch: Tensor, moments: Tensor | None = None
 ):
-    """Map (K, n, n, M) of the windows at ``x`` around the target's pixels ``middle`` (both (2, M)), and the moments."""
+    """Map (K, n, n, M) of the windows at ``x`` (2, M) that begins at the target's pixels ``corner``; the moments."""
     w, side = o.window, o.window + 2 * radius + 1
     first_0, fraction = pair.source.locate(pair.level, x, batch, w // 2, (GRAD_X, GRAD_Y, GREY))
-    first_1, _ = pair.target.locate(pair.level, middle, batch, w // 2 + radius, (GREY,))
+    first_1, _ = pair.target.locate(pair.level, corner + radius, batch, w // 2 + radius, (GREY,))
     maps, sums = [], []
     for i, j, f in zip(*(y.split(CHUNK, -1) for y in (first_0, first_1, fraction)), strict=True):
         G = _project(pair.source.read(pair.level, i, w, None if pair.level else f), o.normalise)
@@ -331,7 +349,7 @@ def _sum_of_squares(source: Pyramid, target: Pyramid, x: Tensor, d: Tensor, batc
         if o.normalise != "none":
             T, J = T - T.mean(-1, keepdim=True), J - J.mean(-1, keepdim=True)
         if o.normalise == "gain_bias":
-            J = J / _gain((T * J).sum(-1), (T * T).sum(-1))[:, None]
+            J = J / _gain((T * J).sum(-1), (T * T).sum(-1)).clamp(*GAIN)[:, None]
         sums.append((J - T).square().sum(-1))
     total = torch.cat(sums)
     return torch.where(total.isfinite(), total, torch.full_like(total, o.window**2))
@@ -361,16 +379,10 @@ def _moments(G: Tensor, normalise: str) -> Tensor:
     return torch.cat([(G[:2] * G[2]).sum(-1), (G[:2] * G[0]).sum(-1), (G[1:last] * G[1:last]).sum(-1)])
 
 
-def _step(c: Tensor, A_inv: Tensor, moments: Tensor) -> Tensor:
-    """Gauss-Newton step (2, M) from the correlations ``c`` (K, M) at the present position."""
-    step = (A_inv * (c[:2] - moments[:2])).sum(1)
-    return step if len(c) == 2 else step / _gain(c[2], moments[5])
-
-
 def _gain(correlation: Tensor, energy: Tensor) -> Tensor:
-    """Contrast of J in units of T's, kept within a factor of five."""
+    """Contrast of J in units of T's."""
     gain = correlation / torch.where(energy > 0, energy, torch.ones_like(energy))
-    return torch.where(energy > 0, gain, torch.ones_like(gain)).clamp(0.2, 5.0)
+    return torch.where(energy > 0, gain, torch.ones_like(gain))
 
 
 def _inverse(A: Tensor, min_eigenvalue: float) -> tuple[Tensor, Tensor]:
