@@ -40,7 +40,7 @@ LANES = 64
 RADIUS, RADIUS_TOP = 1, 3
 
 #: Steps on the first maps of a level; one more map may use what is left of ``iterations``. Coarse, fine.
-STEPS_PER_MAP = ((8,), (8, 4, 4))
+STEPS_PER_MAP = ((8,), (6, 4, 4, 4))
 
 #: Steps that all points of a map take together, before those that still move are picked out.
 STEPS_TOGETHER = 4
@@ -99,17 +99,18 @@ def lucas_kanade(
         pyramid_0: ``build_pyramid(image_0, levels, window)``, made once for an anchor tracked into many views.
         window: width in pixels, odd.
         levels: pyramid levels, full resolution included; fewer where a level would be no larger than the window.
-        iterations: most Gauss-Newton steps per level. A point that outruns its maps (two on a coarse level, four on the
+        iterations: most Gauss-Newton steps per level. A point that outruns its maps (two on a coarse level, five on the
             finest) stops earlier.
         epsilon_px: a shorter step has converged; on coarse levels, which only provide a start, four times that.
         normalise: ``none``; ``bias`` removes the means of both windows; ``gain_bias`` also their ratio of contrast.
         min_eigenvalue: of A / window² (grey values in [0, 1]); a window with less has too little texture.
 
     Returns:
-        Tracks in the dtype of ``uv_0``. ``error`` is the round trip; ``photometric`` the rms grey difference of the
-        windows (in grey values of image 0, after normalisation); ``cov`` is s² A⁻¹ with s² the residual variance, not
-        below that of 8-bit rounding, and the small eigenvalue of A kept from vanishing: always finite, large without
-        texture. ``valid``: inside image 1 on the finest level from start to end, textured, round trip below its limit.
+        Tracks in the dtype of ``uv_0``. ``error`` is the round trip (the way there where it led nowhere);
+        ``photometric`` the rms grey difference of the windows, in grey values of image 0, after normalisation; ``cov``
+        is s² A⁻¹ with s² the residual variance, not below that of 8-bit rounding, and the small eigenvalue of A kept
+        from vanishing: always finite, large without texture. It understates white noise, which reading between pixels
+        smooths out of the residual. ``valid``: inside image 1 on the finest level from start to end, textured, round trip below its limit.
         Not valid: ``uv_1`` is the last position; for a ``uv_0`` outside the image where the search would have started,
         with 0 for what is not finite.
 
@@ -180,7 +181,7 @@ def refine(
 
 
 def _there_and_back(source: Pyramid, target: Pyramid, uv_0: Tensor, init: Tensor | None, limit_px: float, o: _Options):
-    """Tracks of all points, laid out in one row (2, M), filled up to whole chunks by points outside the image."""
+    """Tracks of all points, laid out in one row (2, M), filled up to whole LANES by points outside the image."""
     B, N, _ = uv_0.shape
     fill = -(B * N) % LANES if N else LANES
 
@@ -199,8 +200,10 @@ def _there_and_back(source: Pyramid, target: Pyramid, uv_0: Tensor, init: Tensor
     x = torch.where(known, x, torch.zeros_like(x))
     batch = F.pad(torch.arange(B, device=x.device).repeat_interleave(N), (0, fill))
 
-    forward, found, A = _search(source, target, x, d, batch, known, o)
-    backward, returned, _ = _search(target, source, x + forward, -d, batch, found, o)
+    forward, found, A = _search(source, target, o, x, d, batch, known)
+    search_back = partial(_search, target, source, o)
+    nothing = torch.zeros_like(d), torch.zeros_like(found), torch.zeros_like(A)
+    backward, returned, _ = _for_some(found, search_back, nothing, (x + forward, -d, batch, found))
     error = (forward + backward).square().sum(0).sqrt()
     squares = _sum_of_squares(source, target, x, forward, batch, o)
     return Tracks(
@@ -213,7 +216,7 @@ def _there_and_back(source: Pyramid, target: Pyramid, uv_0: Tensor, init: Tensor
     )
 
 
-def _search(source: Pyramid, target: Pyramid, x: Tensor, d: Tensor, batch: Tensor, known: Tensor, o: _Options):
+def _search(source: Pyramid, target: Pyramid, o: _Options, x: Tensor, d: Tensor, batch: Tensor, known: Tensor):
     """Coarse to fine from ``d``: displacement (2, M), whether it was found (M,), and A (3, M) of the finest level."""
     top = min(len(source.levels), len(target.levels)) - 1
     coarse = o._replace(epsilon_px=o.epsilon_px * COARSE_EPSILON)
