@@ -65,7 +65,11 @@ def read_image(file: Path, hw: tuple[int, int] | None = None) -> np.ndarray:
     Raises:
         FormatError: missing, truncated or unknown file; not 8 bits; another size than ``hw``.
     """
-    data = read_bytes(file)
+    return decode_image(read_bytes(file), file, hw)
+
+
+def decode_image(data: bytes, file: Path, hw: tuple[int, int] | None = None) -> np.ndarray:
+    """As :func:`read_image`, of bytes that lie in an archive; ``file`` names them in errors."""
     header = _checked_header(file, data, hw)
     if header.bits != 8:
         raise FormatError(file, "bits per channel", header.bits, 8)
@@ -87,7 +91,17 @@ def read_depth_png(
     Raises:
         FormatError: missing, truncated or unknown file; not one channel of 16 bits; another size than ``hw``.
     """
-    data = read_bytes(file)
+    return decode_depth_png(read_bytes(file), file, units_per_metre, hw, invalid)
+
+
+def decode_depth_png(
+    data: bytes,
+    file: Path,
+    units_per_metre: float,
+    hw: tuple[int, int] | None = None,
+    invalid: Sequence[int] = (0,),
+) -> np.ndarray:
+    """As :func:`read_depth_png`, of bytes that lie in an archive; ``file`` names them in errors."""
     header = _checked_header(file, data, hw)
     if (header.kind, header.channels, header.bits) != ("png", 1, 16):
         found = f"{header.kind} with {header.channels} channels of {header.bits} bits"
@@ -105,7 +119,12 @@ def image_header(file: Path) -> ImageHeader:
     Raises:
         FormatError: missing, truncated or unknown file, or more than ``MAX_PIXELS`` pixels.
     """
-    return _parse_header(file, read_bytes(file))
+    return decode_image_header(read_bytes(file), file)
+
+
+def decode_image_header(data: bytes, file: Path) -> ImageHeader:
+    """As :func:`image_header`, of bytes that lie in an archive; ``file`` names them in errors."""
+    return _parse_header(file, data)
 
 
 def _checked_header(file: Path, data: bytes, hw: tuple[int, int] | None) -> ImageHeader:
@@ -268,13 +287,22 @@ def read_json(file: Path) -> dict[str, Any]:
     Raises:
         FormatError: missing file, no JSON, or something else than an object on top.
     """
-    try:
-        value = json.loads(read_text(file))
-    except (ValueError, RecursionError) as error:
-        raise FormatError(file, "JSON", error, "a JSON object") from None
+    value = decode_json(read_text(file), file)
     if not isinstance(value, dict):
         raise FormatError(file, "JSON", type(value).__name__, "an object")
     return value
+
+
+def decode_json(text: str | bytes, file: Path) -> Any:
+    """Any JSON value; ``file`` names the text in errors.
+
+    Raises:
+        FormatError: no JSON.
+    """
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:  # ValueError: bytes that are no text, too
+        raise FormatError(file, "JSON", error, "a JSON document") from None
 
 
 def get(value: Any, path: str, kind: type | tuple[type, ...], file: Path) -> Any:
