@@ -23,6 +23,12 @@ from dhtorch.records import Camera, Pose
 #: How far the determinant of a stored rotation may be from 1 before it is taken for damage instead of rounding.
 MAX_DET_ERROR = 0.01
 
+#: No camera of ours has more pixels in a focal length, and no place on this planet is further from another one; numbers
+#: beyond would be infinite in float32.
+MAX_FOCAL = 1e6  # px
+MAX_COORDINATE = 4e7  # m
+_MAX_DISTORTION = 1e4
+
 _GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -43,7 +49,7 @@ def to_camera(
     f, c, wh = np.array([matrix[0, 0], matrix[1, 1]]), matrix[:2, 2], np.array([hw[1], hw[0]])
     if not np.array_equal(matrix[2], [0, 0, 1]) or matrix[1, 0] != 0 or abs(matrix[0, 1]) > 1e-6 * abs(f[0]):
         raise FormatError(file, field, matrix.tolist(), "fx 0 cx, 0 fy cy, 0 0 1 (no skew)")
-    if not (f > 0).all():
+    if not ((f >= 1 / MAX_FOCAL) & (f <= MAX_FOCAL)).all():
         raise FormatError(file, f"{field} focal length", f.tolist(), "two positive numbers of pixels")
     if not ((c > -wh) & (c < 2 * wh)).all():
         raise FormatError(file, f"{field} principal point", c.tolist(), f"a place near the {hw[1]}x{hw[0]} image")
@@ -71,6 +77,9 @@ def to_poses(
     """
     if not np.isfinite(c2w).all():
         raise FormatError(file, field, f"a non-finite number in matrix {_first(~np.isfinite(c2w))}", "finite numbers")
+    bad = np.abs(c2w).max((-1, -2), initial=0) > MAX_COORDINATE
+    if bad.any():
+        raise FormatError(file, f"{field} {_first(bad)}", c2w[bad][0, :3].tolist(), f"at most {MAX_COORDINATE:g} m")
     bad = np.abs(c2w[:, 3] - [0, 0, 0, 1]).max(-1, initial=0) > 1e-6
     if bad.any():
         raise FormatError(file, f"{field} {_first(bad)} last row", c2w[bad][0, 3].tolist(), "0 0 0 1")
@@ -177,6 +186,8 @@ def _distortion(value: object, file: Path) -> np.ndarray | None:
     if count not in (4, 5, 8):
         raise FormatError(file, "distortion", value, "4, 5 or 8 numbers k1 k2 p1 p2 [k3 [k4 k5 k6]]")
     lens = to_array(value, (count,), file, "distortion")
+    if np.abs(lens).max() > _MAX_DISTORTION:
+        raise FormatError(file, "distortion", lens.tolist(), f"numbers of at most {_MAX_DISTORTION:g}")
     return lens if lens.any() else None
 
 

@@ -4,7 +4,7 @@ World axes as a camera's: x right, y down, z forward, the floor at y = 0. Helper
 stands at about (-0.45, 1.3 m up, 0.2) and looks along z. Within 2 m of him a low shelf of drawers and books divides the
 room, with a plant, a globe, a picture and a laptop on it; beyond it an armchair, a sofa under the window on the right,
 and along the brick wall a bookcase, a sideboard with a screen, a picture and a mirror. The other walls are blank or
-papered. Seed 0 is the room as designed; other seeds paint, tint and place things differently.
+papered. The seed decides paint, tint and small placements.
 
 What faces the viewer is painted with detail at several scales: window-based trackers are exact there. Slanted and plain
 boards are white. That near surfaces can be tracked well is a property of this room, not of rooms.
@@ -44,7 +44,7 @@ _CLOTHS: tuple[Triple, ...] = (
 
 
 @lru_cache(maxsize=2)
-def furnished_room(seed: int = 0) -> Scene:
+def furnished_room(seed: int = 2) -> Scene:
     """The room with its light; the same object for the same seed (two are kept)."""
     draw = Random(seed)
     solids = [_shell(draw)]
@@ -141,7 +141,7 @@ def _on_the_divider(draw: Random) -> list[Solid]:
         *_plant(x - 0.92, top, z + 0.05, 1.1),
         _box(x - 0.56, top, z + 0.02, (0.09, 0.03, 0.09), OAK, yaw=10),
         _ball(x - 0.56, top + 0.03, z + 0.02, 0.14, Surface("globe", tile=0.36)),
-        _box(x - 0.22, top, z + 0.07, (0.30, 0.36, 0.07), Surface("poster:1"), yaw=draw.uniform(4, 14)),
+        _box(x - 0.10, top, z + 0.07, (0.30, 0.36, 0.07), Surface("poster:1"), yaw=draw.uniform(4, 14)),
         *_laptop(x + 0.42, top, z - 0.03),
         _ball(x - 0.40, top, z - 0.06, 0.04, Surface("speckle", (1.0, 0.55, 0.15), 0.25)),
         _ball(x - 0.46, top, z - 0.12, 0.042, Surface("speckle", (0.9, 0.2, 0.15), 0.25)),

@@ -30,7 +30,7 @@ class SyntheticRoom(Sequence[Frame]):
     """A lazy sequence of frames (B = 1) of the built-in room, with the attributes of a recording.
 
     Args:
-        seed: of room, path and sensor noise; seed 0 is the room as designed.
+        seed: of the paint and small placements, the path and the sensor noise.
         n_frames: number of frames.
         hw: (height, width) of the image in pixels.
         path: one of :data:`PATHS`. ``walk`` is a hand-held sweep; ``rotation`` does not translate, ``static`` not move.
@@ -62,7 +62,7 @@ class SyntheticRoom(Sequence[Frame]):
     def __init__(
         self,
         *,
-        seed: int = 0,
+        seed: int = 2,
         n_frames: int = 12,
         hw: tuple[int, int] = (480, 640),
         path: str = "walk",
