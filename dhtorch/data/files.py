@@ -9,6 +9,7 @@ Alphabet: ``hw`` (height, width); depth and disparity maps are (h, w) float32.
 
 from __future__ import annotations
 
+import importlib
 import io
 import json
 import math
@@ -17,6 +18,7 @@ import zipfile
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import cv2
@@ -49,6 +51,21 @@ class ImageHeader(NamedTuple):
     channels: int
     bits: int  # per channel
     kind: str  # "png" or "jpeg"
+
+
+def need(*libraries: str, extra: str = "data") -> ModuleType:
+    """The first of ``libraries`` that is installed: decoders of rare formats are not a dependency of the package.
+
+    Raises:
+        ImportError: none is; the message names the extra that brings one.
+    """
+    for library in libraries:
+        try:
+            return importlib.import_module(library)
+        except ImportError:
+            continue
+    names = " or ".join(libraries)
+    raise ImportError(f"this format needs {names}, which is not installed: pip install 'dhtorch[{extra}]'")
 
 
 def set_opencv_threads(threads: int) -> None:
