@@ -411,7 +411,7 @@ def test_real_pairs_agree_with_opencv():
         assert len(distance) > 100, name
         assert np.median(distance) < 0.05, name
         assert (distance < 0.3).mean() > 0.95, name
-    assert np.mean(verdicts) > 0.93
+    assert np.mean(verdicts) > 0.95
 
 
 @pytest.mark.data

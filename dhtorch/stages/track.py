@@ -39,8 +39,8 @@ LANES = 64
 #: A map covers the offsets from -radius to radius + 1; larger on the coarsest level, where nothing is known yet.
 RADIUS, RADIUS_TOP = 1, 3
 
-#: Steps on the first maps of a level; one more map may use what is left of ``iterations``. Coarse, fine.
-STEPS_PER_MAP = ((8,), (6, 4, 4, 4))
+#: Steps on the first map of a level and on each further one, until ``iterations`` are used up.
+FIRST_STEPS, NEXT_STEPS = 8, 4
 
 #: Steps that all points of a map take together, before those that still move are picked out.
 STEPS_TOGETHER = 4
@@ -99,8 +99,8 @@ def lucas_kanade(
         pyramid_0: ``build_pyramid(image_0, levels, window)``, made once for an anchor tracked into many views.
         window: width in pixels, odd.
         levels: pyramid levels, full resolution included; fewer where a level would be no larger than the window.
-        iterations: most Gauss-Newton steps per level. A point that outruns its maps (two on a coarse level, five on the
-            finest) stops earlier.
+        iterations: most Gauss-Newton steps per level. A point that outruns its map waits for the next one, made after
+            step 8 and then after every fourth.
         epsilon_px: a shorter step has converged; on coarse levels, which only provide a start, four times that.
         normalise: ``none``; ``bias`` removes the means of both windows; ``gain_bias`` also their ratio of contrast.
         min_eigenvalue: of A / window² (grey values in [0, 1]); a window with less has too little texture.
@@ -110,9 +110,9 @@ def lucas_kanade(
         ``photometric`` the rms grey difference of the windows, in grey values of image 0, after normalisation; ``cov``
         is s² A⁻¹ with s² the residual variance, not below that of 8-bit rounding, and the small eigenvalue of A kept
         from vanishing: always finite, large without texture. It understates white noise, which reading between pixels
-        smooths out of the residual. ``valid``: inside image 1 on the finest level from start to end, textured, round trip below its limit.
-        Not valid: ``uv_1`` is the last position; for a ``uv_0`` outside the image where the search would have started,
-        with 0 for what is not finite.
+        smooths out of the residual. ``valid``: inside image 1 on the finest level from start to end, textured, round
+        trip below its limit. Not valid: ``uv_1`` is the last position; for a ``uv_0`` outside the image the start of
+        the search, with 0 for what is not finite.
 
     Raises:
         ValueError: wrong shapes or options, an image no larger than the window, a pyramid of another image or window.
@@ -236,14 +236,14 @@ def _descend(pair: _Pair, o: _Options, radius: int, x: Tensor, d: Tensor, batch:
 
     Returns the displacement, whether the window is textured (M,), and A (3, M).
     """
-    first, *rest = _split(o.iterations, STEPS_PER_MAP[pair.level == 0])
+    first = min(FIRST_STEPS, o.iterations)
     corner = pair.target.corner(pair.level, x + d) - radius
     C, moments = _map(pair, o, radius, x, corner, batch)
     A_inv, textured = _inverse(moments[2:5], o.min_eigenvalue * o.window**2)
     live = known & textured & _within(x + d, pair.low, pair.high)
     d, live = _on_map(pair, o, first, _steps(C, moments, A_inv), corner, x, d, live)
-    for steps in rest:
-        again = partial(_on_new_map, pair, o, radius, steps)
+    for done in range(first, o.iterations, NEXT_STEPS):
+        again = partial(_on_new_map, pair, o, radius, min(NEXT_STEPS, o.iterations - done))
         d, live = _for_some(live, again, (d, live), (x, d, batch, live, moments, A_inv))
     return d, textured, moments[2:5]
 
@@ -410,14 +410,6 @@ def _covariance(A: Tensor, variance: Tensor) -> Tensor:
 def _small_eigenvalue(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
     half = (a - c) / 2
     return (a + c) / 2 - (half * half + b * b).sqrt()
-
-
-def _split(total: int, parts: tuple[int, ...]) -> list[int]:
-    """``total`` as a list whose first entries are at most ``parts`` and whose last takes the rest; no zeros."""
-    sizes: list[int] = []
-    for part in (*parts, total):
-        sizes.append(min(part, total - sum(sizes)))
-    return [size for size in sizes if size]
 
 
 def _within(x: Tensor, low: Tensor, high: Tensor) -> Tensor:
