@@ -10,9 +10,10 @@ from contract import PROMISES, Row, equal, leaves, reorder, take, tensor_map
 
 import dhtorch
 from dhtorch.baselines.device_pose import given_pose
-from dhtorch.geometry import camera, epipolar, lookup, se3, steady
+from dhtorch.evaluate import holdout
+from dhtorch.geometry import camera, covariance, epipolar, least_squares, lookup, p3p, pyramid, ransac, se3, steady
 from dhtorch.records import Camera, Frame, Samples, Tracks
-from dhtorch.stages import backproject, holes, score, triangulate
+from dhtorch.stages import backproject, holes, pose, score, track, triangulate
 
 HW = (48, 64)
 
@@ -87,6 +88,47 @@ def two_views(batch, n, dtype):
     return tracks.uv_0, tracks.uv_1, camera_0, camera_1, fit.T_1_from_0
 
 
+def posed(batch, n, dtype):
+    """Seat 5: exact tracks, so that the pose does not depend on which points were drawn."""
+    samples, tracks, _, camera_0, camera_1 = tracked(batch, n, dtype, noise=0.0)
+    return samples, tracks, camera_0, camera_1, uniform(1, 64, 3, dtype=torch.float64).expand(batch, 64, 3)
+
+
+def shifted(batch, n, dtype):
+    """A band-limited picture and its copy moved by a few pixels."""
+    size = (batch, 1, HW[0] + 4, HW[1] + 4)
+    rough = uniform(*size, dtype=torch.float64, seed=7)
+    smooth = torch.nn.functional.avg_pool2d(rough, 5, 1, 2)
+    smooth = ((smooth - 0.5) * 4 + 0.5).clamp(0, 1).to(dtype)
+    return smooth[..., :-4, :-4], smooth[..., 2:-2, 1:-3], pixels(batch, n, dtype, margin=14.0)
+
+
+def judged(batch, n, dtype):
+    frame, samples = sampled(batch, n, dtype)
+    return samples, holdout.truth_at(frame, samples.uv), 1.0
+
+
+def planes(batch, n, dtype):
+    """Linearisation of the pose problem: the point axis is last."""
+    camera_1 = cameras(batch, dtype)
+    xyz, uv = uniform(batch, 3, n, dtype=dtype, low=1, high=2), uniform(batch, 2, n, dtype=dtype, high=60)
+    return poses(batch, dtype), camera_1.f, camera_1.c, xyz, uv
+
+
+def positive(batch, n, dtype):
+    A = uniform(batch, 6, 8, dtype=dtype)
+    return A @ A.mT + 0.1 * torch.eye(6, dtype=dtype)
+
+
+def symmetric_solve(M, b):
+    return least_squares.solve_spd(M + M.mT, b)
+
+
+def triples(batch, n, dtype):
+    Y = uniform(batch, n, 3, 3, dtype=dtype, low=0.5, high=2)
+    return Y / Y[..., 2:], Y
+
+
 def wrong_last_axis(position):
     """A call whose argument at ``position`` lacks its last column."""
     return lambda args: tuple(tensor_map(lambda v: v[..., :-1], a) if k == position else a for k, a in enumerate(args))
@@ -122,6 +164,7 @@ ROWS = [
     Row(se3.retract, lambda b, n, d: (poses(b, d), uniform(b, 6, dtype=d, low=-1)), POINTLESS + " raises", grad=(0, 1), bad=wrong_last_axis(1)),
     Row(se3.rotation_angle, lambda b, n, d: (poses(b, d).R,), POINTLESS, grad=(0,)),
     Row(lookup.patches, lambda b, n, d: (frames(b, n, d)[0].image, pixels(b, n, d).long(), 5), "dtype batch vmap capture gradcheck empty shuffle padding raises", (1,), (0,), bad=wrong_last_axis(1)),
+    Row(lookup.windows, lambda b, n, d: (frames(b, n, d)[0].depth, torch.arange(b)[:, None] * HW[0] * HW[1] + torch.arange(n) % 900, 5), "dtype capture gradcheck empty", grad=(0,)),
     Row(lookup.luma, lambda b, n, d: (frames(b, n, d)[0].image, 1), POINTLESS, grad=(0,)),
     Row(lookup.nearest, lambda b, n, d: (frames(b, n, d)[0].depth, pixels(b, n, d)), "dtype batch vmap capture gradcheck empty shuffle padding nan raises", (1,), (0,), bad=wrong_last_axis(1)),
     Row(lookup.round_half_up, lambda b, n, d: (pixels(b, n, d),), "dtype batch vmap capture empty shuffle padding nan", (0,)),
@@ -137,14 +180,38 @@ ROWS = [
     Row(triangulate.two_view, tracked, ALL, (0, 1), (1, 3, 4), bad=lambda a: (a[0], a[1].replace(uv_0=a[1].uv_0[:, 1:]), *a[2:])),
     Row(triangulate.first_reason, lambda b, n, d: (((uniform(b, n, dtype=d) > 0.5, 3), (uniform(b, n, dtype=d, seed=1) > 0.5, 5)),), "batch vmap capture empty shuffle padding", (0,)),
     Row(score.rank, estimated, ALL, (0, 1, 2), (0,), bad=lambda a: (a[0], a[1].replace(uv=a[1].uv[:, 1:]), *a[2:])),
+    Row(pose.pnp_ransac, posed, "dtype batch vmap capture empty padding raises", (0, 1), bad=lambda a: (a[0], a[1].replace(uv_1=a[1].uv_1[:, 1:]), *a[2:]), atol=1e-4),
+    Row(track.lucas_kanade, shifted, "dtype batch capture empty shuffle padding nan raises", (2,), bad=wrong_last_axis(2), atol=1e-4),
+    Row(track.refine, lambda b, n, d: (*shifted(b, n, d), shifted(b, n, d)[2] + 0.3), "dtype batch capture gradcheck empty shuffle padding nan raises", (2, 3), (0, 1), bad=wrong_last_axis(2), atol=1e-4),
+    Row(pyramid.build_pyramid, lambda b, n, d: (shifted(b, n, d)[0], 2, 9), "dtype batch capture"),
+    Row(p3p.p3p, triples, "dtype batch vmap capture shuffle padding", (0, 1), atol=1e-4),
+    Row(least_squares.linearise, planes, "dtype batch vmap capture gradcheck empty raises", grad=(0, 1, 2, 3, 4), bad=lambda a: (*a[:4], a[4][..., 1:])),
+    Row(least_squares.robust, lambda b, n, d: (uniform(b, n, dtype=d), "cauchy", 0.5), "dtype batch vmap capture gradcheck empty shuffle padding nan", (0,), (0,)),
+    Row(least_squares.gauss_newton_step, lambda b, n, d: (poses(b, d), positive(b, n, d), uniform(b, 6, dtype=d)), "dtype batch vmap capture"),
+    Row(least_squares.solve_spd, lambda b, n, d: (positive(b, n, d), uniform(b, 6, 1, dtype=d)), "dtype batch vmap capture"),
+    Row(least_squares.normal_equations, lambda b, n, d: (uniform(b, 7, 2, n - n % 16 + 16, dtype=d), uniform(b, n - n % 16 + 16, dtype=d)), "dtype batch vmap capture gradcheck", grad=(0, 1)),
+    Row(covariance.from_normal, lambda b, n, d: (positive(b, n, d), uniform(b, dtype=d, low=0.1)), "dtype batch vmap capture"),
+    Row(covariance.mahalanobis, lambda b, n, d: (uniform(b, 6, dtype=d), positive(b, n, d)), "dtype batch vmap capture"),
+    Row(ransac.collinear, lambda b, n, d: (uniform(b, 3, n, dtype=d), torch.ones(b, n, dtype=torch.bool)), "batch capture"),
+    Row(ransac.distinct_triples, lambda b, n, d: (uniform(b, 20, 3, dtype=d), torch.full((b,), n)), "batch vmap capture"),
+    Row(ransac.even_slots, lambda b, n, d: (torch.full((b,), n), 16), "batch vmap capture"),
+    Row(ransac.usable_first, lambda b, n, d: (uniform(b, n, dtype=d) > 0.5, 16), "batch vmap capture"),
+    Row(holdout.range_split, lambda b, n, d: (frames(b, n, d)[0], 1.02), "dtype batch vmap capture gradcheck", grad=(0,)),
+    Row(holdout.truth_at, frames, ALL, (1,), (0,), bad=wrong_last_axis(1)),
+    Row(holdout.candidates, judged, "dtype batch vmap capture empty shuffle raises", (0, 1), bad=lambda a: (a[0], a[1].replace(depth=a[1].depth[:, 1:]), a[2])),
 ]  # fmt: skip
 
-#: Samplers have neither batch nor data; their promises are tested in test_front_end.py.
+#: Functions without a batch of points: samplers, loops over a callable, flat lists of pooled points. Their promises are
+#: tested where they are at home (test_front_end.py, test_pose.py, test_evaluate.py).
 ELSEWHERE = {
-    "dhtorch.stages.sample.spiral",
-    "dhtorch.stages.sample.vogel",
-    "dhtorch.stages.sample.grid",
+    *(f"dhtorch.stages.sample.{name}" for name in ("spiral", "vogel", "grid")),
     "dhtorch.geometry.shapes.check",
+    "dhtorch.geometry.least_squares.minimise",
+    *(f"dhtorch.geometry.ransac.{name}" for name in ("msac_cost", "search")),
+    *(f"dhtorch.evaluate.errors.{name}" for name in ("points", "select", "measure", "summarise", "unit")),
+    *(f"dhtorch.evaluate.risk.{name}" for name in ("curve", "risk_coverage", "measure", "capped")),
+    *(f"dhtorch.evaluate.calibrate.{name}" for name in ("reliability", "pool", "measure")),
+    *(f"dhtorch.evaluate.bootstrap.{name}" for name in ("interval", "resample")),
 }
 
 
@@ -239,9 +306,9 @@ def test_shuffled_points_shuffle_the_answers(row):
 
 @named("padding")
 def test_more_points_change_nothing_for_the_others(row):
-    args = row.make(2, 9, torch.float64)
-    few = reorder(args, row, torch.arange(6))
-    cut = tensor_map(lambda v: v[:, :6] if v.dim() > 1 and v.shape[1] == 9 else v, row.fn(*args))
+    args = row.make(2, 24, torch.float64)
+    few = reorder(args, row, torch.arange(17))
+    cut = tensor_map(lambda v: v[:, :17] if v.dim() > 1 and v.shape[1] == 24 else v, row.fn(*args))
     equal(cut, row.fn(*few), atol=row.atol)
 
 
