@@ -1,0 +1,222 @@
+"""Frames of a video file by their number or their time, at constant memory.
+
+Frame ``i`` is the ``i``-th *to be shown*, whatever the order in the file. A table of presentation times, made by
+reading the packets once without decoding them, says which one that is; so a picture that cannot be decoded is an error
+and never shifts its successors. Reading in order decodes every frame once, reading elsewhere starts at the key frame
+before.
+
+Decoders stay open, a few per process, and are found by file name: whoever holds a path can be pickled, and a forked
+worker opens its own.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import OrderedDict
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dhtorch.data.files import FormatError, need
+
+MAX_VIDEO_PIXELS = 36_000_000  # 8K; a decoder holds up to 17 pictures
+_MAX_FRAMES = 10_000_000
+_MAX_OPEN = 8  # decoders in a process
+_SEEK_AHEAD = 60  # frames: nearer than this, decoding on is cheaper than starting at a key frame
+
+
+class VideoHeader(NamedTuple):
+    """What a video file says about itself."""
+
+    hw: tuple[int, int]  # as stored: a rotation tag is not applied
+    n: int  # frames by the index; a truncated file has fewer
+    rate_hz: float | None
+    codec: str
+    pixels: str  # format of the stored pixels, such as yuv420p
+
+
+def video_header(file: Path, *, all_frames: bool = False) -> VideoHeader:
+    """Size, number of frames and rate of a video, without decoding any.
+
+    Args:
+        file: the video.
+        all_frames: count also frames that an edit list hides, such as one stamped before time 0.
+
+    Raises:
+        FormatError: missing or unknown file, no video stream, or an absurd size.
+        ImportError: no decoder is installed.
+    """
+    return _decoder(file, all_frames).header
+
+
+def video_times(file: Path, *, all_frames: bool = False) -> np.ndarray:
+    """Presentation time (n,) s of every frame, increasing. Reads all packets once, decodes none.
+
+    Raises:
+        FormatError: as :func:`video_header`, or packets that have no time.
+    """
+    decoder = _decoder(file, all_frames)
+    return decoder.table() * float(decoder.stream.time_base)
+
+
+def read_video_frame(
+    file: Path,
+    i: int,
+    hw: tuple[int, int] | None = None,
+    *,
+    pixels: str = "rgb24",
+    nearest: bool = False,
+    all_frames: bool = False,
+) -> np.ndarray:
+    """Frame ``i`` as stored (a rotation tag is not applied), in the array layout of the pixel format.
+
+    Args:
+        file: the video.
+        i: place in the order of presentation, from 0.
+        hw: the size to insist on.
+        pixels: ``rgb24`` gives (h, w, 3) uint8, ``gray`` (h, w) uint8, ``gray16le`` and ``gray12le`` (h, w) uint16.
+        nearest: repeat colour samples that are stored at a lower resolution, instead of interpolating them.
+        all_frames: count also frames that an edit list hides.
+
+    Raises:
+        FormatError: as :func:`video_header`, another size than ``hw``, or a frame that is not there or not decodable.
+    """
+    decoder = _decoder(file, all_frames)
+    frame = decoder.frame(i)
+    wanted = tuple(hw) if hw is not None else decoder.header.hw
+    if (frame.height, frame.width) != wanted:
+        raise FormatError(file, f"frame {i} size", f"{frame.width}x{frame.height}", f"{wanted[1]}x{wanted[0]}")
+    try:
+        return np.asarray(frame.to_ndarray(format=pixels, interpolation="POINT" if nearest else "BICUBIC"))
+    except decoder.errors as error:
+        raise FormatError(file, f"frame {i}", error, f"pixels that convert to {pixels}") from None
+
+
+def count_decodable(file: Path, *, all_frames: bool = False) -> int:
+    """Frames that really decode, by decoding them all; compare with ``video_header(file).n``."""
+    decoder = _decoder(file, all_frames)
+    found = 0
+    for i in range(len(decoder.table())):
+        with suppress(FormatError):
+            decoder.frame(i)
+            found += 1
+    return found
+
+
+def close_videos() -> None:
+    """Close the decoders of this process."""
+    for decoder in _open.values():
+        decoder.container.close()
+    _open.clear()
+
+
+class _Decoder:
+    """One open video and the place where it stands."""
+
+    def __init__(self, file: Path, all_frames: bool) -> None:
+        self.file = file
+        self.pts: np.ndarray | None = None
+        self.keys = np.empty((0, 2), np.int64)  # presentation and decoding stamp of the key frames
+        self.frames: Iterator[Any] = iter(())
+        self.next = -1  # number of the frame that comes next; −1 = unknown
+        av = need("av")
+        self.errors: tuple[type[Exception], ...] = (av.FFmpegError, ValueError, MemoryError, OverflowError, EOFError)
+        if not file.is_file():
+            raise FormatError(file, "file", "no such file", "a video")
+        limits = {"max_pixels": str(MAX_VIDEO_PIXELS)}
+        edits = {"advanced_editlist": "0"} if all_frames else {}
+        try:
+            self.container = av.open(str(file), options=limits, container_options=edits)
+        except self.errors as error:
+            raise FormatError(file, "content", error, "a video file") from None
+        try:
+            self.header = self._start()
+        except self.errors as error:
+            self.container.close()
+            raise error if isinstance(error, FormatError) else FormatError(file, "header", error, "a video") from None
+
+    def _start(self) -> VideoHeader:
+        if not self.container.streams.video:
+            raise FormatError(self.file, "streams", "no video", "a video stream")
+        self.stream = self.container.streams.video[0]
+        context = self.stream.codec_context
+        if context is None:
+            raise FormatError(self.file, "codec", "an unknown one", "one that decodes")
+        context.thread_count = 1  # a data loader has its own workers
+        h, w = context.height, context.width
+        if not 0 < h * w <= MAX_VIDEO_PIXELS:
+            raise FormatError(self.file, "size", f"{w}x{h}", f"1 to {MAX_VIDEO_PIXELS} pixels")
+        shown = [entry for entry in self.stream.index_entries if not entry.is_discard]
+        n = len(shown) if len(self.stream.index_entries) >= self.stream.frames > 0 else len(self.table())
+        if not 0 < n <= _MAX_FRAMES or self.stream.time_base is None:
+            raise FormatError(self.file, "frames", n, f"1 to {_MAX_FRAMES}, with a time base")
+        rate = self.stream.average_rate
+        return VideoHeader((h, w), n, float(rate) if rate else None, context.name, context.pix_fmt or "unknown")
+
+    def table(self) -> np.ndarray:
+        """(n,) int64 presentation stamps in time-base units, increasing; fills ``keys`` on the way."""
+        if self.pts is None:
+            try:
+                self.container.seek(0, stream=self.stream)
+                packets = [
+                    (p.pts, p.dts if p.dts is not None else p.pts, p.is_keyframe, p.is_discard)
+                    for p in self.container.demux(self.stream)
+                    if p.size and p.pts is not None
+                ]
+            except self.errors as error:
+                raise FormatError(self.file, "packets", error, "a whole video") from None
+            shown = [pts for pts, _, _, hidden in packets if not hidden]
+            keys = sorted((pts, dts) for pts, dts, key, _ in packets if key)
+            self.pts, self.keys = np.unique(np.array(shown, np.int64)), np.array(keys, np.int64).reshape(-1, 2)
+            self.next = -1
+        return self.pts
+
+    def frame(self, i: int) -> Any:
+        """The decoded frame of number ``i``."""
+        pts = self.table()
+        if not 0 <= i < len(pts):
+            raise FormatError(self.file, f"frame {i}", f"{len(pts)} frames", f"{self.header.n} frames")
+        try:
+            if not 0 <= self.next <= i <= self.next + _SEEK_AHEAD:
+                self._seek(int(pts[i]))
+            for frame in self.frames:
+                if frame.pts is None or frame.pts < pts[i]:
+                    continue
+                self.next = i + 1
+                if frame.pts == pts[i]:
+                    return frame
+                break
+        except self.errors as error:
+            self.next = -1
+            raise FormatError(self.file, f"frame {i}", error, "a decodable frame") from None
+        self.next = -1
+        raise FormatError(self.file, f"frame {i}", "nothing", "a decodable frame")
+
+    def _seek(self, pts: int) -> None:
+        """To the last key frame shown at or before ``pts``; one decoded earlier but shown later does not lead there."""
+        before = int(np.searchsorted(self.keys[:, 0], pts, "right")) - 1
+        start = int(self.keys[before, 1]) if before >= 0 else int(self.table()[0])
+        self.container.seek(start, stream=self.stream, backward=True)
+        self.frames = self.container.decode(self.stream)
+
+
+_open: OrderedDict[tuple[Path, bool, int, int], _Decoder] = OrderedDict()
+
+
+def _decoder(file: Path, all_frames: bool) -> _Decoder:
+    """An open decoder of this process. A fork shares the file's position with its parent, so it never shares one."""
+    try:
+        changed = file.stat().st_mtime_ns
+    except (OSError, ValueError) as error:
+        found = "no such file" if isinstance(error, FileNotFoundError) else error
+        raise FormatError(file, "file", found, "a video") from None
+    key = (file, all_frames, changed, os.getpid())
+    if key not in _open:
+        while len(_open) >= _MAX_OPEN:
+            _open.popitem(last=False)[1].container.close()
+        _open[key] = _Decoder(file, all_frames)
+    _open.move_to_end(key)
+    return _open[key]
