@@ -121,6 +121,74 @@ def to_c2w(
     return c2w
 
 
+def to_quaternions(
+    rotation: np.ndarray,  # (n, 3) rad, axis times angle
+) -> np.ndarray:
+    """Unit quaternions (n, 4) of rotation vectors."""
+    half = np.linalg.norm(rotation, axis=-1, keepdims=True) / 2
+    return np.concatenate((rotation * np.sinc(half / np.pi) / 2, np.cos(half)), -1)
+
+
+def slerp(
+    a: np.ndarray,  # (n, 4) unit quaternions
+    b: np.ndarray,  # (n, 4)
+    share: np.ndarray,  # (n,) of the way from a to b
+) -> np.ndarray:
+    """Rotations (n, 4) on the shortest way from ``a`` to ``b``, at constant speed."""
+    dot = (a * b).sum(-1)
+    b = np.where(dot < 0, -1.0, 1.0)[:, None] * b  # q and −q are one rotation
+    angle = np.arctan2(np.linalg.norm(b - a, axis=-1), np.linalg.norm(b + a, axis=-1)) * 2
+    scale = np.sinc(angle / np.pi)  # sin(angle) / angle, no division by zero where the two coincide
+    weight_a = (1 - share) * np.sinc((1 - share) * angle / np.pi) / scale
+    weight_b = share * np.sinc(share * angle / np.pi) / scale
+    return weight_a[:, None] * a + weight_b[:, None] * b
+
+
+def turn_camera(camera: Camera, hw: tuple[int, int], turns: int) -> Camera:
+    """Camera of the picture of size ``hw`` after ``turns`` quarter turns clockwise; see :func:`turn_pose`."""
+    for _ in range(turns % 4):
+        c = torch.stack((hw[0] - 1 - camera.c[:, 1], camera.c[:, 0]), -1)
+        lens = camera.distortion
+        if lens is not None:  # the tangential pair turns with the axes
+            lens = torch.cat((lens[:, :2], lens[:, 3:4], -lens[:, 2:3], lens[:, 4:]), -1)
+        camera, hw = camera.replace(f=camera.f.flip(-1), c=c, distortion=lens), (hw[1], hw[0])
+    return camera
+
+
+def turn_pose(
+    c2w: np.ndarray,  # (n, 4, 4)
+    turns: int,
+) -> np.ndarray:
+    """Camera-to-world of a picture after ``turns`` quarter turns clockwise: the camera rolls, the world stays."""
+    quarter = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    return c2w @ np.linalg.matrix_power(quarter, turns % 4)
+
+
+def turn_picture(x: Tensor, turns: int) -> Tensor:
+    """The picture (…, H, W) after ``turns`` quarter turns clockwise."""
+    return torch.rot90(x, -turns % 4, (-2, -1)).contiguous()
+
+
+def resample_depth(
+    depth: Tensor,  # (h, w) m, 0 = no return
+    depth_camera: Camera,  # B = 1, no distortion
+    camera: Camera,  # B = 1, no distortion, same place, same axes
+    hw: tuple[int, int],
+) -> Tensor:
+    """Depth (H, W) at the pixel centres of ``camera``: the nearest pixel of the map, nothing blended; 0 outside it."""
+    if camera.distortion is not None or depth_camera.distortion is not None:
+        raise ValueError("resample_depth: found a camera with distortion, expected ideal ones")
+
+    def places(axis: int, count: int, size: int) -> tuple[Tensor, Tensor]:
+        ray = (torch.arange(count, dtype=torch.float64) - camera.c[0, axis]) / camera.f[0, axis]
+        at = round_half_up(ray * depth_camera.f[0, axis] + depth_camera.c[0, axis])
+        return at.clamp(0, size - 1).long(), (at >= 0) & (at <= size - 1)
+
+    (v, inside_v), (u, inside_u) = places(1, hw[0], depth.shape[0]), places(0, hw[1], depth.shape[1])
+    found = depth.index_select(0, v).index_select(1, u)
+    return torch.where(inside_v[:, None] & inside_u, found, torch.zeros_like(found))
+
+
 def cv_from_gl(
     c2w: np.ndarray,  # (n, 4, 4) pose of a camera with GL axes
 ) -> np.ndarray:

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -52,9 +53,9 @@ class Recording(Sequence[Frame]):
             "times": n if self.times is None else self.times.shape[0],
             "poses": n if self.poses is None else self.poses.t.shape[0],
         }
-        for field, length in lengths.items():
+        for what, length in lengths.items():
             if length != n:
-                raise ValueError(f"recording {self.name}: found {length} {field}, expected one for each of {n} frames")
+                raise ValueError(f"recording {self.name}: found {length} {what}, expected one for each of {n} frames")
         if not bool((self.number.diff() > 0).all()):
             raise ValueError(f"recording {self.name}: number must increase strictly from frame to frame")
 
@@ -62,10 +63,7 @@ class Recording(Sequence[Frame]):
         return self.number.shape[0]
 
     def __getitem__(self, index: int) -> Frame:  # type: ignore[override]  # one frame at a time: slices would decode
-        i, n = operator.index(index), len(self)
-        if not -n <= i < n:
-            raise IndexError(f"recording {self.name}: frame {i} of {n}")
-        i %= n
+        i = self._position(index)
         frame = self.load(i)
         return frame.replace(
             time=None if self.times is None else self.times[i : i + 1],
@@ -73,7 +71,35 @@ class Recording(Sequence[Frame]):
         )
 
     def __repr__(self) -> str:
-        return f"Recording({self.name!r}, {self.format}, {len(self)} frames)"
+        return f"{type(self).__name__}({self.name!r}, {self.format}, {len(self)} frames)"
+
+    def _position(self, index: int) -> int:
+        i, n = operator.index(index), len(self)
+        if not -n <= i < n:
+            raise IndexError(f"recording {self.name}: frame {i} of {n}")
+        return i % n
+
+
+@dataclass(frozen=True, eq=False)
+class TruthRecording(Recording):
+    """A recording that also knows the depth measured by another, better instrument: its own sensor is not its judge."""
+
+    surfaces: ClassVar[dict[int, str]] = {0: "ordinary"}  # values of ``truth(i)["surface"]``
+    odd_surfaces: ClassVar[tuple[str, ...]] = ()
+
+    load_truth: Callable[[int], tuple[Tensor, float]] = field(kw_only=True)  # position → depth (H, W), disagreement
+
+    def truth(self, index: int) -> dict[str, Tensor]:
+        """What is really there at the centre of every image pixel of frame ``index``, as far as it was measured.
+
+        Returns:
+            ``depth`` (1, H, W) m float32, 0 where it is not known; ``surface`` (1, H, W) uint8, all 0: kinds of
+            surface are not told apart; ``disagreement`` (1,), median relative difference from the frame's own sensor
+            where both answer, NaN where they share no pixel. A truth that was rejected for it is 0 everywhere.
+        """
+        depth, disagreement = self.load_truth(self._position(index))
+        surface = torch.zeros(1, *depth.shape, dtype=torch.uint8)
+        return {"depth": depth[None], "surface": surface, "disagreement": torch.tensor([disagreement])}
 
 
 def numbers(n: int) -> Tensor:
