@@ -1,0 +1,246 @@
+"""Parquet tables: some columns of some rows as arrays, without reading the rest of the file.
+
+The footer is checked before the decoder sees it, and every column chunk before it is decoded: the sizes in its page
+headers must add up to what the footer promised and stay below a limit, so that a page cannot unpack into gigabytes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dhtorch.data.files import MAX_BYTES, MAX_TEXT_BYTES, FormatError, need
+
+MAX_ROWS = 50_000_000
+_MAX_CHUNK_BYTES = 1 << 30  # of one column in one row group, unpacked
+
+
+class ParquetHeader(NamedTuple):
+    """What a table says about itself."""
+
+    rows: int
+    columns: tuple[str, ...]
+    groups: tuple[int, ...]  # first row of each row group, and one beyond the last row
+
+
+def parquet_header(file: Path) -> ParquetHeader:
+    """Rows, columns and row groups of a table, from its footer alone.
+
+    Raises:
+        FormatError: missing, truncated or damaged file, or more than ``MAX_ROWS`` rows.
+        ImportError: no decoder is installed.
+    """
+    return _open(file)[1]
+
+
+def read_columns(
+    file: Path,
+    columns: Sequence[str],
+    rows: tuple[int, int] | None = None,
+) -> dict[str, np.ndarray | list[Any]]:
+    """Columns of the rows ``first`` to ``end`` (exclusive), decoding only the row groups that hold them.
+
+    Returns:
+        For each name an array (rows, …) of numbers, or a list where the column holds texts, bytes or structures. Lists
+        of numbers of one length, nested as deep as they like, become the further axes of the array.
+
+    Raises:
+        FormatError: as :func:`parquet_header`; no such column or rows, values missing, or lists of unequal length.
+        ImportError: no decoder is installed.
+    """
+    table, header = _open(file)
+    first, end = rows or (0, header.rows)
+    missing = [name for name in columns if name not in header.columns]
+    if missing:
+        raise FormatError(file, "columns", ", ".join(header.columns), ", ".join(missing))
+    if not 0 <= first <= end <= header.rows:
+        raise FormatError(file, "rows", header.rows, f"rows {first} to {end - 1}")
+    spans = list(zip(header.groups, header.groups[1:], strict=False))
+    wanted = [i for i, (low, high) in enumerate(spans) if low < end and high > first]
+    _check_pages(file, table, columns, wanted)
+    pyarrow = need("pyarrow")
+    try:
+        got = table.read_row_groups(wanted, columns=list(columns), use_threads=False)
+        start = first - (spans[wanted[0]][0] if wanted else 0)
+        if wanted and got.num_rows != spans[wanted[-1]][1] - spans[wanted[0]][0]:
+            raise FormatError(file, "rows", got.num_rows, "as many as the footer says")
+        part = got.slice(start, end - first)
+        return {name: _array(part.column(name).combine_chunks(), file, name) for name in columns}
+    except (pyarrow.ArrowException, OSError, ValueError, TypeError, KeyError, MemoryError) as error:
+        if isinstance(error, FormatError):
+            raise
+        raise FormatError(file, "data", error, "decodable columns") from None
+
+
+def _open(file: Path) -> tuple[Any, ParquetHeader]:
+    size = _footer_size(file)
+    pyarrow, parquet = need("pyarrow"), need("pyarrow.parquet")
+    limits = {"thrift_string_size_limit": size, "thrift_container_size_limit": max(size, 1)}
+    try:
+        table = parquet.ParquetFile(file, memory_map=False, pre_buffer=False, **limits)
+        meta = table.metadata
+        counts = [meta.row_group(i).num_rows for i in range(meta.num_row_groups)]
+        names = tuple(table.schema_arrow.names)
+    except (pyarrow.ArrowException, OSError, ValueError, TypeError, KeyError, MemoryError) as error:
+        raise FormatError(file, "footer", error, "a whole parquet file") from None
+    if min(counts, default=0) < 0 or sum(counts) != meta.num_rows or meta.num_rows > MAX_ROWS:
+        raise FormatError(file, "footer", f"{meta.num_rows} rows in groups of {counts[:4]}", f"at most {MAX_ROWS}")
+    starts = np.cumsum([0, *counts]).tolist()
+    return table, ParquetHeader(meta.num_rows, names, tuple(starts))
+
+
+def _footer_size(file: Path) -> int:
+    try:
+        size = file.stat().st_size
+        with file.open("rb") as stream:
+            head = stream.read(4)
+            stream.seek(max(size - 8, 0))
+            tail = stream.read(8)
+    except (OSError, ValueError) as error:
+        found = "no such file" if isinstance(error, FileNotFoundError) else error
+        raise FormatError(file, "file", found, "a readable file") from None
+    length = int.from_bytes(tail[:4], "little")
+    if size < 12 or head != b"PAR1" or tail[4:] != b"PAR1" or not 0 < length <= min(size - 12, MAX_TEXT_BYTES):
+        raise FormatError(file, "file", f"{size} bytes from {head!r} to {tail[4:]!r}", "a whole parquet file")
+    return length
+
+
+# ----------------------------------------------------------------------------------------------------------- values
+
+
+def _array(column: Any, file: Path, name: str) -> np.ndarray | list[Any]:
+    """Arrow's nested lists → the axes of an array."""
+    types = need("pyarrow.types")
+    if column.null_count:
+        raise FormatError(file, name, f"{column.null_count} missing values", "a value in every row")
+    kind = getattr(column.type, "storage_type", column.type)
+    column = getattr(column, "storage", column)
+    if types.is_integer(kind) or types.is_floating(kind) or types.is_boolean(kind):
+        return column.to_numpy(zero_copy_only=False)
+    if not (types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind)):
+        return column.to_pylist()
+    count = len(column)
+    inner = _array(column.flatten(), file, name)
+    if isinstance(inner, list):
+        return column.to_pylist()
+    if types.is_fixed_size_list(kind):
+        width = kind.list_size
+    else:
+        widths = np.diff(column.offsets.to_numpy())
+        width = int(widths[0]) if count else 0
+        if (widths != width).any():
+            raise FormatError(file, name, "lists of unequal length", "one length for all rows")
+    if len(inner) != count * width:
+        raise FormatError(file, name, f"{len(inner)} numbers", f"{width} for each of {count} rows")
+    return inner.reshape(count, width, *inner.shape[1:])
+
+
+# ------------------------------------------------------------------------------------------------------------ pages
+
+
+def _check_pages(file: Path, table: Any, columns: Sequence[str], groups: Sequence[int]) -> None:
+    """Refuse a chunk whose pages, by their own headers, unpack into more than the footer says or than the limit."""
+    meta = table.metadata
+    total = 0
+    with file.open("rb") as stream:
+        for g in groups:
+            group = meta.row_group(g)
+            for i in range(group.num_columns):
+                chunk = group.column(i)
+                if not any(
+                    chunk.path_in_schema == name or chunk.path_in_schema.startswith(f"{name}.") for name in columns
+                ):
+                    continue
+                total += _chunk_bytes(file, stream, chunk)
+                if total > _MAX_CHUNK_BYTES:
+                    raise FormatError(file, chunk.path_in_schema, f"{total} bytes", f"at most {_MAX_CHUNK_BYTES}")
+
+
+def _chunk_bytes(file: Path, stream: Any, chunk: Any) -> int:
+    """Bytes that the pages of one column chunk unpack into."""
+    start = chunk.data_page_offset
+    if chunk.has_dictionary_page and 0 < (chunk.dictionary_page_offset or 0) < start:
+        start = chunk.dictionary_page_offset
+    size, values, unpacked = chunk.total_compressed_size, 0, 0
+    width = {"INT32": 4, "FLOAT": 4, "INT96": 12, "BOOLEAN": 1}.get(chunk.physical_type, 8)
+    if start < 4 or not 0 <= size <= MAX_BYTES:
+        raise FormatError(file, chunk.path_in_schema, f"{size} bytes at {start}", "a column inside the file")
+    stream.seek(start)
+    data = stream.read(size)
+    at = 0
+    while at < len(data) and values < chunk.num_values:
+        try:
+            page, at = _thrift(data, at)
+            full, packed = int(page[2]), int(page[3])
+            inner = page.get(5) or page.get(8) or {}
+            dictionary = page.get(7) or {}
+            count = int(inner.get(1, 0))
+        except (IndexError, KeyError, TypeError, ValueError, RecursionError) as error:
+            raise FormatError(file, chunk.path_in_schema, f"a page header: {error}", "a whole page") from None
+        if min(full, packed, count) < 0 or packed > len(data) - at or full > chunk.total_uncompressed_size:
+            found = f"a page of {packed} bytes that unpack into {full}"
+            raise FormatError(file, chunk.path_in_schema, found, f"at most {chunk.total_uncompressed_size}")
+        values += count
+        unpacked += max(full, width * max(count, int(dictionary.get(1, 0))))
+        at += packed
+    if values != chunk.num_values or not math.isfinite(unpacked):
+        raise FormatError(file, chunk.path_in_schema, f"pages of {values} values", chunk.num_values)
+    return unpacked
+
+
+def _thrift(data: bytes, at: int, depth: int = 0) -> tuple[dict[int, Any], int]:
+    """A structure in Thrift's compact protocol: field number → value (structures nested), and where it ends."""
+    if depth > 8:
+        raise ValueError("structures nested too deep")
+    fields: dict[int, Any] = {}
+    number = 0
+    while True:
+        head = data[at]
+        at += 1
+        if head == 0:
+            return fields, at
+        kind, step = head & 15, head >> 4
+        if step:
+            number += step
+        else:
+            number, at = _zigzag(data, at)
+        fields[number], at = _thrift_value(data, at, kind, depth)
+
+
+def _thrift_value(data: bytes, at: int, kind: int, depth: int) -> tuple[Any, int]:
+    if kind in (1, 2):  # true and false have no bytes of their own
+        return kind == 1, at
+    if kind == 3:
+        return data[at], at + 1
+    if kind in (4, 5, 6):
+        return _zigzag(data, at)
+    if kind == 7:
+        return None, at + 8
+    if kind == 8:
+        length, at = _varint(data, at)
+        if length > len(data) - at:
+            raise ValueError("a text beyond the end")
+        return data[at : at + length], at + length
+    if kind == 12:
+        return _thrift(data, at, depth + 1)
+    raise ValueError(f"a field of type {kind}")
+
+
+def _varint(data: bytes, at: int) -> tuple[int, int]:
+    value = 0
+    for shift in range(0, 70, 7):
+        byte = data[at]
+        at += 1
+        value |= (byte & 127) << shift
+        if byte < 128:
+            return value, at
+    raise ValueError("an endless number")
+
+
+def _zigzag(data: bytes, at: int) -> tuple[int, int]:
+    value, at = _varint(data, at)
+    return (value >> 1) ^ -(value & 1), at
