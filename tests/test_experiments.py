@@ -1,0 +1,143 @@
+"""The main job and the method comparison, on the exact room and on the real scenes."""
+
+import os
+from functools import partial
+from pathlib import Path
+
+import hydra
+import pytest
+import torch
+from hydra.utils import instantiate
+
+from dhtorch import data
+from dhtorch.codes import Gate, names
+from dhtorch.data.pairs import by_gap
+from dhtorch.data.synthetic import SyntheticRoom
+from dhtorch.experiments import method_comparison, pair
+from dhtorch.run import config_dir
+
+ROOT = os.environ.get("DHTORCH_DATA")
+
+
+def method(name):
+    with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
+        return instantiate(hydra.compose("run", [f"method={name}"]).method, _convert_="all")
+
+
+def scene_row(outcome, **wanted):
+    (row,) = (r for r in outcome.rows if r["pair"] is None and all(r[k] == v for k, v in wanted.items()))
+    return row
+
+
+def test_exact_room_without_sensor_noise():
+    """Median error of recovered far depth < 1 %, silently wrong < 0.5 %; mirror and window are counted apart."""
+    room = SyntheticRoom(lidar="exact", image_noise=0.0)
+    row = scene_row(pair.run([room], {"paper": method("paper")}, by_gap, pair.Settings()))
+    assert row["n_pairs"] == 6 and row["n_candidates"] > 1500
+    assert row["median_rel"] < 0.01 and row["wrong_share"] < 0.005, row
+    assert set(row["apart"]) == {"mirror", "window"} and row["apart"]["mirror"]["n_candidates"] > 20
+    assert row["apart"]["mirror"]["wrong_share"] > 0.5, "what is seen in a mirror lies behind it"
+    assert row["n_dropped"]["excluded"] == sum(row["apart"][k]["n_candidates"] for k in ("mirror", "window"))
+
+
+def test_room_with_the_phone_lidar():
+    room = SyntheticRoom()
+    outcome = pair.run([room], {"paper": method("paper")}, by_gap, pair.Settings())
+    row = scene_row(outcome)
+    assert row["coverage"] > 0.3 and row["median_rel"] < 0.1, row
+    shares = row["hole_share"]
+    assert abs(sum(shares.values()) - 1) < 1e-6 and shares["trackable_no_lidar"] > 0.5
+    assert set(row["gate_share"]) == {g.lower() for g in names(Gate).values()}
+    assert outcome.summary["median_rel"]["value"] == row["median_rel"]
+    assert outcome.examples[0].scene == "synthetic_room" and outcome.n_pairs == 6
+
+
+def small(**options):
+    return SyntheticRoom(hw=(120, 160), n_frames=4, **options)
+
+
+def test_without_a_cutoff_there_is_no_truth():
+    outcome = pair.run(
+        [small()], {"paper": method("paper")}, partial(by_gap, gap=2), pair.Settings(cutoff=float("inf"))
+    )
+    row = scene_row(outcome)
+    assert row["n_candidates"] == 0 and row["median_rel"] is None and row["n_pairs"] == 2
+    assert row["pnp_success"] == 1.0 and row["n_recovered"] > 0
+
+
+def test_pairs_with_few_candidates_are_dropped_and_counted():
+    outcome = pair.run([small()], {"paper": method("paper")}, partial(by_gap, gap=2), pair.Settings(cutoff=50.0))
+    row = scene_row(outcome)
+    assert row["n_few"] == 2 and row["n_pairs"] == 0 and "median_rel" not in row
+
+
+def test_a_rotation_scene_never_enters_the_summary():
+    rotation = small(path="rotation", lidar="exact")
+    outcome = pair.run([rotation], {"paper": method("paper")}, partial(by_gap, gap=2), pair.Settings())
+    assert scene_row(outcome)["role"] == "rotation" and outcome.summary == {}
+
+
+def test_candidates_do_not_depend_on_the_method():
+    methods = {name: method(name) for name in ("paper", "opencv")}
+    outcome = method_comparison.run(
+        [small(lidar="exact")], {}, partial(by_gap, gap=2), pair.Settings(), methods=methods
+    )
+    for truth in ("raw", "5x5", "full"):
+        a, b = (scene_row(outcome, method=m, truth=truth) for m in methods)
+        assert a["n_candidates"] == b["n_candidates"] and a["n_dropped"] == b["n_dropped"]
+    counts = [scene_row(outcome, method="paper", truth=t)["n_candidates"] for t in ("raw", "5x5", "full")]
+    assert counts[0] > counts[1] > counts[2]
+    assert {"paper.median_rel", "opencv.median_rel", "paper.raw.median_rel"} <= set(outcome.summary)
+    assert outcome.verdict in ("supported", "refuted") and outcome.why
+
+
+def test_verdict_goes_either_way():
+    def row(scene, method, median, coverage):
+        return {
+            "scene": scene,
+            "pair": None,
+            "method": method,
+            "truth": "full",
+            "role": None,
+            "median_rel": median,
+            "coverage": coverage,
+        }
+
+    rows = [
+        row("a", "ours", 0.05, 0.5),
+        row("a", "ref", 0.05, 0.5),
+        row("b", "ours", 0.056, 0.5),
+        row("b", "ref", 0.05, 0.5),
+    ]
+    assert method_comparison.compare(rows[:2], "ours", "ref", "full", 0.1) == (1, [])
+    compared, worse = method_comparison.compare(rows, "ours", "ref", "full", 0.1)
+    assert compared == 2 and len(worse) == 1 and "b median_rel" in worse[0]
+    assert method_comparison.compare([*rows[:1], row("a", "ref", 0.05, 0.6)], "ours", "ref", "full", 0.1)[1]
+    with pytest.raises(ValueError, match=r"experiment\.methods"):
+        method_comparison.run([], {"paper": method("paper")}, by_gap, pair.Settings())
+
+
+@pytest.mark.data
+@pytest.mark.skipif(not ROOT, reason="DHTORCH_DATA is not set")
+@pytest.mark.parametrize(
+    ("name", "near", "gap", "median"),
+    [("holo_a", 2.5, 3, 0.08), ("tum_fr1_desk9", 1.0, 4, 0.15), ("middlebury_motorcycle", 2.8, 1, 0.08)],
+)
+def test_real_scenes_give_far_depth(name, near, gap, median):
+    recording = data.open(Path(ROOT) / name, near=near, gap=gap)
+    stride = 8 if len(recording) > 20 else 1
+    row = scene_row(pair.run([recording], {"paper": method("paper")}, partial(by_gap, stride=stride), pair.Settings()))
+    assert row["coverage"] > 0.2 and row["median_rel"] < median and row["pnp_success"] > 0.7, row
+
+
+@pytest.mark.data
+@pytest.mark.skipif(not ROOT, reason="DHTORCH_DATA is not set")
+def test_alone_or_in_a_batch_the_rows_of_a_real_scene_are_equal():
+    torch.set_num_threads(1)
+    recording = data.open(Path(ROOT) / "tum_fr1_desk9", near=1.0, gap=4)
+    rows = []
+    for batch, workers in ((1, 0), (5, 2)):
+        settings = pair.Settings(batch=batch, workers=workers)
+        outcome = pair.run([recording], {"paper": method("paper")}, by_gap, settings)
+        rows.append([{k: v for k, v in r.items() if k != "ms"} for r in outcome.rows])
+    assert rows[0] == rows[1]
