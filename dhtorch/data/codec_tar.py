@@ -1,0 +1,126 @@
+"""Tar archives read in place: where every member lies, and its bytes. Nothing is unpacked, so no name leads anywhere.
+
+One walk over the headers makes the index; a header that is damaged, or a member that would end beyond the archive, ends
+the walk with a ``FormatError``. Understood are the old, ustar, GNU (long names) and pax (path, size) headers, not
+compressed; members that are no plain files (folders, links, devices) are passed over.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from dhtorch.data.files import MAX_BYTES, FormatError
+
+_BLOCK = 512
+_MAX_NAME_BYTES = 1_000_000  # of a long name or a pax header
+_FILES, _PAX, _LONG_NAME, _SPARSE = b"0\x007", b"x", b"L", b"S"
+_NO_DATA = b"123456"  # links, devices, folders: whatever size they claim
+
+
+class Member(NamedTuple):
+    """A plain file in an archive."""
+
+    name: str
+    offset: int  # of its first byte in the archive
+    size: int
+
+
+def members(file: Path) -> Iterator[Member]:
+    """The plain files of an archive in their order.
+
+    Raises:
+        FormatError: missing file, a damaged header, or an archive that ends too early.
+    """
+    try:
+        with file.open("rb") as stream:
+            yield from _walk(file, stream.fileno())
+    except OSError as error:
+        found = "no such file" if isinstance(error, FileNotFoundError) else error
+        raise FormatError(file, "file", found, "a readable tar archive") from None
+
+
+def read_member(file: Path, offset: int, size: int, limit: int = MAX_BYTES) -> bytes:
+    """The bytes of a member.
+
+    Raises:
+        FormatError: the archive cannot be read or has become shorter, or more bytes than ``limit``.
+    """
+    if size > limit:
+        raise FormatError(file, f"member at byte {offset}", f"{size} bytes", f"at most {limit} bytes")
+    try:
+        with file.open("rb") as stream:
+            data = os.pread(stream.fileno(), size, offset)
+    except OSError as error:
+        raise FormatError(file, "file", error, "a readable tar archive") from None
+    if len(data) != size:
+        raise FormatError(file, f"member at byte {offset}", f"{len(data)} bytes", f"{size} bytes")
+    return data
+
+
+def _walk(file: Path, stream: int) -> Iterator[Member]:
+    total, at = os.fstat(stream).st_size, 0
+    special: dict[str, str] = {}  # what an extra header says about the member that follows
+    while at + _BLOCK <= total:
+        header = os.pread(stream, _BLOCK, at)
+        if not header.strip(b"\0"):
+            return
+        name, kind, size = _header(file, header, at)
+        size = int(special.get("size", size)) if special.get("size", "0").isdecimal() else size
+        size = 0 if kind in _NO_DATA else size
+        data, at = at + _BLOCK, at + _BLOCK + (size + _BLOCK - 1) // _BLOCK * _BLOCK
+        if data + size > total:
+            raise FormatError(file, special.get("path", name), f"{total - data} of {size} bytes", "a whole archive")
+        if kind in _LONG_NAME + _PAX:
+            if size > _MAX_NAME_BYTES:
+                raise FormatError(file, f"header at byte {data}", f"{size} bytes", f"at most {_MAX_NAME_BYTES} bytes")
+            text = os.pread(stream, size, data)
+            special |= _pax(text) if kind == _PAX else {"path": _text(text)}
+            continue
+        if kind in _FILES:
+            yield Member(special.get("path", name), data, size)
+        elif kind == _SPARSE:
+            raise FormatError(file, name, "a sparse member", "plain files")
+        special = {}
+    if at == 0:
+        raise FormatError(file, "content", f"{total} bytes", "a tar archive")
+
+
+def _header(file: Path, header: bytes, at: int) -> tuple[str, bytes, int]:
+    """Name, kind and size of a member."""
+    stored = _number(header[148:156])
+    if stored != sum(header[:148]) + 8 * 32 + sum(header[156:]):
+        raise FormatError(file, f"header at byte {at}", "a wrong check sum", "a tar header, not compressed")
+    size = _number(header[124:136])
+    if size is None or size < 0:
+        raise FormatError(file, f"header at byte {at}", f"size {header[124:136]!r}", "a number of bytes")
+    name, folder = _text(header[:100]), _text(header[345:500]) if header[257:263] == b"ustar\0" else ""
+    return (f"{folder}/{name}" if folder else name), header[156:157], size
+
+
+def _number(field: bytes) -> int | None:
+    """Octal digits, or GNU's big-endian number with the top bit set."""
+    if field[0] & 0x80:
+        return int.from_bytes(bytes([field[0] & 0x7F]) + field[1:], "big") if field[0] == 0x80 else None
+    digits = field.strip(b" \0")
+    return int(digits or b"0", 8) if all(48 <= c < 56 for c in digits) else None
+
+
+def _text(field: bytes) -> str:
+    return field.split(b"\0", 1)[0].decode("utf-8", "replace")
+
+
+def _pax(text: bytes) -> dict[str, str]:
+    """``length key=value`` lines; damaged ones end the list."""
+    found, at = {}, 0
+    while (space := text.find(b" ", at, at + 12)) > at and text[at:space].isdigit():
+        end = at + int(text[at:space])
+        if not space < end <= len(text):
+            break
+        key, _, value = text[space + 1 : end - 1].partition(b"=")
+        if key in (b"path", b"size"):
+            found[key.decode()] = value.decode("utf-8", "replace")
+        at = end
+    return found

@@ -1,0 +1,117 @@
+"""TIFF: the first picture of a file, one sample a pixel (confidence, depth).
+
+The first directory is read here, so that size, type and the place of every strip are known and believed only where they
+fit the file; what is left for the decoder is to unpack the strips.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from dhtorch.data.files import MAX_PIXELS, FormatError, need, read_bytes
+
+_SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8}  # bytes of a tag's value by type
+_KINDS = {1: "u", 2: "i", 3: "f"}  # sample format
+_COMPRESSIONS = {1: "none", 5: "LZW", 8: "deflate", 32773: "PackBits", 32946: "deflate"}
+
+
+def read_tiff(file: Path, hw: tuple[int, int] | None = None) -> np.ndarray:
+    """Numbers (h, w) as stored, integer or floating point; NaN may occur.
+
+    Raises:
+        FormatError: missing or damaged file, more than one sample a pixel, another size than ``hw``.
+        ImportError: no decoder is installed.
+    """
+    return decode_tiff(read_bytes(file), file, hw)
+
+
+def decode_tiff(data: bytes, file: Path, hw: tuple[int, int] | None = None) -> np.ndarray:
+    """As :func:`read_tiff`, of bytes that lie in an archive; ``file`` names them in errors."""
+    tags = _first_directory(data, file)
+    one = {key: _one(tags, key, default, file) for key, default in ((256, None), (257, None), (259, 1), (277, 1))}
+    size, dtype = (one[257], one[256]), _dtype(tags, file)
+    if hw is not None and size != tuple(hw):
+        raise FormatError(file, "size", f"{size[1]}x{size[0]}", f"{hw[1]}x{hw[0]}")
+    if not 0 < math.prod(size) <= MAX_PIXELS:
+        raise FormatError(file, "size", f"{size[1]}x{size[0]}", f"1 to {MAX_PIXELS} pixels")
+    if one[277] != 1 or one[259] not in _COMPRESSIONS:
+        found = f"{one[277]} samples a pixel, compression {one[259]}"
+        raise FormatError(file, "layout", found, f"1 sample, compression {', '.join(map(str, _COMPRESSIONS))}")
+    _check_strips(tags, data, file, math.prod(size) * dtype.itemsize if one[259] == 1 else None)
+    library = need("tifffile")
+    try:
+        with library.TiffFile(io.BytesIO(data)) as tiff:
+            page = tiff.pages.first
+            if page.shape != size or page.dtype != dtype:
+                raise FormatError(file, "data", f"{page.dtype} of {page.shape}", f"{dtype} of {size}")
+            picture = page.asarray(maxworkers=1)
+    except FormatError:
+        raise
+    except Exception as error:  # a decoder of many parts: whatever it raises means damage
+        raise FormatError(file, "data", error or type(error).__name__, "a whole TIFF picture") from None
+    if picture.shape != size:
+        raise FormatError(file, "data", f"shape {picture.shape}", f"{size}")
+    return np.ascontiguousarray(picture)
+
+
+def _first_directory(data: bytes, file: Path) -> dict[int, tuple[int, ...]]:
+    """Tag → its whole numbers (tags of other types are left out)."""
+    order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
+    if order is None or len(data) < 8:
+        raise FormatError(file, "content", f"{data[:4]!r}", "a TIFF picture")
+    tags: dict[int, tuple[int, ...]] = {}
+    try:
+        (at,) = struct.unpack_from(f"{order}I", data, 4)
+        (count,) = struct.unpack_from(f"{order}H", data, at)
+        for k in range(count):
+            tag, kind, n = struct.unpack_from(f"{order}HHI", data, at + 2 + 12 * k)
+            if kind not in (1, 3, 4) or n < 1 or n * _SIZES[kind] > len(data):
+                continue
+            place = at + 10 + 12 * k
+            if n * _SIZES[kind] > 4:
+                (place,) = struct.unpack_from(f"{order}I", data, place)
+            tags[tag] = struct.unpack_from(f"{order}{n}{' BXHI'[kind]}", data, place)
+    except struct.error:
+        raise FormatError(file, "directory", f"one beyond the {len(data)} bytes", "a whole TIFF picture") from None
+    return tags
+
+
+def _one(tags: dict[int, tuple[int, ...]], tag: int, default: int | None, file: Path) -> int:
+    values = tags.get(tag, () if default is None else (default,))
+    if len(values) != 1:
+        raise FormatError(file, f"tag {tag}", f"{len(values)} numbers", "one")
+    return values[0]
+
+
+def _dtype(tags: dict[int, tuple[int, ...]], file: Path) -> np.dtype:
+    bits, kind = _one(tags, 258, 1, file), _KINDS.get(_one(tags, 339, 1, file), "?")
+    if (kind, bits) not in {
+        ("u", 8),
+        ("u", 16),
+        ("u", 32),
+        ("i", 8),
+        ("i", 16),
+        ("i", 32),
+        ("f", 16),
+        ("f", 32),
+        ("f", 64),
+    }:
+        raise FormatError(
+            file, "samples", f"{bits} bits of kind {kind}", "8, 16 or 32 bits integer, 16, 32 or 64 floating"
+        )
+    return np.dtype(f"{kind}{bits // 8}")
+
+
+def _check_strips(tags: dict[int, tuple[int, ...]], data: bytes, file: Path, total: int | None) -> None:
+    """Every strip (or tile) lies inside the file; without compression they hold the picture exactly."""
+    tiled = 324 in tags
+    at, sizes = tags.get(324 if tiled else 273, ()), tags.get(325 if tiled else 279, ())
+    if not at or len(at) != len(sizes) or any(a + n > len(data) for a, n in zip(at, sizes, strict=True)):
+        raise FormatError(file, "strips", f"{len(at)} places, {len(sizes)} sizes", "all inside the file")
+    if total is not None and (sum(sizes) < total or (not tiled and sum(sizes) != total)):
+        raise FormatError(file, "strips", f"{sum(sizes)} bytes", f"{total} bytes")
