@@ -11,6 +11,7 @@ known by its seed alone: ``attack(..., only=17)`` repeats mutant 17.
 
 from __future__ import annotations
 
+import faulthandler
 import io
 import json
 import os
@@ -55,10 +56,15 @@ class Outcome(NamedTuple):
 
 
 def read_frames(path: Path) -> None:
-    """Open everything at ``path``, decode every frame and hold it against what every frame promises."""
+    """Open everything at ``path``, decode every frame and every truth, hold them against what they promise."""
     for recording in data.open_all(path):
-        for frame in recording:
+        truth = getattr(recording, "truth", None)
+        for i, frame in enumerate(recording):
             check_frame(frame)
+            if truth is not None:
+                depth = truth(i)["depth"]
+                assert depth.shape[1:] == frame.hw
+                assert bool(torch.isfinite(depth).all()) and bool((depth >= 0).all())
 
 
 def check_frame(frame: Any) -> None:
@@ -169,7 +175,7 @@ def _run(read: Callable[[Path], Any], path: Path, tmp_path: Path) -> tuple[Outco
     if killed or peak > BYTES:
         kind, detail = killed or "memory", ""
     elif code != 0:
-        kind, detail = ("code executed" if code == _EXECUTED else "crash"), f"exit code {code}"
+        kind, detail = ("code executed" if code == _EXECUTED else "crash"), f"exit code {code} {kind} {detail[-2000:]}"
     return Outcome(kind, detail, seconds, peak), used.ru_utime + used.ru_stime
 
 
@@ -188,6 +194,7 @@ def _child(read: Callable[[Path], Any], path: Path, tmp_path: Path, report: int)
         )  # the machine survives what the watch misses
         touched = _guard(tmp_path.resolve(), path)
         os.write(report, f"{_resident(os.getpid())}\n".encode())
+        faulthandler.enable(report, all_threads=False)  # the last words of a crash
         try:
             read(path)
             kind = "frames"

@@ -142,7 +142,8 @@ def _shots(scene: Path) -> dict[str, list[_Shot]]:
     shots: dict[str, list[_Shot]] = {}
     for number, sample in enumerate(files.get(top, "samples", list, scene)):
         calibration = files.get(sample, "calibration_key", str, scene)
-        members = [data[key] for key in files.get(sample, "datum_keys", list, scene) if key in data]
+        keys = [key for key in files.get(sample, "datum_keys", list, scene) if isinstance(key, str)]
+        members = [data[key] for key in keys if key in data]
         kinds = [files.get(d, "datum", dict, scene) for d in members]
         sweeps = [k["point_cloud"] for k in kinds if "point_cloud" in k]
         if len(sweeps) != 1:
@@ -151,7 +152,10 @@ def _shots(scene: Path) -> dict[str, list[_Shot]]:
             if "image" in kind:
                 name = files.get(member, "id.name", str, scene)
                 shot = _shot(scene, member, kind["image"], sweeps[0], number=number, calibration=calibration)
-                shots.setdefault(name, []).append(shot)
+                same = shots.setdefault(name, [])
+                if same and same[-1].number == number:
+                    raise FormatError(scene, f"samples.{number}", f"two images of {name}", "one of each camera")
+                same.append(shot)
     if not shots:
         raise FormatError(scene, "samples", "no image", "instants with camera images")
     return shots

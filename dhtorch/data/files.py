@@ -18,6 +18,7 @@ import zipfile
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
+from tokenize import TokenError
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -253,21 +254,52 @@ def read_npz(file: Path, key: str) -> np.ndarray:
     return _npy(file, key, raw)
 
 
-def _npy(file: Path, key: str, raw: bytes) -> np.ndarray:
-    stream = io.BytesIO(raw)
+class NpyHeader(NamedTuple):
+    """What a numpy array file says about itself."""
+
+    shape: tuple[int, ...]
+    fortran: bool  # first axis fastest
+    dtype: np.dtype
+    start: int  # byte where the values start
+
+
+def npy_header(file: Path, field: str, head: bytes) -> NpyHeader:
+    """Header of an ``.npy`` file from its first bytes (2 KB are plenty); of real numbers, without pickled objects.
+
+    Raises:
+        FormatError: no such header, another kind of values, or a shape that no array has.
+    """
+    stream = io.BytesIO(head)
     try:
         version = np.lib.format.read_magic(stream)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, fortran, dtype = read(stream)
-    except (ValueError, SyntaxError, TypeError, struct.error) as error:
-        raise FormatError(file, key, error, "a numpy array header") from None
+    except (
+        ValueError,
+        SyntaxError,
+        TokenError,
+        TypeError,
+        KeyError,
+        RecursionError,
+        MemoryError,
+        struct.error,
+    ) as error:
+        raise FormatError(file, field, error, "a numpy array header") from None
     if dtype.kind not in "fiu" or dtype.hasobject:
-        raise FormatError(file, f"{key} dtype", dtype, "real numbers")
-    count, left = math.prod(shape), len(raw) - stream.tell()
-    if min(shape, default=0) < 0 or count * dtype.itemsize != left:
-        raise FormatError(file, key, f"{left} bytes", f"{shape} of {dtype}")
-    array = np.frombuffer(raw, dtype, count, stream.tell()).reshape(shape, order="F" if fortran else "C")
-    return array.astype(np.float32 if dtype.itemsize <= 4 and dtype.kind == "f" else np.float64)
+        raise FormatError(file, f"{field} dtype", dtype, "real numbers")
+    if len(shape) > 8 or any(type(n) is not int or not 0 <= n <= 2**40 for n in shape):
+        raise FormatError(file, f"{field} shape", shape, "a few counts")
+    return NpyHeader(shape, bool(fortran), dtype, stream.tell())
+
+
+def _npy(file: Path, key: str, raw: bytes) -> np.ndarray:
+    header = npy_header(file, key, raw)
+    count, left = math.prod(header.shape), len(raw) - header.start
+    if count * header.dtype.itemsize != left:
+        raise FormatError(file, key, f"{left} bytes", f"{header.shape} of {header.dtype}")
+    array = np.frombuffer(raw, header.dtype, count, header.start)
+    array = array.reshape(header.shape, order="F" if header.fortran else "C")
+    return array.astype(np.float32 if header.dtype.itemsize <= 4 and header.dtype.kind == "f" else np.float64)
 
 
 # ------------------------------------------------------------------------------------------------------------ text

@@ -1,0 +1,157 @@
+"""Every reader against damaged captures, and the harness against readers that misbehave."""
+
+from __future__ import annotations
+
+import io
+import os
+import random
+import time
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import hostile
+import pytest
+import torch
+from test_data import walk
+
+from dhtorch import data
+from dhtorch.data import FormatError, writers
+from dhtorch.geometry import se3
+from dhtorch.records import Frame, Pose
+
+MUTANTS, MANY = 100, 2000
+
+
+def frames(n: int = 3) -> list[Frame]:
+    """A short walk in a box, depth at every pixel."""
+    return walk(n, hw=(24, 32))
+
+
+def _tum(root: Path) -> None:
+    writers.write_tum(root, frames())
+
+
+def _named(root: Path) -> None:
+    writers.write_named_frames(root, frames(), fps=30)
+
+
+def _unregistered(root: Path) -> None:
+    shots = frames()
+    writers.write_named_frames(root, [f.replace(depth_camera=f.camera) for f in shots], fps=30)
+
+
+def _counted(root: Path) -> None:
+    writers.write_counted_frames(root, frames())
+
+
+def _driving(root: Path) -> None:
+    shots = frames()
+    writers.write_driving(
+        root, {"FRONT": shots}, Pose(torch.eye(3).double().expand(3, 3, 3), torch.zeros(3, 3).double())
+    )
+
+
+def _pair(write: Callable[[Path, Frame, Frame], None]) -> Callable[[Path], None]:
+    def write_pair(root: Path) -> None:
+        left = frames(1)[0]
+        left = left.replace(
+            camera=left.camera.replace(f=left.camera.f[:, :1].expand(1, 2)),
+            T_world_from_cam=se3.identity(1, torch.zeros(1).double()),
+        )
+        away = Pose(left.T_world_from_cam.R, torch.tensor([[0.125, 0, 0]], dtype=torch.float64))
+        write(root, left, left.replace(T_world_from_cam=away))
+
+    return write_pair
+
+
+#: One line a format: name → a function that writes a tiny capture below a folder and returns what to open (None = the
+#: folder), and, where frames are not all there is to read, a reader of it.
+FORMATS: dict[str, tuple[Callable[[Path], Path | None], Callable[[Path], Any]]] = {
+    "tum": (_tum, hostile.read_frames),
+    "named": (_named, hostile.read_frames),
+    "unregistered": (_unregistered, hostile.read_frames),
+    "counted": (_counted, hostile.read_frames),
+    "driving": (_driving, hostile.read_frames),
+    "calib_pair": (_pair(writers.write_calib_pair), hostile.read_frames),
+    "npz_pair": (_pair(writers.write_npz_pair), hostile.read_frames),
+}
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_damaged_captures_are_a_format_error_or_valid_frames(name: str, tmp_path: Path) -> None:
+    counts = hostile.attack(*FORMATS[name], tmp_path, mutants=MUTANTS)
+    assert counts["frames"] > 0 and counts["FormatError"] > MUTANTS // 5  # damage is felt, and not everywhere
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize("name", FORMATS)
+def test_many_damaged_captures(name: str, tmp_path: Path) -> None:
+    counts = hostile.attack(*FORMATS[name], tmp_path, mutants=MANY, seed=1)
+    print(f"{name}: {dict(counts)}")
+    assert counts.total() == MANY
+
+
+# ------------------------------------------------------------------------------------- the harness finds what it should
+
+
+def _one_file(root: Path) -> Path:
+    (root / "a.txt").write_text("0123456789")
+    return root / "a.txt"
+
+
+def _misread(path: Path, misdeed: Callable[[Path], Any]) -> None:
+    """A reader that does well on the intact file and misbehaves on any other."""
+    if not path.is_file() or path.read_bytes() != b"0123456789":
+        misdeed(path)
+
+
+@pytest.mark.parametrize(
+    ("misdeed", "kind"),
+    [
+        (lambda path: 1 / 0, "ZeroDivisionError"),
+        (lambda path: os.abort(), "crash"),
+        (lambda path: os._exit(86), "code executed"),
+        (lambda path: time.sleep(60), "hang"),
+        (lambda path: bytearray(b"1") * (700 << 20), "memory"),
+        (lambda path: (path.parent / "b").write_text("1"), "crash"),
+        (lambda path: (path.parent.parent / "intact" / "a.txt").read_text(), "escape"),
+        (lambda path: os.system("true"), "escape"),
+        (lambda path: (_ for _ in ()).throw(FormatError(path)), "a FormatError that does not name file and field"),
+    ],
+)
+def test_harness_sees(
+    misdeed: Callable[[Path], Any], kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hostile, "SECONDS", 0.5 if kind == "hang" else hostile.SECONDS)
+    with pytest.raises(AssertionError, match=rf"mutant \d+ \(.*\): {kind}"):
+        hostile.attack(_one_file, lambda path: _misread(path, misdeed), tmp_path, mutants=3)
+
+
+def test_harness_repeats_a_mutant(tmp_path: Path) -> None:
+    good: hostile.Capture = {
+        "a.json": b'{"a": [1, 2, 3]}',
+        "b.txt": b"1 2\n3 4\n",
+        "c/d.png": b"\x89PNG\r\n\x1a\n" + bytes(99),
+    }
+    one, two = ([hostile.mutate(good, random.Random(f"3/{i}")) for i in range(200)] for _ in range(2))
+    assert one == two and len({what for what, _ in one}) > 15
+    assert sum(want == good for _, want in one) < 20
+
+
+def test_bomb_is_a_sound_archive(tmp_path: Path) -> None:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as archive:
+        archive.writestr("a/b.bin", b"123")
+        archive.writestr("a/c.bin", b"456")
+    with zipfile.ZipFile(io.BytesIO(hostile._with_bomb(out.getvalue(), "a/b.bin"))) as archive:
+        assert archive.read("a/c.bin") == b"456" and archive.getinfo("a/b.bin").file_size == 1 << 30
+        with archive.open("a/b.bin") as member:
+            assert member.read(1000) == bytes(1000)
+
+
+def test_what_opens_is_what_reads(tmp_path: Path) -> None:
+    _tum(tmp_path)
+    assert len(data.open(tmp_path)) == 3
