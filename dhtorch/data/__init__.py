@@ -14,7 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
-from dhtorch.data import driving, frames_dir, rectified, tum
+from dhtorch.data import arkitscenes, ca1m, driving, frames_dir, rectified, tum
 from dhtorch.data.files import FormatError
 from dhtorch.data.recording import Recording
 
@@ -25,6 +25,8 @@ FORMATS: Final[dict[str, ModuleType]] = {
     "tum": tum,
     "driving": driving,
     "rectified": rectified,
+    "arkitscenes": arkitscenes,
+    "ca1m": ca1m,
     "frames_dir": frames_dir,
 }
 

@@ -80,7 +80,7 @@ class Recording(Sequence[Frame]):
         return i % n
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class TruthRecording(Recording):
     """A recording that also knows the depth measured by another, better instrument: its own sensor is not its judge."""
 

@@ -5,6 +5,8 @@ a format without a download. Nothing is compressed cleverly and no decoder of ou
 together here. Frames have B = 1; those with poses carry them in ``T_world_from_cam``.
 """
 
+from dhtorch.data.writers.arkitscenes import write_arkitscenes
+from dhtorch.data.writers.ca1m import write_ca1m
 from dhtorch.data.writers.layouts import (
     write_calib_pair,
     write_counted_frames,
@@ -15,6 +17,8 @@ from dhtorch.data.writers.layouts import (
 )
 
 __all__ = [
+    "write_arkitscenes",
+    "write_ca1m",
     "write_calib_pair",
     "write_counted_frames",
     "write_driving",
