@@ -137,6 +137,8 @@ def run(
             num_workers=settings.workers,
             collate_fn=_collate,
             worker_init_fn=_one_thread,
+            # A fork would copy the locks of whatever threads torch and OpenCV run here, and may never return.
+            multiprocessing_context="spawn" if settings.workers else None,
         )
         at = 0
         for batch in progress(loader, recording.name, len(loader)):
