@@ -41,7 +41,11 @@ def read_exr(file: Path, channel: str | None = None, hw: tuple[int, int] | None 
         FormatError: missing, truncated or unknown file, another size than ``hw``, or no such channel.
         ImportError: no decoder is installed.
     """
-    data = read_bytes(file)
+    return decode_exr(read_bytes(file), file, channel, hw)
+
+
+def decode_exr(data: bytes, file: Path, channel: str | None = None, hw: tuple[int, int] | None = None) -> np.ndarray:
+    """As :func:`read_exr`, of bytes in memory; ``file`` names them in errors."""
     header = decode_exr_header(data, file)
     if hw is not None and header.hw != tuple(hw):
         raise FormatError(file, "size", f"{header.hw[1]}x{header.hw[0]}", f"{hw[1]}x{hw[0]}")

@@ -62,6 +62,15 @@ def matrix_of(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=np.float64)
 
 
+def resize_matrix(K: np.ndarray, hw: tuple[int, int], new_hw: tuple[int, int]) -> np.ndarray:
+    """K of an image of size ``hw`` for the same image at another size; an integer is the centre of a pixel."""
+    s = np.array([new_hw[1] / hw[1], new_hw[0] / hw[0]])
+    out = np.array(K, dtype=np.float64)
+    out[:2] *= s[:, None]
+    out[:2, 2] += (s - 1) / 2
+    return out
+
+
 def to_poses(
     c2w: np.ndarray,  # (n, 4, 4)
     file: Path,

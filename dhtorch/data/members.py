@@ -1,0 +1,137 @@
+"""The members of a capture: files of a folder, or entries of a zip archive read in place.
+
+Nothing is ever unpacked to disk. A member remembers where its bytes lie, so it pickles, an archive of any length costs
+nothing to open in a worker, and a member's size is known before its bytes are read.
+"""
+
+from __future__ import annotations
+
+import struct
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from dhtorch.data.files import MAX_BYTES, FormatError, read_bytes
+
+MAX_MEMBERS = 2_000_000
+_LOCAL_HEADER = 30  # bytes before the name
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """One file of a capture."""
+
+    path: Path  # for an archive: the archive's path, then the name inside
+
+    def read(self) -> bytes:
+        """All bytes; at least one, at most ``MAX_BYTES``.
+
+        Raises:
+            FormatError: missing, unreadable, empty, too large, or damaged.
+        """
+        return read_bytes(self.path)
+
+    def ends(self, count: int) -> tuple[bytes, bytes] | None:
+        """First and last ``count`` bytes without reading the rest; None where that is not possible."""
+        try:
+            with self.path.open("rb") as stream:
+                first = stream.read(count)
+                stream.seek(-min(count, stream.seek(0, 2)), 2)
+                return first, stream.read(count)
+        except OSError:
+            return b"", b""
+
+
+@dataclass(frozen=True, slots=True)
+class ZipMember(Member):
+    """One entry of a zip archive."""
+
+    archive: Path
+    offset: int  # of the entry's own header
+    packed: int  # bytes in the archive
+    size: int  # bytes when unpacked
+    method: int
+    crc: int
+
+    def read(self) -> bytes:
+        """As :meth:`Member.read`; a bomb stops at the size that the archive's directory names."""
+        if not 0 < self.size <= MAX_BYTES or self.packed > MAX_BYTES:
+            raise FormatError(self.path, "file size", f"{self.size} bytes", f"1 to {MAX_BYTES} bytes")
+        if self.method not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise FormatError(self.path, "compression", "encryption or a rare method", "none or deflate")
+        data = self._stored(0, self.packed)
+        if self.method == zipfile.ZIP_DEFLATED:
+            try:
+                data = zlib.decompressobj(-zlib.MAX_WBITS).decompress(data, self.size + 1)
+            except zlib.error as error:
+                raise FormatError(self.path, "data", error, "a deflated member") from None
+        if len(data) != self.size or zlib.crc32(data) != self.crc:
+            found = f"{len(data)} bytes with check sum {zlib.crc32(data):08x}"
+            raise FormatError(self.path, "data", found, f"{self.size} bytes with check sum {self.crc:08x}")
+        return data
+
+    def ends(self, count: int) -> tuple[bytes, bytes] | None:
+        """As :meth:`Member.ends`; None for a compressed one."""
+        if self.method != zipfile.ZIP_STORED or self.size < count:
+            return None
+        try:
+            return self._stored(0, count), self._stored(self.packed - count, count)
+        except FormatError:
+            return b"", b""
+
+    def _stored(self, start: int, count: int) -> bytes:
+        """Bytes as they lie in the archive; the entry's header says how far behind it they begin."""
+        try:
+            with self.archive.open("rb") as stream:
+                stream.seek(self.offset)
+                mark, name, extra = struct.unpack("<4s22xHH", stream.read(_LOCAL_HEADER))
+                stream.seek(self.offset + _LOCAL_HEADER + name + extra + start)
+                data = stream.read(count)
+        except (OSError, ValueError, struct.error) as error:
+            raise FormatError(self.path, "entry", error, "a zip entry") from None
+        if len(data) != count or mark != b"PK\x03\x04":
+            raise FormatError(self.path, "entry", f"{len(data)} bytes behind {mark!r}", f"{count} bytes of a zip entry")
+        return data
+
+
+def folder_members(root: Path) -> dict[str, Member]:
+    """Name → member of the files of a folder and of its folders, one level down."""
+    inside = [entry for entry in root.iterdir() if entry.is_dir()]
+    files = [entry for folder in (root, *inside) for entry in folder.iterdir() if not entry.is_dir()]
+    return {file.relative_to(root).as_posix(): Member(file) for file in files}
+
+
+def zip_members(archive: Path) -> dict[str, Member]:
+    """Name → member of the files of a zip archive. A name that occurs twice means the last one.
+
+    Raises:
+        FormatError: no zip archive, or more than ``MAX_MEMBERS`` entries.
+    """
+    try:
+        with zipfile.ZipFile(archive) as directory:
+            entries = directory.infolist()
+    except (zipfile.BadZipFile, struct.error, ValueError, RuntimeError, EOFError, OSError) as error:
+        raise FormatError(archive, "archive", error, "a whole zip archive") from None
+    if len(entries) > MAX_MEMBERS:
+        raise FormatError(archive, "archive", f"{len(entries)} entries", f"at most {MAX_MEMBERS}")
+    return {entry.filename: _zip_member(archive, entry) for entry in entries if not entry.is_dir()}
+
+
+def member(members: Mapping[str, Member], name: str, root: Path) -> Member:
+    """The member of that name.
+
+    Raises:
+        FormatError: there is none.
+    """
+    if name not in members:
+        raise FormatError(root, name, f"no such file among {len(members)}", "a file of that name")
+    return members[name]
+
+
+def _zip_member(archive: Path, entry: zipfile.ZipInfo) -> ZipMember:
+    method = -1 if entry.flag_bits & 0x1 else entry.compress_type  # bit 0: encrypted
+    packed = entry.file_size if method == zipfile.ZIP_STORED else entry.compress_size
+    path = Path(f"{archive}/{entry.filename}")  # an absolute name must not hide the archive's
+    return ZipMember(path, archive, entry.header_offset, packed, entry.file_size, method, entry.CRC)

@@ -1,0 +1,59 @@
+"""Videos from pictures, for the formats that keep their pictures in one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+
+from dhtorch.data.files import need
+
+_TICKS = 600  # per second: 24, 25, 30 and 60 Hz are whole numbers of them
+
+
+def write_video(
+    file: Path,
+    pictures: Sequence[np.ndarray],  # each (H, W, 3) uint8, even sizes
+    times: Sequence[float],  # s, increasing
+    *,
+    codec: str = "libx264",
+    crf: int = 10,
+    key_every: int = 12,
+    b_frames: int = 2,
+    hide_first: bool = False,
+) -> None:
+    """An mp4 with a key frame now and then and frames stored out of order in between, as phones write them.
+
+    ``hide_first``: an edit list lets the film begin with the second frame, so that the first one lies before time 0.
+    """
+    file.parent.mkdir(parents=True, exist_ok=True)
+    h, w = pictures[0].shape[:2]
+    av = need("av")
+    with av.open(str(file), "w", format="mp4") as container:
+        stream = container.add_stream(codec, rate=round(1 / (times[1] - times[0])) if len(times) > 1 else 30)
+        stream.width, stream.height, stream.pix_fmt = w, h, "yuv420p"
+        stream.codec_context.time_base = Fraction(1, _TICKS)
+        stream.codec_context.thread_count = 1
+        order = f"keyint={key_every}:bframes={b_frames}:log-level=none"
+        stream.options = {"crf": str(crf), "g": str(key_every), "bf": str(b_frames)}
+        if codec == "libx265":
+            stream.options = {"crf": str(crf), "x265-params": f"{order}:pools=none:frame-threads=1"}
+        for picture, time in zip(pictures, times, strict=True):
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+            frame.pts, frame.time_base = round((time - times[0]) * _TICKS), Fraction(1, _TICKS)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+        shift = round(Fraction(times[1] - times[0]) / stream.time_base) if hide_first else 0
+    if hide_first:
+        _delay(file, shift)
+
+
+def _delay(file: Path, ticks: int) -> None:
+    """Move the start of the only edit in the file's edit list: what comes before is decoded but not shown."""
+    content = bytearray(file.read_bytes())
+    at = content.index(b"elst") + 16  # version and flags, count, duration, then the start
+    start = int.from_bytes(content[at : at + 4], "big") + ticks
+    content[at : at + 4] = start.to_bytes(4, "big")
+    file.write_bytes(content)
