@@ -14,7 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
-from dhtorch.data import arkitscenes, ca1m, driving, frames_dir, rectified, tum
+from dhtorch.data import arkitscenes, ca1m, driving, frames_dir, rectified, rh20t, tum
 from dhtorch.data.files import FormatError
 from dhtorch.data.recording import Recording
 
@@ -27,6 +27,7 @@ FORMATS: Final[dict[str, ModuleType]] = {
     "rectified": rectified,
     "arkitscenes": arkitscenes,
     "ca1m": ca1m,
+    "rh20t": rh20t,
     "frames_dir": frames_dir,
 }
 

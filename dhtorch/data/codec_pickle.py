@@ -14,6 +14,7 @@ import re
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any, Final
 
 import numpy as np
@@ -41,6 +42,7 @@ _NAMES: Final = {
 }
 _SCALARS = (str, int, float, bool, bytes, type(None))
 _MARK = object()
+_HEADER_ERRORS = (ValueError, SyntaxError, TypeError, KeyError, struct.error, RecursionError, MemoryError, TokenError)
 
 
 class _Name(str):
@@ -78,7 +80,7 @@ def read_npy(file: Path) -> Any:
         version = np.lib.format.read_magic(stream)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, fortran, dtype = read(stream)
-    except (ValueError, SyntaxError, TypeError, KeyError, struct.error, RecursionError, MemoryError) as error:
+    except _HEADER_ERRORS as error:
         raise FormatError(file, "header", error, "a numpy array header") from None
     body = data[stream.tell() :]
     if dtype.hasobject:

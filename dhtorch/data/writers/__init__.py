@@ -15,6 +15,7 @@ from dhtorch.data.writers.layouts import (
     write_npz_pair,
     write_tum,
 )
+from dhtorch.data.writers.rh20t import write_rh20t
 
 __all__ = [
     "write_arkitscenes",
@@ -24,5 +25,6 @@ __all__ = [
     "write_driving",
     "write_named_frames",
     "write_npz_pair",
+    "write_rh20t",
     "write_tum",
 ]
