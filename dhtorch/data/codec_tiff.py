@@ -1,4 +1,4 @@
-"""TIFF: the first picture of a file, one sample a pixel (confidence, depth).
+"""TIFF: the first picture of a file, one sample a pixel (confidence, depth) or several (colour).
 
 The first directory is read here, so that size, type and the place of every strip are known and believed only where they
 fit the file; what is left for the decoder is to unpack the strips.
@@ -9,7 +9,9 @@ from __future__ import annotations
 import io
 import math
 import struct
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,45 +19,79 @@ from dhtorch.data.files import MAX_PIXELS, FormatError, need, read_bytes
 
 _SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8}  # bytes of a tag's value by type
 _KINDS = {1: "u", 2: "i", 3: "f"}  # sample format
+_BITS = {"u": (8, 16, 32), "i": (8, 16, 32), "f": (16, 32, 64)}
 _COMPRESSIONS = {1: "none", 5: "LZW", 8: "deflate", 32773: "PackBits", 32946: "deflate"}
 
 
-def read_tiff(file: Path, hw: tuple[int, int] | None = None) -> np.ndarray:
-    """Numbers (h, w) as stored, integer or floating point; NaN may occur.
+class TiffHeader(NamedTuple):
+    """What a TIFF file says about its first picture."""
+
+    hw: tuple[int, int]
+    samples: int  # a pixel
+    dtype: np.dtype
+
+
+def read_tiff(file: Path, hw: tuple[int, int] | None = None, samples: Sequence[int] = (1,)) -> np.ndarray:
+    """Numbers (h, w), or (h, w, samples) where there are several, as stored, integer or floating point; NaN may occur.
+
+    Args:
+        file: the picture.
+        hw: the size to insist on.
+        samples: how many a pixel may have.
 
     Raises:
-        FormatError: missing or damaged file, more than one sample a pixel, another size than ``hw``.
+        FormatError: missing or damaged file, another number of samples, another size than ``hw``.
         ImportError: no decoder is installed.
     """
-    return decode_tiff(read_bytes(file), file, hw)
+    return decode_tiff(read_bytes(file), file, hw, samples)
 
 
-def decode_tiff(data: bytes, file: Path, hw: tuple[int, int] | None = None) -> np.ndarray:
+def tiff_header(file: Path) -> TiffHeader:
+    """Size and type of a TIFF file without decoding it.
+
+    Raises:
+        FormatError: missing, truncated or unknown file.
+    """
+    tags = _first_directory(read_bytes(file), file)
+    return TiffHeader(
+        (_one(tags, 257, None, file), _one(tags, 256, None, file)), _one(tags, 277, 1, file), _dtype(tags, file)
+    )
+
+
+def decode_tiff(
+    data: bytes, file: Path, hw: tuple[int, int] | None = None, samples: Sequence[int] = (1,)
+) -> np.ndarray:
     """As :func:`read_tiff`, of bytes that lie in an archive; ``file`` names them in errors."""
     tags = _first_directory(data, file)
-    one = {key: _one(tags, key, default, file) for key, default in ((256, None), (257, None), (259, 1), (277, 1))}
-    size, dtype = (one[257], one[256]), _dtype(tags, file)
+    keys = ((256, None), (257, None), (259, 1), (262, 1), (277, 1), (284, 1))
+    one = {key: _one(tags, key, default, file) for key, default in keys}
+    size, count, dtype = (one[257], one[256]), one[277], _dtype(tags, file)
+    shape = size if count == 1 else (*size, count)
     if hw is not None and size != tuple(hw):
         raise FormatError(file, "size", f"{size[1]}x{size[0]}", f"{hw[1]}x{hw[0]}")
-    if not 0 < math.prod(size) <= MAX_PIXELS:
+    if not 0 < math.prod(shape) <= MAX_PIXELS:
         raise FormatError(file, "size", f"{size[1]}x{size[0]}", f"1 to {MAX_PIXELS} pixels")
-    if one[277] != 1 or one[259] not in _COMPRESSIONS:
-        found = f"{one[277]} samples a pixel, compression {one[259]}"
-        raise FormatError(file, "layout", found, f"1 sample, compression {', '.join(map(str, _COMPRESSIONS))}")
-    _check_strips(tags, data, file, math.prod(size) * dtype.itemsize if one[259] == 1 else None)
+    # Palettes, negatives and colours apart from one another are not what a camera or a renderer writes.
+    if count not in samples or one[259] not in _COMPRESSIONS or one[262] not in (1, 2) or one[284] != 1:
+        found = f"{count} samples a pixel, compression {one[259]}, photometric {one[262]}, planes {one[284]}"
+        wanted = (
+            f"{' or '.join(map(str, samples))} samples, compression {', '.join(map(str, _COMPRESSIONS))}, grey or RGB"
+        )
+        raise FormatError(file, "layout", found, wanted)
+    _check_strips(tags, data, file, math.prod(shape) * dtype.itemsize if one[259] == 1 else None)
     library = need("tifffile")
     try:
         with library.TiffFile(io.BytesIO(data)) as tiff:
             page = tiff.pages.first
-            if page.shape != size or page.dtype != dtype:
-                raise FormatError(file, "data", f"{page.dtype} of {page.shape}", f"{dtype} of {size}")
+            if page.shape != shape or page.dtype != dtype:
+                raise FormatError(file, "data", f"{page.dtype} of {page.shape}", f"{dtype} of {shape}")
             picture = page.asarray(maxworkers=1)
     except FormatError:
         raise
     except Exception as error:  # a decoder of many parts: whatever it raises means damage
         raise FormatError(file, "data", error or type(error).__name__, "a whole TIFF picture") from None
-    if picture.shape != size:
-        raise FormatError(file, "data", f"shape {picture.shape}", f"{size}")
+    if picture.shape != shape:
+        raise FormatError(file, "data", f"shape {picture.shape}", f"{shape}")
     return np.ascontiguousarray(picture)
 
 
@@ -82,28 +118,18 @@ def _first_directory(data: bytes, file: Path) -> dict[int, tuple[int, ...]]:
 
 
 def _one(tags: dict[int, tuple[int, ...]], tag: int, default: int | None, file: Path) -> int:
-    values = tags.get(tag, () if default is None else (default,))
+    """The number of a tag; where there is one for each sample they must agree."""
+    values = set(tags.get(tag, () if default is None else (default,)))
     if len(values) != 1:
-        raise FormatError(file, f"tag {tag}", f"{len(values)} numbers", "one")
-    return values[0]
+        raise FormatError(file, f"tag {tag}", f"{len(values)} different numbers", "one")
+    return values.pop()
 
 
 def _dtype(tags: dict[int, tuple[int, ...]], file: Path) -> np.dtype:
     bits, kind = _one(tags, 258, 1, file), _KINDS.get(_one(tags, 339, 1, file), "?")
-    if (kind, bits) not in {
-        ("u", 8),
-        ("u", 16),
-        ("u", 32),
-        ("i", 8),
-        ("i", 16),
-        ("i", 32),
-        ("f", 16),
-        ("f", 32),
-        ("f", 64),
-    }:
-        raise FormatError(
-            file, "samples", f"{bits} bits of kind {kind}", "8, 16 or 32 bits integer, 16, 32 or 64 floating"
-        )
+    if bits not in _BITS.get(kind, ()):
+        wanted = "8, 16 or 32 bits integer, 16, 32 or 64 floating"
+        raise FormatError(file, "samples", f"{bits} bits of kind {kind}", wanted)
     return np.dtype(f"{kind}{bits // 8}")
 
 

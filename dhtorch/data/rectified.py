@@ -118,7 +118,7 @@ def _npz_pair(root: Path) -> _Pair:
 
 def _checked(pair: _Pair, file: Path) -> _Pair:
     """The right view of a rectified pair keeps rows and scale, and ``doffs`` is no free number."""
-    if not pair.baseline > 0:
+    if not 0 < pair.baseline <= convert.MAX_COORDINATE:
         raise FormatError(file, "baseline", pair.baseline, "a positive length")
     left, right = pair.cameras
     if not torch.equal(left.f, right.f):
