@@ -78,6 +78,7 @@ def read_video_frame(
         i: place in the order of presentation, from 0.
         hw: the size to insist on.
         pixels: ``rgb24`` gives (h, w, 3) uint8, ``gray`` (h, w) uint8, ``gray16le`` and ``gray12le`` (h, w) uint16.
+            ``luma`` gives the first plane as stored, (h, w) uint8 or uint16, no range stretched: coded numbers.
         nearest: repeat colour samples that are stored at a lower resolution, instead of interpolating them.
         all_frames: count also frames that an edit list hides.
 
@@ -89,10 +90,18 @@ def read_video_frame(
     wanted = tuple(hw) if hw is not None else decoder.header.hw
     if (frame.height, frame.width) != wanted:
         raise FormatError(file, f"frame {i} size", f"{frame.width}x{frame.height}", f"{wanted[1]}x{wanted[0]}")
+    if pixels == "luma":
+        return _luma(frame)
     try:
         return np.asarray(frame.to_ndarray(format=pixels, interpolation="POINT" if nearest else "BICUBIC"))
     except decoder.errors as error:
         raise FormatError(file, f"frame {i}", error, f"pixels that convert to {pixels}") from None
+
+
+def _luma(frame: Any) -> np.ndarray:
+    plane, deep = frame.planes[0], frame.format.components[0].bits > 8
+    rows = np.frombuffer(plane, "<u2" if deep else np.uint8).reshape(-1, plane.line_size // (2 if deep else 1))
+    return rows[: frame.height, : frame.width].copy()
 
 
 def count_decodable(file: Path, *, all_frames: bool = False) -> int:
