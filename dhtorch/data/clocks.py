@@ -37,7 +37,7 @@ def poses_at(
     span = others[after] - others[before]
     share = (times - others[before]) / np.where(span > 0, span, 1)
     own = nearest(times, others, same)
-    between = (own < 0) & (share > 0) & (share < 1) & (span <= max_gap)
+    between = (own < 0) & (share > 0) & (share < 1) & (span > 0) & (span <= max_gap)
     own = np.where(between | (own >= 0), own, nearest(times, others, max_difference))
     before, after = np.where(between, before, own), np.where(between, after, own)
     share = np.where(between, share, 0.0)

@@ -30,7 +30,7 @@ def write_arkitscenes(
 ) -> None:
     """Assets of one capture: pictures, depth, confidence, intrinsics and ``lowres_wide.traj``.
 
-    ``lowres_wide``, ``vga_wide``, ``wide`` (``color``): image and intrinsics of the frames. ``lowres_depth``: depth, its
+    ``lowres_wide``, ``vga_wide``, ``wide`` (``color``): image and intrinsics. ``lowres_depth``: depth, its
     intrinsics (``lowres_wide_intrinsics``) and confidence, where the frames have one. ``highres_depth``: depth and its
     intrinsics (``wide_intrinsics``). ``<asset>_intrinsics``: intrinsics alone.
 
