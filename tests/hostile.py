@@ -266,6 +266,8 @@ def mutate(good: Capture, draw: random.Random) -> tuple[str, Capture]:
     want = dict(good)
     told = []
     for _ in range(1 if draw.random() < 0.85 else 2):
+        if not any(content is not None for content in want.values()):
+            break  # nothing left to damage
         if draw.random() < 0.12:
             told.append(_move(want, draw))
             continue
