@@ -1,0 +1,105 @@
+"""HDF5: arrays of numbers of which one row at a time is read.
+
+The library is asked for shape, type and storage of an array first. What leads out of the file (soft and external links,
+external storage, virtual arrays) and what needs a plug-in to decode is refused.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dhtorch.data.files import MAX_BYTES, FormatError, need
+
+_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+_FILTERS = {"gzip", "lzf", "shuffle", "fletcher32"}  # come with the library
+_MAX_NAMES = 10_000
+
+
+class Hdf5Array(NamedTuple):
+    """An array in an HDF5 file: what the file says about it."""
+
+    file: Path
+    key: str
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+    def row(self, i: int) -> np.ndarray:
+        """Entry ``i`` of the first axis, as stored.
+
+        Raises:
+            FormatError: the file has changed or its data is damaged.
+            IndexError: no such entry.
+        """
+        if not 0 <= i < self.shape[0]:
+            raise IndexError(f"{self.file}: {self.key}: entry {i} of {self.shape[0]}")
+        with _opened(self.file) as group:
+            array = _checked(group, self.key, self.file)
+            if array.shape != self.shape or array.dtype != self.dtype:
+                found = f"{array.dtype} of {array.shape}"
+                raise FormatError(self.file, self.key, found, f"{self.dtype} of {self.shape}")
+            return np.asarray(array[i])
+
+
+def hdf5_arrays(file: Path) -> dict[str, Hdf5Array]:
+    """Name → array of numbers, of the top level of a file. Nothing of the values is read.
+
+    Raises:
+        FormatError: missing or damaged file, an array that lies elsewhere, or rows beyond ``MAX_BYTES``.
+        ImportError: no decoder is installed.
+    """
+    with _opened(file) as group:
+        if len(group) > _MAX_NAMES:
+            raise FormatError(file, "names", f"{len(group)}", f"at most {_MAX_NAMES}")
+        found = {}
+        for key in group:
+            array = _checked(group, key, file)
+            found[key] = Hdf5Array(file, key, array.shape, array.dtype)
+        return found
+
+
+@contextmanager
+def _opened(file: Path) -> Iterator[Any]:
+    library = need("h5py")
+    try:
+        with file.open("rb") as stream:
+            head = stream.read(len(_SIGNATURE))
+    except (OSError, ValueError) as error:
+        found = "no such file" if isinstance(error, FileNotFoundError) else error
+        raise FormatError(file, "file", found, "a readable file") from None
+    if head != _SIGNATURE:
+        raise FormatError(file, "content", repr(head), "an HDF5 file")
+    try:
+        with library.File(file, "r") as group:
+            yield group
+    except (FormatError, IndexError):
+        raise
+    except Exception as error:  # whatever the library raises means damage
+        raise FormatError(file, "data", error or type(error).__name__, "a whole HDF5 file") from None
+
+
+def _checked(group: Any, key: str, file: Path) -> Any:
+    """An array of numbers stored in this file, whose rows fit into memory."""
+    library = need("h5py")
+    if not isinstance(group.get(key, getlink=True), library.HardLink):
+        raise FormatError(file, key, "a link", "an array in this file")
+    array = group.get(key)
+    if not isinstance(array, library.Dataset) or array.dtype.kind not in "fiu" or not array.shape:
+        raise FormatError(file, key, type(array).__name__, "an array of numbers")
+    if array.is_virtual or array.external:
+        raise FormatError(file, key, "values in another file", "an array in this file")
+    pipeline = array.id.get_create_plist()
+    names = {1: "gzip", 2: "shuffle", 3: "fletcher32", 32000: "lzf"}
+    filters = {names.get(pipeline.get_filter(i)[0], "unknown") for i in range(pipeline.get_nfilters())}
+    if not filters <= _FILTERS:
+        raise FormatError(file, f"{key} filters", ", ".join(sorted(filters)), ", ".join(sorted(_FILTERS)))
+    row = math.prod(array.shape[1:]) * array.dtype.itemsize
+    chunk = math.prod(array.chunks or (1,)) * array.dtype.itemsize
+    if max(row, chunk) > MAX_BYTES:
+        raise FormatError(file, f"{key} size", f"rows of {row} and chunks of {chunk} bytes", f"at most {MAX_BYTES}")
+    return array
