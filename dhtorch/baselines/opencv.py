@@ -44,7 +44,8 @@ def lucas_kanade(
         error = np.linalg.norm(back[:, 0] - start, axis=-1)
         inside = ((there[:, 0] >= 0) & (there[:, 0] <= [grey_1.shape[1] - 1, grey_1.shape[0] - 1])).all(-1)
         valid = (found[:, 0] > 0) & (returned[:, 0] > 0) & inside & (error < max_round_trip_px)
-        rows.append((there[:, 0], error, residual[:, 0] / 255, valid))
+        residual = np.where(found[:, 0] > 0, residual[:, 0], 0) / 255  # left undefined where nothing was found
+        rows.append((there[:, 0], error, residual, valid))
     uv_1, error, photometric, valid = (
         torch.from_numpy(np.stack(column)).to(uv_0.device) for column in zip(*rows, strict=True)
     )

@@ -1,0 +1,85 @@
+"""Timing both sides in turn, in one process, and one row format for every script.
+
+Rows: ``{name, mode, n, batch, threads, device, ours_ms, ours_iqr, peer, peer_ms, ratio, ours_error, peer_error, bar}``;
+``ratio`` is ours / peer of medians, below 1 = ours is faster.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import torch
+
+
+def in_turn(calls: Sequence[Callable[[], Any]], *, repeats: int = 15, warm_up: int = 3) -> list[list[float]]:
+    """Milliseconds of each call, ``repeats`` times, the calls taking turns so that noise hits all alike."""
+    for _ in range(warm_up):
+        for call in calls:
+            call()
+    times: list[list[float]] = [[] for _ in calls]
+    for _ in range(repeats):
+        for call, record in zip(calls, times, strict=True):
+            start = time.perf_counter()
+            call()
+            record.append(1e3 * (time.perf_counter() - start))
+    return times
+
+
+def iqr(values: Sequence[float]) -> float:
+    """Interquartile range."""
+    quarters = statistics.quantiles(values, n=4)
+    return quarters[2] - quarters[0]
+
+
+def row(name: str, ours: Sequence[float], peer: str, theirs: Sequence[float], **more: Any) -> dict[str, Any]:
+    """One line of a result file; ``more`` fills n, batch, threads, mode, errors, bar."""
+    a, b = statistics.median(ours), statistics.median(theirs)
+    base = {
+        "mode": "eager",
+        "n": None,
+        "batch": 1,
+        "device": "cpu",
+        "ours_error": None,
+        "peer_error": None,
+        "bar": False,
+    }
+    timing = {"ours_ms": a, "ours_iqr": iqr(ours), "peer": peer, "peer_ms": b, "ratio": a / b}
+    return {"name": name, **base, "threads": torch.get_num_threads(), **timing, **more}
+
+
+def set_threads(threads: int) -> None:
+    """The same number of threads for torch and OpenCV."""
+    torch.set_num_threads(threads)
+    cv2.setNumThreads(threads)
+
+
+def arguments(description: str) -> argparse.ArgumentParser:
+    """The options every script has."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--json", type=Path, help="write the rows to this file")
+    parser.add_argument("--full", action="store_true", help="the whole grid instead of the default few minutes")
+    parser.add_argument("--repeats", type=int, default=15)
+    return parser
+
+
+def report(rows: list[dict[str, Any]], path: Path | None) -> None:
+    """Print the rows as a table and write them as strict JSON."""
+    head = f"{'name':34} {'mode':8} {'n':>6} {'B':>3} {'thr':>3} {'ours ms':>9} {'iqr':>7} {'peer':22} {'ms':>9}"
+    print(head + f" {'ratio':>6} {'ours err':>9} {'peer err':>9}")
+    for r in rows:
+        errors = "".join(f" {r[k]:9.4g}" if r[k] is not None else f" {'-':>9}" for k in ("ours_error", "peer_error"))
+        print(
+            f"{r['name']:34} {r['mode']:8} {r['n'] or 0:6d} {r['batch']:3d} {r['threads']:3d} {r['ours_ms']:9.2f} "
+            f"{r['ours_iqr']:7.2f} {r['peer']:22} {r['peer_ms']:9.2f} {r['ratio']:6.2f}{errors}"
+        )
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(rows, indent=1, allow_nan=False) + "\n")
+        print(f"wrote {path}")
