@@ -169,7 +169,7 @@ def _recording(
 ) -> Recording:
     there = set().union(*frames.values())
     needed = [*_NEEDED, *(what for what in _OPTIONAL if what in there)]
-    report = [] if "wide/depth/confidence" in there or not confidence else ["no confidence: every return counts alike"]
+    report = []
     keys = list(frames)
     for what in needed:
         kept = [key for key in keys if what in frames[key]]
@@ -178,6 +178,8 @@ def _recording(
         keys = kept
     if not keys:
         raise FormatError(archive, "frames", "; ".join(report) or "none", f"members {', '.join(needed)}")
+    if confidence and "wide/depth/confidence" not in there:
+        report.append("no confidence: every return counts alike")
     spans = {
         what: np.array([frames[key].get(what, (-1, 0)) for key in keys], dtype=np.int64)
         for what in {*needed, *_TRUTH} & there
