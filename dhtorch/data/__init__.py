@@ -14,7 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
-from dhtorch.data import arkitscenes, ca1m, driving, frames_dir, rectified, rh20t, tum
+from dhtorch.data import arkitscenes, ca1m, driving, frames_dir, record3d, rectified, rh20t, stray, tum
 from dhtorch.data.files import FormatError
 from dhtorch.data.recording import Recording
 
@@ -22,12 +22,14 @@ __all__ = ["FORMATS", "FormatError", "Recording", "open", "open_all", "open_scen
 
 #: Name → reader, asked in this order; the first that recognises a folder reads it.
 FORMATS: Final[dict[str, ModuleType]] = {
+    "record3d": record3d,  # before tum: its folder, too, holds rgb/ and depth/
     "tum": tum,
     "driving": driving,
     "rectified": rectified,
     "arkitscenes": arkitscenes,
     "ca1m": ca1m,
     "rh20t": rh20t,
+    "stray": stray,
     "frames_dir": frames_dir,
 }
 

@@ -425,6 +425,14 @@ def read_bytes(file: Path, limit: int = MAX_BYTES) -> bytes:
         raise FormatError(file, "file", found, "a readable file") from None
 
 
+def left_out(names: Sequence[int | str], why: str) -> list[str]:
+    """A line for a recording's report about frames that are not in it; none for none."""
+    if not names:
+        return []
+    shown = ", ".join(map(str, names[:6])) + (" …" if len(names) > 6 else "")
+    return [f"frame {shown}: {why}: left out" if len(names) == 1 else f"{len(names)} frames ({shown}): {why}: left out"]
+
+
 def _kind_name(kind: type | tuple[type, ...]) -> str:
     kinds = kind if isinstance(kind, tuple) else (kind,)
     words: dict[type, str] = {dict: "an object", list: "a list", str: "a text"}

@@ -99,12 +99,12 @@ def read(
     shots, late = _covered(shots, meta)
     c2w, lost, said = _poses([shot.number for shot in shots], meta, poses)
     kept = [shot for shot in shots if shot.number not in lost]
-    report += late + said + _left_out(sorted(lost), "its pose is not usable (tracking lost)")
+    report += late + said + files.left_out(sorted(lost), "its pose is not usable (tracking lost)")
     if not kept:
         raise FormatError(inner, "frames", "; ".join(report) or "none", "frames with picture, depth and metadata")
     load = _Load(tuple(kept), meta, *_sizes(kept, meta), exr_channel)
     good = [i for i, shot in enumerate(kept) if not (verify or _suspect(shot)) or _decodes(load, i)]
-    report += _left_out([shot.number for i, shot in enumerate(kept) if i not in set(good)], "damaged")
+    report += files.left_out([shot.number for i, shot in enumerate(kept) if i not in set(good)], "damaged")
     if not good:
         raise FormatError(inner, "frames", "; ".join(report), "frames that decode")
     number = torch.tensor([kept[i].number for i in good])
@@ -267,7 +267,7 @@ def _shots(members: Mapping[str, Member], root: Path) -> tuple[list[_Shot], list
             shots.append(_Shot(number, found["jpg"], found["depth"], found.get("conf")))
     gap = sorted(set(range(min(parts), max(parts))) - set(parts)) if max(parts) - min(parts) < 10 * len(parts) else []
     missing |= {"no file": gap} if gap else {}
-    return shots, [line for why, numbers in missing.items() for line in _left_out(numbers, why)]
+    return shots, [line for why, numbers in missing.items() for line in files.left_out(numbers, why)]
 
 
 def _covered(shots: list[_Shot], meta: _Metadata) -> tuple[list[_Shot], list[str]]:
@@ -276,7 +276,7 @@ def _covered(shots: list[_Shot], meta: _Metadata) -> tuple[list[_Shot], list[str
     lengths += [len(meta.K)] if len(meta.K) > 1 else []
     known = [shot for shot in shots if shot.number < min(lengths, default=shot.number + 1)]
     late = [shot.number for shot in shots if shot not in known] if len(known) < len(shots) else []
-    return known, _left_out(late, f"beyond the metadata's {min(lengths, default=0)} rows")
+    return known, files.left_out(late, f"beyond the metadata's {min(lengths, default=0)} rows")
 
 
 def _poses(numbers: list[int], meta: _Metadata, wanted: bool) -> tuple[np.ndarray | None, set[int], list[str]]:
@@ -344,12 +344,3 @@ def _decodes(load: _Load, i: int) -> bool:
     except FormatError:
         return False
     return True
-
-
-def _left_out(numbers: Sequence[int], why: str) -> list[str]:
-    if not numbers:
-        return []
-    shown = ", ".join(map(str, numbers[:6])) + (" …" if len(numbers) > 6 else "")
-    return [
-        f"frame {shown}: {why}: left out" if len(numbers) == 1 else f"{len(numbers)} frames ({shown}): {why}: left out"
-    ]

@@ -15,7 +15,9 @@ from dhtorch.data.writers.layouts import (
     write_npz_pair,
     write_tum,
 )
+from dhtorch.data.writers.record3d import write_r3d, write_record3d_exr, write_record3d_mp4
 from dhtorch.data.writers.rh20t import write_rh20t
+from dhtorch.data.writers.stray import write_stray
 
 __all__ = [
     "write_arkitscenes",
@@ -25,6 +27,10 @@ __all__ = [
     "write_driving",
     "write_named_frames",
     "write_npz_pair",
+    "write_r3d",
+    "write_record3d_exr",
+    "write_record3d_mp4",
     "write_rh20t",
+    "write_stray",
     "write_tum",
 ]
