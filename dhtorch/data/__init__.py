@@ -16,9 +16,10 @@ from typing import Any, Final
 
 from dhtorch.data import arkitscenes, ca1m, driving, frames_dir, record3d, rectified, rh20t, stray, tum
 from dhtorch.data.files import FormatError
+from dhtorch.data.focal_stacks import open_stacks
 from dhtorch.data.recording import Recording
 
-__all__ = ["FORMATS", "FormatError", "Recording", "open", "open_all", "open_scenes", "recognise"]
+__all__ = ["FORMATS", "FormatError", "Recording", "open", "open_all", "open_scenes", "open_stacks", "recognise"]
 
 #: Name → reader, asked in this order; the first that recognises a folder reads it.
 FORMATS: Final[dict[str, ModuleType]] = {

@@ -1,0 +1,54 @@
+"""Focal stacks of any known format, beside the recordings: ``open_stacks(path)``."""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Final
+
+from dhtorch.data import ddff12, fod500, image_folder
+from dhtorch.data.files import FormatError
+from dhtorch.data.stacks import Stacks
+
+#: Name → reader, asked in this order; the first that recognises a folder reads it.
+STACK_FORMATS: Final[dict[str, ModuleType]] = {"fod500": fod500, "ddff12": ddff12, "images": image_folder}
+
+
+def open_stacks(root: str | Path, format: str = "auto", **options: Any) -> Stacks:
+    """The focal stacks at ``root``, opened lazily: nothing is decoded before a stack is asked for.
+
+    Args:
+        root: a folder, or an HDF5 file.
+        format: ``fod500``, ``ddff12``, ``images``, or ``auto`` to recognise it by its content.
+        options: keyword options of the reader, see ``dhtorch.data.<format>.read`` (``images``: ``image_folder``).
+
+    Raises:
+        FormatError: nothing there, an unknown format, or a file that is not what its format promises.
+        ValueError: an option that the reader does not have.
+    """
+    root = Path(root)
+    if not root.exists():
+        raise FormatError(root, "path", "no such file or folder", "focal stacks")
+    if format == "auto":
+        format = recognise_stacks(root)[0]
+    elif format not in STACK_FORMATS:
+        raise FormatError(root, "format", format, f"auto, {', '.join(STACK_FORMATS)}")
+    read = STACK_FORMATS[format].read
+    known = list(inspect.signature(read).parameters)[1:]
+    for option in options:
+        if option not in known:
+            raise ValueError(f"stacks: format {format} has no option {option!r}, expected one of {', '.join(known)}")
+    return read(root, **options)
+
+
+def recognise_stacks(root: str | Path) -> tuple[str, str]:
+    """(format, what makes it one, in words) of focal stacks.
+
+    Raises:
+        FormatError: no format recognises it.
+    """
+    for name, reader in STACK_FORMATS.items():
+        if evidence := reader.recognise(Path(root)):
+            return name, evidence
+    raise FormatError(root, "format", "no focal stack", f"one of {', '.join(STACK_FORMATS)}")

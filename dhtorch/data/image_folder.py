@@ -1,0 +1,73 @@
+"""A plain folder of pictures of one view as a focal stack, in the order of the numbers in their names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from torch import Tensor
+
+from dhtorch.data import codec_tiff, files
+from dhtorch.data.files import FormatError
+from dhtorch.data.stacks import FocalStack, Stacks, focus_distances, read_pictures
+
+_PICTURE = re.compile(r"[^.].*\.(png|jpe?g|tiff?)", re.IGNORECASE)
+
+
+def recognise(root: Path) -> str | None:
+    """What makes ``root`` a focal stack of this format, in words; None if nothing does."""
+    pictures = sorted(_files(root), key=_by_number)
+    if len(pictures) < 2 or _size(pictures[0]) is None or _size(pictures[0]) != _size(pictures[-1]):
+        return None
+    return f"{len(pictures)} pictures of one size"
+
+
+def read(root: str | Path, *, focus_m: Sequence[float] | None = None) -> Stacks:
+    """Open a folder of pictures (PNG, JPEG, TIFF) as one focal stack.
+
+    Args:
+        root: the folder.
+        focus_m: the distances in focus, in the order of the pictures. None = not known.
+
+    Raises:
+        FormatError: less than two pictures, or another number of distances.
+    """
+    root = Path(root)
+    pictures = tuple(sorted(_files(root), key=_by_number))
+    if len(pictures) < 2:
+        raise FormatError(root, "pictures", len(pictures), "at least two, at different focus")
+    focus = None if focus_m is None else focus_distances(focus_m, root, len(pictures))
+    name = root.resolve().name
+    return Stacks(name, "images", _Load(pictures, focus), (name,), root)
+
+
+@dataclass(frozen=True, eq=False)
+class _Load:
+    """0 → the stack."""
+
+    pictures: tuple[Path, ...]
+    focus: Tensor | None
+
+    def __call__(self, i: int) -> FocalStack:
+        return FocalStack(read_pictures(self.pictures)[None], None if self.focus is None else self.focus[None])
+
+
+def _files(root: Path) -> list[Path]:
+    return [file for file in root.iterdir() if _PICTURE.fullmatch(file.name)] if root.is_dir() else []
+
+
+def _by_number(file: Path) -> tuple[object, ...]:
+    """1, 2, 10 in this order, with or without leading zeros."""
+    parts = re.split(r"(\d+)", file.name)
+    return tuple((not part.isdecimal(), int(part) if part.isdecimal() else part) for part in parts)
+
+
+def _size(file: Path) -> tuple[int, int] | None:
+    """(height, width); None of a damaged file."""
+    try:
+        tiff = file.suffix.lower() in (".tif", ".tiff")
+        return codec_tiff.tiff_header(file).hw if tiff else files.image_header(file).hw
+    except FormatError:
+        return None
