@@ -59,10 +59,10 @@ class Table:
 
 def tables(result: Result) -> list[Table]:
     """The tables of one result: errors by scene, what the truth test dropped, holes by class, time by stage."""
-    order = list(dict.fromkeys(row["scene"] for row in result["rows"]))
-    scenes = sorted((row for row in result["rows"] if row["pair"] is None), key=lambda row: order.index(row["scene"]))
     methods = list(dict.fromkeys(row["method"] for row in result["rows"]))
-    found = [_main(result, scenes, methods)]
+    truths = list(dict.fromkeys(row.get("truth") for row in result["rows"]))
+    several = len(truths) > 1
+    found = [_main(result, t, f"{describe(result)}; truth test {t}" if several else describe(result)) for t in truths]
     groups = (("n_dropped", "truth dropped", "count"), ("hole_share", "holes by class", "percent"))
     for group, title, show in (*groups, ("ms", "milliseconds per pair", "number")):
         table = _group(result, methods, group, title, show)
@@ -84,7 +84,7 @@ def print_tables(result: Result, console: Any = None) -> None:
 
     console = console or Console()
     if not console.is_terminal:
-        console.width = max(console.width, 140)  # a file has no edge to wrap at
+        console.width = max(console.width, 180)  # a file has no edge to wrap at
     for table in tables(result):
         shown = RichTable(
             title=escape(table.title), box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False
@@ -138,29 +138,36 @@ def describe(result: Result) -> str:
     )
 
 
-def _main(result: Result, scenes: list[Any], methods: list[str]) -> Table:
+def _main(result: Result, truth: str | None, title: str) -> Table:
+    """Errors by scene and method for one truth test; scenes with a role stand apart from the summary."""
+    mine = [row for row in result["rows"] if row.get("truth") == truth]
+    order = list(dict.fromkeys(row["scene"] for row in mine))
+    scenes = sorted((row for row in mine if row["pair"] is None), key=lambda row: order.index(row["scene"]))
+    methods = list(dict.fromkeys(row["method"] for row in mine))
     columns = (*COLUMNS, *(c for c in OPTIONAL if any(row.get(c.metric) is not None for row in scenes)))
     lead = ["scene", "method"] if len(methods) > 1 else ["scene"]
-    pairs = [(row["scene"], row["method"]) for row in result["rows"] if row["pair"] is not None]
+    pairs = [(row["scene"], row["method"]) for row in mine if row["pair"] is not None]
+    apart = {row["scene"] for row in scenes if row.get("role")}
 
     def line(scene: str, method: str, count: str, cells: list[str]) -> list[str]:
         return [*[scene, method][: len(lead)], count, *cells]
 
     rows = []
     for row in scenes:
-        count = pairs.count((row["scene"], row["method"]))
+        name = f"{row['scene']} ({row['role']})" if row.get("role") else row["scene"]
         cells = [_show(row.get(c.metric), c.show) for c in columns]
-        rows.append(line(row["scene"], row["method"], str(count), cells))
+        rows.append(line(name, row["method"], str(pairs.count((row["scene"], row["method"]))), cells))
     footer = []
-    for method in methods:
-        entries = [(_entry(result, method, c.metric), c.show) for c in columns]
-        n_scenes, n_pairs = len({row["scene"] for row in scenes}), sum(m == method for _, m in pairs)
+    n_scenes = len({row["scene"] for row in scenes} - apart)
+    for method in methods if n_scenes else ():
+        entries = [(_entry(result, method, c.metric, truth), c.show) for c in columns]
+        n_pairs = sum(m == method and scene not in apart for scene, m in pairs)
         values = [_show(entry.get("value"), show) for entry, show in entries]
         footer.append(line(f"{n_scenes} scene{'s' * (n_scenes != 1)}", method, str(n_pairs), values))
         ranges = [_range(entry.get("low"), entry.get("high"), show) for entry, show in entries]
         if any(ranges):
             footer.append(line(INTERVAL, method, "", ranges))
-    return Table(describe(result), [*lead, "pairs", *(c.head for c in columns)], rows + footer, len(lead), len(footer))
+    return Table(title, [*lead, "pairs", *(c.head for c in columns)], rows + footer, len(lead), len(footer))
 
 
 def _group(result: Result, methods: list[str], group: str, title: str, show: str) -> Table | None:
@@ -178,10 +185,11 @@ def _group(result: Result, methods: list[str], group: str, title: str, show: str
     return Table(title, head, rows) if members and rows else None
 
 
-def _entry(result: Result, method: str, metric: str) -> Mapping[str, Any]:
-    """Summary of a metric, under the method's name or, in a result of one method, plain."""
+def _entry(result: Result, method: str, metric: str, truth: str | None = None) -> Mapping[str, Any]:
+    """Summary of a metric: under the method and truth test, under the method, or plain in a result of one method."""
     summary = result["summary"]
-    return summary.get(f"{method}.{metric}") or summary.get(metric) or {}
+    found = summary.get(f"{method}.{truth}.{metric}") or summary.get(f"{method}.{metric}")
+    return found or summary.get(metric) or {}
 
 
 def _show(value: float | None, show: str) -> str:
