@@ -250,6 +250,17 @@ def test_a_frame_missing_in_the_middle_is_skipped_and_reported(tmp_path: Path) -
     check_same(recording, [frames[i] for i in (0, 2, 4, 7)], 1 / 1000)
 
 
+def test_confidence_is_that_of_the_depth_map(tmp_path: Path) -> None:
+    root = tmp_path / "1"
+    image = shots([100.0], VGA, VGA_HW)
+    depths = shots([99.991, 100.007])
+    writers.write_arkitscenes(root, {"vga_wide": image, "lowres_depth": depths}, trajectory=image)
+    assert torch.equal(stored(root)[0].conf, depths[1].conf)
+    drop(root, "confidence", "100.007")  # the other one is near the image too, but belongs to another depth map
+    with pytest.raises(FormatError, match="1 images without confidence: left out"):
+        stored(root)
+
+
 def test_no_confidence_at_all(tmp_path: Path) -> None:
     root = tmp_path / "1"
     capture(root)
@@ -388,10 +399,10 @@ def test_laser_depth_far_in_time_or_in_disagreement_is_no_truth(tmp_path: Path) 
     far = recording.truth(-1)
     assert not far["depth"].any() and math.isnan(float(far["disagreement"]))
     assert len(stored(root, max_truth_gap=1.0).report) == 0
-    nothing = wrong.replace(depth=torch.zeros_like(wrong.depth))
-    writers.write_arkitscenes(root, {"highres_depth": [nothing]})
-    unshared = stored(root).truth(0)
-    assert not unshared["depth"].any() and math.isnan(float(unshared["disagreement"]))
+    blind = frames[0].replace(depth=torch.zeros_like(frames[0].depth))
+    writers.write_arkitscenes(root, {"highres_depth": frames[:1], "lowres_depth": [blind]})
+    unchecked = stored(root).truth(0)  # right, but nothing says so
+    assert not unchecked["depth"].any() and math.isnan(float(unchecked["disagreement"]))
     assert not hasattr(stored(root, truth=False), "truth")
 
 
@@ -471,7 +482,7 @@ def test_bad_files(tmp_path: Path) -> None:
     ):
         traj.write_text(text)
         fails(message, root)
-    fails(r"option max_\*: found 0.0", root, max_pose_gap=0)
+    fails("option max_pose_gap: found 0.0", root, max_pose_gap=0)
     for file in (root / "lowres_depth").iterdir():
         file.unlink()
     fails(r"lowres_depth: found none, expected <video id>_<seconds>.png", root)

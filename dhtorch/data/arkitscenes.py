@@ -98,9 +98,10 @@ def read(
         FormatError: a missing asset, nothing that associates, or a damaged file.
     """
     root = Path(root)
-    limits = (max_difference, max_pose_difference, max_pose_gap, max_truth_gap, max_disagreement)
-    for limit in limits:
-        files.to_positive(limit, root, "option max_*")
+    limits = {"max_difference": max_difference, "max_pose_difference": max_pose_difference}
+    limits |= {"max_pose_gap": max_pose_gap, "max_truth_gap": max_truth_gap, "max_disagreement": max_disagreement}
+    for option, limit in limits.items():
+        files.to_positive(limit, root, f"option {option}")
     places = _places(root)
     name, pictures = _pictures(root, places, image)
     links, report = _links(root, places, name, pictures.times, max_difference)
