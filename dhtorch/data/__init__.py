@@ -14,7 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
-from dhtorch.data import arkitscenes, ca1m, driving, frames_dir, record3d, rectified, rh20t, stray, tum
+from dhtorch.data import arkitscenes, ca1m, driving, frames_dir, lerobot, record3d, rectified, rh20t, stray, tum
 from dhtorch.data.files import FormatError
 from dhtorch.data.focal_stacks import open_stacks
 from dhtorch.data.recording import Recording
@@ -30,6 +30,7 @@ FORMATS: Final[dict[str, ModuleType]] = {
     "arkitscenes": arkitscenes,
     "ca1m": ca1m,
     "rh20t": rh20t,
+    "lerobot": lerobot,
     "stray": stray,
     "frames_dir": frames_dir,
 }

@@ -7,6 +7,7 @@ headers must add up to what the footer promised and stay below a limit, so that 
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -74,6 +75,36 @@ def read_columns(
         if isinstance(error, FormatError):
             raise
         raise FormatError(file, "data", error, "decodable columns") from None
+
+
+def read_cell(file: Path, column: str, row: int) -> Any:
+    """One value; its row group stays in memory, so that the next row costs nothing.
+
+    Raises:
+        FormatError: as :func:`read_columns`.
+    """
+    try:
+        key = (file, file.stat().st_mtime_ns, column)
+    except (OSError, ValueError) as error:
+        found = "no such file" if isinstance(error, FileNotFoundError) else error
+        raise FormatError(file, "file", found, "a readable file") from None
+    first, values = _held.get(key, (0, ()))
+    if not first <= row < first + len(values):
+        _held.pop(key, None)
+        while len(_held) >= _MAX_HELD:
+            _held.popitem(last=False)
+        starts = parquet_header(file).groups
+        if not 0 <= row < starts[-1]:
+            raise FormatError(file, "rows", starts[-1], f"row {row}")
+        group = int(np.searchsorted(starts, row, "right")) - 1
+        first, values = starts[group], read_columns(file, [column], (starts[group], starts[group + 1]))[column]
+        _held[key] = (first, values)
+    return values[row - first]
+
+
+#: Row groups in memory, by file, time of change and column: first row and values.
+_held: OrderedDict[tuple[Path, int, str], tuple[int, Any]] = OrderedDict()
+_MAX_HELD = 4
 
 
 def _open(file: Path) -> tuple[Any, ParquetHeader]:

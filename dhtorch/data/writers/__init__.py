@@ -16,6 +16,7 @@ from dhtorch.data.writers.layouts import (
     write_npz_pair,
     write_tum,
 )
+from dhtorch.data.writers.lerobot import write_lerobot
 from dhtorch.data.writers.record3d import write_r3d, write_record3d_exr, write_record3d_mp4
 from dhtorch.data.writers.rh20t import write_rh20t
 from dhtorch.data.writers.stray import write_stray
@@ -29,6 +30,7 @@ __all__ = [
     "write_driving",
     "write_fod500",
     "write_image_folder",
+    "write_lerobot",
     "write_light_field",
     "write_named_frames",
     "write_npz_pair",

@@ -1,0 +1,62 @@
+"""Rows of a LeRobot table: which belong to an episode, in what order, at what time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from dhtorch.data.codec_parquet import parquet_header, read_columns
+from dhtorch.data.files import FormatError
+from dhtorch.data.lerobot_meta import Episode, Meta
+
+
+def read_table(file: Path, more: Sequence[str]) -> dict[str, np.ndarray]:
+    """The columns that place a row, and ``more``, of a whole table; pictures stay where they are.
+
+    Raises:
+        FormatError: a missing or damaged table or column.
+    """
+    have = parquet_header(file).columns
+    table: dict[str, np.ndarray] = {}
+    places = [name for name in ("timestamp", "frame_index", "episode_index") if name in have or name != "episode_index"]
+    for name, values in read_columns(file, [*places, *more]).items():
+        if not isinstance(values, np.ndarray):
+            raise FormatError(file, name, "no numbers", "numbers")
+        if name in places and values.size != len(values):
+            raise FormatError(file, name, f"shape {values.shape}", "one number a row")
+        table[name] = values.reshape(-1) if name in places else values
+    return table
+
+
+def episode_rows(
+    meta: Meta, episode: Episode, table: dict[str, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
+    """Rows of the episode, their frame numbers and times (s), and what was left out.
+
+    Raises:
+        FormatError: no usable row.
+    """
+    every = np.full(len(table["timestamp"]), episode.number)
+    rows = np.flatnonzero(table.get("episode_index", every) == episode.number)
+    number, stamp = table["frame_index"][rows].astype(np.float64), table["timestamp"][rows].astype(np.float64)
+    sound = (number >= 0) & (number < 2**31) & (stamp >= 0) & (stamp < 1e9)  # false for NaN
+    keep = sound & _later(number, sound) & _later(stamp, sound)
+    report = []
+    if not keep.all():
+        report.append(f"episode {episode.number}: {int((~keep).sum())} rows out of order: left out")
+    if episode.length is not None and episode.length != len(rows):
+        report.append(f"episode {episode.number}: {len(rows)} rows, {episode.length} according to meta/episodes")
+    rows, number, stamp = rows[keep], number[keep], stamp[keep]
+    if len(rows) == 0:
+        raise FormatError(episode.data, f"episode {episode.number}", "no usable row", "frames")
+    # Stamps are float32; the grid that they were rounded from is exact.
+    grid = number / meta.fps
+    return rows, number.astype(np.int64), np.where(np.abs(grid - stamp) < 1e-4, grid, stamp), report
+
+
+def _later(values: np.ndarray, sound: np.ndarray) -> np.ndarray:
+    """Which values are larger than every sound one before them."""
+    known = np.where(sound, values, -1.0)
+    return values > np.maximum.accumulate(np.concatenate(([-1.0], known)))[:-1]

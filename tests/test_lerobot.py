@@ -1,0 +1,366 @@
+"""LeRobot data sets, v3 and v2.1: written with known geometry, read back, and damaged."""
+
+from __future__ import annotations
+
+import json
+import math
+import pickle
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import hostile
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+pytest.importorskip("av")
+pytest.importorskip("pyarrow")
+
+import pyarrow
+from pyarrow import parquet
+
+from dhtorch import data
+from dhtorch.data import codec_parquet, lerobot_depth
+from dhtorch.data.codec_video import close_videos
+from dhtorch.data.files import FormatError
+from dhtorch.data.lerobot_meta import Feature
+from dhtorch.data.writers.lerobot import quantise, write_lerobot
+from dhtorch.data.writers.lossless import write_lossless
+from dhtorch.geometry import camera as cameras
+from dhtorch.geometry import se3
+from dhtorch.records import Camera, Frame, Pose
+
+HW = (48, 64)
+CAMERA = Camera(torch.tensor([[61.5, 58.25]]), torch.tensor([[33.5, 21.75]]))
+BOX = torch.tensor([2.0, 1.5, 3.0], dtype=torch.float64)
+KEY = "observation.images.front"
+STEP = {"video": 3e-3, "tiff": 1e-6, "png": 1e-3, "array": 1e-3}  # m, up to 5 m (codes: 2.8 mm there)
+
+
+@pytest.fixture(autouse=True)
+def _clean() -> Iterator[None]:
+    torch.set_num_threads(1)
+    yield
+    close_videos()
+
+
+# ---------------------------------------------------------------------------------- a box room known to the last digit
+
+
+def pose(i: int) -> Pose:
+    xi = [0.25 - 0.03 * i, 0.7 + 0.05 * i, -0.4 + 0.04 * i, 0.3 * math.sin(i), 0.1 * i, -0.2 + 0.08 * i]
+    return se3.exp(torch.tensor([xi]).double())
+
+
+def render(T: Pose, time: float, camera: Camera = CAMERA) -> Frame:
+    v, u = torch.meshgrid(torch.arange(HW[0]), torch.arange(HW[1]), indexing="ij")
+    ray = se3.rotate(T.R, cameras.rays(camera.to(torch.float64), torch.stack((u, v), -1).reshape(1, -1, 2).double()))[0]
+    depth = ((torch.sign(ray) * BOX - T.t[0]) / ray).amin(-1)
+    xyz = (T.t[0] + depth[:, None] * ray).reshape(*HW, 3)
+    tone = torch.stack([torch.sin(3 * xyz[..., 0] + 1), torch.sin(4 * xyz[..., 1]), torch.sin(5 * xyz[..., 2])])
+    image = ((tone * 0.5 + 0.5) * 255).round().to(torch.uint8)
+    stamp = torch.tensor([time], dtype=torch.float64)
+    return Frame(image[None], depth.reshape(1, *HW).float(), camera, time=stamp, T_world_from_cam=T)
+
+
+def off_wall(frame: Frame) -> Tensor:
+    """Relative distance of the frame's world points from the walls."""
+    v, u = torch.nonzero(frame.depth[0] > 0, as_tuple=True)
+    uv, z = torch.stack((u, v), -1).double()[None], frame.depth[0, v, u].double()[None]
+    xyz = se3.apply(frame.T_world_from_cam, cameras.unproject(frame.camera.to(torch.float64), uv, z))[0]
+    return ((xyz.abs() / BOX).amax(-1) - 1).abs()
+
+
+def episodes() -> list[list[Frame]]:
+    """Two episodes of unequal length, so that nothing falls on the same place in both."""
+    return [[render(pose(i), i / 30) for i in range(2)], [render(pose(5 + i), i / 30) for i in range(4)]]
+
+
+def same_scene(recording: data.Recording, frames: list[Frame], step: float) -> None:
+    assert len(recording) == len(frames) and recording.report == ()
+    for frame, want in zip(recording, frames, strict=True):
+        assert torch.equal(frame.image, want.image)
+        torch.testing.assert_close(frame.depth, want.depth, atol=step / 2 + 1e-6, rtol=0)
+        assert torch.equal(frame.camera.f, want.camera.f) and torch.equal(frame.camera.c, want.camera.c)
+        torch.testing.assert_close(frame.T_world_from_cam.R, want.T_world_from_cam.R, atol=1e-12, rtol=0)
+        torch.testing.assert_close(frame.T_world_from_cam.t, want.T_world_from_cam.t, atol=1e-12, rtol=0)
+        torch.testing.assert_close(frame.time, want.time, atol=1e-9, rtol=0)
+        assert float(off_wall(frame).max()) < 2 * step
+
+
+# ------------------------------------------------------------------------------------------------ written, then read
+
+
+@pytest.mark.parametrize("version", [3, 2])
+@pytest.mark.parametrize(
+    ("image", "depth", "intrinsics"),
+    [("video", "video", "feature"), ("image", "tiff", "side-car"), ("video", "png", "feature"), ("image", "array", "feature")],
+)  # fmt: skip
+def test_gives_back_the_scene(tmp_path: Path, version: int, image: str, depth: str, intrinsics: str) -> None:
+    shots = episodes()
+    write_lerobot(tmp_path, shots, version=version, image=image, depth=depth, intrinsics=intrinsics)
+    assert data.recognise(tmp_path)[0] == "lerobot"
+    recordings = data.open_all(tmp_path)
+    assert [r.name for r in recordings] == [f"{tmp_path.name}/episode_{i:06d}/front" for i in range(2)]
+    for recording, frames in zip(recordings, shots, strict=True):
+        same_scene(recording, frames, STEP[depth])
+        assert recording.rate_hz == 30 and len(pickle.dumps(recording)) < 20_000
+    backwards = [recordings[1][i].image for i in (3, 0, 2)]
+    assert all(torch.equal(got, shots[1][i].image) for got, i in zip(backwards, (3, 0, 2), strict=True))
+
+
+def test_one_episode_and_its_camera_by_name(tmp_path: Path) -> None:
+    write_lerobot(tmp_path, episodes())
+    same_scene(data.open(tmp_path, episode=1, camera=KEY), episodes()[1], STEP["video"])
+    assert [r.name[-12:] for r in data.open_all(tmp_path, episode=[1, 0])] == ["000001/front", "000000/front"]
+    with pytest.raises(FormatError, match=r"meta: episodes: found 0 of those asked for, expected \[7\]"):
+        data.open(tmp_path, episode=7)
+    with pytest.raises(FormatError, match=r"info.json: cameras: found wrist, expected of observation.images.front"):
+        data.open(tmp_path, camera="wrist")
+
+
+@pytest.mark.parametrize("depth_pixels", ["gray12le", "yuv420p12le"])
+def test_depth_codes_survive_both_pixel_formats(tmp_path: Path, depth_pixels: str) -> None:
+    """A conversion of yuv420p12le to grey would stretch its range: codes are read as they stand."""
+    write_lerobot(tmp_path, episodes(), depth_pixels=depth_pixels)
+    same_scene(data.open(tmp_path, episode=0), episodes()[0], STEP["video"])
+
+
+def test_lost_zeros_are_no_returns(tmp_path: Path) -> None:
+    frame = episodes()[0][0]
+    depth = frame.depth.clone()
+    depth[0, :4], depth[0, 4:6], depth[0, 6:8], depth[0, 8:10] = 0, 12.0, 9.5, 0.011
+    write_lerobot(tmp_path, [[frame.replace(depth=depth)]])
+    got = data.open(tmp_path)[0].depth[0]
+    assert not got[:6].any() and not got[8:10].any()  # never a made-up centimetre
+    torch.testing.assert_close(got[6:8], depth[0, 6:8], atol=2.2e-3, rtol=0)
+    assert bool((got[10:] > 0).all())
+    cut = data.open(tmp_path, depth_range=[0.5, 3.0])[0].depth[0]
+    assert torch.equal(cut, torch.where((got >= 0.5) & (got <= 3), got, torch.zeros_like(got))) and bool(
+        (cut != got).any()
+    )
+
+
+@pytest.mark.parametrize("log", [True, False])
+def test_codes_to_metres(log: bool) -> None:
+    feature = Feature("d", "video", (1, 4096, 1), {"video.depth_min": 0.2, "video.depth_max": 4, "video.use_log": log})
+    metres = lerobot_depth.decode_codes(feature, np.arange(4096, dtype=np.uint16), Path("x"))
+    assert not metres[[0, 1, 4094, 4095]].any() and (np.diff(metres[2:-2]) > 0).all()
+    steps = np.diff(metres[2:-2])
+    assert steps[-1] / steps[0] == pytest.approx((4 + 3.5) / (0.2 + 3.5) if log else 1, rel=0.01)
+    with pytest.raises(FormatError, match="12-bit codes"):
+        lerobot_depth.decode_codes(feature, np.array([4096], dtype=np.uint16), Path("x"))
+    bad = Feature("d", "video", (1, 1), {"video.depth_min": 5.0, "video.depth_max": 4.0})
+    with pytest.raises(FormatError, match="a range of metres"):
+        lerobot_depth.decode_codes(bad, np.zeros((1, 1), np.uint16), Path("x"))
+
+
+def test_writer_codes_by_the_published_rule() -> None:
+    """Step 1.5 mm at 1 m, 1.8 at 2 m, 2.8 at 5 m, 4.4 at 10 m."""
+    z = torch.tensor([[[1.0, 2.0, 5.0, 9.98]]])
+    blank = Frame(torch.zeros(1, 3, 1, 4), z, CAMERA)
+    codes = quantise(blank)
+    feature = Feature("d", "video", (1, 4, 1), {})
+    metres = lerobot_depth.decode_codes(feature, codes + np.array([[0], [1]], dtype=np.uint16), Path("x"))
+    np.testing.assert_allclose(np.diff(metres, axis=0)[0] * 1000, [1.5, 1.8, 2.8, 4.4], atol=0.06)
+
+
+def test_depth_unit_of_pictures(tmp_path: Path) -> None:
+    """Without a unit in the info whole numbers are mm and others m; the info and the option win."""
+    write_lerobot(tmp_path, episodes(), depth="png")
+    exact = data.open(tmp_path, episode=0)[0].depth
+    torch.testing.assert_close(data.open(tmp_path, episode=0, depth_unit="m")[0].depth, exact * 1000)
+    edit(tmp_path, lambda info: info["features"][f"{KEY}_depth"]["info"].update(depth_unit="m"))
+    torch.testing.assert_close(data.open(tmp_path, episode=0)[0].depth, exact * 1000)
+    edit(tmp_path, lambda info: info["features"][f"{KEY}_depth"]["info"].update(depth_unit="ft"))
+    with pytest.raises(FormatError, match=r"depth_unit: found ft, expected m or mm"):
+        data.open(tmp_path, episode=0)[0]
+
+
+def edit(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    file = root / "meta" / "info.json"
+    info = json.loads(file.read_text())
+    change(info)
+    file.write_text(json.dumps(info))
+
+
+# -------------------------------------------------------------------------------------------------- intrinsics, depth
+
+
+def test_K_must_come_from_somewhere(tmp_path: Path) -> None:
+    write_lerobot(tmp_path, episodes(), intrinsics=None)
+    with pytest.raises(
+        FormatError, match=r"meta/intrinsics.json: observation.images.front: .*option K, a feature such"
+    ):
+        data.open(tmp_path, episode=0)
+    camera = data.open(tmp_path, episode=0, K=[61.5, 58.25, 33.5, 21.75], distortion=[0.1, 0, 0, 0])[0].camera
+    assert torch.equal(camera.f, CAMERA.f) and torch.equal(camera.c, CAMERA.c) and float(camera.distortion[0, 0]) > 0
+    side = {KEY: {"K": [[50, 0, 30], [0, 50, 20], [0, 0, 1]], "dist": [0.1, 0.01, 0, 0, 0], "K_depth": [[70, 0, 31], [0, 66, 23], [0, 0, 1]]}}  # fmt: skip
+    (tmp_path / "meta" / "intrinsics.json").write_text(json.dumps(side))
+    frame = data.open(tmp_path, episode=0)[0]
+    assert frame.camera.f.tolist() == [[50, 50]] and frame.camera.distortion.shape == (1, 5)
+    assert frame.depth_camera.f.tolist() == [[70, 66]]
+    assert data.open(tmp_path, episode=0, K_depth=[71, 66, 31, 23])[0].depth_camera.f.tolist() == [[71, 66]]
+    with pytest.raises(FormatError, match=r"option intrinsics: found x, expected one of"):
+        data.open(tmp_path, episode=0, intrinsics="x")
+
+
+def test_K_may_change_from_frame_to_frame(tmp_path: Path) -> None:
+    lenses = [Camera(CAMERA.f + i, CAMERA.c) for i in range(3)]
+    shots = [render(pose(i), i / 30, camera) for i, camera in enumerate(lenses)]
+    write_lerobot(tmp_path, [episodes()[0], shots])
+    same_scene(data.open(tmp_path, episode=1), shots, STEP["video"])
+
+
+def test_depth_is_the_one_named_like_the_camera(tmp_path: Path) -> None:
+    write_lerobot(tmp_path, episodes(), depth="array")
+    other = {"dtype": "image", "shape": [*HW, 3], "info": {}}
+    edit(tmp_path, lambda info: info["features"].update({"observation.images.wrist": other}))
+    recording = data.open(tmp_path, episode=0, camera=KEY)
+    assert recording.report == () and recording[0].depth.any()
+    edit(tmp_path, lambda info: info["features"].update({"side_depth": info["features"].pop(f"{KEY}_depth")}))
+    recording = data.open(tmp_path, episode=0, camera=KEY)
+    assert recording.report == (f"{KEY}: no depth feature: depth is empty",)
+    assert not recording[0].depth.any() and recording[0].depth.shape == (1, *HW)
+    with pytest.raises(FormatError, match=r"side_depth, expected|columns"):
+        data.open(tmp_path, episode=0, camera=KEY, depth="side_depth")[0]
+    with pytest.raises(FormatError, match=r"option depth: found nothing_there"):
+        data.open(tmp_path, episode=0, camera=KEY, depth="nothing_there")
+
+
+# ------------------------------------------------------------------------------------------------------- rows and time
+
+
+def rewrite(file: Path, change: Callable[[pyarrow.Table], pyarrow.Table]) -> None:
+    parquet.write_table(change(parquet.read_table(file)), file, row_group_size=3)
+
+
+def test_episodes_are_not_told_from_the_stamps(tmp_path: Path) -> None:
+    """In v3 both start at stamp 0 in one table and one video; the boundary stands in meta/episodes alone."""
+    write_lerobot(tmp_path, episodes())
+    file = tmp_path / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
+    name = f"videos/{KEY}/from_timestamp"
+    rewrite(file, lambda t: t.set_column(t.schema.get_field_index(name), name, pyarrow.array([0.0, 1 / 30])))
+    first, second = data.open_all(tmp_path)
+    assert torch.equal(first[0].image, episodes()[0][0].image)
+    assert torch.equal(second[0].image, episodes()[0][1].image)  # as the table says
+    rewrite(file, lambda t: t.set_column(t.schema.get_field_index(name), name, pyarrow.array([0.0, 0.1 + 2e-4])))
+    with pytest.raises(FormatError, match=r"time 0.100200 s: found nearest frame at 0.100000 s, expected one within"):
+        data.open(tmp_path, episode=1)[0]
+    assert torch.equal(data.open(tmp_path, episode=1, tolerance=1e-3)[0].image, episodes()[1][1].image)
+
+
+def test_missing_and_shuffled_rows_are_reported(tmp_path: Path) -> None:
+    write_lerobot(tmp_path, episodes(), version=2)
+    file = tmp_path / "data" / "chunk-000" / "episode_000001.parquet"
+    rewrite(file, lambda t: t.take([0, 1, 3]))
+    recording = data.open(tmp_path, episode=1)
+    assert recording.number.tolist() == [0, 1, 3] and "3 rows, 4 according to meta/episodes" in recording.report[0]
+    assert torch.equal(recording[2].image, episodes()[1][3].image)
+    rewrite(file, lambda t: t.take([0, 2, 1]))
+    recording = data.open(tmp_path, episode=1)
+    assert recording.number.tolist() == [0, 3] and "1 rows out of order: left out" in recording.report[0]
+
+
+def test_a_shorter_video_is_an_error_where_it_ends(tmp_path: Path) -> None:
+    write_lerobot(tmp_path, episodes(), version=2, depth=None)
+    file = tmp_path / "videos" / "chunk-000" / KEY / "episode_000001.mp4"
+    pictures = [frame.image[0].permute(1, 2, 0).numpy() for frame in episodes()[1][:3]]
+    write_lossless(file, pictures, "rgb24")
+    recording = data.open(tmp_path, episode=1)
+    assert torch.equal(recording[2].image, episodes()[1][2].image)
+    with pytest.raises(FormatError, match=r"episode_000001.mp4: time 0.100000 s: found nearest frame at 0.066667 s"):
+        recording[3]
+
+
+def test_opening_decodes_no_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_lerobot(tmp_path, episodes(), image="image", depth="tiff")
+    asked: list[str] = []
+    read = codec_parquet.read_columns
+    monkeypatch.setattr(codec_parquet, "read_columns", lambda f, c, r=None: asked.extend(c) or read(f, c, r))
+    recording = data.open(tmp_path, episode=1)
+    assert KEY not in asked
+    for frame in recording:
+        assert frame.depth.any()
+    assert asked.count(KEY) == 2 == asked.count(f"{KEY}_depth")  # four rows in two row groups
+
+
+# ---------------------------------------------------------------------------------------------------------- bad input
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("data_path", "../{chunk_index:03d}.parquet"),
+        ("data_path", "/etc/{chunk_index:03d}.parquet"),
+        ("data_path", "{chunk_index.__class__}.parquet"),
+        ("data_path", "{chunk_index:0999999999d}.parquet"),
+        ("data_path", "{other}.parquet"),
+        ("video_path", "{video_key:03d}"),
+        ("codebase_version", "v1.6"),
+        ("fps", 0),
+        ("fps", None),
+        ("chunks_size", 0),
+        ("features", []),
+    ],
+)
+def test_bad_info(tmp_path: Path, key: str, value: object) -> None:
+    write_lerobot(tmp_path, episodes(), depth=None)
+    edit(tmp_path, lambda info: info.update({key: value}))
+    with pytest.raises(FormatError, match=rf"info.json: {key}"):
+        data.open_all(tmp_path)
+
+
+def test_pages_that_unpack_into_too_much_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Megabytes of zeros in a few kilobytes: honest in the footer, then claimed by a page alone."""
+    file = tmp_path / "x.parquet"
+    parquet.write_table(pyarrow.table({"x": [bytes(3 << 20)] * 2}), file, compression="zstd", use_dictionary=False)
+    assert file.stat().st_size < 10_000 and len(codec_parquet.read_columns(file, ["x"])["x"][1]) == 3 << 20
+    monkeypatch.setattr(codec_parquet, "_MAX_CHUNK_BYTES", 4 << 20)
+    with pytest.raises(FormatError, match=r"x.parquet: x: found \d+ bytes, expected at most 4194304"):
+        codec_parquet.read_columns(file, ["x"])
+    parquet.write_table(pyarrow.table({"x": np.arange(100)}), file, use_dictionary=False, compression="none")
+    assert codec_parquet.read_columns(file, ["x"])["x"].tolist() == list(range(100))
+    good = file.read_bytes()
+    size = codec_parquet._thrift(good, 4)[0][2]
+    coded = [bytes([(2 * n & 127) | 128, 2 * n >> 7]) for n in (size, size + 1000)]  # zigzag, seven bits a byte
+    file.write_bytes(good.replace(coded[0], coded[1], 1))
+    with pytest.raises(FormatError, match=rf"that unpack into {size + 1000}"):
+        codec_parquet.read_columns(file, ["x"])
+
+
+def test_columns_that_cannot_be_arrays(tmp_path: Path) -> None:
+    file = tmp_path / "x.parquet"
+    columns = {"hole": [1.0, None], "ragged": [[1.0], [1.0, 2.0]], "text": ["a", "b"], "deep": [[[1, 2]], [[3, 4]]]}
+    parquet.write_table(pyarrow.table(columns), file)
+    for name, message in (("hole", "1 missing values"), ("ragged", "lists of unequal length"), ("none", "columns")):
+        with pytest.raises(FormatError, match=message):
+            codec_parquet.read_columns(file, [name])
+    read = codec_parquet.read_columns(file, ["text", "deep"], (1, 2))
+    assert read["text"] == ["b"] and read["deep"].tolist() == [[[3, 4]]]
+    assert codec_parquet.read_cell(file, "deep", 1).tolist() == [[3, 4]]
+    with pytest.raises(FormatError, match=r"rows: found 2, expected row 2"):
+        codec_parquet.read_cell(file, "deep", 2)
+
+
+def _v3(root: Path) -> None:
+    write_lerobot(root, [episodes()[0], episodes()[1][:2]], depth="video")
+
+
+def _v2(root: Path) -> None:
+    write_lerobot(root, [episodes()[0]], version=2, image="image", depth="tiff", intrinsics="side-car")
+
+
+@pytest.mark.parametrize("write", [_v3, _v2])
+def test_damaged_sets(tmp_path: Path, write: Callable[[Path], None]) -> None:
+    counts = hostile.attack(write, hostile.read_frames, tmp_path, mutants=60)
+    assert counts["FormatError"] > 20
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(0)
+@pytest.mark.parametrize("write", [_v3, _v2])
+def test_many_damaged_sets(tmp_path: Path, write: Callable[[Path], None]) -> None:
+    hostile.attack(write, hostile.read_frames, tmp_path, mutants=2000, seed=1)
