@@ -186,6 +186,7 @@ def _child(read: Callable[[Path], Any], path: Path, tmp_path: Path, report: int)
         nothing = os.open(os.devnull, os.O_RDWR)
         for stream in (0, 1, 2):
             os.dup2(nothing, stream)
+        sys.stdout = sys.stderr = open(os.devnull, "w")  # noqa: PTH123, SIM115  (pytest's own would write to a file)
         signal.signal(signal.SIGXFSZ, signal.SIG_DFL)  # Python turns it into an error that a reader might swallow
         resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
