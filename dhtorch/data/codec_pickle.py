@@ -110,7 +110,8 @@ def _filled(dtype: np.dtype, shape: tuple[int, ...], fortran: bool, raw: bytes) 
     """An array of raw bytes; its size is what the bytes say, not what the header says."""
     if dtype.kind not in "biufSU" or dtype.itemsize == 0 or dtype.names or dtype.subdtype:
         raise ValueError(f"array of {dtype}")
-    if len(shape) > 8 or any(type(n) is not int or n < 0 for n in shape):
+    # Beside a zero any other number would fit no bytes at all, and whoever walks along that axis would not come back.
+    if len(shape) > 8 or any(type(n) is not int or not 0 <= n <= max(len(raw), 4096) for n in shape):
         raise ValueError(f"array shape {shape}")
     if math.prod(shape) * dtype.itemsize != len(raw):
         raise ValueError(f"{len(raw)} bytes for an array of {shape}")
