@@ -1,0 +1,181 @@
+"""README's tables and picture, made from committed result files and the built-in room.
+
+python benchmarks/readme.py            rewrite the tables between the markers in README.md
+python benchmarks/readme.py --check    exit 1 if README.md does not say what the result files say
+python benchmarks/readme.py --picture  also render benchmarks/results/room.png again
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).resolve().parent
+README = HERE.parent / "README.md"
+RESULTS = HERE / "results"
+
+
+def percent(value: float | None) -> str:
+    """A share as text."""
+    return "–" if value is None else f"{100 * value:.1f} %"
+
+
+def number(value: float | None) -> str:
+    """Two decimals."""
+    return "–" if value is None else f"{value:.2f}"
+
+
+def table(head: list[str], rows: list[list[str]]) -> str:
+    """A Markdown table, words left and numbers right."""
+    align = [":--", *["--:"] * (len(head) - 1)]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, align, *rows))
+
+
+def scenes(name: str, truth: str) -> dict[str, dict[str, dict[str, Any]]]:
+    """Scene → method → row of a result file, for one truth test."""
+    found: dict[str, dict[str, dict[str, Any]]] = {}
+    for row in json.loads((RESULTS / f"{name}.json").read_text())["rows"]:
+        if row["pair"] is None and row["truth"] == truth:
+            found.setdefault(row["scene"], {})[row["method"]] = row
+    return found
+
+
+def kept(row: dict[str, Any]) -> float:
+    """Share of the held-back returns that the truth test and the texture limit let through."""
+    return row["n_candidates"] / (row["n_candidates"] + sum(row["n_dropped"].values()))
+
+
+def room() -> str:
+    """The built-in room: exact and with the LiDAR model, both methods."""
+    rows = []
+    for name, words in (("room_exact", "exact depth, no noise"), ("room_phone", "LiDAR model")):
+        (methods,) = scenes(name, "full").values()
+        for method in ("paper", "opencv"):
+            r = methods[method]
+            numbers = [percent(r[k]) for k in ("coverage", "median_rel", "p90_rel", "wrong_share")]
+            rows.append([f"{words}, `{method}`", str(r["n_candidates"]), *numbers])
+    return table(["sensor, method", "candidates", "coverage", "median error", "p90", "> 20 % off"], rows)
+
+
+def shared() -> str:
+    """The real scenes: both methods side by side, full truth test."""
+    rows = []
+    for scene, methods in scenes("shared_scenes", "full").items():
+        a, b = methods["paper"], methods["opencv"]
+        name = f"{scene} ({a['role']})" if a["role"] else scene
+        cells = [name, str(a["n_pairs"]), str(a["n_candidates"]), percent(kept(a))]
+        for key, show in (("coverage", percent), ("median_rel", percent), ("p90_rel", percent), ("corr", number)):
+            cells.append(f"{show(a[key])} / {show(b[key])}")
+        rows.append([*cells, f"{percent(a['pnp_success'])} / {percent(b['pnp_success'])}"])
+    head = ["scene", "pairs", "candidates", "truth kept", "coverage", "median error", "p90", "corr", "pose found"]
+    return table(head, rows)
+
+
+def truths() -> str:
+    """What the truth test changes: medians over scenes."""
+    summary = json.loads((RESULTS / "shared_scenes.json").read_text())["summary"]
+    rows = []
+    for truth in ("raw", "5x5", "full"):
+        prefix = {m: f"{m}." if truth == "full" else f"{m}.{truth}." for m in ("paper", "opencv")}
+        cells = [truth, str(int(summary[f"{prefix['paper']}n_candidates"]["value"]))]
+        for key in ("coverage", "median_rel", "p90_rel"):
+            cells.append(" / ".join(percent(summary[f"{p}{key}"]["value"]) for p in prefix.values()))
+        rows.append(cells)
+    return table(["truth test", "candidates", "coverage", "median error", "p90"], rows)
+
+
+def speed() -> str:
+    """Milliseconds per pair by stage."""
+    rows = json.loads((RESULTS / "pair.json").read_text())
+    shown = []
+    for threads in (1, 2):
+        for batch in (1, 8):
+            mine = {
+                r["name"].partition(".")[2] or "whole pair": r
+                for r in rows
+                if (r["threads"], r["batch"]) == (threads, batch)
+            }
+            for stage in ("whole pair", "track", "pose", "triangulate"):
+                r = mine[stage]
+                cells = [f"{threads} thread{'s' * (threads > 1)}, B = {batch}, {stage}"]
+                shown.append([*cells, f"{r['ours_ms']:.1f}", f"{r['peer_ms']:.1f}", f"{r['ratio']:.2f}"])
+    return table(["", "`paper`, ms", "`opencv`, ms", "ratio"], shown)
+
+
+def picture(path: Path) -> None:
+    """The idea at a glance: what the sensor may say within 2 m, and what two views add."""
+    import matplotlib as mpl
+    import torch
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    from dhtorch import extend, merge
+    from dhtorch.codes import Source
+    from dhtorch.data.synthetic import SyntheticRoom
+    from dhtorch.evaluate import holdout
+
+    torch.set_num_threads(1)
+    recording = SyntheticRoom()
+    whole = recording[0]
+    near, other = holdout.range_split(whole, 2.0), holdout.range_split(recording[recording.gap], 2.0)
+    trace: dict[str, Any] = {}
+    estimate = extend(near, other, trace=trace)
+    merged = merge(trace["samples"], estimate)
+    figure, axes = plt.subplots(1, 3, figsize=(15, 4.1))
+    sensor, recovered = (merged.source[0] == s for s in (Source.SENSOR, Source.RECOVERED))
+    panels = (
+        ("one view of a room", None),
+        ("a sensor that reaches 2 m", sensor),
+        ("… and what two views add", sensor | recovered),
+    )
+    for axis, (title, mask) in zip(axes, panels, strict=True):
+        grey = whole.image[0].float().mean(0)
+        axis.imshow(
+            whole.image[0].permute(1, 2, 0) if mask is None else grey, cmap="gray", alpha=1 if mask is None else 0.45
+        )
+        if mask is not None:
+            dots = axis.scatter(*merged.uv[0][mask].T, c=merged.depth[0][mask], s=5, cmap="turbo", vmin=1, vmax=5)
+        axis.set_title(title, fontsize=13)
+        axis.set(xlim=(0, 639), ylim=(479, 0))
+        axis.axis("off")
+    figure.tight_layout()
+    figure.colorbar(dots, ax=axes, label="depth, m", shrink=0.85, pad=0.01)
+    figure.savefig(path, dpi=80, bbox_inches="tight")
+
+
+TABLES = {"room": room, "shared": shared, "truths": truths, "speed": speed}
+
+
+def fill(text: str) -> str:
+    """README with the tables as the result files have them."""
+    for name, make in TABLES.items():
+        pattern = rf"(<!-- {name} -->\n).*?(<!-- end -->)"
+        text, count = re.subn(pattern, lambda m, make=make: f"{m[1]}{make()}\n{m[2]}", text, flags=re.DOTALL)
+        if count != 1:
+            raise ValueError(f"{README}: marker <!-- {name} -->: found {count}, expected one")
+    return text
+
+
+def main() -> int:
+    """Rewrite or check README.md."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true")
+    parser.add_argument("--picture", action="store_true")
+    options = parser.parse_args()
+    now = README.read_text()
+    wanted = fill(now)
+    if options.check:
+        return int(now != wanted)
+    README.write_text(wanted)
+    if options.picture:
+        picture(RESULTS / "room.png")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
