@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 #: Sub-command → module with ``main(argv) -> int``.
-COMMANDS = {"report": "dhtorch.report"}
+COMMANDS = {"inspect": "dhtorch.capture", "report": "dhtorch.report"}
 
 #: What bad input raises: reported in one line, without a traceback.
 USER_ERRORS = (ValueError, OSError, KeyError, ImportError)

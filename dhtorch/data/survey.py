@@ -1,0 +1,332 @@
+"""What a capture holds, in words: facts, warnings, and a few pictures to look at.
+
+Only some frames, spread over the capture, are decoded, so that a large one answers at once. Nothing here refuses: a
+frame that cannot be read, a missing pose or an empty depth map becomes a warning.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dhtorch.data.files import FormatError
+from dhtorch.data.stacks import FocalStack, Stacks
+from dhtorch.geometry import camera as cameras
+from dhtorch.geometry import lookup, se3
+from dhtorch.records import Camera, Frame, Pose
+
+PERCENTILES = (1, 5, 25, 50, 75, 95, 99)
+
+_CONSTANT_M, _CONSTANT_RAD = 1e-3, 1e-3  # poses that move less do not move
+_FAST = 5.0  # m/s; nobody carries a phone so fast
+_MANY_HOLES = 0.5
+_FAR = 200.0  # m; more is millimetres taken for metres
+_DISAGREE = 0.1  # median relative difference of depth carried from frame to frame
+_SAMPLED = 200_000  # depth values a frame that enter the percentiles
+
+
+@dataclass(frozen=True, eq=False)
+class Tile:
+    """One picture of the contact sheet, as it is stored."""
+
+    title: str
+    image: Tensor | None = None  # (C, H, W)
+    depth: Tensor | None = None  # (h, w) m
+    conf: Tensor | None = None  # (h, w)
+
+
+@dataclass(eq=False)
+class Survey:
+    """What was found in one recording, stack, or folder; filled in as it is read."""
+
+    name: str
+    format: str
+    facts: list[tuple[str, str]] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    tiles: list[Tile] = field(default_factory=list)
+    depths: Tensor = field(default_factory=lambda: torch.zeros(0))  # (M,) m, returns of the frames that were read
+    path: Tensor | None = None  # (n, 3) m, places of the camera
+
+    def say(self, what: str, text: str) -> None:
+        """Add a fact."""
+        self.facts.append((what, text))
+
+    def warn(self, text: str) -> None:
+        """Add a warning."""
+        self.warnings.append(text)
+
+
+def survey_recording(recording: Any, frames: int = 8) -> Survey:
+    """Facts of a recording (or what looks like one), from its tables and ``frames`` of its frames."""
+    out = Survey(recording.name, recording.format)
+    n = len(recording)
+    skipped = int(recording.number[-1] - recording.number[0]) + 1 - n
+    out.say("frames", f"{n}" + (f", {skipped} numbers missing in between" if skipped else ""))
+    _times(recording.times, recording.rate_hz, out)
+    places = sorted({round(k * (n - 1) / max(frames - 1, 1)) for k in range(frames)})
+    shots: dict[int, Frame] = {}
+    for i in places:
+        try:
+            shots[i] = recording[i]
+        except FormatError as error:
+            out.warn(f"frame {int(recording.number[i])} cannot be read: {error}")
+    if shots:
+        _pictures(list(shots.values()), out)
+        _depths(list(shots.values()), out)
+        _confidence([s.conf for s in shots.values() if s.conf is not None], out)
+        _cameras(list(shots.values()), out)
+    _poses(recording, out)
+    _agreement(recording, shots, out)
+    out.warnings.extend(recording.report)
+    for i, shot in shots.items():
+        conf = None if shot.conf is None else shot.conf[0]
+        image = shot.image[0] if shot.image.numel() else None
+        out.tiles.append(Tile(f"{int(recording.number[i])}", image, shot.depth[0], conf))
+    return out
+
+
+def survey_stacks(stacks: Stacks, shown: int = 8) -> Survey:
+    """Facts of focal stacks, from the first of them."""
+    out = Survey(stacks.name, stacks.format)
+    stack: FocalStack = stacks[0]
+    images = stack.images[0]
+    s, c, h, w = images.shape
+    out.say("focal stacks", f"{len(stacks)}, of {s} pictures each")
+    out.say("pictures", f"{w}x{h}, {_kind(c, images)}")
+    if stack.focus_m is None:
+        out.warn("no focus distances: the order of the pictures is all that is known")
+    else:
+        out.say("in focus at", ", ".join(f"{x:.3g}" for x in stack.focus_m[0].tolist()) + " m")
+    if stack.focal_length_m is not None and stack.f_number is not None:
+        out.say("lens", f"f = {1e3 * float(stack.focal_length_m):g} mm, N = {float(stack.f_number):g}")
+    if stack.camera is not None:
+        out.say("intrinsics", _camera(stack.camera, (h, w)))
+    if stack.depth is not None:
+        _depth_facts([stack.depth[0]], out)
+    _duplicates(list(images), out, "pictures")
+    out.warnings.extend(stacks.report)
+    for k in sorted({round(k * (s - 1) / max(shown - 1, 1)) for k in range(shown)}):
+        out.tiles.append(Tile(f"picture {k + 1}", images[k]))
+    if stack.depth is not None:
+        out.tiles.append(Tile("truth", depth=stack.depth[0]))
+    return out
+
+
+def survey_pictures(name: str, images: dict[str, Tensor], depths: dict[str, Tensor]) -> Survey:
+    """Facts of loose pictures and depth maps that no format claims: no intrinsics, no poses, no order."""
+    out = Survey(name, "loose pictures")
+    for what, found in (("pictures", images), ("depth maps", depths)):
+        if found:
+            sizes = sorted({f"{x.shape[-1]}x{x.shape[-2]}" for x in found.values()})
+            out.say(what, f"{len(found)}, {', '.join(sizes)}")
+    if depths:
+        _depth_facts(list(depths.values()), out)
+    out.warn("no intrinsics and no poses: nothing can be measured in it")
+    out.tiles.extend(Tile(title, image=image) for title, image in images.items())
+    out.tiles.extend(Tile(title, depth=depth) for title, depth in depths.items())
+    return out
+
+
+# -------------------------------------------------------------------------------------------------------------- facts
+
+
+def _times(times: Tensor | None, rate_hz: float | None, out: Survey) -> None:
+    nominal = f"nominal {rate_hz:.3g} Hz" if rate_hz else ""
+    if times is None or len(times) < 2:
+        out.say("rate", nominal or "not known")
+        if times is None:
+            out.warn("no time stamps")
+        return
+    step = times.diff()
+    middle = float(step.median())
+    measured = f"{1 / middle:.4g} Hz" if middle > 0 else "0 s from frame to frame"
+    out.say("rate", f"{measured} measured" + (f", {nominal}" if nominal else ""))
+    out.say("duration", f"{float(times[-1] - times[0]):.3f} s")
+    if bool((step <= 0).any()):
+        out.warn(f"time stamps do not increase at {int((step <= 0).sum())} places")
+    gaps = step > 2.5 * middle
+    if bool(gaps.any()):
+        out.warn(f"{int(gaps.sum())} gaps in time, the longest {float(step.max()):.3f} s")
+
+
+def _pictures(shots: Sequence[Frame], out: Survey) -> None:
+    image = shots[0].image
+    if image.numel() == 0:
+        out.say("pictures", "none")
+        out.warn("depth only: there are no pictures")
+        return
+    h, w = shots[0].hw
+    out.say("pictures", f"{w}x{h}, {_kind(image.shape[1], image)}")
+    _duplicates([s.image[0] for s in shots], out, "frames")
+    grey = torch.stack([lookup.luma(s.image[:, :, ::4, ::4], 1).mean() for s in shots])
+    if float(grey.max()) < 0.02:
+        out.warn("all pictures are black")
+
+
+def _kind(channels: int, images: Tensor) -> str:
+    return f"{'colour' if channels == 3 else 'grey'}, {'8 bits' if images.dtype == torch.uint8 else 'float'}"
+
+
+def _duplicates(images: Sequence[Tensor], out: Survey, what: str) -> None:
+    if len(images) > 1 and all(x.shape == images[0].shape and torch.equal(x, images[0]) for x in images[1:]):
+        out.warn(f"all {what} that were read are the same picture")
+
+
+def _depths(shots: Sequence[Frame], out: Survey) -> None:
+    own = shots[0].depth_camera is not None
+    _depth_facts([s.depth[0] for s in shots], out, ", not registered to the picture" if own else "")
+
+
+def _depth_facts(depths: Sequence[Tensor], out: Survey, remark: str = "") -> None:
+    sizes = sorted({f"{d.shape[1]}x{d.shape[0]}" for d in depths})
+    out.say("depth", ", ".join(sizes) + remark)
+    holes = torch.stack([(d == 0).double().mean() for d in depths])
+    out.say("holes", _span([100 * h for h in holes.tolist()], "{:.1f}") + " % of the depth map")
+    values = torch.cat([_thinned(d[d > 0]) for d in depths])
+    out.depths = values
+    if values.numel() == 0:
+        out.warn("no depth at all in the frames that were read")
+        return
+    ranks = torch.quantile(values.double(), torch.tensor(PERCENTILES).double() / 100)
+    table = ", ".join(f"{p} %: {x:.3f}" for p, x in zip(PERCENTILES, ranks.tolist(), strict=True))
+    out.say("depth percentiles", f"{table} m")
+    out.say("depth range", f"{float(values.min()):.3f} to {float(values.max()):.3f} m")
+    empty = int((holes == 1).sum())
+    if empty:
+        out.warn(f"{empty} of {len(depths)} depth maps that were read are empty")
+    elif float(holes.mean()) > _MANY_HOLES:
+        out.warn(f"most of the depth map is holes ({100 * float(holes.mean()):.0f} %)")
+    if float(ranks[3]) > _FAR:
+        out.warn(f"median depth is {float(ranks[3]):.0f} m: are these millimetres?")
+    if float(values.max() - values.min()) < 1e-3:
+        out.warn("depth is the same everywhere")
+
+
+def _thinned(values: Tensor) -> Tensor:
+    return values[:: max(1, -(-values.numel() // _SAMPLED))]
+
+
+def _confidence(maps: Sequence[Tensor], out: Survey) -> None:
+    if not maps:
+        return
+    counts = torch.stack([torch.bincount(m.flatten().long(), minlength=3)[:3] for m in maps]).sum(0)
+    share = (100 * counts / counts.sum().clamp(min=1)).tolist()
+    named = zip(("low", "medium", "high"), share, strict=True)
+    out.say("confidence", ", ".join(f"{word} {x:.1f} %" for word, x in named))
+    if max(share) > 99.99:
+        out.warn("confidence is the same everywhere")
+
+
+def _cameras(shots: Sequence[Frame], out: Survey) -> None:
+    hw, first = shots[0].hw, shots[0].camera
+    if min(hw) == 0 and shots[0].depth_camera is not None:
+        first, hw = shots[0].depth_camera, (shots[0].depth.shape[-2], shots[0].depth.shape[-1])
+    out.say("intrinsics", _camera(first, hw))
+    f = torch.cat([s.camera.f for s in shots])
+    if float((f.amax(0) / f.amin(0)).max()) > 1 + 1e-6:
+        out.say("focal length", _span(f[:, 0].tolist(), "{:.2f}") + " px: it changes from frame to frame")
+    if shots[0].depth_camera is not None and min(shots[0].hw) > 0:
+        out.say("of the depth", _camera(shots[0].depth_camera, tuple(shots[0].depth.shape[-2:])))  # type: ignore[arg-type]
+    fx, fy = first.f[0].tolist()
+    if not 0.95 < fx / fy < 1.05:
+        out.warn(f"focal lengths {fx:.1f} and {fy:.1f} px: pixels are not square")
+    centre = torch.tensor([hw[1], hw[0]]) / 2
+    if min(hw) > 0 and bool(((first.c[0] - centre).abs() > 0.3 * centre).any()):
+        out.warn("the principal point is far from the middle of the picture")
+
+
+def _camera(camera: Camera, hw: tuple[int, int]) -> str:
+    (fx, fy), (cx, cy) = camera.f[0].tolist(), camera.c[0].tolist()
+    view = [2 * math.degrees(math.atan(n / 2 / f)) for n, f in ((hw[1], fx), (hw[0], fy))]
+    lens = "no distortion" if camera.distortion is None else f"{camera.distortion.shape[-1]} distortion coefficients"
+    return f"f {fx:.2f} {fy:.2f}, c {cx:.2f} {cy:.2f} px, field of view {view[0]:.0f}° x {view[1]:.0f}°, {lens}"
+
+
+def _span(values: Sequence[float], form: str) -> str:
+    low, high = form.format(min(values)), form.format(max(values))
+    return low if low == high else f"{low} to {high}"
+
+
+# -------------------------------------------------------------------------------------------------------------- poses
+
+
+def _poses(recording: Any, out: Survey) -> None:
+    poses: Pose | None = recording.poses
+    if poses is None:
+        out.say("poses", "none")
+        return
+    out.path = poses.t
+    off = float((torch.linalg.det(poses.R) - 1).abs().max())
+    out.say("poses", f"{len(recording)}, determinant within {off:.1e} of 1")
+    if len(recording) < 2:
+        return
+    step = poses.t.diff(dim=0).norm(dim=-1)
+    turn = se3.rotation_angle(se3.relative(poses[1:], poses[:-1]).R)
+    size = float((poses.t.amax(0) - poses.t.amin(0)).norm())
+    length, turned = float(step.sum()), _degrees(turn.sum())
+    out.say("path", f"{length:.3f} m long inside a box of {size:.3f} m, {turned:.1f}° of turning")
+    usual = f"{float(step.median()):.4f} m and {_degrees(turn.median()):.2f}° from frame to frame"
+    out.say("step", f"{usual}, at most {float(step.max()):.3f} m")
+    if float(step.sum()) < _CONSTANT_M and float(turn.sum()) < _CONSTANT_RAD:
+        out.warn("poses are constant")
+    elif size < _CONSTANT_M:
+        out.warn("the camera turns but does not move: there is no baseline")
+    if recording.times is not None:
+        speed = step / recording.times.diff().clamp(min=1e-9)
+        out.say("speed", f"{float(speed.median()):.3f} m/s, at most {float(speed.max()):.3f} m/s")
+        if float(speed.max()) > _FAST and not recording.sparse:
+            number = int(recording.number[int(speed.argmax()) + 1])
+            out.warn(f"the camera jumps: {float(speed.max()):.1f} m/s at frame {number}")
+
+
+def _degrees(angle: Tensor) -> float:
+    return math.degrees(float(angle))
+
+
+def _agreement(recording: Any, shots: dict[int, Frame], out: Survey) -> None:
+    """Depth carried by the poses into a later frame against the depth there."""
+    if recording.poses is None or recording.sparse or len(recording) < 2:
+        return
+    step = min(recording.gap or 5, len(recording) - 1)
+    found = []
+    for i in list(shots)[:: max(1, len(shots) // 3)]:
+        j = i + step if i + step < len(recording) else i - step
+        try:
+            later = shots.get(j) or recording[j]
+        except FormatError:
+            continue
+        error = _disagreement(shots[i], later)
+        if error is not None:
+            found.append(error)
+    if found:
+        middle = sorted(found)[len(found) // 2]
+        out.say("depth and poses", f"agree to {100 * middle:.2f} % from frame to frame")
+        if middle > _DISAGREE:
+            out.warn("depth and poses contradict each other: axes, units or scale may be wrong")
+
+
+def _disagreement(a: Frame, b: Frame) -> float | None:
+    """Median of |z − z'| / z' of the returns of ``a`` carried into ``b``; None where too few meet."""
+    if a.T_world_from_cam is None or b.T_world_from_cam is None:
+        return None
+    v, u = (x[::7] for x in torch.nonzero(a.depth[0] > 0, as_tuple=True))
+    uv = torch.stack((u, v), -1)[None].to(a.camera.f.dtype)
+    xyz = cameras.unproject(_depth_camera(a), uv, a.depth[0, v, u][None])
+    xyz = se3.apply(se3.relative(a.T_world_from_cam, b.T_world_from_cam), xyz.double())
+    value, inside = lookup.nearest(b.depth, cameras.project(_depth_camera(b), xyz.to(uv.dtype)))
+    meet = inside & (value > 0) & (xyz[..., 2] > 0)
+    if int(meet.sum()) < 50:
+        return None
+    return float(((xyz[..., 2] - value).abs() / value)[meet].median())
+
+
+def _depth_camera(frame: Frame) -> Camera:
+    hw = (frame.depth.shape[-2], frame.depth.shape[-1])
+    if frame.depth_camera is not None:
+        return frame.depth_camera
+    return frame.camera if hw == frame.hw else cameras.resize(frame.camera, frame.hw, hw)
