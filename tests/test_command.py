@@ -14,7 +14,7 @@ import pytest
 from dhtorch import archive
 from dhtorch.run import config_dir
 
-TINY = ["data.hw=[120,160]", "data.n_frames=4", "pairs.gap=2", "method.n=256", "threads=1"]
+TINY = ["data.hw=[120,160]", "data.n_frames=4", "pairs.gap=2", "method.n=256"]
 REPO = Path(__file__).resolve().parents[1]
 
 
