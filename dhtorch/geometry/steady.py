@@ -1,7 +1,8 @@
 """Elementwise functions whose rounding does not depend on where in a tensor an element stands.
 
 On the CPU, torch evaluates sin, atan2, pow, … with vector instructions and hands the last few elements of a tensor to
-the scalar library, which may round differently. An element's answer would then depend on how many others travel with it.
+the scalar library, which may round differently. An element's answer would then depend on how many others travel with
+it.
 Additions, products, quotients and square roots are exact to rounding everywhere and need no such care.
 """
 
