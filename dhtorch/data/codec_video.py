@@ -25,6 +25,7 @@ from dhtorch.data.files import FormatError, need
 MAX_VIDEO_PIXELS = 36_000_000  # 8K; a decoder holds up to 17 pictures
 _MAX_FRAMES = 10_000_000
 _MAX_OPEN = 8  # decoders in a process
+_MAX_FAILED = 100  # packets in a row: behind them nothing is worth the time
 _SEEK_AHEAD = 60  # frames: nearer than this, decoding on is cheaper than starting at a key frame
 
 
@@ -93,7 +94,8 @@ def read_video_frame(
     if pixels == "luma":
         return _luma(frame)
     try:
-        return np.asarray(frame.to_ndarray(format=pixels, interpolation="POINT" if nearest else "BICUBIC"))
+        way = "POINT" if nearest else "BICUBIC"
+        return np.asarray(frame.to_ndarray(format=pixels, interpolation=way, threads=1))
     except decoder.errors as error:
         raise FormatError(file, f"frame {i}", error, f"pixels that convert to {pixels}") from None
 
@@ -195,7 +197,7 @@ class _Decoder:
                 if frame.pts is None or frame.pts < pts[i]:
                     continue
                 self.next = i + 1
-                if frame.pts == pts[i]:
+                if frame.pts == pts[i] and not frame.is_corrupt:
                     return frame
                 break
         except self.errors as error:
@@ -209,23 +211,47 @@ class _Decoder:
         before = int(np.searchsorted(self.keys[:, 0], pts, "right")) - 1
         start = int(self.keys[before, 1]) if before >= 0 else int(self.table()[0])
         self.container.seek(start, stream=self.stream, backward=True)
-        self.frames = self.container.decode(self.stream)
+        self.frames = self._decoded()
+
+    def _decoded(self) -> Iterator[Any]:
+        """Frames from where the file stands; packets that do not decode are passed over."""
+        failed = 0
+        for packet in self.container.demux(self.stream):
+            try:
+                frames = packet.decode()
+            except self.errors:
+                failed += 1
+                if failed > _MAX_FAILED:
+                    raise
+                continue
+            failed = 0
+            yield from frames
 
 
-_open: OrderedDict[tuple[Path, bool, int, int], _Decoder] = OrderedDict()
+_open: OrderedDict[tuple[Path, bool, int], _Decoder] = OrderedDict()
+_inherited: list[_Decoder] = []
 
 
 def _decoder(file: Path, all_frames: bool) -> _Decoder:
-    """An open decoder of this process. A fork shares the file's position with its parent, so it never shares one."""
+    """An open decoder of this process."""
     try:
         changed = file.stat().st_mtime_ns
     except (OSError, ValueError) as error:
         found = "no such file" if isinstance(error, FileNotFoundError) else error
         raise FormatError(file, "file", found, "a video") from None
-    key = (file, all_frames, changed, os.getpid())
+    key = (file, all_frames, changed)
     if key not in _open:
         while len(_open) >= _MAX_OPEN:
             _open.popitem(last=False)[1].container.close()
         _open[key] = _Decoder(file, all_frames)
     _open.move_to_end(key)
     return _open[key]
+
+
+def _leave_to_parent() -> None:
+    """A forked process shares its parent's file positions, and threads that it would wait for are not there."""
+    _inherited.extend(_open.values())  # kept, because freeing would wait
+    _open.clear()
+
+
+os.register_at_fork(after_in_child=_leave_to_parent)
