@@ -25,6 +25,8 @@ from dhtorch.data.survey import Survey, survey_pictures, survey_recording, surve
 
 _LEVELS = 2  # folders below the path
 _MOST = 12  # recordings that are shown of one capture
+_SPARSE = 0.1  # share of returns below which they are drawn larger
+_COLOURS = "turbo_r"  # near is red
 _PICTURES = (".png", ".jpg", ".jpeg")
 
 
@@ -58,6 +60,7 @@ def main(argv: Sequence[str]) -> int:
     out = options.out or Path("outputs") / f"{now:%Y-%m-%d}" / f"{now:%H-%M-%S}"
     for capture in found:
         for survey in surveys(capture, options.frames):
+            survey.name = _full_name(options.path, capture.path, survey.name)
             print_survey(capture, survey)
             print(f"wrote {write_sheet(survey, out)}\n")
     return 0
@@ -109,6 +112,12 @@ def surveys(capture: Found, frames: int = 8) -> Iterator[Survey]:
 
 
 # ------------------------------------------------------------------------------------------------------------- finding
+
+
+def _full_name(asked: Path, found: Path, name: str) -> str:
+    """A capture further down is named after the way to it: the last folder alone may be called ``9``."""
+    below = found.relative_to(asked).parts
+    return "/".join((asked.resolve().name, *below[:-1], name)) if below else name
 
 
 def _named(path: Path, format: str) -> Found:
@@ -211,7 +220,7 @@ def print_survey(capture: Found, survey: Survey, console: Any = None) -> None:
 
 
 def write_sheet(survey: Survey, out: Path) -> Path:
-    """Write the contact sheet into ``out``; pictures above their depth and confidence, then depth and path.
+    """Write the contact sheet into ``out``: pictures above their depth and confidence, below them depth and path.
 
     Returns:
         The PNG file, named after the recording.
@@ -219,29 +228,35 @@ def write_sheet(survey: Survey, out: Path) -> Path:
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     rows = [kind for kind in ("image", "depth", "conf") if any(getattr(t, kind) is not None for t in survey.tiles)]
-    plots = [kind for kind, there in (("depths", survey.depths.numel()), ("path", survey.path is not None)) if there]
-    columns = max(len(survey.tiles), 2 * len(plots), 1)
-    first = next((x for t in survey.tiles for x in (t.image, t.depth) if x is not None), torch.zeros(1, 3, 4))
-    aspect = min(max(first.shape[-2] / first.shape[-1], 0.5), 1.5)
-    heights = [1.6 * aspect] * len(rows) + [1.7] * bool(plots)
-    figure = Figure(figsize=(1.6 * columns + 0.9, sum(heights) + 0.7), dpi=120, layout="constrained")
+    wanted = ((_plot_depths, survey.depths.numel() > 0), (_plot_path, survey.path is not None))
+    plots = [draw for draw, there in wanted if there]
+    first = next((x for t in survey.tiles for x in (t.image, t.depth) if x is not None), torch.zeros(3, 4))
+    tall = 1.6 * min(max(first.shape[-2] / first.shape[-1], 0.5), 1.5) * len(rows) + 0.15
+    width, heights = max(1.6 * len(survey.tiles), 3.2 * len(plots), 4.8), [tall] + [1.9] * bool(plots)
+    figure = Figure(figsize=(width, sum(heights) + 0.3), dpi=120, layout="constrained")
     figure.suptitle(f"{survey.name}: {survey.format}", fontsize=9)
-    grid = figure.add_gridspec(max(len(heights), 1), columns, height_ratios=heights or None)
-    limits = _limits(survey.depths)
-    for r, kind in enumerate(rows):
-        for k, tile in enumerate(survey.tiles):
-            axes = figure.add_subplot(grid[r, k])
-            axes.axis("off")
-            _draw(axes, getattr(tile, kind), kind, limits)
-            if r == 0 or (kind == "depth" and tile.image is None):
-                axes.set_title(tile.title[:18], fontsize=6, pad=2)
-    for k, kind in enumerate(plots):
-        axes = figure.add_subplot(grid[len(rows), k * columns // len(plots) : (k + 1) * columns // len(plots)])
-        (_plot_depths if kind == "depths" else _plot_path)(axes, survey)
+    parts = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
+    _draw_tiles(parts[0], rows, survey)
+    for k, draw in enumerate(plots):
+        draw(parts[1].add_subplot(1, len(plots), k + 1), survey)
     out.mkdir(parents=True, exist_ok=True)
     file = out / f"{re.sub(r'[^A-Za-z0-9._-]+', '_', survey.name) or 'capture'}.png"
     figure.savefig(file)
     return file
+
+
+def _draw_tiles(figure: Any, rows: Sequence[str], survey: Survey) -> None:
+    limits = _limits(survey.depths)
+    for k, tile in enumerate(survey.tiles):
+        title = tile.title[:22]
+        for r, kind in enumerate(rows):
+            axes = figure.add_subplot(len(rows), len(survey.tiles), r * len(survey.tiles) + k + 1)
+            axes.axis("off")
+            picture = getattr(tile, kind)
+            if picture is not None:
+                _draw(axes, picture, kind, limits)
+                axes.set_title(title, fontsize=6, pad=2)
+                title = ""  # above the first picture of a column only
 
 
 def _limits(depths: Tensor) -> tuple[float, float]:
@@ -251,30 +266,42 @@ def _limits(depths: Tensor) -> tuple[float, float]:
     return float(low), float(max(high, low + 1e-3))
 
 
-def _draw(axes: Any, picture: Tensor | None, kind: str, limits: tuple[float, float]) -> None:
-    if picture is None:
-        return
+def _draw(axes: Any, picture: Tensor, kind: str, limits: tuple[float, float]) -> None:
     step = max(1, max(picture.shape[-2:]) // 400)
-    picture = picture[..., ::step, ::step]
     if kind == "image":
-        pixels = picture.permute(1, 2, 0).numpy()
+        pixels = picture[:, ::step, ::step].permute(1, 2, 0).numpy()
         axes.imshow(pixels if pixels.shape[2] == 3 else pixels[..., 0], cmap="gray")
     elif kind == "depth":
-        axes.imshow(np.ma.masked_equal(picture.numpy(), 0), cmap="turbo_r", vmin=limits[0], vmax=limits[1])
-        axes.add_patch(_frame(picture.shape))
+        sparse = float((picture > 0).double().mean()) < _SPARSE
+        shown = _nearest(picture, 3 * step) if sparse else picture[::step, ::step]
+        axes.imshow(np.ma.masked_equal(shown.numpy(), 0), cmap=_COLOURS, vmin=limits[0], vmax=limits[1])
+        axes.add_patch(_outline(shown.shape))
     else:
-        axes.imshow(picture.numpy(), cmap="viridis", vmin=0, vmax=2, interpolation="nearest")
+        axes.imshow(picture[::step, ::step].numpy(), cmap="viridis", vmin=0, vmax=2, interpolation="nearest")
 
 
-def _frame(shape: Sequence[int]) -> Any:
-    """The outline of a depth map, since its holes are white."""
+def _nearest(depth: Tensor, size: int) -> Tensor:
+    """The nearest return in each block, 0 where there is none: single returns would not be seen."""
+    far = torch.where(depth > 0, -depth, -torch.inf)
+    best = -torch.nn.functional.max_pool2d(far[None], size, ceil_mode=True)[0]
+    return torch.where(torch.isfinite(best), best, torch.zeros_like(best))
+
+
+def _outline(shape: Sequence[int]) -> Any:
+    """Around a depth map, since its holes are white."""
     from matplotlib.patches import Rectangle  # noqa: PLC0415
 
     return Rectangle((-0.5, -0.5), shape[1], shape[0], fill=False, edgecolor="#B4B4B4", linewidth=0.6)
 
 
 def _plot_depths(axes: Any, survey: Survey) -> None:
-    axes.hist(survey.depths.numpy(), bins=80, range=(0, _limits(survey.depths)[1] * 1.1), color="#0072B2")
+    """How often which depth occurs, in the colours of the depth maps."""
+    from matplotlib import colormaps  # noqa: PLC0415
+
+    low, high = _limits(survey.depths)
+    counts, edges = np.histogram(survey.depths.numpy(), bins=90, range=(0, 1.1 * high))
+    middle = (edges[1:] + edges[:-1]) / 2
+    axes.bar(middle, counts, edges[1] - edges[0], color=colormaps[_COLOURS]((middle - low) / (high - low)))
     axes.set_xlabel("depth [m]", fontsize=7)
     axes.set_yticks([])
     axes.tick_params(labelsize=6)
@@ -284,12 +311,12 @@ def _plot_path(axes: Any, survey: Survey) -> None:
     """The two directions in which the camera moved most, both at the same scale."""
     assert survey.path is not None
     t = survey.path.double().numpy()
-    wide = np.sort(np.argsort(np.ptp(t, axis=0))[1:])
-    axes.plot(t[:, wide[0]], t[:, wide[1]], color="#333333", linewidth=0.8)
-    axes.plot(*t[0, wide], "o", color="#009E73", markersize=4, label="first")
-    axes.plot(*t[-1, wide], "s", color="#D55E00", markersize=4, label="last")
+    a, b = sorted(np.argsort(np.ptp(t, axis=0))[1:])
+    axes.plot(t[:, a], t[:, b], color="#333333", linewidth=0.8)
+    for place, mark, colour, label in ((t[0], "o", "#009E73", "first"), (t[-1], "s", "#D55E00", "last")):
+        axes.plot(place[a], place[b], mark, color=colour, markersize=4, label=label)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel(f"{'xyz'[wide[0]]} [m]", fontsize=7)
-    axes.set_ylabel(f"{'xyz'[wide[1]]} [m]", fontsize=7)
+    axes.set_xlabel(f"path: {'xyz'[a]} [m]", fontsize=7)
+    axes.set_ylabel(f"{'xyz'[b]} [m]", fontsize=7)
     axes.tick_params(labelsize=6)
     axes.legend(fontsize=6, frameon=False)

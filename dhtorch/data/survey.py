@@ -77,7 +77,7 @@ def survey_recording(recording: Any, frames: int = 8) -> Survey:
             out.warn(f"frame {int(recording.number[i])} cannot be read: {error}")
     if shots:
         _pictures(list(shots.values()), out)
-        _depths(list(shots.values()), out)
+        _depths(list(shots.values()), recording.sparse, out)
         _confidence([s.conf for s in shots.values() if s.conf is not None], out)
         _cameras(list(shots.values()), out)
     _poses(recording, out)
@@ -177,12 +177,12 @@ def _duplicates(images: Sequence[Tensor], out: Survey, what: str) -> None:
         out.warn(f"all {what} that were read are the same picture")
 
 
-def _depths(shots: Sequence[Frame], out: Survey) -> None:
-    own = shots[0].depth_camera is not None
-    _depth_facts([s.depth[0] for s in shots], out, ", not registered to the picture" if own else "")
+def _depths(shots: Sequence[Frame], sparse: bool, out: Survey) -> None:
+    remark = ", not registered to the picture" if shots[0].depth_camera is not None else ""
+    _depth_facts([s.depth[0] for s in shots], out, remark + ", sparse returns" * sparse, sparse)
 
 
-def _depth_facts(depths: Sequence[Tensor], out: Survey, remark: str = "") -> None:
+def _depth_facts(depths: Sequence[Tensor], out: Survey, remark: str = "", sparse: bool = False) -> None:
     sizes = sorted({f"{d.shape[1]}x{d.shape[0]}" for d in depths})
     out.say("depth", ", ".join(sizes) + remark)
     holes = torch.stack([(d == 0).double().mean() for d in depths])
@@ -199,7 +199,7 @@ def _depth_facts(depths: Sequence[Tensor], out: Survey, remark: str = "") -> Non
     empty = int((holes == 1).sum())
     if empty:
         out.warn(f"{empty} of {len(depths)} depth maps that were read are empty")
-    elif float(holes.mean()) > _MANY_HOLES:
+    elif float(holes.mean()) > _MANY_HOLES and not sparse:
         out.warn(f"most of the depth map is holes ({100 * float(holes.mean()):.0f} %)")
     if float(ranks[3]) > _FAR:
         out.warn(f"median depth is {float(ranks[3]):.0f} m: are these millimetres?")
