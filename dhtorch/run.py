@@ -91,7 +91,7 @@ def _job(cfg: Any) -> int:
 
     try:
         runtime = HydraConfig.get().runtime
-        settings = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
+        settings: Any = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
         parts = {k: instantiate(cfg[k], _convert_="all") for k in ("data", "method", "pairs", "experiment")}
         _execute(settings, parts, dict(runtime.choices), Path(runtime.output_dir))
     except InstantiationException as error:

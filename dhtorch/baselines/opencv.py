@@ -5,6 +5,8 @@ Everything loops over the batch and carries no gradient.
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import torch
@@ -12,7 +14,7 @@ from torch import Tensor
 
 from dhtorch.codes import PoseCode
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry import epipolar, se3
+from dhtorch.geometry import covariance, epipolar, se3
 from dhtorch.geometry.lookup import luma
 from dhtorch.records import Camera, Pose, PoseFit, Samples, Tracks
 
@@ -34,23 +36,33 @@ def lucas_kanade(
     """
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, iterations, epsilon_px)
     options = {"winSize": (window, window), "maxLevel": levels - 1, "criteria": criteria}
-    rows = []
-    for grey_0, grey_1, start in zip(_grey(image_0), _grey(image_1), _array(uv_0, np.float32), strict=True):
-        if len(start) == 0:
-            rows.append((start, np.zeros(0, np.float32), np.zeros(0, np.float32), np.zeros(0, bool)))
-            continue
-        there, found, residual = cv2.calcOpticalFlowPyrLK(grey_0, grey_1, start[:, None], None, **options)
-        back, returned, _ = cv2.calcOpticalFlowPyrLK(grey_1, grey_0, there, None, **options)
-        error = np.linalg.norm(back[:, 0] - start, axis=-1)
-        inside = ((there[:, 0] >= 0) & (there[:, 0] <= [grey_1.shape[1] - 1, grey_1.shape[0] - 1])).all(-1)
-        valid = (found[:, 0] > 0) & (returned[:, 0] > 0) & inside & (error < max_round_trip_px)
-        residual = np.where(found[:, 0] > 0, residual[:, 0], 0) / 255  # left undefined where nothing was found
-        rows.append((there[:, 0], error, residual, valid))
-    uv_1, error, photometric, valid = (
-        torch.from_numpy(np.stack(column)).to(uv_0.device) for column in zip(*rows, strict=True)
-    )
+    images = zip(_grey(image_0), _grey(image_1), _array(uv_0, np.float32), strict=True)
+    columns = zip(*(_track(*views, options, max_round_trip_px) for views in images), strict=True)
+    uv_1, error, photometric, valid = (torch.from_numpy(np.stack(c)).to(uv_0.device) for c in columns)
     cov = torch.full((*uv_0.shape, 2), torch.nan, dtype=uv_0.dtype, device=uv_0.device)
     return Tracks(uv_0, uv_1.to(uv_0), error.to(uv_0), photometric.to(uv_0), cov, valid)
+
+
+def _track(
+    grey_0: np.ndarray, grey_1: np.ndarray, start: np.ndarray, options: dict[str, Any], max_round_trip_px: float
+) -> tuple[np.ndarray, ...]:
+    """Position, round trip, mean grey difference and validity of one pair's points."""
+    n = len(start)
+    if n == 0:
+        return start, np.zeros(n), np.zeros(n), np.zeros(n, bool)
+    flow: Any = cv2.calcOpticalFlowPyrLK
+    there, found, residual = flow(grey_0, grey_1, start[:, None], None, **options)
+    back, returned, _ = flow(grey_1, grey_0, there, None, **options)
+    uv, found = there[:, 0], found[:, 0] > 0
+    error = np.linalg.norm(back[:, 0] - start, axis=-1)
+    inside = ((uv >= 0) & (uv <= [grey_1.shape[1] - 1, grey_1.shape[0] - 1])).all(-1)
+    valid = found & (returned[:, 0] > 0) & inside & (error < max_round_trip_px)
+    return (
+        uv,
+        error,
+        np.where(found, residual[:, 0], 0) / 255,
+        valid,
+    )  # undefined elsewhere
 
 
 def pnp_ransac(
@@ -102,7 +114,7 @@ def _solve(
     xyz: np.ndarray, uv: np.ndarray, K: np.ndarray, hypotheses: int, threshold_px: float, confidence: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """R (3, 3), t (3,) and inlier indices of one pair, or None."""
-    options = {"reprojectionError": threshold_px, "iterationsCount": hypotheses, "confidence": confidence}
+    options: Any = {"reprojectionError": threshold_px, "iterationsCount": hypotheses, "confidence": confidence}
     ok, rvec, tvec, inlier = cv2.solvePnPRansac(xyz, uv, K, None, flags=cv2.SOLVEPNP_EPNP, **options)
     if not ok or inlier is None:
         return None
@@ -122,18 +134,24 @@ def _describe(samples: Samples, tracks: Tracks, camera_1: Camera, pose: Pose, in
     J = (epipolar.point_jacobians(camera, xyz)[1] * weight[..., None, None]).flatten(1, 2)  # (B, 2N, 6)
     count = inlier.sum(-1)
     squares = (miss * miss).sum((-1, -2))
-    sigma2 = squares / (2 * count - 6).clamp_min(1)
-    eye = torch.eye(6, dtype=torch.float64, device=J.device)
-    bad = (code != PoseCode.OK)[:, None, None]
-    cov = sigma2[:, None, None] * torch.linalg.inv(torch.where(bad, eye, J.mT @ J))
-    cov = torch.where(bad, torch.nan, cov)
-    snr = (t * torch.linalg.solve(torch.where(bad, eye, cov)[:, 3:, 3:], t)).sum(-1).sqrt()
-    like = samples.xyz.dtype
-    lost = bad[:, 0, 0]
-    rms = torch.where(lost, torch.nan, (squares / count.clamp_min(1)).sqrt())
-    sigma = torch.where(lost, torch.nan, sigma2.sqrt())
-    numbers = (x.to(like) for x in (rms, sigma, torch.where(lost, torch.nan, snr)))
-    return PoseFit(pose, cov.to(like), inlier, count, *numbers, code)
+    sigma_px = (squares / (2 * count - 6).clamp_min(1)).sqrt()
+    cov, _ = covariance.from_normal(J.mT @ J, sigma_px)
+    t_snr = covariance.mahalanobis(t, cov[:, 3:, 3:])
+    lost, like = code != PoseCode.OK, samples.xyz
+
+    def answer(x: Tensor) -> Tensor:
+        return torch.where(lost.view(-1, *[1] * (x.ndim - 1)), torch.nan, x).to(like)
+
+    return PoseFit(
+        T_1_from_0=pose,
+        cov=answer(cov),
+        inlier=inlier,
+        n_inlier=count,
+        rms_px=answer((squares / count.clamp_min(1)).sqrt()),
+        sigma_px=answer(sigma_px),
+        t_snr=answer(t_snr),
+        code=code,
+    )
 
 
 def _grey(image: Tensor) -> list[np.ndarray]:

@@ -316,7 +316,9 @@ class _Scene:
             row |= {"n_holes": int(hole.sum()), "n_recovered": int((one.keep & hole).sum())}
             row |= {"gate_share": share, "ms": {k: v / size for k, v in trace["ms"].items()}}
             self.pair_rows.append(row)
-            for code in self._odd if kinds is not None else ():
+            if kinds is None:
+                continue
+            for code in self._odd:
                 kind, there = self.recording.surfaces[code], truth[b : b + 1]
                 there = there.replace(code=torch.where(kinds[b : b + 1] == code, _reopen(there), holdout.Rule.EXCLUDED))
                 self.apart.setdefault((name, test, kind), []).append(errors.select(one, there))
