@@ -6,7 +6,6 @@ headers must add up to what the footer promised and stay below a limit, so that 
 
 from __future__ import annotations
 
-import math
 from collections import OrderedDict
 from collections.abc import Sequence
 from pathlib import Path
@@ -62,9 +61,9 @@ def read_columns(
         raise FormatError(file, "rows", header.rows, f"rows {first} to {end - 1}")
     spans = list(zip(header.groups, header.groups[1:], strict=False))
     wanted = [i for i, (low, high) in enumerate(spans) if low < end and high > first]
-    _check_pages(file, table, columns, wanted)
     pyarrow = need("pyarrow")
     try:
+        _check_pages(file, table, columns, wanted)
         got = table.read_row_groups(wanted, columns=list(columns), use_threads=False)
         start = first - (spans[wanted[0]][0] if wanted else 0)
         if wanted and got.num_rows != spans[wanted[-1]][1] - spans[wanted[0]][0]:
@@ -208,17 +207,16 @@ def _chunk_bytes(file: Path, stream: Any, chunk: Any) -> int:
             page, at = _thrift(data, at)
             full, packed = int(page[2]), int(page[3])
             inner = page.get(5) or page.get(8) or {}
-            dictionary = page.get(7) or {}
-            count = int(inner.get(1, 0))
-        except (IndexError, KeyError, TypeError, ValueError, RecursionError) as error:
+            count, entries = int(inner.get(1, 0)), int((page.get(7) or {}).get(1, 0))
+        except (IndexError, KeyError, TypeError, ValueError, AttributeError) as error:
             raise FormatError(file, chunk.path_in_schema, f"a page header: {error}", "a whole page") from None
         if min(full, packed, count) < 0 or packed > len(data) - at or full > chunk.total_uncompressed_size:
             found = f"a page of {packed} bytes that unpack into {full}"
             raise FormatError(file, chunk.path_in_schema, found, f"at most {chunk.total_uncompressed_size}")
         values += count
-        unpacked += max(full, width * max(count, int(dictionary.get(1, 0))))
+        unpacked += max(full, width * max(count, entries))
         at += packed
-    if values != chunk.num_values or not math.isfinite(unpacked):
+    if values != chunk.num_values:
         raise FormatError(file, chunk.path_in_schema, f"pages of {values} values", chunk.num_values)
     return unpacked
 
