@@ -74,8 +74,9 @@ class ZipMember(Member):
 
     def ends(self, count: int) -> tuple[bytes, bytes] | None:
         """As :meth:`Member.ends`; None for a compressed one."""
-        if self.method != zipfile.ZIP_STORED or self.size < count:
+        if self.method != zipfile.ZIP_STORED:
             return None
+        count = min(count, self.size)
         try:
             return self._stored(0, count), self._stored(self.packed - count, count)
         except FormatError:

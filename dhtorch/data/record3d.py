@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -283,7 +282,7 @@ def _poses(numbers: list[int], meta: _Metadata, wanted: bool) -> tuple[np.ndarra
     """(camera-to-world of the usable frames, numbers of the others, what to report)."""
     if meta.poses is None or not wanted or not numbers:
         return None, set(), []
-    if not np.abs(meta.poses - [0, 0, 0, 1, 0, 0, 0]).max() > 1e-9:  # front camera: no tracking
+    if (np.abs(meta.poses - [0, 0, 0, 1, 0, 0, 0]) <= 1e-9).all():  # front camera: no tracking
         return None, set(), ["every pose is the identity: the device had none"]
     rows = meta.poses[numbers]
     with np.errstate(invalid="ignore", over="ignore"):
@@ -307,10 +306,13 @@ def _times(number: torch.Tensor, meta: _Metadata) -> tuple[torch.Tensor | None, 
 
 def _sizes(shots: list[_Shot], meta: _Metadata) -> tuple[tuple[int, int], tuple[int, int]]:
     """(height, width) of picture and depth map, from the first frame that is whole enough to say."""
-    for shot in shots[:-1]:
-        with suppress(FormatError):
+    first: FormatError | None = None
+    for shot in shots:
+        try:
             return _sizes_of(shot, meta)
-    return _sizes_of(shots[-1], meta)
+        except FormatError as error:
+            first = first or error
+    raise first or FormatError(meta.file, "frames", "none", "at least one")
 
 
 def _sizes_of(shot: _Shot, meta: _Metadata) -> tuple[tuple[int, int], tuple[int, int]]:
