@@ -89,26 +89,14 @@ def surveys(capture: Found, frames: int = 8) -> Iterator[Survey]:
 
     A recording that its reader refuses is shown as the loose pictures it has, with the reader's words as a warning.
     """
-    if capture.kind == "stacks":
-        yield survey_stacks(data.open_stacks(capture.path, capture.format), frames)
-    elif capture.kind == "pictures":
-        yield _survey_loose(capture.path, frames)
-    else:
-        try:
-            recordings, warning = _opened(capture)
-        except FormatError as error:
-            if not capture.path.is_dir() or not any(_classified(capture.path)):
-                raise
-            survey = _survey_loose(capture.path, frames)
-            survey.warnings.insert(0, f"the {capture.format} reader refuses it: {error}")
-            yield survey
-            return
-        for recording in recordings[:_MOST]:
-            survey = survey_recording(recording, frames)
-            survey.warnings.extend(warning)
-            if len(recordings) > _MOST:
-                survey.warn(f"{len(recordings)} recordings in this capture: the first {_MOST} are shown")
-            yield survey
+    try:
+        yield from _READ[capture.kind](capture, frames)
+    except FormatError as error:
+        if not capture.path.is_dir() or not any(_classified(capture.path)):
+            raise
+        (survey,) = _loose(capture, frames)
+        survey.warnings.insert(0, f"the {capture.format} reader refuses it: {error}")
+        yield survey
 
 
 # ------------------------------------------------------------------------------------------------------------- finding
@@ -141,14 +129,25 @@ def _recognised(path: Path) -> Found | None:
     return None
 
 
-def _opened(capture: Found) -> tuple[list[Any], list[str]]:
-    """The recordings; without their pictures where these are missing and the reader can do so."""
+def _recordings(capture: Found, frames: int) -> Iterator[Survey]:
+    """Each recording; without its pictures where these are missing and the reader can do so."""
+    warning = []
     try:
-        return data.open_all(capture.path, capture.format), []
+        recordings = data.open_all(capture.path, capture.format)
     except FormatError as error:
         if "images" not in inspect.signature(data.FORMATS[capture.format].read).parameters:
             raise
-        return data.open_all(capture.path, capture.format, images=False), [f"no pictures: {error}"]
+        recordings, warning = data.open_all(capture.path, capture.format, images=False), [f"no pictures: {error}"]
+    if len(recordings) > _MOST:
+        warning.append(f"{len(recordings)} recordings in this capture: the first {_MOST} are shown")
+    for recording in recordings[:_MOST]:
+        survey = survey_recording(recording, frames)
+        survey.warnings.extend(warning)
+        yield survey
+
+
+def _stacks(capture: Found, frames: int) -> Iterator[Survey]:
+    yield survey_stacks(data.open_stacks(capture.path, capture.format), frames)
 
 
 def _classified(folder: Path) -> tuple[list[Path], list[Path]]:
@@ -166,32 +165,31 @@ def _classified(folder: Path) -> tuple[list[Path], list[Path]]:
     return pictures, depths
 
 
-def _survey_loose(folder: Path, frames: int) -> Survey:
-    """Some of the pictures and depth maps, the latter taken to be in millimetres."""
-    pictures, depths = _classified(folder)
-    images: dict[str, Tensor] = {}
-    metres: dict[str, Tensor] = {}
+def _loose(capture: Found, frames: int) -> Iterator[Survey]:
+    """Some of the pictures and depth maps of a folder, the latter taken to be in millimetres."""
+    pictures, depths = _classified(capture.path)
+    shown: dict[str, dict[str, Tensor]] = {"image": {}, "depth": {}}
     unreadable: list[str] = []
-    for file in _spread(pictures, frames):
-        try:
-            images[file.name] = torch.from_numpy(files.read_image(file))
-        except FormatError as error:
-            unreadable.append(str(error))
-    for file in _spread(depths, frames):
-        try:
-            metres[file.name] = torch.from_numpy(files.read_depth_png(file, 1000.0))
-        except FormatError as error:
-            unreadable.append(str(error))
-    survey = survey_pictures(folder.resolve().name, images, metres)
+    for kind, sources in (("image", pictures), ("depth", depths)):
+        for file in _spread(sources, frames):
+            try:
+                picture = files.read_image(file) if kind == "image" else files.read_depth_png(file, 1000.0)
+                shown[kind][file.name] = torch.from_numpy(picture)
+            except FormatError as error:
+                unreadable.append(str(error))
+    survey = survey_pictures(capture.path.resolve().name, shown["image"], shown["depth"])
     if depths:
         survey.warn("16-bit pictures are taken to be depth in millimetres")
     survey.warnings.extend(unreadable)
-    return survey
+    yield survey
+
+
+_READ = {"recording": _recordings, "stacks": _stacks, "pictures": _loose}
 
 
 def _spread(items: Sequence[Path], count: int) -> list[Path]:
     n = len(items)
-    return [items[i] for i in sorted({round(k * (n - 1) / max(count - 1, 1)) for k in range(min(count, n))})]
+    return [items[i] for i in sorted({round(k * (n - 1) / max(count - 1, 1)) for k in range(count)})] if n else []
 
 
 # ------------------------------------------------------------------------------------------------------------ showing

@@ -13,13 +13,16 @@ from dhtorch.data import codec_tiff, files
 from dhtorch.data.files import FormatError
 from dhtorch.data.stacks import FocalStack, Stacks, focus_distances, read_pictures
 
+_LOOKED_AT = 16  # pictures of a folder, to tell whether they are of one kind
 _PICTURE = re.compile(r"[^.].*\.(png|jpe?g|tiff?)", re.IGNORECASE)
 
 
 def recognise(root: Path) -> str | None:
     """What makes ``root`` a focal stack of this format, in words; None if nothing does."""
     pictures = sorted(_files(root), key=_by_number)
-    if len(pictures) < 2 or _size(pictures[0]) is None or _size(pictures[0]) != _size(pictures[-1]):
+    some = pictures[:: max(1, len(pictures) // _LOOKED_AT)]
+    kinds = {_kind(file) for file in (*some, *pictures[-1:])}
+    if len(pictures) < 2 or None in kinds or len(kinds) != 1:
         return None
     return f"{len(pictures)} pictures of one size"
 
@@ -64,10 +67,12 @@ def _by_number(file: Path) -> tuple[object, ...]:
     return tuple((not part.isdecimal(), int(part) if part.isdecimal() else part) for part in parts)
 
 
-def _size(file: Path) -> tuple[int, int] | None:
-    """(height, width); None of a damaged file."""
+def _kind(file: Path) -> tuple[object, ...] | None:
+    """Size, channels and bits of a picture; None of one that is damaged or of a kind that is not read."""
     try:
-        tiff = file.suffix.lower() in (".tif", ".tiff")
-        return codec_tiff.tiff_header(file).hw if tiff else files.image_header(file).hw
+        if file.suffix.lower() in (".tif", ".tiff"):
+            return tuple(codec_tiff.tiff_header(file))
+        header = files.image_header(file)
+        return header[:3] if header.bits == 8 else None
     except FormatError:
         return None
