@@ -27,6 +27,7 @@ _LEVELS = 2  # folders below the path
 _MOST = 12  # recordings that are shown of one capture
 _SPARSE = 0.1  # share of returns below which they are drawn larger
 _COLOURS = "turbo_r"  # near is red
+_ARCHIVES = (".r3d", ".mp4", ".mov", ".tar", ".h5", ".hdf5")  # files that may be a whole capture
 _PICTURES = (".png", ".jpg", ".jpeg")
 
 
@@ -67,7 +68,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def find(path: Path) -> list[Found]:
-    """The captures at ``path``, else one folder below, else two; the nearest level that has any.
+    """The captures at ``path``, else one folder below, else two; the nearest level that has any, folders before files.
 
     Raises:
         FormatError: there is none.
@@ -76,10 +77,12 @@ def find(path: Path) -> list[Found]:
         raise FormatError(path, "path", "no such file or folder", "a capture")
     level = [path]
     for _ in range(_LEVELS + 1):
-        found = [capture for folder in level if (capture := _recognised(folder)) is not None]
-        if found:
-            return found
-        level = [entry for folder in level if folder.is_dir() for entry in sorted(folder.iterdir()) if entry.is_dir()]
+        inside = [entry for folder in level if folder.is_dir() for entry in sorted(folder.iterdir())]
+        for candidates in (level, [entry for entry in inside if entry.suffix.lower() in _ARCHIVES]):
+            found = [capture for entry in candidates if (capture := _recognised(entry)) is not None]
+            if found:
+                return found
+        level = [entry for entry in inside if entry.is_dir()]
     formats = ", ".join((*data.FORMATS, *focal_stacks.STACK_FORMATS))
     raise FormatError(path, "content", "no capture here or two folders below", f"one of {formats}, or pictures")
 
