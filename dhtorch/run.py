@@ -144,6 +144,9 @@ def _execute(settings: dict[str, Any], parts: dict[str, Any], choices: Mapping[s
     )
     archive.write(target, result)
     report.print_tables(result)
+    few = {r["scene"]: r["n_few"] for r in outcome.rows if r["pair"] is None and r["n_few"]}
+    for scene, n in few.items():
+        print(f"{scene}: {n} pair{'s' * (n > 1)} dropped, fewer than 20 candidates each")
     written = [target, *(_draw(outcome.examples, folder) if settings["figures"] else ())]
     if outcome.verdict:
         print(f"{outcome.verdict}: {outcome.why}")
@@ -228,6 +231,9 @@ def _draw(examples: Iterable[Any], folder: Path) -> list[Path]:
 def _fail(error: BaseException, show: bool = False) -> int:
     if show:
         traceback.print_exception(error)
-    message = " ".join(str(error).split())
+    lines = [line for line in str(error).splitlines() if line.strip()]
+    if any("Original Traceback" in line for line in lines):  # a data-loader worker sends its whole traceback along
+        lines = lines[-1:]
+    message = " ".join(" ".join(lines).split())
     print(f"dhtorch: {type(error).__name__}: {message}", file=sys.stderr)
     return 2
