@@ -8,6 +8,9 @@ from __future__ import annotations
 
 from typing import Final
 
+import torch
+from torch import Tensor
+
 
 class Flag:
     """Bits of ``Samples.flag``: several may hold at once. The first five are the paper's."""
@@ -102,3 +105,16 @@ ROUTE_OF_HOLE: Final[dict[int, int]] = {
     Hole.HIGHLIGHT: Route.NOTHING,
     Hole.AT_BORDER: Route.TURN_HEAD,
 }
+
+
+def first_reason(*reasons: tuple[Tensor, int], otherwise: int = 0) -> Tensor:
+    """Codes int32 of the first mask that holds, asked in the order given; ``otherwise`` where none does.
+
+    Args:
+        reasons: (mask, code) pairs; masks are equally shaped bool tensors.
+        otherwise: code where no mask holds.
+    """
+    code = torch.full_like(reasons[0][0], otherwise, dtype=torch.int32)
+    for mask, reason in reversed(reasons):
+        code = torch.where(mask, torch.full_like(code, reason), code)
+    return code

@@ -179,7 +179,6 @@ ROWS = [
     Row(holes.min_eigenvalue, lambda b, n, d: (frames(b, n, d)[0].image, pixels(b, n, d)), ALL, (1,), (0,), bad=wrong_last_axis(1)),
     Row(holes.route, lambda b, n, d: (sampled(b, n, d)[1].hole,), "batch vmap capture empty shuffle padding", (0,)),
     Row(triangulate.two_view, tracked, ALL, (0, 1), (1, 3, 4), bad=lambda a: (a[0], a[1].replace(uv_0=a[1].uv_0[:, 1:]), *a[2:])),
-    Row(triangulate.first_reason, lambda b, n, d: (((uniform(b, n, dtype=d) > 0.5, 3), (uniform(b, n, dtype=d, seed=1) > 0.5, 5)),), "batch vmap capture empty shuffle padding", (0,)),
     Row(score.rank, estimated, ALL, (0, 1, 2), (0,), bad=lambda a: (a[0], a[1].replace(uv=a[1].uv[:, 1:]), *a[2:])),
     Row(pose.pnp_ransac, posed, "dtype batch vmap capture empty padding raises", (0, 1), bad=lambda a: (a[0], a[1].replace(uv_1=a[1].uv_1[:, 1:]), *a[2:]), atol=1e-4),
     Row(track.lucas_kanade, shifted, "dtype batch capture empty shuffle padding nan raises", (2,), bad=wrong_last_axis(2), atol=1e-4),

@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor
 
-from dhtorch.codes import names
+from dhtorch.codes import first_reason, names
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.lookup import nearest, patches, round_half_up
 from dhtorch.geometry.shapes import check
@@ -124,7 +124,7 @@ def truth_at(
     if truth == "full":
         wide, _, _ = _window(frame.depth, place, _side(WIDE_SPARSE if sparse else window, scale))
         fails_wide = _spreads(wide, WIDE_SPREAD)
-    code = _first((depth <= 0, Rule.NO_RETURN), (fails_close, Rule.CLOSE), (fails_wide, Rule.WIDE))
+    code = first_reason((depth <= 0, Rule.NO_RETURN), (fails_close, Rule.CLOSE), (fails_wide, Rule.WIDE))
     return Truth(depth, code)
 
 
@@ -158,7 +158,7 @@ def candidates(
     )
     near = truth.depth <= (math.inf if cutoff is None else cutoff)
     plain = samples.trackability < min_texture * _median(samples.trackability)
-    code = _first(
+    code = first_reason(
         (truth.code == Rule.NO_RETURN, Rule.NO_RETURN),
         (near, Rule.NEAR),
         (truth.code == Rule.CLOSE, Rule.CLOSE),
@@ -213,14 +213,6 @@ def _spreads(window: Tensor, limit: float) -> Tensor:
     high = window.amax((-2, -1))
     low = torch.where(window > 0, window, torch.full_like(window, torch.inf)).amin((-2, -1))
     return (high > 0) & (high >= low * (1 + limit))
-
-
-def _first(*reasons: tuple[Tensor, int]) -> Tensor:
-    """Codes (B, N) of the first mask that holds; CANDIDATE where none does."""
-    code = torch.full_like(reasons[0][0], Rule.CANDIDATE, dtype=torch.int32)
-    for mask, rule in reversed(reasons):
-        code = torch.where(mask, torch.full_like(code, rule), code)
-    return code
 
 
 def _median(x: Tensor) -> Tensor:

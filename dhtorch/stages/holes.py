@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dhtorch.codes import ROUTE_OF_HOLE, Flag, Hole
+from dhtorch.codes import ROUTE_OF_HOLE, Flag, Hole, first_reason
 from dhtorch.geometry.lookup import luma, patches, round_half_up
 from dhtorch.geometry.shapes import check
 from dhtorch.records import Frame, Samples
@@ -46,18 +46,15 @@ def classify(
     """
     check("classify", image=(frame.image, "B C H W"), uv=(samples.uv, "B N 2"), flag=(samples.flag, "B N"))
     trackability = min_eigenvalue(frame.image, samples.uv, block=block)
-    classes = (
-        (Flag.BORDER, Hole.AT_BORDER),
-        (Flag.UNDEREXPOSED, Hole.TOO_DARK),
-        (Flag.SATURATED, Hole.TOO_BRIGHT),
-        (Flag.SPECULAR, Hole.HIGHLIGHT),
+    hole = first_reason(
+        (samples.xyz.isfinite().all(-1), Hole.NONE),
+        ((samples.flag & Flag.BORDER) != 0, Hole.AT_BORDER),
+        ((samples.flag & Flag.UNDEREXPOSED) != 0, Hole.TOO_DARK),
+        ((samples.flag & Flag.SATURATED) != 0, Hole.TOO_BRIGHT),
+        ((samples.flag & Flag.SPECULAR) != 0, Hole.HIGHLIGHT),
+        (trackability.detach() < min_trackability, Hole.LOW_TEXTURE),
+        otherwise=Hole.TRACKABLE_NO_LIDAR,
     )
-    textured = trackability.detach() >= min_trackability
-    hole = torch.where(textured, Hole.TRACKABLE_NO_LIDAR, Hole.LOW_TEXTURE).to(torch.int32)
-    for bit, name in reversed(classes):
-        hole = torch.where((samples.flag & bit) != 0, torch.full_like(hole, name), hole)
-    is_hole = samples.xyz.isnan().any(-1)
-    hole = torch.where(is_hole, hole, torch.full_like(hole, Hole.NONE))
     return samples.replace(trackability=trackability.to(samples.depth.dtype), hole=hole)
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from dhtorch.codes import Gate
+from dhtorch.codes import Gate, first_reason
 from dhtorch.geometry import epipolar
 from dhtorch.geometry.shapes import check
 from dhtorch.records import Camera, Estimate, PoseFit, Samples, Tracks
@@ -58,14 +58,13 @@ def two_view(
     )
     parallax_deg = geometry.parallax * (180 / math.pi)
     behind = ~((geometry.depth > 0) & (geometry.depth_1 > 0))
-    reasons = (
+    gate = first_reason(
         (~tracked, Gate.NO_TRACK),
         (~posed, Gate.NO_POSE),
         (behind, Gate.BEHIND),
         (parallax_deg <= (min_parallax_deg if min_parallax_deg is not None else -1.0), Gate.PARALLAX),
         (geometry.residual_px >= (max_residual_px if max_residual_px is not None else torch.inf), Gate.RESIDUAL),
     )
-    gate = first_reason(reasons)
     own, shared = epipolar.depth_variance(geometry, tracks.cov, fit.cov.nan_to_num())
     keep, measured = gate == Gate.ANSWER, tracked & posed
     return Estimate(
@@ -79,14 +78,6 @@ def two_view(
         score=keep.to(geometry.depth.dtype),
         gate=gate,
     )
-
-
-def first_reason(reasons: tuple[tuple[Tensor, int], ...]) -> Tensor:
-    """Gate codes (B, N) from (mask, code) pairs in the order asked; ANSWER where none holds."""
-    gate = torch.zeros_like(reasons[0][0], dtype=torch.int32) + Gate.ANSWER
-    for mask, code in reversed(reasons):
-        gate = torch.where(mask, torch.full_like(gate, code), gate)
-    return gate
 
 
 def _stand_in(fit: PoseFit) -> epipolar.Pose:
