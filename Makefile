@@ -14,7 +14,7 @@ run: $(VENV)/.installed
 
 test: $(VENV)/.installed-dev lint
 	@echo "== tests (real sequences: $${DHTORCH_DATA:-DHTORCH_DATA is unset, their tests skip})"
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist worksteal $(ARGS)
 	@echo "== done; nothing was written outside $(VENV), the caches and temporary folders"
 
 lint: $(VENV)/.installed-dev
