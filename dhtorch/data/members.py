@@ -11,6 +11,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from io import RawIOBase
 from pathlib import Path
 
 from dhtorch.data.files import MAX_BYTES, FormatError, read_bytes
@@ -61,7 +62,7 @@ class ZipMember(Member):
             raise FormatError(self.path, "file size", f"{self.size} bytes", f"1 to {MAX_BYTES} bytes")
         if self.method not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise FormatError(self.path, "compression", "encryption or a rare method", "none or deflate")
-        data = self._stored(0, self.packed)
+        (data,) = self._stored((0, self.packed))
         if self.method == zipfile.ZIP_DEFLATED:
             try:
                 data = zlib.decompressobj(-zlib.MAX_WBITS).decompress(data, self.size + 1)
@@ -78,23 +79,36 @@ class ZipMember(Member):
             return None
         count = min(count, self.size)
         try:
-            return self._stored(0, count), self._stored(self.packed - count, count)
+            first, last = self._stored((0, count), (self.packed - count, count))
+            return first, last
         except FormatError:
             return b"", b""
 
-    def _stored(self, start: int, count: int) -> bytes:
-        """Bytes as they lie in the archive; the entry's header says how far behind it they begin."""
+    def _stored(self, *spans: tuple[int, int]) -> list[bytes]:
+        """(start, count) bytes as they lie in the archive; the entry's header says how far behind it they begin."""
         try:
-            with self.archive.open("rb") as stream:
+            with self.archive.open("rb", buffering=0) as stream:
                 stream.seek(self.offset)
                 mark, name, extra = struct.unpack("<4s22xHH", stream.read(_LOCAL_HEADER))
-                stream.seek(self.offset + _LOCAL_HEADER + name + extra + start)
-                data = stream.read(count)
+                begin = self.offset + _LOCAL_HEADER + name + extra
+                found = [_read(stream, begin + start, count) for start, count in spans]
         except (OSError, ValueError, struct.error) as error:
             raise FormatError(self.path, "entry", error, "a zip entry") from None
-        if len(data) != count or mark != b"PK\x03\x04":
-            raise FormatError(self.path, "entry", f"{len(data)} bytes behind {mark!r}", f"{count} bytes of a zip entry")
-        return data
+        short = [(len(data), count) for data, (_, count) in zip(found, spans, strict=True) if len(data) != count]
+        if short or mark != b"PK\x03\x04":
+            have, want = short[0] if short else (self.packed, self.packed)
+            raise FormatError(self.path, "entry", f"{have} bytes behind {mark!r}", f"{want} bytes of a zip entry")
+        return found
+
+
+def _read(stream: RawIOBase, start: int, count: int) -> bytes:
+    """Up to ``count`` bytes; a raw stream may give them in pieces."""
+    stream.seek(start)
+    pieces, missing = [], count
+    while missing and (piece := stream.read(missing)):
+        pieces.append(piece)
+        missing -= len(piece)
+    return b"".join(pieces)
 
 
 def folder_members(root: Path) -> dict[str, Member]:
