@@ -29,7 +29,8 @@ import traceback
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -41,6 +42,7 @@ from dhtorch.data import FormatError, files
 
 SECONDS = 2.0  # wall clock for one mutant
 BYTES = 512 << 20  # resident, above the level before the call
+FINE = ("frames", "FormatError")
 _EXECUTED = 86  # exit code of a child that ran code out of a file
 
 Capture = dict[str, bytes | None]  # None = a folder stands where the file was
@@ -106,31 +108,49 @@ def attack(
         seed: of all choices.
         only: the one mutant to repeat.
     """
+    counts, failures = Counter[str](), []
+    with sample(write, read, tmp_path) as (good, outcome_of):
+        for number in range(mutants) if only is None else (only,):
+            what, want = mutate(good, random.Random(f"{seed}/{number}"))
+            outcome = outcome_of(want)
+            counts[outcome.kind] += 1
+            if outcome.kind not in FINE:
+                figures = f"after {outcome.seconds:.2f} s, {outcome.bytes / 2**20:.0f} MiB"
+                failures.append(f"mutant {number} ({what}): {outcome.kind} {figures}: {outcome.detail}")
+    assert not failures, f"{dict(counts)}\n" + "\n".join(failures[:5])
+    return counts
+
+
+@contextmanager
+def sample(
+    write: Callable[[Path], Path | None], read: Callable[[Path], Any], tmp_path: Path
+) -> Iterator[tuple[Capture, Callable[[Capture], Outcome]]]:
+    """Write an intact sample; gives it with a function that lays another capture in its place and reads that.
+
+    Arguments as of :func:`attack`; for tests that draw their mutants otherwise, such as Hypothesis.
+    """
     root = tmp_path / "capture"
     root.mkdir()
     path = write(root) or root
     shutil.copytree(root, tmp_path / "intact")
     good: Capture = {str(f.relative_to(root)): f.read_bytes() for f in sorted(root.rglob("*")) if f.is_file()}
+    have = good
+
+    def outcome_of(want: Capture) -> Outcome:
+        nonlocal have
+        _lay(root, have, want)
+        have = want
+        return run(read, path, tmp_path)
+
     files.set_opencv_threads(1)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # a thread pool does not survive a fork
     try:
         read(path)  # warm up: what is imported late is not charged to a mutant; the intact sample must read
-        have, counts, failures = good, Counter[str](), []
-        for number in range(mutants) if only is None else (only,):
-            what, want = mutate(good, random.Random(f"{seed}/{number}"))
-            _lay(root, have, want)
-            have = want
-            outcome = run(read, path, tmp_path)
-            counts[outcome.kind] += 1
-            if outcome.kind not in ("frames", "FormatError"):
-                failures.append(f"mutant {number} ({what}): {outcome.kind} after {outcome.seconds:.2f} s, "
-                                f"{outcome.bytes / 2**20:.0f} MiB: {outcome.detail}")  # fmt: skip
+        yield good, outcome_of
     finally:
         torch.set_num_threads(threads)
         _lay(root, have, good)
-    assert not failures, f"{dict(counts)}\n" + "\n".join(failures[:5])
-    return counts
 
 
 # ------------------------------------------------------------------------------------------------- one mutant, one child

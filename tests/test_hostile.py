@@ -14,6 +14,8 @@ from typing import Any
 import hostile
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from test_data import walk
 
 from dhtorch import data
@@ -92,6 +94,22 @@ def test_many_damaged_captures(name: str, tmp_path: Path) -> None:
     counts = hostile.attack(*FORMATS[name], tmp_path, mutants=MANY, seed=1)
     print(f"{name}: {dict(counts)}")
     assert counts.total() == MANY
+
+
+@pytest.mark.parametrize("name", ["tum", "named", "driving"])
+def test_damage_that_hypothesis_looks_for(name: str, tmp_path: Path) -> None:
+    """The same mutations with every choice in the hands of Hypothesis, which shrinks what it finds."""
+    write, read = FORMATS[name]
+    with hostile.sample(write, read, tmp_path) as (good, outcome_of):
+
+        @settings(max_examples=60, deadline=None, derandomize=True, database=None)
+        @given(draw=st.randoms(use_true_random=False))
+        def check(draw: random.Random) -> None:
+            what, want = hostile.mutate(good, draw)
+            outcome = outcome_of(want)
+            assert outcome.kind in hostile.FINE, f"{what}: {outcome}"
+
+        check()
 
 
 # ------------------------------------------------------------------------------------- the harness finds what it should
