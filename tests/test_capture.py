@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import hostile
 import numpy as np
 import pytest
 import torch
@@ -91,7 +92,7 @@ WRITTEN: dict[str, tuple[Callable[[Path], object], str, int]] = {
     "stray_depth_only": (lambda root: writers.write_stray(root, with_conf(walk(3)), video=False), "stray", 1),
     "r3d": (lambda root: writers.write_r3d(root / "a.r3d", with_conf(walk(3))), "record3d", 1),
     "record3d_exr": (lambda root: writers.write_record3d_exr(root, walk(3)), "record3d", 1),
-    "arkitscenes": (lambda root: _arkitscenes(root), "arkitscenes", 1),
+    "arkitscenes": (_arkitscenes, "arkitscenes", 1),
     "ca1m": (lambda root: writers.write_ca1m(root / "ca1m-val-42.tar", with_conf(walk(3)), walk(3)), "ca1m", 1),
     "rh20t": (lambda root: writers.write_rh20t(root, {"036422060909": walk(3, (36, 64))}), "rh20t", 1),
     "lerobot": (lambda root: writers.write_lerobot(root, [walk(3), walk(4)]), "lerobot", 2),
@@ -330,6 +331,16 @@ def test_warnings_are_printed(tmp_path: Path) -> None:
     survey = survey_recording(replace(recording(walk(2)), report=("frame [7]: left out",)))
     capture.print_survey(capture.Found(tmp_path, "recording", "test", "as told"), survey, Console(file=out, width=200))
     assert "warning" in out.getvalue() and "frame [7]: left out" in out.getvalue()
+
+
+@pytest.mark.parametrize("name", ["named", "stray_depth_only", "images"])
+def test_damaged_captures_are_inspected_or_refused_in_one_line(name: str, tmp_path: Path) -> None:
+    def look(path: Path) -> None:
+        for found in capture.find(path):
+            for survey in capture.surveys(found, 3):
+                assert survey.facts
+
+    hostile.attack(WRITTEN[name][0], look, tmp_path, mutants=60)
 
 
 # --------------------------------------------------------------------------------------------------------- real pieces
