@@ -391,6 +391,19 @@ def test_mp4_drops_both_red_ends_jumps_and_grey() -> None:
     assert not record3d_video.hue_depth(grey, 0, 3, 0.05).any()
 
 
+@pytest.mark.parametrize("stored", ["yuv420p", "yuv420p10le"])
+def test_mp4_colours_are_not_blended_on_the_way(tmp_path: Path, stored: str) -> None:
+    """Colour is stored at half the resolution; interpolated, it would bleed over more columns beside each edge."""
+    depth = torch.ones(1, 64, 96)
+    depth[..., 32:64] = 2
+    frame = render(camera_of(0), pose(0), (64, 96)).replace(depth=depth)
+    writers.write_record3d_mp4(tmp_path / "a.mp4", [frame] * 2, crf=1, stored=stored)
+    got = data.open(tmp_path / "a.mp4")[0].depth[0, 4:-4]
+    kept = (got > 0).all(0)
+    assert torch.nonzero(~kept).flatten().tolist() == [31, 32, 63, 64]
+    torch.testing.assert_close(got[:, kept], depth[0, 4:-4][:, kept], atol=0.02, rtol=0)
+
+
 def test_mp4_intrinsics_beside_it_or_nowhere(tmp_path: Path) -> None:
     file, frames = film(tmp_path, 2)
     whole = file.read_bytes()

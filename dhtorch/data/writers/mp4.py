@@ -22,18 +22,20 @@ def write_video(
     crf: int = 10,
     key_every: int = 12,
     b_frames: int = 2,
+    stored: str = "yuv420p",
     hide_first: bool = False,
 ) -> None:
     """An mp4 with a key frame now and then and frames stored out of order in between, as phones write them.
 
-    ``hide_first``: an edit list lets the film begin with the second frame, so that the first one lies before time 0.
+    ``stored``: format of the pixels in the file; ``yuv420p10le`` has ten bits. ``hide_first``: an edit list lets the film
+    begin with the second frame, so that the first one lies before time 0.
     """
     file.parent.mkdir(parents=True, exist_ok=True)
     h, w = pictures[0].shape[:2]
     av = need("av")
     with av.open(str(file), "w", format="mp4") as container:
         stream = container.add_stream(codec, rate=round(1 / (times[1] - times[0])) if len(times) > 1 else 30)
-        stream.width, stream.height, stream.pix_fmt = w, h, "yuv420p"
+        stream.width, stream.height, stream.pix_fmt = w, h, stored
         stream.codec_context.time_base = Fraction(1, _TICKS)
         stream.codec_context.thread_count = 1
         order = f"keyint={key_every}:bframes={b_frames}:log-level=none"

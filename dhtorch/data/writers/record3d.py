@@ -89,6 +89,7 @@ def write_record3d_mp4(
     fps: float = 30.0,
     depth_range: tuple[float, float] | None = None,
     crf: int = 4,
+    stored: str = "yuv420p",
 ) -> None:
     """The RGBD mp4: hue and colour side by side, intrinsics as JSON behind the film.
 
@@ -96,7 +97,7 @@ def write_record3d_mp4(
     """
     near, far = depth_range or (0.0, 3.0)
     pictures = [np.concatenate((_hue((f.depth[0].numpy() - near) / (far - near)), pixels(f)), 1) for f in frames]
-    write_video(file, pictures, [i / fps for i in range(len(frames))], crf=crf)
+    write_video(file, pictures, [i / fps for i in range(len(frames))], crf=crf, stored=stored)
     meta: dict[str, Any] = {"intrinsicMatrix": K_matrix(frames[0].camera).T.ravel().tolist()}
     if depth_range is not None:
         meta["rangeOfEncodedDepth"] = list(depth_range)
