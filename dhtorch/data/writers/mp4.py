@@ -27,8 +27,8 @@ def write_video(
 ) -> None:
     """An mp4 with a key frame now and then and frames stored out of order in between, as phones write them.
 
-    ``stored``: format of the pixels in the file; ``yuv420p10le`` has ten bits. ``hide_first``: an edit list lets the film
-    begin with the second frame, so that the first one lies before time 0.
+    ``stored``: format of the pixels in the file; ``yuv420p10le`` has ten bits. ``hide_first``: an edit list lets the
+    film begin with the second frame, so that the first one lies before time 0.
     """
     file.parent.mkdir(parents=True, exist_ok=True)
     h, w = pictures[0].shape[:2]
