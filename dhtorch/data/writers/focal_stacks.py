@@ -36,7 +36,7 @@ def write_ddff12(
     dtype: str = "float32",
     compression: str | None = None,
 ) -> None:
-    """``stack_<split>`` (N, S, H, W, 3), 0 to 255, and where there is depth ``disp_<split>`` (N, H, W), px, 0 = invalid."""
+    """``stack_<split>`` (N, S, H, W, 3), 0 to 255; with depth, ``disp_<split>`` (N, H, W) px, 0 = invalid."""
     file.parent.mkdir(parents=True, exist_ok=True)
     with need("h5py").File(file, "w") as group:
         for split, stacks in splits.items():
