@@ -284,7 +284,9 @@ def test_bad_stacks(tmp_path: Path) -> None:
     writers.write_image_folder(tmp_path, stack(0, 3))
     writers.write_image_folder(tmp_path / "b", stack(0, 2, hw=(12, 17)))
     (tmp_path / "b/image2.png").rename(tmp_path / "image2.png")
-    fails(r"image2.png: picture: found 17x12, 3 channels, .*, expected 16x12.* as image1.png", tmp_path, format="images")
+    fails(
+        r"image2.png: picture: found 17x12, 3 channels, .*, expected 16x12.* as image1.png", tmp_path, format="images"
+    )
     fails(r": format: found no focal stack", tmp_path)  # pictures of several sizes are not recognised as one
     fails(r"option focus_m: found .* expected positive distances", tmp_path, format="images", focus_m=[1, 2, 0])
 
