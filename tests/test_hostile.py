@@ -13,6 +13,13 @@ from typing import Any
 
 import hostile
 import pytest
+import test_arkitscenes
+import test_ca1m
+import test_focal_stacks
+import test_lerobot
+import test_record3d
+import test_rh20t
+import test_stray
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -96,13 +103,28 @@ def test_many_damaged_captures(name: str, tmp_path: Path) -> None:
     assert counts.total() == MANY
 
 
-@pytest.mark.parametrize("name", ["tum", "named", "driving"])
+#: The samples of the formats that have a test file of their own.
+OTHERS: dict[str, tuple[Callable[[Path], Path | None], Callable[[Path], Any]]] = {
+    "arkitscenes": (test_arkitscenes.hostile_sample, test_arkitscenes.read_all),
+    "ca1m": (test_ca1m.hostile_sample, test_ca1m.read_all),
+    "record3d_archive": (test_record3d.write_archive, hostile.read_frames),
+    "record3d_exr": (test_record3d.write_exr, hostile.read_frames),
+    "record3d_mp4": (test_record3d.write_mp4, hostile.read_frames),
+    "stray": (test_stray.write, hostile.read_frames),
+    "lerobot_v3": (test_lerobot._v3, hostile.read_frames),
+    "lerobot_v2": (test_lerobot._v2, hostile.read_frames),
+    "rh20t": (test_rh20t._write, test_rh20t._read),
+    **{name: (write, test_focal_stacks.read_stacks) for name, write in test_focal_stacks.HOSTILE.items()},
+}
+
+
+@pytest.mark.parametrize("name", [*FORMATS, *OTHERS])
 def test_damage_that_hypothesis_looks_for(name: str, tmp_path: Path) -> None:
     """The same mutations with every choice in the hands of Hypothesis, which shrinks what it finds."""
-    write, read = FORMATS[name]
+    write, read = (FORMATS | OTHERS)[name]
     with hostile.sample(write, read, tmp_path) as (good, outcome_of):
 
-        @settings(max_examples=60, deadline=None, derandomize=True, database=None)
+        @settings(max_examples=40, deadline=None, derandomize=True, database=None)
         @given(draw=st.randoms(use_true_random=False))
         def check(draw: random.Random) -> None:
             what, want = hostile.mutate(good, draw)
