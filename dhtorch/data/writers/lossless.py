@@ -13,6 +13,9 @@ from dhtorch.data.files import need
 
 _H264 = {"qp": "0", "preset": "ultrafast"}
 _HEVC = {"preset": "ultrafast", "x265-params": "lossless=1:log-level=none:pools=none:frame-threads=1"}
+#: On a busy machine the muxer has once refused a packet of the 12-bit encoder that it takes the next time.
+_ATTEMPTS = 3
+
 #: Pixel format → encoder and options that lose nothing.
 _LOSSLESS: dict[str, tuple[str, dict[str, str]]] = {
     "rgb24": ("libx264rgb", _H264),
@@ -37,9 +40,23 @@ def write_lossless(
     """
     av = need("av")
     encoder, lossless = _LOSSLESS[pixels]
+    chosen = dict(lossless if options is None else options)
     file.parent.mkdir(parents=True, exist_ok=True)
+    for attempt in range(_ATTEMPTS):
+        try:
+            _encode(file, pictures, pixels, rate, encoder, chosen)
+            return
+        except av.error.PatchWelcomeError:
+            if attempt == _ATTEMPTS - 1:
+                raise
+
+
+def _encode(
+    file: Path, pictures: Sequence[np.ndarray], pixels: str, rate: Fraction, encoder: str, options: dict[str, str]
+) -> None:
+    av = need("av")
     with av.open(str(file), "w", format="mp4") as container:
-        stream = container.add_stream(encoder, rate=rate, options=dict(lossless if options is None else options))
+        stream = container.add_stream(encoder, rate=rate, options=options)
         stream.pix_fmt = pixels
         stream.height, stream.width = pictures[0].shape[:2]
         stream.codec_context.thread_count = 1
