@@ -106,13 +106,14 @@ def _execute(settings: dict[str, Any], parts: dict[str, Any], choices: Mapping[s
 
     from dhtorch import archive, report  # noqa: PLC0415
     from dhtorch.data import files as data_files  # noqa: PLC0415
+    from dhtorch.experiments.pair import MIN_CANDIDATES  # noqa: PLC0415
 
     if settings["threads"] is not None:
         torch.set_num_threads(settings["threads"])
         data_files.set_opencv_threads(settings["threads"])
     recordings = _recordings(parts["data"])
-    files = _files(recordings)
-    key = archive.result_key(settings | {"choices": dict(choices)}, archive.data_digest(files))
+    digest = archive.data_digest(_files(recordings))
+    key = archive.result_key(settings | {"choices": dict(choices)}, digest)
     target = folder / "result.json"
     if settings["resume"] and archive.finished(target, key):
         print(f"{target}: finished and valid, left untouched")
@@ -133,7 +134,7 @@ def _execute(settings: dict[str, Any], parts: dict[str, Any], choices: Mapping[s
             "name": choices["data"],
             "scenes": scenes,
             "n_pairs": outcome.n_pairs,
-            "digest": archive.data_digest(files),
+            "digest": digest,
         },
         summary=outcome.summary,
         rows=outcome.rows,
@@ -146,7 +147,7 @@ def _execute(settings: dict[str, Any], parts: dict[str, Any], choices: Mapping[s
     report.print_tables(result)
     few = {r["scene"]: r["n_few"] for r in outcome.rows if r["pair"] is None and r["n_few"]}
     for scene, n in few.items():
-        print(f"{scene}: {n} pair{'s' * (n > 1)} dropped, fewer than 20 candidates each")
+        print(f"{scene}: {n} pair{'s' * (n > 1)} dropped, fewer than {MIN_CANDIDATES} candidates each")
     written = [target, *(_draw(outcome.examples, folder) if settings["figures"] else ())]
     if outcome.verdict:
         print(f"{outcome.verdict}: {outcome.why}")
