@@ -106,7 +106,7 @@ def _execute(settings: dict[str, Any], parts: dict[str, Any], choices: Mapping[s
 
     from dhtorch import archive, report  # noqa: PLC0415
     from dhtorch.data import files as data_files  # noqa: PLC0415
-    from dhtorch.experiments.pair import MIN_CANDIDATES  # noqa: PLC0415
+    from dhtorch.experiments.protocol import MIN_CANDIDATES  # noqa: PLC0415
 
     if settings["threads"] is not None:
         torch.set_num_threads(settings["threads"])
@@ -158,7 +158,7 @@ def _common(settings: Mapping[str, Any]) -> Any:
     """The options that every pair of the job shares."""
     import torch  # noqa: PLC0415
 
-    from dhtorch.experiments.pair import Settings  # noqa: PLC0415
+    from dhtorch.experiments.protocol import Settings  # noqa: PLC0415
 
     dtype = getattr(torch, str(settings["dtype"]), None)
     if dtype not in (torch.float32, torch.float64):

@@ -20,7 +20,7 @@ from dhtorch import data
 from dhtorch.data import FormatError, arkitscenes, ca1m, clocks, convert, files, writers
 from dhtorch.data.writers import parts
 from dhtorch.evaluate import holdout
-from dhtorch.experiments.pair import PairData
+from dhtorch.experiments.protocol import PairData
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame, Pose

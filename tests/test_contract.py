@@ -211,6 +211,7 @@ ELSEWHERE = {
     *(f"dhtorch.evaluate.errors.{name}" for name in ("points", "select", "measure", "summarise", "unit")),
     *(f"dhtorch.evaluate.risk.{name}" for name in ("curve", "risk_coverage", "measure", "capped")),
     *(f"dhtorch.evaluate.calibrate.{name}" for name in ("reliability", "pool", "measure")),
+    "dhtorch.evaluate.curves.sampled",
     *(f"dhtorch.evaluate.bootstrap.{name}" for name in ("interval", "resample")),
 }
 

@@ -13,8 +13,9 @@ from dhtorch import data
 from dhtorch.codes import Gate, names
 from dhtorch.data.pairs import by_gap
 from dhtorch.data.synthetic import SyntheticRoom
-from dhtorch.experiments import method_comparison, pair
+from dhtorch.experiments import method_comparison, pair, protocol
 from dhtorch.run import config_dir
+from dhtorch.stages.track import lucas_kanade
 
 ROOT = os.environ.get("DHTORCH_DATA")
 
@@ -75,6 +76,57 @@ def test_a_rotation_scene_never_enters_the_summary():
     rotation = small(path="rotation", lidar="exact")
     outcome = pair.run([rotation], {"paper": method("paper")}, partial(by_gap, gap=2), pair.Settings())
     assert scene_row(outcome)["role"] == "rotation" and outcome.summary == {}
+
+
+def test_variants_share_tracks_and_pay_for_them():
+    asked = []
+
+    def track(*args):
+        asked.append(args)
+        return lucas_kanade(*args)
+
+    base = method("paper")
+    variants = {
+        "gated": protocol.Variant(protocol.refill(base, track=track)),
+        "other_seed": protocol.Variant(protocol.refill(base, track=track), seed=7),
+        "own": protocol.Variant(base),
+    }
+    outcome = protocol.run([small()], protocol.Protocol(variants), partial(by_gap, gap=3), protocol.Settings())
+    assert len(asked) == outcome.n_pairs == 1
+    rows = [scene_row(outcome, method=name) for name in variants]
+    assert rows[0]["ms"]["track"] == pytest.approx(rows[1]["ms"]["track"], rel=0.5)
+    same = [{k: r[k] for k in ("coverage", "median_rel", "n_candidates")} for r in rows]
+    assert same[0] == same[2]
+    assert set(outcome.points) == {("synthetic_room", name, "full") for name in variants}
+
+
+def test_refill_changes_a_seat_or_its_options_and_nothing_else():
+    base = method("paper")
+    changed = protocol.refill(base, n=64, track={"levels": 6}, score=len)
+    assert changed.func is base.func and changed.keywords["n"] == 64 and changed.keywords["score"] is len
+    assert changed.keywords["track"].keywords == base.keywords["track"].keywords | {"levels": 6}
+    assert changed.keywords["pose"] is base.keywords["pose"] and base.keywords["track"].keywords["levels"] == 4
+
+
+def test_a_scene_without_pairs_keeps_a_row_that_says_so():
+    room = small()
+    outcome = protocol.run(
+        [room], protocol.Protocol({"paper": protocol.Variant(method("paper"))}), lambda _: [], protocol.Settings()
+    )
+    assert scene_row(outcome)["note"] == "too short" and outcome.summary["n_pairs"]["value"] == 0
+
+
+def test_curves_of_a_scene_are_what_its_points_say():
+    outcome = pair.run([small(lidar="exact")], {"paper": method("paper")}, partial(by_gap, gap=2), pair.Settings())
+    row, points = scene_row(outcome), outcome.points["synthetic_room", "paper", "full"]
+    curve = row["curves"]["risk_coverage"]
+    assert curve["coverage"][-1] == pytest.approx(row["coverage"])
+    assert curve["median_rel"][-1] == pytest.approx(row["median_rel"])
+    assert curve["risk"][-1] == pytest.approx(float(points.answered().error.clamp(max=1).mean()))
+    assert all(a >= b - 1e-12 for a, b in zip(curve["risk"], curve["oracle"], strict=True))
+    distance = row["curves"]["distance"]
+    assert distance["depth"] == sorted(distance["depth"]) and len(distance["coverage"]) == 10
+    assert sum(row["curves"]["reliability"]["weight"]) == pytest.approx(1)
 
 
 def test_candidates_do_not_depend_on_the_method():

@@ -85,3 +85,22 @@ def test_by_baseline_takes_the_earliest_within_tolerance() -> None:
 def test_impossible_pairs_say_why(call: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_scaled_gaps_of_a_short_recording_are_missing_not_fatal() -> None:
+    assert pairs.by_scaled_gap(line(5, gap=2), 0.5) == [(0, 1), (1, 2), (2, 3), (3, 4)]
+    assert pairs.by_scaled_gap(line(5, gap=1), 0.5) == pairs.by_gap(line(5), 1), "at least one frame"
+    assert pairs.by_scaled_gap(line(5, gap=3), 2.0) == []
+    assert pairs.by_scaled_gap(line(3, gap=3, number=torch.tensor([0, 2, 4])), 1.0) == []
+    with pytest.raises(ValueError, match=r"pairs.factor: line knows no gap"):
+        pairs.by_scaled_gap(line(5), 1.0)
+
+
+def test_views_between_are_different_and_end_at_the_other() -> None:
+    assert pairs.between(3, 9, 1) == [9]
+    assert pairs.between(0, 20, 5) == [4, 8, 12, 16, 20]
+    for n in range(1, 8):
+        found = pairs.between(2, 9, n)
+        assert len(set(found)) == n and found[-1] == 9 and min(found) > 2 and found == sorted(found)
+    with pytest.raises(ValueError, match=r"views: found 4 for frames 0 to 3, expected 1 to 3"):
+        pairs.between(0, 3, 4)

@@ -94,6 +94,33 @@ def by_baseline(
     return _some(pairs, recording, f"{metres} m ± {tolerance:g} m")
 
 
+def by_scaled_gap(recording: Recording, factor: float, stride: int | None = None) -> list[tuple[int, int]]:
+    """Pairs at ``factor`` times the recording's own gap, rounded, at least one frame; none where it is too short.
+
+    Raises:
+        ValueError: no gap known, factor not positive, or stride below 1.
+    """
+    if recording.gap is None:
+        raise ValueError(f"pairs.factor: {recording.name} knows no gap of its own, expected one with a gap")
+    gap = max(1, int(_positive("pairs.factor", factor) * recording.gap + 0.5))
+    span = int(recording.number[-1] - recording.number[0])
+    try:
+        return by_gap(recording, gap, stride) if gap <= span else []
+    except ValueError:  # frames were lost: no two of those left are that far apart
+        return []
+
+
+def between(i: int, j: int, views: int) -> list[int]:
+    """``views`` different positions spread evenly over the way from ``i`` to ``j``: ``j`` is the last, ``i`` no part.
+
+    Raises:
+        ValueError: there are not that many.
+    """
+    if not 1 <= views <= j - i:
+        raise ValueError(f"views: found {views} for frames {i} to {j}, expected 1 to {j - i}")
+    return [i + round((j - i) * (k + 1) / views) for k in range(views)]
+
+
 def _stride(recording: Recording, stride: int | None) -> int:
     if stride is None:
         return 2 if len(recording) >= _MANY else 1

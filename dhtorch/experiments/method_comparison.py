@@ -8,11 +8,13 @@ What would refute it: one scene on which either number is worse by more than 10 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 from dhtorch.experiments import pair
+from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
+from dhtorch.experiments.rows import Row
 
 QUESTION = "Does the torch pipeline give what the same seats filled by OpenCV give, scene by scene?"
 EXPECTATION = "On every scene median error and coverage of ours are at most 10 % worse than the reference's."
@@ -20,16 +22,16 @@ EXPECTATION = "On every scene median error and coverage of ours are at most 10 %
 
 def run(
     recordings: Sequence[Any],
-    chosen: Mapping[str, pair.Method],
-    pairs: Callable[[Any], Sequence[tuple[int, int]]],
-    settings: pair.Settings,
+    chosen: Mapping[str, Method],
+    pairs: Pairs,
+    settings: Settings,
     *,
-    methods: Mapping[str, pair.Method] | None = None,
+    methods: Mapping[str, Method] | None = None,
     reference: str = "opencv",
     truths: Sequence[str] = ("raw", "5x5", "full"),
     tolerance: float = 0.1,
-    progress: Callable[[Iterable[Any], str, int], Iterable[Any]] = lambda items, _text, _total: items,
-) -> pair.Outcome:
+    progress: Progress = quiet,
+) -> Outcome:
     """Run several methods side by side on the same pairs, for several truth tests.
 
     Args:
@@ -58,7 +60,7 @@ def run(
     return outcome
 
 
-def compare(rows: Sequence[pair.Row], ours: str, reference: str, truth: str, tolerance: float) -> tuple[int, list[str]]:
+def compare(rows: Sequence[Row], ours: str, reference: str, truth: str, tolerance: float) -> tuple[int, list[str]]:
     """Number of scenes compared, and one line for every number that is worse by more than ``tolerance``."""
     scenes = {
         (r["scene"], r["method"]): r for r in rows if r["pair"] is None and r["truth"] == truth and r["role"] is None

@@ -1,0 +1,56 @@
+"""Tracks asked once: variants that differ in the pose, the gates or the seed look at the same ones."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dhtorch.records import Tracks
+
+Track = Callable[..., Tracks]
+
+
+class SharedTracks:
+    """Remembers the tracks of one batch of pairs.
+
+    A seat filled by the same function with the same options, asked about the same images and pixels, gets the same
+    record. Its time is charged to every variant as if each had tracked.
+    """
+
+    def __init__(self) -> None:
+        self._known: list[tuple[Any, Tensor, Tensor, Tensor, Tracks, float]] = []
+        self._owed = 0.0
+
+    def seat(self, track: Track) -> Track:
+        """The track seat of one variant."""
+        self._owed = 0.0
+        return partial(self._track, track)
+
+    def charge(self, ms: dict[str, float]) -> None:
+        """Add to ``ms["track"]`` what the tracks that were remembered had cost."""
+        ms["track"] = ms.get("track", 0.0) + self._owed
+
+    def _track(self, track: Track, image_0: Tensor, image_1: Tensor, uv_0: Tensor, **options: Any) -> Tracks:
+        if options:  # initial values or a pyramid of the caller's own: not the same question
+            return track(image_0, image_1, uv_0, **options)
+        key = _key(track)
+        for known, a, b, uv, tracks, ms in self._known:
+            if known == key and a is image_0 and b is image_1 and torch.equal(uv, uv_0):
+                self._owed += ms
+                return tracks
+        start = time.perf_counter()
+        tracks = track(image_0, image_1, uv_0)
+        self._known.append((key, image_0, image_1, uv_0, tracks, 1e3 * (time.perf_counter() - start)))
+        return tracks
+
+
+def _key(fn: Any) -> Any:
+    """What a seat does, comparable: partials of one function with equal options are equal."""
+    if isinstance(fn, partial):
+        return (_key(fn.func), tuple(map(_key, fn.args)), {k: _key(v) for k, v in fn.keywords.items()})
+    return fn
