@@ -12,6 +12,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ import torch
 from torch import Tensor
 
 from dhtorch import data
-from dhtorch.data import FormatError, files, focal_stacks
+from dhtorch.data import FormatError, files
 from dhtorch.data.survey import Survey, survey_pictures, survey_recording, survey_stacks
 
 _LEVELS = 2  # folders below the path
@@ -83,7 +84,7 @@ def find(path: Path) -> list[Found]:
             if found:
                 return found
         level = [entry for entry in inside if entry.is_dir()]
-    formats = ", ".join((*data.FORMATS, *focal_stacks.STACK_FORMATS))
+    formats = ", ".join((*data.FORMATS, *data.STACK_FORMATS))
     raise FormatError(path, "content", "no capture here or two folders below", f"one of {formats}, or pictures")
 
 
@@ -112,21 +113,18 @@ def _full_name(asked: Path, found: Path, name: str) -> str:
 
 
 def _named(path: Path, format: str) -> Found:
-    if format in focal_stacks.STACK_FORMATS:
+    if format in data.STACK_FORMATS:
         return Found(path, "stacks", format, "as told")
     if format not in data.FORMATS:
-        raise FormatError(path, "format", format, ", ".join(("auto", *data.FORMATS, *focal_stacks.STACK_FORMATS)))
+        raise FormatError(path, "format", format, ", ".join(("auto", *data.FORMATS, *data.STACK_FORMATS)))
     return Found(path, "recording", format, "as told")
 
 
 def _recognised(path: Path) -> Found | None:
     """What stands at this very path: a recording wins over focal stacks, these over loose pictures."""
-    for name, reader in data.FORMATS.items():
+    for name, reader in (data.FORMATS | data.STACK_FORMATS).items():
         if evidence := reader.recognise(path):
-            return Found(path, "recording", name, evidence)
-    for name, reader in focal_stacks.STACK_FORMATS.items():
-        if evidence := reader.recognise(path):
-            return Found(path, "stacks", name, evidence)
+            return Found(path, "recording" if name in data.FORMATS else "stacks", name, evidence)
     if path.is_dir() and (count := sum(file.suffix.lower() in _PICTURES for file in path.iterdir())):
         return Found(path, "pictures", "loose pictures", f"{count} pictures of no known format")
     return None
@@ -143,7 +141,7 @@ def _recordings(capture: Found, frames: int) -> Iterator[Survey]:
         recordings, warning = data.open_all(capture.path, capture.format, images=False), [f"no pictures: {error}"]
     if len(recordings) > _MOST:
         warning.append(f"{len(recordings)} recordings in this capture: the first {_MOST} are shown")
-    for recording in recordings[:_MOST]:
+    for recording in islice(recordings, _MOST):
         survey = survey_recording(recording, frames)
         survey.warnings.extend(warning)
         yield survey

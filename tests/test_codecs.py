@@ -201,7 +201,7 @@ def test_unsound_videos(tmp_path: Path) -> None:
         codec_video.read_video_frame(file, N)
     with pytest.raises(FormatError, match=r"frame 0 size: found 64x48, expected 48x64"):
         codec_video.read_video_frame(file, 0, (64, 48))
-    with pytest.raises(FormatError, match=r"no.mp4: file: found no such file, expected a video"):
+    with pytest.raises(FormatError, match=r"no.mp4: file: found no such file, expected a readable file"):
         codec_video.video_header(tmp_path / "no.mp4")
     whole = file.read_bytes()
     file.write_bytes(whole[: len(whole) // 2])

@@ -22,7 +22,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from dhtorch import data, tree
-from dhtorch.data import convert, driving, files, frames_dir, rectified, tum, writers
+from dhtorch.data import codec_numpy, convert, driving, files, frames_dir, rectified, tum, writers
 from dhtorch.data.files import FormatError
 from dhtorch.data.recording import Recording, numbers
 from dhtorch.data.writers import parts
@@ -406,12 +406,13 @@ def test_nothing_there_or_unknown(tmp_path: Path, named: Path) -> None:
     fails(r"nowhere: path: found no such file or folder, expected a capture", tmp_path / "nowhere")
     fails(r"nowhere: path: found no such file or folder, expected a tum capture", tmp_path / "nowhere", "tum")
     (tmp_path / "empty").mkdir()
-    fails(rf"format: found an empty folder, expected one of {', '.join(data.FORMATS)}", tmp_path / "empty")
+    every = ", ".join((*data.FORMATS, *data.STACK_FORMATS))
+    fails(rf"format: found an empty folder, expected one of {every}", tmp_path / "empty")
     (tmp_path / "scan.xyz").write_text("1 2 3")
     fails(r"scan.xyz: format: found a .xyz file, expected one of", tmp_path / "scan.xyz")
     for format in data.FORMATS:  # also where the reader is named and the path is a file
         fails(r"scan.xyz", tmp_path / "scan.xyz", format)
-    fails(rf"format: found kitti, expected auto, {', '.join(data.FORMATS)}", named, "kitti")
+    fails(rf"format: found kitti, expected auto, {every}", named, "kitti")
     fails(r"data: format frames_dir has no option 'unit', expected one of K, K_depth, distortion", named, unit=3)
     fails(r"scene_\*.json: found 0 such files, expected exactly one", named, "driving")
     fails(r"rgb frames: found none", named, "tum")
@@ -661,9 +662,9 @@ def test_npz_bomb_is_not_unpacked(tmp_path: Path) -> None:
         with zipfile.ZipFile(tmp_path / f"{name}.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             archive.writestr("data.npy", head.getvalue() + body)
     with pytest.raises(FormatError, match=r"liar.npz: data: found 64 bytes, expected \(1000000000000,\) of float64"):
-        files.read_npz(tmp_path / "liar.npz", "data")
+        codec_numpy.read_npz(tmp_path / "liar.npz", "data")
     with pytest.raises(FormatError, match=r"big.npz: data: found an array that unpacks beyond the limit"):
-        files.read_npz(tmp_path / "big.npz", "data")
+        codec_numpy.read_npz(tmp_path / "big.npz", "data")
 
 
 def test_bad_driving(tmp_path: Path) -> None:

@@ -18,8 +18,8 @@ import tifffile
 import torch
 from torch import Tensor
 
-from dhtorch import data
-from dhtorch.data import FormatError, codec_hdf5, codec_tiff, ddff12, files, fod500, image_folder, writers
+from dhtorch import data, run
+from dhtorch.data import FormatError, codec_hdf5, codec_numpy, codec_tiff, ddff12, fod500, image_folder, writers
 from dhtorch.data.light_field import refocus
 from dhtorch.data.stacks import FocalStack, Stacks
 
@@ -262,6 +262,33 @@ def test_opening_decodes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert len(data.open_stacks(tmp_path / "a")) == len(data.open_stacks(tmp_path / "b.h5")) == 1
 
 
+WRITTEN = {
+    "fod500": lambda root: writers.write_fod500(root, {0: stack(0), 1: stack(1)}),
+    "ddff12": lambda root: writers.write_ddff12(root / "a.h5", {"val": [stack(0, 10)]}),
+    "images": lambda root: writers.write_image_folder(root, stack(0, 5)),
+}
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_open_gives_stacks_and_a_job_of_pairs_says_why_not(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = tmp_path / "sweep"
+    root.mkdir()
+    WRITTEN[name](root)
+    assert data.recognise(root)[0] == name
+    got, want = data.open(root), data.open_stacks(root)
+    assert isinstance(got, Stacks) and (got.names, got.format, len(got)) == (want.names, name, len(want))
+    assert torch.equal(got[0].images, want[0].images)
+    with pytest.raises(ValueError, match=rf"data: near, gap given for .*sweep, which holds focal stacks \({name}\)"):
+        data.open(root, near=1.0, gap=3)
+    monkeypatch.chdir(tmp_path)
+    assert run.main(["data=auto", f"data.root={root}", "pairs.gap=1", "holdout.cutoff=1.0"]) != 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"holds focal stacks ({name}), pictures of one view, expected a recording whose camera moves" in said
+    assert "Traceback" not in said and not list(tmp_path.rglob("result.json"))
+
+
 def test_stacks_are_a_sequence_and_pickle(tmp_path: Path) -> None:
     writers.write_fod500(tmp_path, {0: stack(0), 1: stack(1)})
     stacks = pickle.loads(pickle.dumps(data.open_stacks(tmp_path)))
@@ -348,7 +375,7 @@ def test_bad_light_field(tmp_path: Path) -> None:
     fails(r"LF_0001.npy: light field: found float32 of", tmp_path)
     np.save(file, np.array([{"a": 1}]), allow_pickle=True)
     fails(r"LF_0001.npy: light field dtype: found object, expected real numbers", tmp_path)
-    assert files.npy_header(file, "x", good).shape == (3, 3, 12, 16, 3)
+    assert codec_numpy.npy_header(file, "x", good).shape == (3, 3, 12, 16, 3)
 
 
 def test_a_missing_library_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,7 +5,10 @@ from __future__ import annotations
 import json
 import math
 import pickle
+import shutil
+import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +25,7 @@ import pyarrow
 from pyarrow import parquet
 
 from dhtorch import data
-from dhtorch.data import codec_parquet, lerobot_depth
+from dhtorch.data import codec_parquet, lerobot_depth, lerobot_rows
 from dhtorch.data.codec_video import close_videos
 from dhtorch.data.files import FormatError
 from dhtorch.data.lerobot_meta import Feature
@@ -119,6 +122,52 @@ def test_one_episode_and_its_camera_by_name(tmp_path: Path) -> None:
         data.open(tmp_path, episode=7)
     with pytest.raises(FormatError, match=r"info.json: cameras: found wrist, expected of observation.images.front"):
         data.open(tmp_path, camera="wrist")
+
+
+@pytest.mark.parametrize("version", [3, 2])
+def test_thousands_of_episodes_are_listed_and_none_is_opened(
+    tmp_path: Path, version: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Twenty thousand, by copies of the metadata: opening reads no table, and the last one is the right one."""
+    write_lerobot(tmp_path, episodes(), version=version)
+    n, meta = 20_000, tmp_path / "meta"
+    if version == 2:
+        (meta / "episodes.jsonl").write_text("\n".join(json.dumps({"episode_index": i, "length": 4}) for i in range(n)))
+        for kind in ("data", "videos"):
+            for file in list((tmp_path / kind).rglob("episode_000001.*")):
+                other = Path(str(file).replace("chunk-000", "chunk-019").replace("000001", f"{n - 1:06d}"))
+                other.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy(file, other)
+        rewrite(next((tmp_path / "data/chunk-019").iterdir()), partial(with_column, "episode_index", n - 1))
+    else:
+        listed = meta / "episodes/chunk-000/file-000.parquet"
+        parquet.write_table(many(parquet.read_table(listed), n), listed)
+        rewrite(tmp_path / "data/chunk-000/file-000.parquet", lambda t: with_column("episode_index", n - 1, t.slice(2)))
+    opened: list[Path] = []
+    read = lerobot_rows._read_table.__wrapped__
+    monkeypatch.setattr(lerobot_rows, "_read_table", lambda f, *a: opened.append(f) or read(f, *a))
+    start = time.process_time()
+    recordings = data.open_all(tmp_path, gap=3)
+    assert time.process_time() - start < 1 and opened == []  # measured below 0.2 s
+    assert len(recordings) == n and recordings.names[7].endswith("/episode_000007/front")
+    same_scene(recordings[-1], episodes()[1], STEP["video"])
+    assert recordings[-1].gap == 3 and len(opened) == 2 and recordings[n - 1].name == recordings.names[-1]
+    assert pickle.loads(pickle.dumps(recordings)).names == recordings.names
+    with pytest.raises(IndexError):
+        recordings[n]
+    with pytest.raises(FormatError, match=r"20000 recordings: .*episode_000000/front, .*…, expected one"):
+        data.open(tmp_path)
+
+
+def many(table: pyarrow.Table, n: int) -> pyarrow.Table:
+    """The first row n − 1 times, then the second, numbered."""
+    rows = table.take([0] * (n - 1) + [1])
+    return rows.set_column(rows.schema.get_field_index("episode_index"), "episode_index", pyarrow.array(range(n)))
+
+
+def with_column(name: str, value: int, table: pyarrow.Table) -> pyarrow.Table:
+    """The table with one value in every row of a column."""
+    return table.set_column(table.schema.get_field_index(name), name, pyarrow.array([value] * len(table)))
 
 
 @pytest.mark.parametrize("depth_pixels", ["gray12le", "yuv420p12le"])

@@ -270,6 +270,47 @@ def test_damaged_headers(tmp_path: Path) -> None:
             codec_pickle.read_npy(file)
 
 
+HEADERS = [
+    "",
+    "()",
+    "{}",
+    "[" * 5000,
+    "(" * 9000 + ")" * 9000,
+    "-" * 9000 + "1",
+    "'" + "x" * 100,
+    "'" * 3,
+    "{'descr': (), 'fortran_order': False, 'shape': (4,)}",  # numpy's parser: IndexError
+    "{'descr': [], 'fortran_order': False, 'shape': (4,)}",
+    "{'descr': [()], 'fortran_order': False, 'shape': (4,)}",
+    "{'descr': ['<f8'], 'fortran_order': False, 'shape': (4,)}",
+    "{'descr': '<f99999999999999999999', 'fortran_order': False, 'shape': (4,)}",
+    f"{{'descr': [('a', '<f8', ({2**70},))], 'fortran_order': False, 'shape': (4,)}}",
+    f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({2**70},)}}",
+    "{'descr': '<f8', 'fortran_order': False, 'shape': (4, -1)}",
+    "{'descr': '<f8', 'fortran_order': False, 'shape': (True,)}",
+    "{'descr': '<f8', 'fortran_order': 'no', 'shape': (4,)}",
+    "{'descr': '<f8', 'fortran_order': False, 'shape': (4L,)}",  # as Python 2 wrote it: four, and there are three
+    "{'descr': '<f8', 'fortran_order': False, 'shape': (4L,",
+    "{[]: 1}",
+    "{'descr': '<f8', 'fortran_order': False, 'shape': (4,)} + 1",
+    "__import__('os')._exit(86)",
+    "\x00",
+    "\\",
+    "é",
+]
+
+
+@pytest.mark.parametrize("version", [1, 2, 3, 9])
+def test_no_header_raises_anything_else(tmp_path: Path, version: int) -> None:
+    for text in HEADERS:
+        head = text.encode() + b"\n"
+        size = struct.pack("<H" if version == 1 else "<I", len(head))
+        (tmp_path / "x.npy").write_bytes(b"\x93NUMPY" + bytes([version, 0]) + size + head + bytes(24))
+        with pytest.raises(FormatError, match=r"x.npy: (header|header shape|data): found ") as caught:
+            codec_pickle.read_npy(tmp_path / "x.npy")
+        assert "\n" not in str(caught.value)
+
+
 def _write(root: Path) -> Path:
     np.save(root / "x.npy", plain(), allow_pickle=True)
     return root / "x.npy"

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dhtorch.data.files import MAX_BYTES, FormatError, need
+from dhtorch.data.files import MAX_BYTES, UNREADABLE, FormatError, need, unreadable
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _FILTERS = {"gzip", "lzf", "shuffle", "fletcher32"}  # come with the library
@@ -69,9 +69,8 @@ def _opened(file: Path) -> Iterator[Any]:
     try:
         with file.open("rb") as stream:
             head = stream.read(len(_SIGNATURE))
-    except (OSError, ValueError) as error:
-        found = "no such file" if isinstance(error, FileNotFoundError) else error
-        raise FormatError(file, "file", found, "a readable file") from None
+    except UNREADABLE as error:
+        raise unreadable(file, error) from None
     if head != _SIGNATURE:
         raise FormatError(file, "content", repr(head), "an HDF5 file")
     try:

@@ -13,7 +13,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dhtorch.data.files import MAX_BYTES, MAX_TEXT_BYTES, FormatError, need
+from dhtorch.data.files import (
+    MAX_BYTES,
+    MAX_TEXT_BYTES,
+    UNREADABLE,
+    FormatError,
+    last_change,
+    need,
+    unreadable,
+)
 
 MAX_ROWS = 50_000_000
 _MAX_CHUNK_BYTES = 1 << 30  # of one column in one row group, unpacked
@@ -82,11 +90,7 @@ def read_cell(file: Path, column: str, row: int) -> Any:
     Raises:
         FormatError: as :func:`read_columns`.
     """
-    try:
-        key = (file, file.stat().st_mtime_ns, column)
-    except (OSError, ValueError) as error:
-        found = "no such file" if isinstance(error, FileNotFoundError) else error
-        raise FormatError(file, "file", found, "a readable file") from None
+    key = (file, last_change(file), column)
     first, values = _held.get(key, (0, ()))
     if not first <= row < first + len(values):
         _held.pop(key, None)
@@ -130,9 +134,8 @@ def _footer_size(file: Path) -> int:
             head = stream.read(4)
             stream.seek(max(size - 8, 0))
             tail = stream.read(8)
-    except (OSError, ValueError) as error:
-        found = "no such file" if isinstance(error, FileNotFoundError) else error
-        raise FormatError(file, "file", found, "a readable file") from None
+    except UNREADABLE as error:
+        raise unreadable(file, error) from None
     length = int.from_bytes(tail[:4], "little")
     if size < 12 or head != b"PAR1" or tail[4:] != b"PAR1" or not 0 < length <= min(size - 12, MAX_TEXT_BYTES):
         raise FormatError(file, "file", f"{size} bytes from {head!r} to {tail[4:]!r}", "a whole parquet file")

@@ -8,18 +8,17 @@ believed before the bytes for it are there. Protocols 2 to 5, the module paths o
 
 from __future__ import annotations
 
-import io
 import math
 import re
 import struct
 from collections.abc import Callable
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any, Final
 
 import numpy as np
 
 from dhtorch.data import files
+from dhtorch.data.codec_numpy import npy_header
 from dhtorch.data.files import FormatError
 
 MAX_PICKLE_BYTES: Final = 128_000_000
@@ -42,7 +41,6 @@ _NAMES: Final = {
 }
 _SCALARS = (str, int, float, bool, bytes, type(None))
 _MARK = object()
-_HEADER_ERRORS = (ValueError, SyntaxError, TypeError, KeyError, struct.error, RecursionError, MemoryError, TokenError)
 
 
 class _Name(str):
@@ -75,18 +73,12 @@ def read_npy(file: Path) -> Any:
         FormatError: missing or damaged file, or a pickle that contains or does anything else.
     """
     data = files.read_bytes(file, MAX_PICKLE_BYTES)
-    stream = io.BytesIO(data)
-    try:
-        version = np.lib.format.read_magic(stream)
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, fortran, dtype = read(stream)
-    except _HEADER_ERRORS as error:
-        raise FormatError(file, "header", error, "a numpy array header") from None
-    body = data[stream.tell() :]
+    shape, fortran, dtype, start = npy_header(file, "header", data)
+    body = data[start:]
     if dtype.hasobject:
         return loads(body, file)
     try:
-        return _filled(dtype, shape, bool(fortran), body)
+        return _filled(dtype, shape, fortran, body)
     except (ValueError, TypeError, OverflowError) as error:
         raise FormatError(file, "data", error, f"numbers of type {dtype}") from None
 

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from dhtorch.data.files import MAX_BYTES, FormatError
+from dhtorch.data.files import MAX_BYTES, FormatError, unreadable
 
 _BLOCK = 512
 _MAX_NAME_BYTES = 1_000_000  # of a long name or a pax header
@@ -38,8 +38,7 @@ def members(file: Path) -> Iterator[Member]:
         with file.open("rb") as stream:
             yield from _walk(file, stream.fileno())
     except OSError as error:
-        found = "no such file" if isinstance(error, FileNotFoundError) else error
-        raise FormatError(file, "file", found, "a readable tar archive") from None
+        raise unreadable(file, error) from None
 
 
 def read_member(file: Path, offset: int, size: int, limit: int = MAX_BYTES) -> bytes:
@@ -54,7 +53,7 @@ def read_member(file: Path, offset: int, size: int, limit: int = MAX_BYTES) -> b
         with file.open("rb") as stream:
             data = os.pread(stream.fileno(), size, offset)
     except OSError as error:
-        raise FormatError(file, "file", error, "a readable tar archive") from None
+        raise unreadable(file, error) from None
     if len(data) != size:
         raise FormatError(file, f"member at byte {offset}", f"{len(data)} bytes", f"{size} bytes")
     return data

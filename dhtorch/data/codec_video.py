@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dhtorch.data.files import FormatError, need
+from dhtorch.data.files import FormatError, last_change, need
 
 MAX_VIDEO_PIXELS = 36_000_000  # 8K; a decoder holds up to 17 pictures
 _MAX_FRAMES = 10_000_000
@@ -234,12 +234,7 @@ _inherited: list[_Decoder] = []
 
 def _decoder(file: Path, all_frames: bool) -> _Decoder:
     """An open decoder of this process."""
-    try:
-        changed = file.stat().st_mtime_ns
-    except (OSError, ValueError) as error:
-        found = "no such file" if isinstance(error, FileNotFoundError) else error
-        raise FormatError(file, "file", found, "a video") from None
-    key = (file, all_frames, changed)
+    key = (file, all_frames, last_change(file))
     if key not in _open:
         while len(_open) >= _MAX_OPEN:
             _open.popitem(last=False)[1].container.close()

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from dhtorch.data import convert, files
 from dhtorch.data.codec_hdf5 import Hdf5Array, hdf5_arrays
+from dhtorch.data.codec_numpy import real_header
 from dhtorch.data.files import FormatError
 from dhtorch.data.light_field import refocus
 from dhtorch.data.stacks import FocalStack, Stacks, focus_distances
@@ -162,7 +163,7 @@ def _light_fields(root: Path, depth_folder: str) -> tuple[list[_Shot], list[str]
 def _light_field(file: Path) -> Tensor:
     """(U, V, H, W, 3) uint8."""
     raw = files.read_bytes(file)
-    header = files.npy_header(file, "light field", raw)
+    header = real_header(file, "light field", raw)
     shape = header.shape
     usable = len(shape) == 5 and shape[4] in (1, 3) and max(shape[:2]) <= _MAX_APERTURES and min(shape) > 0
     if header.dtype != np.uint8 or header.fortran or not usable:

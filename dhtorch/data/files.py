@@ -10,15 +10,11 @@ Alphabet: ``hw`` (height, width); depth and disparity maps are (h, w) float32.
 from __future__ import annotations
 
 import importlib
-import io
 import json
-import math
 import struct
-import zipfile
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from tokenize import TokenError
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -203,9 +199,6 @@ def _decode(file: Path, data: bytes, flags: int, hw: tuple[int, int]) -> np.ndar
     return image
 
 
-# ---------------------------------------------------------------------------------------------------------- arrays
-
-
 def read_pfm(file: Path, hw: tuple[int, int] | None = None) -> np.ndarray:
     """One-channel portable float map (h, w) float32, first row on top (the file stores the last row first).
 
@@ -229,77 +222,6 @@ def read_pfm(file: Path, hw: tuple[int, int] | None = None) -> np.ndarray:
         raise FormatError(file, "data", f"{len(data) - start} bytes", f"4 for each of {_size(size)} pixels")
     order = "<f4" if scale < 0 else ">f4"
     return np.frombuffer(data, order, h * w, start).reshape(h, w)[::-1].astype(np.float32)
-
-
-def read_npz(file: Path, key: str) -> np.ndarray:
-    """Array ``key`` of an ``.npz`` archive as floating point; pickled objects are refused.
-
-    Raises:
-        FormatError: missing or damaged archive, no such key, not numeric, or larger than it says or than ``MAX_BYTES``.
-    """
-    try:
-        with zipfile.ZipFile(io.BytesIO(read_bytes(file))) as archive:
-            if f"{key}.npy" not in archive.namelist():
-                raise FormatError(file, "key", ", ".join(sorted(archive.namelist())[:8]) or "nothing", f"{key}.npy")
-            member = archive.getinfo(f"{key}.npy")
-            if member.file_size > MAX_BYTES:
-                raise FormatError(file, key, "an array that unpacks beyond the limit", f"at most {MAX_BYTES} bytes")
-            if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                raise FormatError(file, key, f"compression {member.compress_type}", "none or deflate, as numpy writes")
-            raw = archive.read(member)
-    except FormatError:
-        raise
-    except (zipfile.BadZipFile, zlib.error, struct.error, ValueError, RuntimeError, EOFError, OSError) as error:
-        raise FormatError(file, "archive", error, "a whole .npz archive") from None
-    return _npy(file, key, raw)
-
-
-class NpyHeader(NamedTuple):
-    """What a numpy array file says about itself."""
-
-    shape: tuple[int, ...]
-    fortran: bool  # first axis fastest
-    dtype: np.dtype
-    start: int  # byte where the values start
-
-
-def npy_header(file: Path, field: str, head: bytes) -> NpyHeader:
-    """Header of an ``.npy`` file from its first bytes (2 KB are plenty); of real numbers, without pickled objects.
-
-    Raises:
-        FormatError: no such header, another kind of values, or a shape that no array has.
-    """
-    stream = io.BytesIO(head)
-    try:
-        version = np.lib.format.read_magic(stream)
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, fortran, dtype = read(stream)
-    except (
-        ValueError,
-        SyntaxError,
-        TokenError,
-        TypeError,
-        KeyError,
-        RecursionError,
-        MemoryError,
-        struct.error,
-    ) as error:
-        raise FormatError(file, field, error, "a numpy array header") from None
-    if dtype.kind not in "fiu" or dtype.hasobject:
-        raise FormatError(file, f"{field} dtype", dtype, "real numbers")
-    if len(shape) > 8 or any(type(n) is not int or not 0 <= n <= 2**40 for n in shape):
-        raise FormatError(file, f"{field} shape", shape, "a few counts")
-    return NpyHeader(shape, bool(fortran), dtype, stream.tell())
-
-
-def _npy(file: Path, key: str, raw: bytes) -> np.ndarray:
-    header = npy_header(file, key, raw)
-    count, left = math.prod(header.shape), len(raw) - header.start
-    if count * header.dtype.itemsize != left:
-        raise FormatError(file, key, f"{left} bytes", f"{header.shape} of {header.dtype}")
-    array = np.frombuffer(raw, header.dtype, count, header.start)
-    array = array.reshape(header.shape, order="F" if header.fortran else "C")
-    return array.astype(np.float32 if header.dtype.itemsize <= 4 and header.dtype.kind == "f" else np.float64)
 
 
 # ------------------------------------------------------------------------------------------------------------ text
@@ -420,9 +342,30 @@ def read_bytes(file: Path, limit: int = MAX_BYTES) -> bytes:
         return file.read_bytes()
     except FormatError:
         raise
-    except (OSError, ValueError) as error:  # ValueError: a name that no file can have
-        found = "no such file" if isinstance(error, FileNotFoundError) else error
-        raise FormatError(file, "file", found, "a readable file") from None
+    except UNREADABLE as error:
+        raise unreadable(file, error) from None
+
+
+def last_change(file: Path) -> int:
+    """When a file was changed last, ns: part of the key of whatever is kept of it in memory.
+
+    Raises:
+        FormatError: the file is missing or unreadable.
+    """
+    try:
+        return file.stat().st_mtime_ns
+    except UNREADABLE as error:
+        raise unreadable(file, error) from None
+
+
+#: What opening a file may raise; ValueError: a name that no file can have.
+UNREADABLE = (OSError, ValueError)
+
+
+def unreadable(file: Path, error: Exception) -> FormatError:
+    """What to raise instead of ``error``, one of ``UNREADABLE``."""
+    found = "no such file" if isinstance(error, FileNotFoundError) else error
+    return FormatError(file, "file", found, "a readable file")
 
 
 def left_out(names: Sequence[int | str], why: str) -> list[str]:

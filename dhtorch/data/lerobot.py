@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -25,9 +24,9 @@ from dhtorch.data.codec_parquet import read_cell
 from dhtorch.data.codec_video import read_video_frame, video_times
 from dhtorch.data.files import FormatError
 from dhtorch.data.lerobot_depth import decode_codes, decode_picture, depth_of
-from dhtorch.data.lerobot_meta import Episode, Feature, Meta, colour_keys, inside, read_episodes, read_meta
+from dhtorch.data.lerobot_meta import Episode, Episodes, Feature, Meta, colour_keys, inside, read_episodes, read_meta
 from dhtorch.data.lerobot_rows import episode_rows, read_table
-from dhtorch.data.recording import Recording
+from dhtorch.data.recording import Recording, Recordings
 from dhtorch.records import Camera, Frame, Pose
 
 _UNITS = {"m": 1.0, "mm": 1000.0}
@@ -55,7 +54,7 @@ def read(
     depth_unit: str | None = None,
     depth_range: Sequence[float] | None = None,
     tolerance: float = 1e-4,
-) -> list[Recording]:
+) -> Recordings:
     """Open a data set folder, one recording for each episode and camera.
 
     Args:
@@ -79,10 +78,11 @@ def read(
 
     Returns:
         Recordings named ``<data set>/episode_<number>/<camera>``, times from the start of the episode. Rows that are
-        missing or out of order are left out and reported.
+        missing or out of order are left out and reported. A table is read when one of its episodes is asked for.
 
     Raises:
-        FormatError: no K, an unknown key or episode, a damaged file, or values no camera or pose can have.
+        FormatError: an unknown key or episode, or damaged metadata; of a single episode also no K, a damaged table, or
+            values no camera or pose can have.
     """
     root = Path(root)
     meta = read_meta(root)
@@ -96,15 +96,23 @@ def read(
         _Rig(meta, key, depth, K, K_depth, distortion, intrinsics, pose, depth_unit, span, tolerance) for key in keys
     ]
     wanted = None if episode is None else [episode] if isinstance(episode, int) else [int(e) for e in episode]
-    tables: dict[Path, dict[str, Any]] = {}
-    recordings = []
-    for place in read_episodes(meta, wanted):
-        if place.data not in tables:
-            tables.clear()  # episodes come in the order of their files
-            columns = {c for rig in rigs for c in (rig.K_key, rig.pose_key) if c}
-            tables[place.data] = read_table(place.data, sorted(columns))
-        recordings += [rig.recording(place, tables[place.data]) for rig in rigs]
-    return recordings
+    columns = sorted({c for rig in rigs for c in (rig.K_key, rig.pose_key) if c})
+    episodes = read_episodes(meta, wanted)
+    names = [rig.name(number) for number in episodes.numbers for rig in rigs]
+    return Recordings(names, _Make(episodes, tuple(rigs), tuple(columns)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Make:
+    """Position → recording: the cameras of the first episode, then those of the second, …"""
+
+    episodes: Episodes
+    rigs: tuple[_Rig, ...]
+    columns: tuple[str, ...]  # of the tables, beside those that place a row
+
+    def __call__(self, i: int) -> Recording:
+        episode = self.episodes[i // len(self.rigs)]
+        return self.rigs[i % len(self.rigs)].recording(episode, read_table(episode.data, self.columns))
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,7 +223,11 @@ class _Rig:
         names = (f"{self.key}.{what}", f"observation.camera.{self.key.split('.')[-1]}.{what}")
         return next((name for name in names if name in self.meta.features), None)
 
-    def recording(self, episode: Episode, table: dict[str, Any]) -> Recording:
+    def name(self, episode: int) -> str:
+        """Of the recording."""
+        return f"{self.meta.name}/episode_{episode:06d}/{self.key.split('.')[-1]}"
+
+    def recording(self, episode: Episode, table: dict[str, np.ndarray]) -> Recording:
         meta, image = self.meta, self.image
         rows, numbers, times, report = episode_rows(meta, episode, table)
         depth = depth_of(meta, self.key, self.depth_key)
@@ -224,8 +236,7 @@ class _Rig:
         cameras, depth_camera = self._cameras(table, rows, depth)
         poses = None
         if self.pose_key is not None:
-            poses = _poses(np.asarray(table[self.pose_key])[rows], episode.data, self.pose_key)
-        name = f"{meta.root.resolve().name}/episode_{episode.number:06d}/{self.key.split('.')[-1]}"
+            poses = _poses(table[self.pose_key][rows], episode.data, self.pose_key)
         load = _Load(
             data=episode.data,
             root=meta.root,
@@ -241,7 +252,7 @@ class _Rig:
             tolerance=self.tolerance,
         )
         return Recording(
-            name=name,
+            name=self.name(episode.number),
             format="lerobot",
             load=load,
             number=torch.from_numpy(numbers),
@@ -252,7 +263,9 @@ class _Rig:
             report=tuple(report),
         )
 
-    def _cameras(self, table: dict[str, Any], rows: np.ndarray, depth: Feature | None) -> tuple[Camera, Camera | None]:
+    def _cameras(
+        self, table: dict[str, np.ndarray], rows: np.ndarray, depth: Feature | None
+    ) -> tuple[Camera, Camera | None]:
         root, hw = self.meta.root, self.image.hw
         side = root / "meta" / "intrinsics.json"
         entry = files.read_json(side).get(self.key, {}) if side.is_file() else {}
@@ -266,7 +279,7 @@ class _Rig:
         if self.K is not None:
             return convert.to_camera(_matrix(self.K, root, "option K"), hw, root, "option K", lens), of_depth
         if self.K_key is not None:
-            values = np.asarray(table[self.K_key])[rows]
+            values = table[self.K_key][rows]
             return _cameras_of(values, hw, root / "data", self.K_key, lens), of_depth
         if "K" not in entry:
             found = "no K in option, feature or side-car"

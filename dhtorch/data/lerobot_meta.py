@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from dhtorch.data import files
 from dhtorch.data.codec_parquet import parquet_header, read_columns
 from dhtorch.data.files import FormatError
 
 _MAX_EPISODES = 10_000_000
+_PARTS = ("chunk_index", "file_index")
 _V2_DATA = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
 _V2_VIDEO = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
 _V3_DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -59,12 +62,48 @@ class Meta:
     """``meta/info.json``, checked."""
 
     root: Path
+    name: str  # of the data set
     version: int  # 2 or 3
     fps: float
     features: dict[str, Feature]
     chunks_size: int
     data_path: str
     video_path: str
+
+    @property
+    def videos(self) -> list[str]:
+        """Keys of the features that lie in videos."""
+        return [key for key, feature in self.features.items() if feature.dtype == "video"]
+
+
+@dataclass(frozen=True, eq=False)
+class Episodes:
+    """The episodes asked for, in that order. There may be tens of thousands: places are made out one at a time."""
+
+    meta: Meta
+    numbers: np.ndarray  # (n,)
+    columns: dict[str, np.ndarray]  # (n,) each: ``length``, and in v3 the places under their names in meta/episodes
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def __getitem__(self, i: int) -> Episode:
+        meta, number = self.meta, int(self.numbers[i])
+        row = {name: values[i].item() for name, values in self.columns.items()}
+
+        def index(prefix: str) -> dict[str, Any]:
+            if meta.version == 2:
+                return {"episode_chunk": number // meta.chunks_size, "episode_index": number}
+            return {part: row[f"{prefix}/{part}"] for part in _PARTS}
+
+        videos = {
+            key: (
+                _path(meta, "video_path", {**index(f"videos/{key}"), "video_key": key}),
+                row.get(f"videos/{key}/from_timestamp", 0.0),
+            )
+            for key in meta.videos
+        }
+        return Episode(number, row.get("length"), _path(meta, "data_path", index("data")), videos)
 
 
 def read_meta(root: Path) -> Meta:
@@ -91,6 +130,7 @@ def read_meta(root: Path) -> Meta:
     features = files.get(info, "features", dict, file)
     return Meta(
         root=root,
+        name=root.resolve().name,
         version=number,
         fps=files.to_positive(info.get("fps"), file, "fps"),
         features={key: _feature(key, value, file) for key, value in features.items()},
@@ -100,65 +140,59 @@ def read_meta(root: Path) -> Meta:
     )
 
 
-def read_episodes(meta: Meta, wanted: list[int] | None) -> list[Episode]:
-    """The wanted episodes (None = all), in their order.
+def read_episodes(meta: Meta, wanted: Sequence[int] | None) -> Episodes:
+    """The wanted episodes (None = all, by number); of two with one number the first counts.
 
     Raises:
-        FormatError: missing or damaged tables, or an episode that is not there.
+        FormatError: missing or damaged tables, a path that cannot be, or an episode that is not there.
     """
-    found: dict[int, Episode] = {}
-    listed = _episodes_v3 if meta.version == 3 else _episodes_v2
-    for episode in listed(meta, None if wanted is None else set(wanted)):
-        found.setdefault(episode.number, episode)
-    missing = [n for n in wanted or () if n not in found]
-    if missing or not found:
-        raise FormatError(meta.root / "meta", "episodes", f"{len(found)} of those asked for", missing or "at least one")
-    return [found[n] for n in wanted or sorted(found)]
+    columns = _columns_v3(meta) if meta.version == 3 else _columns_v2(meta)
+    numbers, rows = np.unique(columns.pop("episode_index"), return_index=True)
+    place = dict(zip(numbers.tolist(), rows.tolist(), strict=True))
+    chosen = numbers.tolist() if wanted is None else list(wanted)
+    missing = [n for n in chosen if n not in place]
+    if missing or not chosen:
+        found = f"{len(chosen) - len(missing)} of those asked for"
+        raise FormatError(meta.root / "meta", "episodes", found, missing or "at least one")
+    rows = np.array([place[n] for n in chosen])
+    episodes = Episodes(meta, np.array(chosen), {name: values[rows] for name, values in columns.items()})
+    _ = episodes[0]  # paths that cannot be are found now
+    return episodes
 
 
-def _episodes_v3(meta: Meta, wanted: set[int] | None) -> Iterator[Episode]:
+def _columns_v3(meta: Meta) -> dict[str, np.ndarray]:
     tables = sorted((meta.root / "meta" / "episodes").glob("*/*.parquet"))
     if not tables:
         raise FormatError(meta.root / "meta" / "episodes", "tables", "none", "chunk-000/file-000.parquet")
-    videos = [key for key, feature in meta.features.items() if feature.dtype == "video"]
+    places = ["data", *(f"videos/{key}" for key in meta.videos)]
+    counts = ["episode_index", *(f"{place}/{part}" for place in places for part in _PARTS)]
+    starts = [f"videos/{key}/from_timestamp" for key in meta.videos]
+    found: list[dict[str, np.ndarray]] = []
     for table in tables:
-        have = set(parquet_header(table).columns)
-        names = ["episode_index", "data/chunk_index", "data/file_index"]
-        names += [f"videos/{key}/{part}" for key in videos for part in ("chunk_index", "file_index", "from_timestamp")]
-        spans = ["dataset_from_index", "dataset_to_index"] if "dataset_from_index" in have else []
-        columns = read_columns(table, names + spans)
-        numbers = [_count(x, table, "episode_index") for x in columns["episode_index"]]
-        for i, number in enumerate(numbers):
-            if wanted is not None and number not in wanted:
-                continue
-            row = {name: values[i] for name, values in columns.items()}
-            places = {}
-            for key in videos:
-                at = _seconds(row[f"videos/{key}/from_timestamp"], table, key)
-                index = {
-                    part: _count(row[f"videos/{key}/{part}"], table, key) for part in ("chunk_index", "file_index")
-                }
-                places[key] = (_path(meta, "video_path", {**index, "video_key": key}), at)
-            index = {part: _count(row[f"data/{part}"], table, part) for part in ("chunk_index", "file_index")}
-            ends = [_count(row[name], table, name, 2**53) for name in spans]
-            length = ends[1] - ends[0] if ends else None
-            yield Episode(number, length, _path(meta, "data_path", index), places)
+        spans = ["dataset_from_index", "dataset_to_index"]
+        spans = spans if {*spans} <= {*parquet_header(table).columns} else []
+        read = read_columns(table, [*counts, *starts, *spans])
+        columns = {name: _counts(read[name], table, name) for name in counts}
+        columns |= {name: _numbers(read[name], table, name, np.isfinite) for name in starts}
+        if spans:
+            first, end = (_counts(read[name], table, name, 2**53) for name in spans)
+            columns["length"] = end - first
+        found.append(columns)
+    shared = set.intersection(*({*columns} for columns in found))
+    return {name: np.concatenate([columns[name] for columns in found]) for name in shared}
 
 
-def _episodes_v2(meta: Meta, wanted: set[int] | None) -> Iterator[Episode]:
+def _columns_v2(meta: Meta) -> dict[str, np.ndarray]:
     table = meta.root / "meta" / "episodes.jsonl"
-    videos = [key for key, feature in meta.features.items() if feature.dtype == "video"]
+    rows = []
     for line, text in enumerate(files.read_text(table).splitlines(), 1):
-        if not text.strip():
-            continue
-        row = files.decode_json(text, table)
-        number = _count(files.get(row, "episode_index", int, table), table, f"line {line}")
-        length = _count(files.get(row, "length", int, table), table, f"line {line}")
-        if wanted is not None and number not in wanted:
-            continue
-        index: dict[str, int | str] = {"episode_chunk": number // meta.chunks_size, "episode_index": number}
-        places = {key: (_path(meta, "video_path", {**index, "video_key": key}), 0.0) for key in videos}
-        yield Episode(number, length, _path(meta, "data_path", index), places)
+        if text.strip():
+            row = files.decode_json(text, table)
+            rows.append([files.get(row, key, int, table) for key in ("episode_index", "length")])
+            if not all(0 <= value < _MAX_EPISODES for value in rows[-1]):
+                raise FormatError(table, f"line {line}", rows[-1], f"counts below {_MAX_EPISODES}")
+    numbers = np.array(rows, dtype=np.int64).reshape(-1, 2)
+    return {"episode_index": numbers[:, 0], "length": numbers[:, 1]}
 
 
 def colour_keys(meta: Meta, asked: str | Sequence[str] | None = None) -> list[str]:
@@ -221,12 +255,15 @@ def _feature(key: str, value: Any, file: Path) -> Feature:
     return Feature(key, dtype, tuple(shape), info)
 
 
-def _count(value: Any, file: Path, field: str, limit: int = _MAX_EPISODES) -> int:
-    number = float(files.to_array(value, (), file, field))
-    if not 0 <= number < limit or number != int(number):
-        raise FormatError(file, field, number, f"a count below {limit}")
-    return int(number)
+def _counts(values: Any, file: Path, field: str, limit: int = _MAX_EPISODES) -> np.ndarray:
+    return _numbers(values, file, field, lambda x: (x >= 0) & (x < limit) & (x == np.floor(x))).astype(np.int64)
 
 
-def _seconds(value: Any, file: Path, field: str) -> float:
-    return float(files.to_array(value, (), file, f"videos/{field}/from_timestamp"))
+def _numbers(values: Any, file: Path, field: str, sound: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """A column (n,) as float64, all of its values sound."""
+    if not isinstance(values, np.ndarray) or values.ndim != 1 or values.dtype.kind not in "fiu":
+        raise FormatError(file, field, "no numbers", "one number a row")
+    column = values.astype(np.float64)
+    if not (good := sound(column)).all():
+        raise FormatError(file, field, column[~good][0], "a count, or a time in s")
+    return column

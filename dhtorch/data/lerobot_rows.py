@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
+from dhtorch.data import files
 from dhtorch.data.codec_parquet import parquet_header, read_columns
 from dhtorch.data.files import FormatError
 from dhtorch.data.lerobot_meta import Episode, Meta
 
 
-def read_table(file: Path, more: Sequence[str]) -> dict[str, np.ndarray]:
+def read_table(file: Path, more: tuple[str, ...]) -> dict[str, np.ndarray]:
     """The columns that place a row, and ``more``, of a whole table; pictures stay where they are.
+
+    The last table stays in memory, since the next episode lies in it as a rule.
 
     Raises:
         FormatError: a missing or damaged table or column.
     """
+    return _read_table(file, files.last_change(file), more)
+
+
+@lru_cache(maxsize=1)
+def _read_table(file: Path, _changed: int, more: tuple[str, ...]) -> dict[str, np.ndarray]:
     have = parquet_header(file).columns
     table: dict[str, np.ndarray] = {}
     places = [name for name in ("timestamp", "frame_index", "episode_index") if name in have or name != "episode_index"]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 
 from dhtorch.data.recording import Recording
+from dhtorch.data.stacks import Stacks
 
 #: From this many frames on, neighbouring anchors are nearly the same picture: take every other one.
 _MANY = 25
@@ -25,6 +26,7 @@ def by_gap(recording: Recording, gap: int | None = None, stride: int | None = No
     Raises:
         ValueError: no gap given and none known, gap or stride below 1, or no two frames that far apart.
     """
+    _refuse_stacks(recording)
     gap = recording.gap if gap is None else gap
     if gap is None:
         raise ValueError(f"pairs.gap: {recording.name} knows no gap of its own, expected a number of frames")
@@ -52,6 +54,7 @@ def by_time(
     Raises:
         ValueError: no time stamps, seconds not positive, tolerance negative, or no two frames that far apart.
     """
+    _refuse_stacks(recording)
     if recording.times is None:
         raise ValueError(f"pairs.seconds: {recording.name} has no time stamps, expected a recording with them")
     _positive("pairs.seconds", seconds)
@@ -81,6 +84,7 @@ def by_baseline(
     Raises:
         ValueError: no poses, metres not positive, tolerance negative, or no two frames that far apart.
     """
+    _refuse_stacks(recording)
     if recording.poses is None:
         raise ValueError(f"pairs.metres: {recording.name} has no poses, expected a recording with them")
     _positive("pairs.metres", metres)
@@ -119,6 +123,13 @@ def between(i: int, j: int, views: int) -> list[int]:
     if not 1 <= views <= j - i:
         raise ValueError(f"views: found {views} for frames {i} to {j}, expected 1 to {j - i}")
     return [i + round((j - i) * (k + 1) / views) for k in range(views)]
+
+
+def _refuse_stacks(recording: object) -> None:
+    """Focal stacks open like recordings, but their pictures are of one view, without depth from a sensor."""
+    if isinstance(recording, Stacks):
+        found = f"{recording.name} holds focal stacks ({recording.format}), pictures of one view"
+        raise ValueError(f"pairs: {found}, expected a recording whose camera moves; dhtorch inspect shows stacks")
 
 
 def _stride(recording: Recording, stride: int | None) -> int:

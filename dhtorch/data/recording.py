@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -37,6 +37,7 @@ class Recording(Sequence[Frame]):
     root: Path | None = None  # folder or file that was opened; None = not from disk
     times: Tensor | None = None  # (n,) s, float64
     poses: Pose | None = None  # (n) T_world_from_cam, float64
+    pose_axes: str = "cv"  # axes in which the capture writes its trajectory, cv or gl; ``poses`` are cv in any case
     rate_hz: float | None = None  # nominal frame rate
     sparse: bool = False  # depth is a projected LiDAR sweep: mostly empty between returns
     near: float | None = None  # m, the cutoff to use for a range split on this scene
@@ -100,6 +101,32 @@ class TruthRecording(Recording):
         depth, disagreement = self.load_truth(self._position(index))
         surface = torch.zeros(1, *depth.shape, dtype=torch.uint8)
         return {"depth": depth[None], "surface": surface, "disagreement": torch.tensor([disagreement])}
+
+
+@dataclass(frozen=True, eq=False)
+class Recordings(Sequence[Recording]):
+    """Many recordings of one data set, each opened when it is asked for.
+
+    A set of robot episodes holds tens of thousands, with tables of their own: opening them all takes minutes, listing
+    them a second. Nothing is kept, so asking twice opens twice. What is wrong with one shows when that one is opened.
+    """
+
+    names: Sequence[str]  # of the recordings
+    make: Callable[[int], Recording]  # picklable; position → recording of that name
+    kept: dict[str, Any] = field(default_factory=dict)  # fields of every recording that the caller has set
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, index: int) -> Recording:  # type: ignore[override]  # one at a time: slices would open all
+        return replace(self.make(range(len(self))[operator.index(index)]), **self.kept)
+
+    def __repr__(self) -> str:
+        return f"Recordings({len(self)}, {self.names[0]!r} …)"
+
+    def replaced(self, fields: dict[str, Any]) -> Recordings:
+        """The same with some fields set in every recording."""
+        return replace(self, kept=self.kept | fields)
 
 
 def numbers(n: int) -> Tensor:

@@ -22,7 +22,7 @@ from dhtorch.codes import Gate, Hole, names
 from dhtorch.data.files import set_opencv_threads
 from dhtorch.data.pairs import between
 from dhtorch.evaluate import errors, holdout
-from dhtorch.experiments.rows import Row, scene_row, summarise
+from dhtorch.experiments.rows import Row, overlay, scene_row, summarise
 from dhtorch.experiments.shared_tracks import SharedTracks
 from dhtorch.geometry.lookup import nearest, patches, round_half_up
 from dhtorch.pair import Trace
@@ -52,6 +52,7 @@ class Settings:
     """What all pairs of a job share."""
 
     cutoff: float | None = None  # m; None = the scene's own near limit
+    cutoff_factor: float = 1.0  # on either
     truth: tuple[str, ...] = ("full",)  # truth tests to report: raw | 5x5 | full
     seed: int = 0
     device: str = "cpu"
@@ -61,7 +62,8 @@ class Settings:
 
     def cutoff_of(self, recording: Any) -> float | None:
         """The cutoff on one scene, m; None where nothing is known to be near."""
-        return recording.near if self.cutoff is None else self.cutoff
+        cutoff = recording.near if self.cutoff is None else self.cutoff
+        return None if cutoff is None else cutoff * self.cutoff_factor
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,7 @@ class Batch:
     others: tuple[Frame, ...]  # further views, the pair's own last
     exact: Frame  # the anchor with the depth it is held against
     surface: Tensor  # (B, H, W) kind of surface, (B, 1, 1) where the recording knows none
+    disagreement: Tensor  # (B,) median relative difference of the independent truth from the sensor; NaN = not known
 
     @property
     def odd(self) -> dict[int, str]:
@@ -103,6 +106,7 @@ class Variant:
     method: Method
     fit: Callable[[Batch, int], PoseFit] | None = None  # a pose from elsewhere: (batch, number of samples) → fit
     seed: int | None = None  # None = the job's
+    needs: Callable[[Any], str | None] = lambda _recording: None  # recording → why it cannot run there, None = it can
 
 
 @dataclass(frozen=True)
@@ -134,6 +138,7 @@ class Answer:
                 others=tuple(f[cut] for f in self.batch.others),
                 exact=self.batch.exact[cut],
                 surface=self.batch.surface[cut],
+                disagreement=self.batch.disagreement[cut],
             ),
             estimate=self.estimate[cut],
             trace={**records, "ms": {k: v / size for k, v in self.trace["ms"].items()}},
@@ -241,7 +246,8 @@ def run(
     """
     outcome = Outcome()
     for recording in recordings:
-        scene, chosen = _Scene(recording, protocol, settings), list(pairs(recording))
+        chosen = list(pairs(recording))  # first: a data set without pairs of views says so
+        scene = _Scene(recording, protocol, settings)
         loader = _load(recording, chosen, protocol, settings)
         for at, items in zip(
             range(0, len(chosen), settings.batch), progress(loader, recording.name, len(loader)), strict=True
@@ -282,8 +288,12 @@ def n_views(method: Method) -> int:
     return int(method.keywords.get("views", 1))
 
 
-class PairData(Dataset[tuple[Frame, tuple[Frame, ...], Frame, Tensor]]):
-    """Pairs of one recording for a data loader: anchor, further views, anchor with its truth as depth, surfaces."""
+#: anchor, further views, anchor with its truth as depth, kinds of surface, disagreement of truth and sensor
+Loaded = tuple[Frame, tuple[Frame, ...], Frame, Tensor, Tensor]
+
+
+class PairData(Dataset[Loaded]):
+    """Pairs of one recording for a data loader."""
 
     def __init__(self, recording: Any, pairs: Sequence[tuple[int, int]], dtype: torch.dtype, views: int = 1) -> None:
         self.recording, self.pairs, self.dtype, self.views = recording, pairs, dtype, views
@@ -291,15 +301,15 @@ class PairData(Dataset[tuple[Frame, tuple[Frame, ...], Frame, Tensor]]):
     def __len__(self) -> int:
         return len(self.pairs)
 
-    def __getitem__(self, index: int) -> tuple[Frame, tuple[Frame, ...], Frame, Tensor]:
+    def __getitem__(self, index: int) -> Loaded:
         i, j = self.pairs[index]
         anchor = self.recording[i].to(self.dtype)
         others = tuple(self.recording[k].to(self.dtype) for k in between(i, j, self.views))
         if not hasattr(self.recording, "truth"):
-            return anchor, others, anchor, torch.zeros(1, 1, 1)
+            return anchor, others, anchor, torch.zeros(1, 1, 1), torch.full((1,), torch.nan)
         exact = self.recording.truth(i)
         known = anchor.replace(depth=exact["depth"].to(self.dtype), depth_camera=None)
-        return anchor, others, known, exact["surface"].float()
+        return anchor, others, known, exact["surface"].float(), exact.get("disagreement", torch.full((1,), torch.nan))
 
 
 class _Scene:
@@ -308,8 +318,9 @@ class _Scene:
     def __init__(self, recording: Any, protocol: Protocol, settings: Settings) -> None:
         self.recording, self.protocol, self.settings = recording, protocol, settings
         self.cutoff = settings.cutoff_of(recording)
-        adapted = {k: replace(v, method=adapt(v.method, recording)) for k, v in protocol.variants.items()}
-        self.variants: dict[str, Variant] = adapted
+        self.missing = {k: reason for k, v in protocol.variants.items() if (reason := v.needs(recording))}
+        able = {k: v for k, v in protocol.variants.items() if k not in self.missing}
+        self.variants = {k: replace(v, method=adapt(v.method, recording)) for k, v in able.items()}
         self.last = list(protocol.cohorts)[-1]
         blind = protocol.hide is holdout.range_split and not _is_cut(self.cutoff)
         self.least = 0 if blind else protocol.min_candidates
@@ -319,6 +330,7 @@ class _Scene:
         self.apart: dict[tuple[str, str, str], list[errors.Points]] = {}
         self.census: list[dict[int, float]] = []
         self.dropped: dict[tuple[str, str], list[dict[str, int]]] = {}
+        self.overlays: dict[str, Row] = {}
         self.n_few = 0
 
     def add(self, batch: Batch) -> None:
@@ -344,7 +356,7 @@ class _Scene:
     def rows(self) -> list[Row]:
         """One row per pair, variant and cohort, then one per variant and cohort for the scene (pair null)."""
         rows = list(self.pair_rows)
-        for name in self.variants:
+        for name in self.protocol.variants:
             for cohort in self.protocol.cohorts:
                 key = (name, cohort)
                 mine = [r for r in self.pair_rows if (r["method"], r["truth"]) == key]
@@ -352,7 +364,7 @@ class _Scene:
                 row |= {"role": self.recording.role, "cutoff_m": self.cutoff}
                 row |= {"n_pairs": len(mine), "n_few": self.n_few}
                 if not mine:
-                    row["note"] = "too few candidates" if self.n_few else "too short"
+                    row["note"] = self.missing.get(name) or ("too few candidates" if self.n_few else "too short")
                 else:
                     shares = {
                         names(Hole)[k].lower(): sum(c[k] for c in self.census) / len(self.census)
@@ -361,6 +373,7 @@ class _Scene:
                     }
                     apart = {k[2]: p for k, p in self.apart.items() if k[:2] == key}
                     row |= scene_row(mine, self.pooled[key], self.dropped[key], apart) | {"hole_share": shares}
+                    row |= {"overlay": self.overlays[name]} if cohort == self.last else {}
                 rows.append(row)
         return rows
 
@@ -397,6 +410,7 @@ class _Scene:
         found: Row = {"pnp_ok": bool(fit.ok[0]), "n_inlier": int(fit.n_inlier[0]), "n_holes": int(hole.sum())}
         found |= {"n_recovered": int((estimate.keep & hole).sum()), "gate_share": share, "ms": answer.trace["ms"]}
         more = self.protocol.columns(answer)
+        self.overlays.setdefault(answer.variant, overlay(answer.samples, estimate, answer.batch.anchor.hw))
         for cohort, truth in answer.truths.items():
             points = errors.select(estimate, truth)
             self.pooled.setdefault((answer.variant, cohort), []).append(points)
@@ -407,9 +421,7 @@ class _Scene:
                 self.apart.setdefault((answer.variant, cohort, kind), []).append(errors.select(estimate, there))
 
 
-def _load(
-    recording: Any, pairs: list[tuple[int, int]], protocol: Protocol, settings: Settings
-) -> DataLoader[tuple[Frame, tuple[Frame, ...], Frame, Tensor]]:
+def _load(recording: Any, pairs: list[tuple[int, int]], protocol: Protocol, settings: Settings) -> DataLoader[Loaded]:
     wanted = max(n_views(v.method) for v in protocol.variants.values())
     views = min([wanted, *(j - i for i, j in pairs)])  # a short gap holds fewer frames
     return DataLoader(
@@ -423,10 +435,10 @@ def _load(
     )
 
 
-def _collate(items: list[tuple[Frame, tuple[Frame, ...], Frame, Tensor]]) -> tuple[Any, ...]:
-    anchor, others, exact, surface = zip(*items, strict=True)
+def _collate(items: list[Loaded]) -> Loaded:
+    anchor, others, exact, surface, disagreement = zip(*items, strict=True)
     views = tuple(tree.collate(view) for view in zip(*others, strict=True))
-    return tree.collate(anchor), views, tree.collate(exact), torch.cat(surface)
+    return tree.collate(anchor), views, tree.collate(exact), torch.cat(surface), torch.cat(disagreement)
 
 
 def _to(item: Any, device: str) -> Any:

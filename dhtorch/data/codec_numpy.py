@@ -1,0 +1,95 @@
+"""numpy's own files, ``.npy`` and ``.npz``, without pickled objects; those are read by ``codec_pickle``.
+
+The header is a Python expression, and numpy's parser of it was not written for damaged files: whatever it raises ends
+as a ``FormatError`` here. An array's size is believed once its bytes are there.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import struct
+import warnings
+import zipfile
+import zlib
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from dhtorch.data.files import MAX_BYTES, FormatError, read_bytes
+
+
+class NpyHeader(NamedTuple):
+    """What a numpy array file says about itself."""
+
+    shape: tuple[int, ...]
+    fortran: bool  # first axis fastest
+    dtype: np.dtype
+    start: int  # byte where the values start
+
+
+def npy_header(file: Path, field: str, head: bytes) -> NpyHeader:
+    """Header of an ``.npy`` file from its first bytes (12 KB are plenty); of numbers, texts or pickled objects.
+
+    Raises:
+        FormatError: no such header, or a shape that no array has.
+    """
+    stream = io.BytesIO(head)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of headers as Python 2 wrote them
+            version = np.lib.format.read_magic(stream)
+            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            shape, fortran, dtype = read(stream)
+    except Exception as error:  # a parser of Python's and numpy's rules for types: there is no list of what they raise
+        raise FormatError(file, field, f"{type(error).__name__} {error}", "a numpy array header") from None
+    if len(shape) > 8 or any(type(n) is not int or not 0 <= n <= 2**40 for n in shape):
+        raise FormatError(file, f"{field} shape", shape, "a few counts")
+    return NpyHeader(shape, bool(fortran), dtype, stream.tell())
+
+
+def real_header(file: Path, field: str, head: bytes) -> NpyHeader:
+    """As :func:`npy_header`, of real numbers only."""
+    header = npy_header(file, field, head)
+    if header.dtype.kind not in "fiu" or header.dtype.hasobject:
+        raise FormatError(file, f"{field} dtype", header.dtype, "real numbers")
+    return header
+
+
+def real_numbers(file: Path, field: str, raw: bytes) -> np.ndarray:
+    """The bytes of an ``.npy`` file of real numbers as floating point.
+
+    Raises:
+        FormatError: as :func:`real_header`, or another number of bytes than the header says.
+    """
+    header = real_header(file, field, raw)
+    count, left = math.prod(header.shape), len(raw) - header.start
+    if count * header.dtype.itemsize != left:
+        raise FormatError(file, field, f"{left} bytes", f"{header.shape} of {header.dtype}")
+    array = np.frombuffer(raw, header.dtype, count, header.start)
+    array = array.reshape(header.shape, order="F" if header.fortran else "C")
+    return array.astype(np.float32 if header.dtype.itemsize <= 4 and header.dtype.kind == "f" else np.float64)
+
+
+def read_npz(file: Path, key: str) -> np.ndarray:
+    """Array ``key`` of an ``.npz`` archive as floating point; pickled objects are refused.
+
+    Raises:
+        FormatError: missing or damaged archive, no such key, not numeric, or larger than it says or than ``MAX_BYTES``.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(read_bytes(file))) as archive:
+            if f"{key}.npy" not in archive.namelist():
+                raise FormatError(file, "key", ", ".join(sorted(archive.namelist())[:8]) or "nothing", f"{key}.npy")
+            member = archive.getinfo(f"{key}.npy")
+            if member.file_size > MAX_BYTES:
+                raise FormatError(file, key, "an array that unpacks beyond the limit", f"at most {MAX_BYTES} bytes")
+            if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise FormatError(file, key, f"compression {member.compress_type}", "none or deflate, as numpy writes")
+            raw = archive.read(member)
+    except FormatError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, struct.error, ValueError, RuntimeError, EOFError, OSError) as error:
+        raise FormatError(file, "archive", error, "a whole .npz archive") from None
+    return real_numbers(file, key, raw)
