@@ -11,7 +11,7 @@ from contract import PROMISES, Row, equal, leaves, reorder, take, tensor_map
 import dhtorch
 from dhtorch.baselines.device_pose import given_pose
 from dhtorch.evaluate import holdout
-from dhtorch.geometry import camera, covariance, epipolar, least_squares, lookup, p3p, pyramid, ransac, se3, steady
+from dhtorch.geometry import affine, camera, covariance, epipolar, least_squares, lookup, p3p, pyramid, ransac, se3, steady
 from dhtorch.records import Camera, Frame, Samples, Tracks
 from dhtorch.stages import backproject, holes, pose, score, track, triangulate
 
@@ -104,6 +104,16 @@ def shifted(batch, n, dtype):
     return smooth[..., :-4, :-4], smooth[..., 2:-2, 1:-3], pixels(batch, n, dtype, margin=14.0)
 
 
+def pyramids(batch, n, dtype):
+    image_0, image_1, _ = shifted(batch, n, dtype)
+    return pyramid.build_pyramid(image_0, 2), pyramid.build_pyramid(image_1, 2)
+
+
+def nearby(batch, n, dtype):
+    uv = shifted(batch, n, dtype)[2]
+    return uv, uv + 0.3
+
+
 def judged(batch, n, dtype):
     frame, samples = sampled(batch, n, dtype)
     return samples, holdout.truth_at(frame, samples.uv), 1.0
@@ -180,10 +190,14 @@ ROWS = [
     Row(holes.route, lambda b, n, d: (sampled(b, n, d)[1].hole,), "batch vmap capture empty shuffle padding", (0,)),
     Row(triangulate.two_view, tracked, ALL, (0, 1), (1, 3, 4), bad=lambda a: (a[0], a[1].replace(uv_0=a[1].uv_0[:, 1:]), *a[2:])),
     Row(score.rank, estimated, ALL, (0, 1, 2), (0,), bad=lambda a: (a[0], a[1].replace(uv=a[1].uv[:, 1:]), *a[2:])),
+    Row(score.rank_by_error, estimated, ALL, (0, 1, 2), (0,), bad=lambda a: (a[0], a[1].replace(uv=a[1].uv[:, 1:]), *a[2:])),
     Row(pose.pnp_ransac, posed, "dtype batch vmap capture empty padding raises", (0, 1), bad=lambda a: (a[0], a[1].replace(uv_1=a[1].uv_1[:, 1:]), *a[2:]), atol=1e-4),
     Row(track.lucas_kanade, shifted, "dtype batch capture empty shuffle padding nan raises", (2,), bad=wrong_last_axis(2), atol=1e-4),
     Row(track.refine, lambda b, n, d: (*shifted(b, n, d), shifted(b, n, d)[2] + 0.3), "dtype batch capture gradcheck empty shuffle padding nan raises", (2, 3), (0, 1), bad=wrong_last_axis(2), atol=1e-4),
     Row(pyramid.build_pyramid, lambda b, n, d: (shifted(b, n, d)[0], 2, 9), "dtype batch capture"),
+    Row(track.lucas_kanade_affine, shifted, "dtype batch capture empty shuffle padding nan raises", (2,), bad=wrong_last_axis(2), atol=1e-4),
+    Row(affine.register, lambda b, n, d: (*pyramids(b, n, d), *nearby(b, n, d)), "dtype batch capture empty shuffle padding nan raises", (2, 3), bad=wrong_last_axis(2), atol=1e-4),
+    Row(affine.step, lambda b, n, d: (*pyramids(b, n, d), *nearby(b, n, d), torch.eye(2, dtype=d).expand(b, n, 2, 2)), "dtype batch capture gradcheck empty shuffle padding nan raises", (2, 3), (0, 1, 2), bad=wrong_last_axis(2), atol=1e-4),
     Row(p3p.p3p, triples, "dtype batch vmap capture shuffle padding", (0, 1), atol=1e-4),
     Row(least_squares.linearise, planes, "dtype batch vmap capture gradcheck empty raises", grad=(0, 1, 2, 3, 4), bad=lambda a: (*a[:4], a[4][..., 1:])),
     Row(least_squares.robust, lambda b, n, d: (uniform(b, n, dtype=d), "cauchy", 0.5), "dtype batch vmap capture gradcheck empty shuffle padding nan", (0,), (0,)),
