@@ -11,7 +11,19 @@ from contract import PROMISES, Row, equal, leaves, reorder, take, tensor_map
 import dhtorch
 from dhtorch.baselines.device_pose import given_pose
 from dhtorch.evaluate import holdout
-from dhtorch.geometry import affine, camera, covariance, epipolar, least_squares, lookup, p3p, pyramid, ransac, se3, steady
+from dhtorch.geometry import (
+    affine,
+    camera,
+    covariance,
+    epipolar,
+    least_squares,
+    lookup,
+    p3p,
+    pyramid,
+    ransac,
+    se3,
+    steady,
+)
 from dhtorch.records import Camera, Frame, Samples, Tracks
 from dhtorch.stages import backproject, holes, pose, score, track, triangulate
 
@@ -226,7 +238,7 @@ ELSEWHERE = {
     *(f"dhtorch.evaluate.risk.{name}" for name in ("curve", "risk_coverage", "measure", "capped")),
     *(f"dhtorch.evaluate.calibrate.{name}" for name in ("reliability", "pool", "measure")),
     "dhtorch.evaluate.curves.sampled",
-    *(f"dhtorch.evaluate.bootstrap.{name}" for name in ("interval", "resample")),
+    *(f"dhtorch.evaluate.bootstrap.{name}" for name in ("interval", "interval_of", "resample")),
 }
 
 

@@ -7,14 +7,14 @@ many times too narrow.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-#: How scenes are joined to one number.
-STATISTICS = ("median", "mean")
+#: How scenes are joined to one number; the geometric mean is for ratios.
+STATISTICS = ("median", "mean", "geometric_mean")
 
 
 class Interval(NamedTuple):
@@ -34,11 +34,11 @@ def interval(
     draws: int = 2000,
     seed: int = 0,
 ) -> Interval:
-    """Median or mean over scenes with its percentile bootstrap interval.
+    """Median, mean or geometric mean over scenes with its percentile bootstrap interval.
 
     Args:
         values: one number a scene; None and non-finite ones are undefined and left out.
-        statistic: ``median`` or ``mean``.
+        statistic: ``median``, ``mean`` or ``geometric_mean`` (of positive numbers).
         level: probability content of the interval.
         draws: resamples.
         seed: of the resamples; the same seed gives the same interval.
@@ -53,19 +53,43 @@ def interval(
     """
     if statistic not in STATISTICS:
         raise ValueError(f"bootstrap.statistic: found {statistic!r}, expected one of {', '.join(STATISTICS)}")
+    defined = torch.tensor([v for v in values if v is not None and math.isfinite(v)], dtype=torch.float64)
+    join = {"median": _median, "mean": _mean, "geometric_mean": _geometric_mean}[statistic]
+    return interval_of(lambda index: join(defined[index]), defined.numel(), level=level, draws=draws, seed=seed)
+
+
+def interval_of(
+    number: Callable[[Tensor], Tensor],
+    n: int,
+    *,
+    level: float = 0.95,
+    draws: int = 2000,
+    seed: int = 0,
+) -> Interval:
+    """Any number computed from n scenes, with its percentile bootstrap interval.
+
+    Args:
+        number: indices of scenes (draws, n), each row one choice of scenes → the number of every row (draws,), NaN
+            where it is undefined.
+        n: scenes.
+        level, draws, seed: as for :func:`interval`.
+
+    Returns:
+        Interval; draws in which the number is undefined are left out of it.
+
+    Raises:
+        ValueError: a level outside (0, 1).
+    """
     if not 0 < level < 1:
         raise ValueError(f"bootstrap.level: found {level}, expected a number between 0 and 1")
-    defined = torch.tensor([v for v in values if v is not None and math.isfinite(v)], dtype=torch.float64)
-    n = defined.numel()
-    if n == 0:
-        return Interval(None, None, None, 0)
-    join = _mean if statistic == "mean" else _median
-    value = float(join(defined[None])[0])
+    value = float(number(torch.arange(n)[None])[0]) if n else math.nan
+    if not math.isfinite(value):
+        return Interval(None, None, None, n)
     if n == 1:
         return Interval(value, None, None, 1)
-    spread = join(defined[resample(n, draws, seed=seed)])
+    spread = number(resample(n, draws, seed=seed)).double()
     edges = torch.tensor([(1 - level) / 2, (1 + level) / 2], dtype=torch.float64)
-    low, high = torch.quantile(spread, edges).tolist()
+    low, high = torch.nanquantile(spread, edges).tolist()
     return Interval(value, low, high, n)
 
 
@@ -81,3 +105,7 @@ def _median(x: Tensor) -> Tensor:
 
 def _mean(x: Tensor) -> Tensor:
     return x.mean(-1)
+
+
+def _geometric_mean(x: Tensor) -> Tensor:
+    return x.log().mean(-1).exp()
