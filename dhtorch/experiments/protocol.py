@@ -106,6 +106,7 @@ class Variant:
     method: Method
     fit: Callable[[Batch, int], PoseFit] | None = None  # a pose from elsewhere: (batch, number of samples) → fit
     seed: int | None = None  # None = the job's
+    given: Callable[[Batch], Mapping[str, Any]] = lambda _batch: {}  # further options: an oracle may see it all
     needs: Callable[[Any], str | None] = lambda _recording: None  # recording → why it cannot run there, None = it can
 
 
@@ -262,15 +263,16 @@ def run(
     return outcome
 
 
-def refill(method: Method, **seats: Any) -> Method:
+def refill(method: Method, func: Callable[..., Estimate] | None = None, **seats: Any) -> Method:
     """The method with some seats or options replaced; ``{seat: {option: value}}`` changes options of a seat.
 
+    ``func`` replaces what joins the seats (``extend``).
     Nested partials are joined into one, so that ``.keywords`` always shows every seat.
     """
     merged = dict(method.keywords)
     for name, value in seats.items():
         merged[name] = refill(merged[name], **value) if isinstance(value, Mapping) else value
-    return partial(method.func, *method.args, **merged)
+    return partial(func or method.func, *method.args, **merged)
 
 
 def adapt(method: Method, recording: Any) -> Method:
@@ -387,6 +389,7 @@ class _Scene:
             options["track"] = shared.seat(method.keywords["track"])
         if variant.fit is not None:
             options["fit"] = variant.fit(batch, method.keywords["n"])
+        options |= variant.given(batch)
         views = n_views(method)
         with torch.no_grad():
             other = seen[-1] if views == 1 else tree.stack(seen[-views:])
