@@ -120,13 +120,14 @@ def test_curves_of_a_scene_are_what_its_points_say():
     outcome = pair.run([small(lidar="exact")], {"paper": method("paper")}, partial(by_gap, gap=2), pair.Settings())
     row, points = scene_row(outcome), outcome.points["synthetic_room", "paper", "full"]
     curve = row["curves"]["risk_coverage"]
-    assert curve["coverage"][-1] == pytest.approx(row["coverage"])
-    assert curve["median_rel"][-1] == pytest.approx(row["median_rel"])
-    assert curve["risk"][-1] == pytest.approx(float(points.answered().error.clamp(max=1).mean()))
-    assert all(a >= b - 1e-12 for a, b in zip(curve["risk"], curve["oracle"], strict=True))
+    five_digits = partial(pytest.approx, rel=1e-4)
+    assert curve["coverage"][-1] == five_digits(row["coverage"])
+    assert curve["median_rel"][-1] == five_digits(row["median_rel"])
+    assert curve["risk"][-1] == five_digits(float(points.answered().error.clamp(max=1).mean()))
+    assert all(a >= b for a, b in zip(curve["risk"], curve["oracle"], strict=True))
     distance = row["curves"]["distance"]
     assert distance["depth"] == sorted(distance["depth"]) and len(distance["coverage"]) == 10
-    assert sum(row["curves"]["reliability"]["weight"]) == pytest.approx(1)
+    assert sum(row["curves"]["reliability"]["weight"]) == five_digits(1)
 
 
 def test_candidates_do_not_depend_on_the_method():

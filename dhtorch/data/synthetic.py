@@ -7,6 +7,7 @@ frames, the order of access, the process or the number of threads.
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Sequence
 from random import Random
@@ -19,6 +20,7 @@ from dhtorch.data.paths import PATHS, hand_held
 from dhtorch.data.raycast import DARK, MIRROR, ORDINARY, WINDOW, world_rays
 from dhtorch.data.room import furnished_room
 from dhtorch.data.shading import Scene
+from dhtorch.geometry import se3
 from dhtorch.geometry.camera import Camera, resize
 from dhtorch.records import Frame, Pose
 
@@ -43,6 +45,12 @@ class SyntheticRoom(Sequence[Frame]):
         depth_noise: factor on the LiDAR's noise; 0 keeps its drop-outs and limits.
         image_noise: standard deviation of the pixel noise, grey levels of 255.
         supersample: rays per pixel and axis.
+        trajectory_axes: ``cv`` or ``gl``, the axes in which the device is said to write its trajectory (``pose_axes``;
+            frames carry OpenCV axes in any case).
+        trajectory_offset_deg: constant angle by which the device's axes are turned against the camera's; the
+            trajectory that frames carry is then wrong by it, ``true_poses`` is not.
+        near: m, cutoff for a range split.
+        gap: frame step; 6 with the default step is a way of 12 cm.
 
     Raises:
         ValueError: an unknown path or LiDAR, or a size, count or limit that is not positive.
@@ -52,8 +60,6 @@ class SyntheticRoom(Sequence[Frame]):
     format = "synthetic"
     root = None
     sparse = False
-    near = 2.0  # m
-    gap = 6  # frames; with the default step a way of 12 cm
     levels = None
     surfaces = SURFACES  # values of ``truth(i)["surface"]``
     odd_surfaces = ("mirror", "window")  # where triangulation rightly finds something else than the surface
@@ -74,12 +80,19 @@ class SyntheticRoom(Sequence[Frame]):
         depth_noise: float = 1.0,
         image_noise: float = 1.0,
         supersample: int = 2,
+        trajectory_axes: str = "cv",
+        trajectory_offset_deg: float = 0.0,
+        near: float = 2.0,
+        gap: int = 6,
     ):
         if path not in PATHS:
             raise ValueError(f"synthetic room: path is {path!r}, expected one of {', '.join(PATHS)}")
         if lidar not in ("phone", "exact", None):
             raise ValueError(f"synthetic room: lidar is {lidar!r}, expected phone, exact or None")
+        if trajectory_axes not in ("cv", "gl"):
+            raise ValueError(f"synthetic room: trajectory_axes is {trajectory_axes!r}, expected cv or gl")
         positive = {"n_frames": n_frames, "rate_hz": rate_hz, "range_limit": range_limit, "supersample": supersample}
+        positive |= {"near": near, "gap": gap}
         for name, value in {**positive, "hw": min(hw), "depth_hw": min(depth_hw)}.items():
             if not value > 0:
                 raise ValueError(f"synthetic room: {name} is {value}, expected a positive number")
@@ -87,10 +100,12 @@ class SyntheticRoom(Sequence[Frame]):
         self.hw, self.depth_hw = (hw[0], hw[1]), (depth_hw[0], depth_hw[1])
         self.range_limit, self.depth_noise, self.image_noise = range_limit, depth_noise, image_noise
         self.supersample = supersample
+        self.near, self.gap = near, gap
         self.role = "rotation" if path in ("rotation", "static") else None
         self.number = torch.arange(n_frames)
         self.times = self.number.double() / rate_hz
-        self.poses = hand_held(path, n_frames, step_m=step_m, rate_hz=rate_hz, seed=seed)
+        self.true_poses = hand_held(path, n_frames, step_m=step_m, rate_hz=rate_hz, seed=seed)
+        self.pose_axes, self.poses = trajectory_axes, _turned(self.true_poses, trajectory_offset_deg)
         self.camera = _phone_camera(self.hw)
         self._frames: dict[int, Frame] = {}
 
@@ -120,8 +135,8 @@ class SyntheticRoom(Sequence[Frame]):
         """
         i = self._position(index)
         scene = furnished_room(self.seed)
-        depth, solid = scene.solids.view(self.camera, self.poses[i : i + 1], self.hw)
-        o, d = world_rays(self.camera, self.poses[i : i + 1], self.hw)
+        depth, solid = scene.solids.view(self.camera, self.true_poses[i : i + 1], self.hw)
+        o, d = world_rays(self.camera, self.true_poses[i : i + 1], self.hw)
         face, _, _ = scene.solids.locate(solid, [o[k] + d[k] * depth for k in range(3)])
         shape = (1, *self.hw)
         return {"depth": depth.view(shape), "surface": scene.kind[face].to(torch.uint8).view(shape)}
@@ -133,7 +148,7 @@ class SyntheticRoom(Sequence[Frame]):
         return i % n
 
     def _render(self, i: int) -> Frame:
-        pose = self.poses[i : i + 1]
+        pose = self.true_poses[i : i + 1]
         scene = furnished_room(self.seed)
         image = _photograph(scene, self.camera, pose, self.hw, self.supersample)
         image = image * 255 + self.image_noise * torch.randn(image.shape, generator=self._generator(i, "image"))
@@ -154,7 +169,7 @@ class SyntheticRoom(Sequence[Frame]):
             depth_camera=depth_camera,
             conf=conf,
             time=self.times[i : i + 1],
-            T_world_from_cam=pose.to(torch.float32),
+            T_world_from_cam=self.poses[i : i + 1].to(torch.float32),
         )
 
     def _generator(self, i: int, stream: str) -> Generator:
@@ -216,6 +231,12 @@ def phone_lidar(
     depth = torch.where(answered, reported, torch.zeros_like(reported))
     conf = torch.where(answered, level, 0).to(torch.uint8)
     return depth.view(1, *hw), conf.view(1, *hw)
+
+
+def _turned(poses: Pose, degrees: float) -> Pose:
+    """The poses a device would report whose axes are turned by a constant angle against those of its camera."""
+    turn = se3.exp(poses.t.new_tensor([[math.radians(degrees) / 3**0.5] * 3 + [0.0] * 3]))
+    return Pose(poses.R @ turn.R, poses.t)
 
 
 def _photograph(scene: Scene, camera: Camera, pose: Pose, hw: tuple[int, int], supersample: int) -> Tensor:

@@ -6,7 +6,6 @@ import math
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from dhtorch.evaluate import calibrate, risk
 from dhtorch.evaluate.errors import Points
@@ -34,11 +33,11 @@ def sampled(pooled: Points) -> dict[str, Any]:
     ranked = answered.error[order]
     return {
         "risk_coverage": {
-            "coverage": coverage[at - 1].tolist(),
-            "risk": mean[at - 1].tolist(),
-            "oracle": oracle[at - 1].tolist(),
-            "score": answered.score[order][at - 1].tolist(),
-            "median_rel": [float(ranked[:k].quantile(0.5)) for k in at.tolist()],
+            "coverage": _rounded(coverage[at - 1].tolist()),
+            "risk": _rounded(mean[at - 1].tolist()),
+            "oracle": _rounded(oracle[at - 1].tolist()),
+            "score": _rounded(answered.score[order][at - 1].tolist()),
+            "median_rel": _rounded([float(ranked[:k].quantile(0.5)) for k in at.tolist()]),
         },
         "distance": _by_distance(pooled),
         "reliability": _reliability(pooled),
@@ -54,13 +53,14 @@ def _by_distance(pooled: Points) -> dict[str, list[float | None]]:
         found["depth"].append(float(here.true_depth.quantile(0.5)))
         found["coverage"].append(float(here.keep.double().mean()))
         found["median_rel"].append(float(error.quantile(0.5)) if error.numel() else None)
-    return found
+    return {name: _rounded(values) for name, values in found.items()}
 
 
 def _reliability(pooled: Points) -> dict[str, list[float | None]]:
     table = calibrate.reliability(*calibrate.pool([pooled]), bins=BINS)
-    return {name: _none_if_nan(getattr(table, name)) for name in ("claimed", "realised", "weight")}
+    return {name: _rounded(getattr(table, name).tolist()) for name in ("claimed", "realised", "weight")}
 
 
-def _none_if_nan(x: Tensor) -> list[float | None]:
-    return [None if math.isnan(v) else v for v in x.tolist()]
+def _rounded(values: list[float | None]) -> list[float | None]:
+    """Five significant digits: a figure shows no more, and a result file holds many curves. NaN becomes None."""
+    return [None if v is None or math.isnan(v) else float(f"{v:.5g}") for v in values]

@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor
 
-from dhtorch.codes import first_reason, names
+from dhtorch.codes import Flag, first_reason, names
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.lookup import nearest, patches, round_half_up
 from dhtorch.geometry.shapes import check
@@ -74,6 +74,57 @@ def range_split(frame: Frame, cutoff: float | None) -> Frame:
     if math.isnan(cutoff) or cutoff <= 0:
         raise ValueError(f"holdout.cutoff: found {cutoff}, expected a positive number of metres, or null for none")
     return frame.replace(depth=torch.where(frame.depth > cutoff, torch.zeros_like(frame.depth), frame.depth))
+
+
+def half(
+    samples: Samples,
+    seed: int,
+    *,
+    share: float = 0.5,
+    min_trackability: float = 1e-5,
+) -> tuple[Tensor, Tensor]:
+    """Sets A and B, (B, N) bool each: the trackable samples with a usable return, split at random.
+
+    A may fix the pose, B is what answers are held against; no sample is in both. The split depends on the seed and
+    the sample's place alone: not on batch mates, device or method.
+
+    Args:
+        samples: of whole frames, classified.
+        seed: of the split.
+        share: of the samples that A receives, in expectation.
+        min_trackability: samples below it are in neither set.
+
+    Raises:
+        ValueError: wrong shapes, or a share outside (0, 1).
+
+    Source: paper, "Held-out triangulation on in-house captures".
+    """
+    sizes = check("half", xyz=(samples.xyz, "B N 3"), trackability=(samples.trackability, "B N"))
+    if not 0 < share < 1:
+        raise ValueError(f"holdout.share: found {share}, expected a number between 0 and 1")
+    draw = torch.rand(sizes["N"], generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    first = (draw < share).to(samples.xyz.device)
+    usable = samples.xyz.isfinite().all(-1) & (samples.trackability >= min_trackability)
+    return usable & first, usable & ~first
+
+
+def without_returns(samples: Samples, hidden: Tensor) -> Samples:
+    """The samples as if the sensor had been silent at the ``hidden`` (B, N) ones: no stage can see those returns.
+
+    Raises:
+        ValueError: wrong shapes.
+
+    Gradient: to the returns that stay.
+    """
+    check("without_returns", xyz=(samples.xyz, "B N 3"), hidden=(hidden, "B N"))
+    zero = torch.zeros_like(samples.depth)
+    return samples.replace(
+        depth=torch.where(hidden, zero, samples.depth),
+        sigma=torch.where(hidden, zero, samples.sigma),
+        xyz=torch.where(hidden[..., None], torch.full_like(samples.xyz, torch.nan), samples.xyz),
+        confidence=torch.where(hidden, torch.zeros_like(samples.confidence), samples.confidence),
+        flag=torch.where(hidden, samples.flag | Flag.NO_DEPTH, samples.flag),
+    )
 
 
 def truth_at(
@@ -164,6 +215,60 @@ def candidates(
         (truth.code == Rule.CLOSE, Rule.CLOSE),
         (truth.code == Rule.WIDE, Rule.WIDE),
         (torch.zeros_like(near) if excluded is None else excluded, Rule.EXCLUDED),
+        (plain, Rule.TEXTURE),
+    )
+    return truth.replace(code=code)
+
+
+def drop_outs(
+    frame: Frame,
+    samples: Samples,
+    truth: Truth,
+    *,
+    window: int = 7,
+    min_returns: int = 3,
+    agreement: float = 0.1,
+    min_texture: float = 0.2,
+) -> Truth:
+    """The sensor's own holes whose depth another instrument knows for sure: the cohort of real holes.
+
+    A sample is one where the sensor map has no return at the nearest pixel, the independent truth is there and passed
+    its test, and the sensor's returns right around the hole agree with that truth, so that the two are registered and
+    the hole is not the shadow of a nearer edge.
+
+    Args:
+        frame: the views with the sensor's full depth.
+        samples: of these frames.
+        truth: the independent depth at the samples, from :func:`truth_at`.
+        window: side of the window in the sensor map that is asked for neighbours, px of that map.
+        min_returns: fewest returns in it.
+        agreement: relative difference allowed between their median and the truth.
+        min_texture: trackability asked, as a share of the median over the frame's samples.
+
+    Returns:
+        Truth whose code is CANDIDATE, or why not: NO_RETURN (no independent depth), NEAR (the sensor answered there),
+        CLOSE, WIDE, EXCLUDED (neighbours missing or contradicting), TEXTURE.
+
+    Raises:
+        ValueError: wrong shapes.
+
+    Source: paper, "Real holes are harder than masked ones"; its filter is not published, this one is stated above.
+    """
+    sizes = check("drop_outs", depth=(frame.depth, "B h w"), uv=(samples.uv, "B N 2"), truth=(truth.depth, "B N"))
+    place = cam.depth_pixels(frame.camera, frame.hw, frame.depth_camera, (sizes["h"], sizes["w"]), samples.uv)
+    answered = _nearest_pixel(frame.depth, place) > 0
+    around = _window(frame.depth, place, window)[0].flatten(-2)
+    count = (around > 0).sum(-1)
+    ordered = torch.where(around > 0, around, torch.full_like(around, torch.inf)).sort(-1).values
+    middle = ordered.gather(-1, ((count - 1).clamp_min(0) // 2)[..., None])[..., 0]
+    agrees = (count >= min_returns) & ((middle - truth.depth).abs() <= agreement * truth.depth)
+    plain = samples.trackability < min_texture * _median(samples.trackability)
+    code = first_reason(
+        (truth.code == Rule.NO_RETURN, Rule.NO_RETURN),
+        (answered, Rule.NEAR),
+        (truth.code == Rule.CLOSE, Rule.CLOSE),
+        (truth.code == Rule.WIDE, Rule.WIDE),
+        (~agrees, Rule.EXCLUDED),
         (plain, Rule.TEXTURE),
     )
     return truth.replace(code=code)

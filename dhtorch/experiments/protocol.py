@@ -211,7 +211,7 @@ class Outcome:
     def scenes(self, variant: str, cohort: str = "full") -> dict[str, Row]:
         """Scene → its row, for one variant; scenes with a role are left out."""
         wanted = (variant, cohort, None, None)
-        return {r["scene"]: r for r in self.rows if (r["method"], r["truth"], r["pair"], r["role"]) == wanted}
+        return {r["scene"]: r for r in self.rows if (r["method"], r["truth"], r["pair"], r.get("role")) == wanted}
 
 
 def join(outcomes: Iterable[Outcome]) -> Outcome:

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from dhtorch import tree
 from dhtorch.evaluate import calibrate, curves, errors, risk
+from dhtorch.pair import merge
+from dhtorch.records import Estimate, Samples
 
 Row = dict[str, Any]
+
+#: Points of an overlay.
+SHOWN = 400
 
 #: Columns of a pair that a scene row measures anew on its pooled points, or that name the pair.
 _OWN = {"scene", "pair", "method", "truth", "gate_share", "ms", "pnp_ok", "n_inlier", "n_holes", "n_recovered"}
@@ -60,6 +67,19 @@ def summarise(rows: Sequence[Row], variants: Sequence[str], cohorts: Sequence[st
             prefix = "".join(f"{p}." for p in parts)
             summary |= {prefix + name: value for name, value in errors.summarise(scenes).items()}
     return summary
+
+
+def overlay(samples: Samples, estimate: Estimate, hw: tuple[int, int]) -> Row:
+    """The first pair as points to draw: pixels, gates, sources and depths of at most :data:`SHOWN` samples.
+
+    No picture goes along: result files are published, and licences of many data sets do not allow that.
+    """
+    whole = merge(samples, estimate)
+    step = max(1, math.ceil(samples.uv.shape[1] / SHOWN))
+    found: Row = {"hw": list(hw), "u": whole.uv[0, ::step, 0].round(), "v": whole.uv[0, ::step, 1].round()}
+    found |= {"gate": estimate.gate[0, ::step], "source": whole.source[0, ::step]}
+    found |= {"depth": [float(f"{v:.4g}") for v in whole.depth[0, ::step].tolist()]}
+    return {k: v.int().tolist() if isinstance(v, Tensor) else v for k, v in found.items()}
 
 
 def mean(values: Sequence[float]) -> float | None:

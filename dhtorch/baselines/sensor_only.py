@@ -1,0 +1,56 @@
+"""The sensor by itself: what there is to have without a second view."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dhtorch.baselines.device_pose import given_pose
+from dhtorch.codes import Gate
+from dhtorch.geometry import se3
+from dhtorch.records import Estimate, Frame, Samples
+
+
+def sensor_only(
+    frame_0: Frame,
+    frame_1: Frame,
+    *,
+    sample: Callable[..., Tensor],
+    backproject: Callable[..., Samples],
+    classify: Callable[..., Samples],
+    n: int = 2048,
+    trace: dict[str, Any] | None = None,
+    **_other_seats: Any,
+) -> Estimate:
+    """The front end's usable returns as answers; every other sample is silent (gate NO_TRACK).
+
+    Takes the place of ``dhtorch.pair.extend`` in a method: it reads seats 1 to 3 and nothing of the second view.
+
+    Returns:
+        Estimate whose ``depth`` and ``sigma`` are the sensor's.
+    """
+    start = time.perf_counter()
+    like = frame_0.camera.f
+    samples = classify(frame_0, backproject(frame_0, sample(frame_0.hw, n, device=like.device, dtype=like.dtype)))
+    keep = samples.xyz.isfinite().all(-1)
+    nan, zero = torch.full_like(samples.depth, torch.nan), torch.zeros_like(samples.depth)
+    estimate = Estimate(
+        uv=samples.uv,
+        depth=torch.where(keep, samples.depth, nan),
+        sigma=torch.where(keep, samples.sigma, nan),
+        sigma_shared=torch.where(keep, zero, nan),
+        parallax_deg=zero,
+        residual_px=zero,
+        n_views=torch.ones_like(samples.hole),
+        score=torch.where(keep, samples.confidence, zero),
+        gate=torch.where(keep, Gate.ANSWER, Gate.NO_TRACK).to(torch.int32),
+    )
+    if trace is not None:
+        eye = se3.identity(like.shape[0], like)
+        fit = given_pose(eye.replace(t=torch.full_like(eye.t, torch.nan)), samples.uv.shape[1])
+        trace.update(samples=samples, fit=fit, estimate=estimate, ms={"sensor": 1e3 * (time.perf_counter() - start)})
+    return estimate
