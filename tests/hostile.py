@@ -5,37 +5,30 @@ read in a forked child of this (warmed-up) process, under a limit of time and of
 outcome of a mutant is ``"frames"`` (it read as valid data), ``"FormatError"`` (one line that names file and field) or a
 failure: another exception, a crash, a hang, too much memory, a file touched outside the capture, code executed.
 
-A sample is held as ``{relative path: bytes}``; a mutation is a function from one such capture to another, so a mutant is
-known by its seed alone: ``attack(..., only=17)`` repeats mutant 17.
+What is done to a sample stands in ``mutations``; a mutant is known by its seed alone: ``attack(..., only=17)`` repeats
+mutant 17.
 """
 
 from __future__ import annotations
 
 import faulthandler
-import io
-import json
 import os
-import pickle
 import random
 import resource
 import select
 import shutil
 import signal
-import struct
 import sys
-import tarfile
 import time
 import traceback
-import zipfile
-import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from mutations import EXECUTED, Capture, mutate
 
 from dhtorch import data
 from dhtorch.data import FormatError, files
@@ -43,9 +36,6 @@ from dhtorch.data import FormatError, files
 SECONDS = 2.0  # wall clock for one mutant
 BYTES = 512 << 20  # resident, above the level before the call
 FINE = ("frames", "FormatError")
-_EXECUTED = 86  # exit code of a child that ran code out of a file
-
-Capture = dict[str, bytes | None]  # None = a folder stands where the file was
 
 
 class Outcome(NamedTuple):
@@ -195,7 +185,7 @@ def _run(read: Callable[[Path], Any], path: Path, tmp_path: Path) -> tuple[Outco
     if killed or peak > BYTES:
         kind, detail = killed or "memory", ""
     elif code != 0:
-        kind, detail = ("code executed" if code == _EXECUTED else "crash"), f"exit code {code} {kind} {detail[-2000:]}"
+        kind, detail = ("code executed" if code == EXECUTED else "crash"), f"exit code {code} {kind} {detail[-2000:]}"
     return Outcome(kind, detail, seconds, peak), used.ru_utime + used.ru_stime
 
 
@@ -277,339 +267,3 @@ def _lay(root: Path, have: Capture, want: Capture) -> None:
         if name in want:
             file.parent.mkdir(parents=True, exist_ok=True)
             file.mkdir() if content is None else file.write_bytes(content)
-
-
-# ---------------------------------------------------------------------------------------------------------- mutations
-
-
-def mutate(good: Capture, draw: random.Random) -> tuple[str, Capture]:
-    """(what was done, the damaged capture): one file changed, now and then two, or files moved about."""
-    want = dict(good)
-    told = []
-    for _ in range(1 if draw.random() < 0.85 else 2):
-        if not any(content is not None for content in want.values()):
-            break  # nothing left to damage
-        if draw.random() < 0.12:
-            told.append(_move(want, draw))
-            continue
-        name = _victim(want, draw)
-        told.append(f"{name}: {_damage(want, name, draw)}")
-    return "; ".join(told), want
-
-
-def _victim(capture: Capture, draw: random.Random) -> str:
-    """Kinds of file are equally likely, so that one table among a hundred pictures gets its share."""
-    kinds: dict[str, list[str]] = {}
-    for name, content in sorted(capture.items()):
-        if content is not None:
-            kinds.setdefault("".join(c for c in name if not c.isdigit()), []).append(name)
-    return draw.choice(kinds[draw.choice(sorted(kinds))])
-
-
-def _move(capture: Capture, draw: random.Random) -> str:
-    """A file missing, empty, a folder, or in the place of another one."""
-    name = _victim(capture, draw)
-    way = draw.choice(("missing", "empty", "folder", "swapped", "replaced"))
-    other = _victim(capture, draw)
-    if way == "missing":
-        del capture[name]
-    elif way == "swapped":
-        capture[name], capture[other] = capture[other], capture[name]
-    else:
-        capture[name] = {"empty": b"", "folder": None, "replaced": capture[other]}[way]
-    return f"{name}: {way}" + (f" with {other}" if way in ("swapped", "replaced") else "")
-
-
-def _damage(capture: Capture, name: str, draw: random.Random) -> str:
-    content = capture[name]
-    assert content is not None
-    if not content:
-        return "empty already"
-    special: list[Callable[[bytes, str, random.Random], bytes]] = []
-    if content[:4] == b"\x89PNG":
-        special = [_png]
-    elif content[:2] == b"PK":
-        special = [_zip]
-    elif content[257:262] == b"ustar":
-        special = [_tar]
-    elif name.endswith((".json", ".pincam", ".txt", ".csv", ".traj", ".jsonl")) or _is_text(content):
-        special = [_json, _json, _word] if content.lstrip()[:1] in (b"{", b"[") else [_word, _lines]
-    way = draw.choice(special if special and draw.random() < 0.75 else _BYTES)
-    capture[name] = way(content, name, draw)
-    return way.__name__.strip("_")
-
-
-def _is_text(content: bytes) -> bool:
-    return all(byte in b"\t\n\r" or 32 <= byte < 127 for byte in content[:256])
-
-
-# bytes ------------------------------------------------------------------------------------------------------------
-
-
-def _at(content: bytes, draw: random.Random) -> int:
-    """Headers are hit as often as all the rest."""
-    return draw.randrange(min(128, len(content)) if draw.random() < 0.5 else len(content))
-
-
-def _flip(content: bytes, name: str, draw: random.Random) -> bytes:
-    out = bytearray(content)
-    for _ in range(draw.choice((1, 1, 2, 8, 64))):
-        out[_at(content, draw)] ^= 1 << draw.randrange(8)
-    return bytes(out)
-
-
-def _truncate(content: bytes, name: str, draw: random.Random) -> bytes:
-    return content[: _at(content, draw)]
-
-
-def _insert(content: bytes, name: str, draw: random.Random) -> bytes:
-    at = _at(content, draw)
-    return content[:at] + draw.randbytes(draw.choice((1, 2, 4, 100))) + content[at:]
-
-
-def _delete(content: bytes, name: str, draw: random.Random) -> bytes:
-    at = _at(content, draw)
-    return content[:at] + content[at + draw.choice((1, 2, 4, 100)) :]
-
-
-def _duplicate(content: bytes, name: str, draw: random.Random) -> bytes:
-    at, to = sorted((_at(content, draw), _at(content, draw)))
-    return content[:to] + content[at:]
-
-
-def _zero(content: bytes, name: str, draw: random.Random) -> bytes:
-    at, size = _at(content, draw), draw.choice((1, 4, 64, 4096))
-    return content[:at] + bytes([draw.choice((0, 0, 255))]) * len(content[at : at + size]) + content[at + size :]
-
-
-def _integer(content: bytes, name: str, draw: random.Random) -> bytes:
-    """An absurd number over an aligned field, in either byte order."""
-    size = draw.choice((1, 2, 4, 8))
-    at = _at(content, draw) // size * size
-    value = draw.choice((0, 1, 2, 1 << (8 * size - 1), (1 << 8 * size) - 1, (1 << (8 * size - 1)) - 1, 1 << (4 * size)))
-    return content[:at] + value.to_bytes(size, draw.choice(("little", "big"))) + content[at + size :]
-
-
-def _pickled(content: bytes, name: str, draw: random.Random) -> bytes:
-    """A pickle that ends the process when it is loaded, plain or as a numpy array of objects."""
-    payload = pickle.dumps(_Bomb(), protocol=2)
-    if draw.random() < 0.5:
-        return payload
-    head = b"{'descr': '|O', 'fortran_order': False, 'shape': (), }"
-    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head) + 1) + head + b"\n" + payload
-
-
-class _Bomb:
-    def __reduce__(self) -> tuple[Any, ...]:
-        return os._exit, (_EXECUTED,)
-
-
-_BYTES = (_flip, _flip, _truncate, _insert, _delete, _duplicate, _zero, _integer, _integer, _pickled)
-
-
-# text -------------------------------------------------------------------------------------------------------------
-
-_WORDS = [
-    *("nan", "inf", "-inf", "-1", "0", "-0.0", "1e999", "1e300", "-1e300", "1e-300", "1e18", "-1e18", "1.5.2", "1,5"),
-    *("9223372036854775808", "4294967296", "65536", "2147483647", "0x10", "true", "null", "None", "x", "é", "\x00"),
-    *("../../../../etc/hostname", "/etc/hostname", ".", "..", "file:///etc/hostname"),
-    *("", "9" * 400, "a" * 10_000, "\n", ";", ",", '"', "[", "}", "\\", f"__import__('os')._exit({_EXECUTED})"),
-]
-
-
-def _spans(text: str, draw: random.Random) -> tuple[int, int]:
-    """A word: what stands between separators."""
-    at = draw.randrange(len(text)) if text else 0
-    low, high = at, at
-    while low > 0 and text[low - 1] not in " \t\r\n,;=[]{}()\"'":
-        low -= 1
-    while high < len(text) and text[high] not in " \t\r\n,;=[]{}()\"'":
-        high += 1
-    return low, high
-
-
-def _word(content: bytes, name: str, draw: random.Random) -> bytes:
-    """A word replaced by something hostile; a file's name now and then by the way to the intact copy beside."""
-    text = content.decode(errors="replace")
-    low, high = _spans(text, draw)
-    word = text[low:high]
-    new = f"../intact/{word}" if "." in word and "/" in word and draw.random() < 0.5 else draw.choice(_WORDS)
-    return (text[:low] + new + text[high:]).encode()
-
-
-def _lines(content: bytes, name: str, draw: random.Random) -> bytes:
-    """A line gone, twice, at another place, or cut: missing frames and time stamps out of order."""
-    lines = content.split(b"\n")
-    i, j = draw.randrange(len(lines)), draw.randrange(len(lines))
-    way = draw.randrange(5)
-    if way == 0:
-        del lines[i]
-    elif way == 1:
-        lines.insert(j, lines[i])
-    elif way == 2:
-        lines[i], lines[j] = lines[j], lines[i]
-    elif way == 3:
-        lines[i] = lines[i][: draw.randrange(len(lines[i]) + 1)]
-    else:
-        lines = lines[:i]
-    return b"\n".join(lines)
-
-
-_VALUES: tuple[Any, ...] = (
-    *(None, True, "", "x", [], {}, 0, -1, 1, 2.5, 1e300, -1e300, 1e-300, float("nan"), float("inf"), -float("inf")),
-    *(2**31, 2**63, 2**64, 10**400, "nan", "1e999", "../../../../etc/hostname", "/etc/hostname", "\x00", "a" * 10_000),
-    *([[[[]]]], [0] * 3, [0.0] * 9, [0.0] * 16, [float("nan")] * 9, [1] * 10_000, {"a": 1}, [None], ["x"]),
-    f"__import__('os')._exit({_EXECUTED})",
-)
-
-
-def _json(content: bytes, name: str, draw: random.Random) -> bytes:
-    """A value of a JSON document (or of one line of it) replaced, removed, repeated, nested or renamed."""
-    try:
-        value = json.loads(content)
-    except (ValueError, RecursionError):
-        lines = content.split(b"\n")
-        i = draw.randrange(len(lines))
-        try:
-            json.loads(lines[i])
-        except (ValueError, RecursionError):
-            return _word(content, name, draw)
-        lines[i] = _json(lines[i], name, draw)
-        return b"\n".join(lines)
-    holder: Any = {"": value}
-    where: Any = ""
-    while isinstance(holder[where], (dict, list)) and holder[where] and (where == "" or draw.random() < 0.8):
-        holder = holder[where]
-        where = draw.choice(sorted(holder)) if isinstance(holder, dict) else draw.randrange(len(holder))
-    way = draw.random()
-    old = holder[where]
-    if way < 0.6:
-        holder[where] = draw.choice(_VALUES)
-        if isinstance(old, str) and "." in old and draw.random() < 0.5:
-            holder[where] = f"../intact/{old}"
-    elif way < 0.75:
-        del holder[where]
-    elif way < 0.85 and isinstance(holder, list):
-        holder.insert(draw.randrange(len(holder) + 1), old)
-    elif way < 0.95:
-        holder[where] = draw.choice(([old], {"x": old}, str(old), [old, old]))
-    else:
-        return b"[" * 100_000 + content
-    return json.dumps(value).encode()
-
-
-# containers -------------------------------------------------------------------------------------------------------
-
-
-def _png(content: bytes, name: str, draw: random.Random) -> bytes:
-    """A chunk damaged and its check sum made good again, so that the decoder gets to see it."""
-    chunks, at = [], 8
-    while at + 12 <= len(content):
-        size = int.from_bytes(content[at : at + 4], "big")
-        chunks.append((content[at + 4 : at + 8], content[at + 8 : at + 8 + size]))
-        at += 12 + size
-    i = draw.randrange(len(chunks))
-    kind, body = chunks[i]
-    way = draw.randrange(4)
-    if kind == b"IDAT" and way == 0:
-        body = zlib.compress(draw.choice((b"", b"\x09" * 100, bytes(1_000_000))))
-    elif body and way < 3:
-        body = draw.choice((_flip, _integer, _truncate, _duplicate))(body, name, draw)
-    else:
-        chunks.insert(
-            draw.randrange(len(chunks)), (draw.choice((b"PLTE", b"tRNS", b"zTXt", b"IDAT", b"iCCP")), b"\xff" * 7)
-        )
-    chunks[i if chunks[i][0] == kind else i + 1] = (kind, body)
-    framed = (struct.pack(">I", len(b)) + k + b + struct.pack(">I", zlib.crc32(k + b)) for k, b in chunks)
-    return content[:8] + b"".join(framed)
-
-
-def _zip(content: bytes, name: str, draw: random.Random) -> bytes:
-    """A member damaged inside a sound archive, gone, twice, named out of the archive, or a bomb."""
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            members: Capture = {info.filename: archive.read(info) for info in archive.infolist() if not info.is_dir()}
-            method = archive.infolist()[0].compress_type if archive.infolist() else zipfile.ZIP_STORED
-    except (zipfile.BadZipFile, ValueError, RuntimeError, zlib.error, OSError):
-        return _flip(content, name, draw)
-    if not members:
-        return _flip(content, name, draw)
-    bomb = _member(members, draw)
-    out = io.BytesIO()
-    with zipfile.ZipFile(out, "w", method) as archive:
-        for member, body in members.items():
-            archive.writestr(member, body or b"")
-    return _with_bomb(out.getvalue(), bomb) if bomb else out.getvalue()
-
-
-def _tar(content: bytes, name: str, draw: random.Random) -> bytes:
-    """The same for a tar; also members that are links and devices."""
-    try:
-        with tarfile.open(fileobj=io.BytesIO(content)) as archive:
-            members: Capture = {m.name: archive.extractfile(m).read() for m in archive.getmembers() if m.isfile()}  # type: ignore[union-attr]
-    except (tarfile.TarError, ValueError, EOFError, OSError):
-        return _flip(content, name, draw)
-    if not members:
-        return _flip(content, name, draw)
-    _member(members, draw)
-    odd = draw.choice(sorted(members)) if members and draw.random() < 0.2 else None
-    out = io.BytesIO()
-    with tarfile.open(fileobj=out, mode="w") as archive:
-        for member, given in members.items():
-            info, body = tarfile.TarInfo(member), given or b""
-            info.size = len(body)
-            if member == odd:
-                info.type, info.size = (
-                    draw.choice((tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.CHRTYPE, tarfile.DIRTYPE)),
-                    0,
-                )
-                info.linkname = "../../intact"
-            archive.addfile(info, io.BytesIO(body if info.size else b""))
-    return out.getvalue()
-
-
-def _member(members: Capture, draw: random.Random) -> str | None:
-    """Damage the members in place; the name of one to be blown up, if any."""
-    name = _victim(members, draw)
-    way = draw.random()
-    if way < 0.75:
-        _damage(members, name, draw)
-    elif way < 0.85:
-        _move(members, draw)
-    elif way < 0.92:
-        members[f"../../{name}"] = members.pop(name)
-    else:
-        return name
-    return None
-
-
-def _with_bomb(content: bytes, name: str) -> str | bytes:
-    """The archive with member ``name`` replaced by a gigabyte of zeros, deflated."""
-    packed, crc, size = _bomb()
-    out = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(out, "w", zipfile.ZIP_STORED) as archive:
-        for info in old.infolist():
-            archive.writestr(info.filename, packed if info.filename == name else old.read(info))
-    raw = bytearray(out.getvalue())
-    with zipfile.ZipFile(io.BytesIO(bytes(raw))) as archive:
-        info, directory = archive.getinfo(name), archive.start_dir
-    entry = raw.index(b"PK\x01\x02", directory)
-    while raw[entry + 46 : entry + 46 + len(name.encode())] != name.encode():
-        entry = raw.index(b"PK\x01\x02", entry + 4)
-    for at in (info.header_offset + 8, entry + 10):  # method, time, date, crc, packed size, size
-        raw[at : at + 2] = struct.pack("<H", zipfile.ZIP_DEFLATED)
-        raw[at + 6 : at + 10] = struct.pack("<I", crc)
-        raw[at + 14 : at + 18] = struct.pack("<I", size)
-    return bytes(raw)
-
-
-@cache
-def _bomb() -> tuple[bytes, int, int]:
-    """(deflated bytes, crc, size) of a gigabyte of zeros."""
-    block, blocks = bytes(1 << 24), 64
-    squeeze = zlib.compressobj(1, zlib.DEFLATED, -15)
-    one = squeeze.compress(block) + squeeze.flush(zlib.Z_FULL_FLUSH)
-    crc = 0
-    for _ in range(blocks):
-        crc = zlib.crc32(block, crc)
-    return one * blocks + zlib.compressobj(1, zlib.DEFLATED, -15).flush(), crc, len(block) * blocks

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,8 +13,8 @@ import hostile
 import numpy as np
 import pytest
 import torch
+from box import HW, pose, render
 from rich.console import Console
-from test_data import HW, pose, render
 from test_focal_stacks import stack
 
 from dhtorch import capture, data, run
@@ -26,14 +26,6 @@ from dhtorch.records import Camera, Frame, Pose
 
 ROOT = os.environ.get("DHTORCH_DATA")
 real = pytest.mark.skipif(not ROOT, reason="DHTORCH_DATA is not set")
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 CAMERA = Camera(torch.tensor([[61.5, 60.25]]), torch.tensor([[33.5, 21.75]]))

@@ -12,21 +12,23 @@ from pathlib import Path
 from typing import Any
 
 import hostile
+import mutations
 import pytest
 import test_arkitscenes
 import test_ca1m
 import test_focal_stacks
 import test_lerobot
+import test_pickle
 import test_record3d
 import test_rh20t
 import test_stray
 import torch
+from box import walk
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_data import walk
 
 from dhtorch import data
-from dhtorch.data import FormatError, writers
+from dhtorch.data import FormatError, codec_pickle, codec_tiff, writers
 from dhtorch.geometry import se3
 from dhtorch.records import Frame, Pose
 
@@ -75,59 +77,64 @@ def _pair(write: Callable[[Path, Frame, Frame], None]) -> Callable[[Path], None]
     return write_pair
 
 
-#: One line a format: name → a function that writes a tiny capture below a folder and returns what to open (None = the
-#: folder), and, where frames are not all there is to read, a reader of it.
-FORMATS: dict[str, tuple[Callable[[Path], Path | None], Callable[[Path], Any]]] = {
-    "tum": (_tum, hostile.read_frames),
-    "named": (_named, hostile.read_frames),
-    "unregistered": (_unregistered, hostile.read_frames),
-    "counted": (_counted, hostile.read_frames),
-    "driving": (_driving, hostile.read_frames),
-    "calib_pair": (_pair(writers.write_calib_pair), hostile.read_frames),
-    "npz_pair": (_pair(writers.write_npz_pair), hostile.read_frames),
+Sample = tuple[Callable[[Path], Path | None], Callable[[Path], Any]]
+
+#: Of every reader: a function that writes a tiny capture below a folder and returns what to open (None = the folder),
+#: and one that opens and reads all of it.
+SAMPLES: dict[str, Sample] = {
+    **{
+        name: (write, hostile.read_frames)
+        for name, write in {
+            "tum": _tum,
+            "named": _named,
+            "unregistered": _unregistered,
+            "counted": _counted,
+            "driving": _driving,
+            "calib_pair": _pair(writers.write_calib_pair),
+            "npz_pair": _pair(writers.write_npz_pair),
+            "arkitscenes": test_arkitscenes.hostile_sample,
+            "ca1m": test_ca1m.hostile_sample,
+            "record3d_archive": test_record3d.hostile_archive,
+            "record3d_exr": test_record3d.hostile_exr,
+            "record3d_mp4": test_record3d.hostile_mp4,
+            "stray": test_stray.hostile_new,
+            "stray_old": test_stray.hostile_old,
+            "lerobot_v3": test_lerobot.hostile_v3,
+            "lerobot_v2": test_lerobot.hostile_v2,
+        }.items()
+    },
+    "rh20t": (test_rh20t.hostile_sample, test_rh20t.read_all),
+    **{name: (write, test_focal_stacks.read_stacks) for name, write in test_focal_stacks.HOSTILE.items()},
+    "pickle": (test_pickle.hostile_sample, codec_pickle.read_npy),
+    "tiff": (test_ca1m.hostile_tiff, codec_tiff.read_tiff),
 }
 
 
-@pytest.mark.parametrize("name", FORMATS)
-def test_damaged_captures_are_a_format_error_or_valid_frames(name: str, tmp_path: Path) -> None:
-    counts = hostile.attack(*FORMATS[name], tmp_path, mutants=MUTANTS)
+@pytest.mark.parametrize("name", SAMPLES)
+def test_damaged_captures_are_a_format_error_or_valid(name: str, tmp_path: Path) -> None:
+    counts = hostile.attack(*SAMPLES[name], tmp_path, mutants=MUTANTS)
     assert counts["frames"] > 0 and counts["FormatError"] > MUTANTS // 5  # damage is felt, and not everywhere
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1200)
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("name", SAMPLES)
 def test_many_damaged_captures(name: str, tmp_path: Path) -> None:
-    counts = hostile.attack(*FORMATS[name], tmp_path, mutants=MANY, seed=1)
+    counts = hostile.attack(*SAMPLES[name], tmp_path, mutants=MANY, seed=1)
     print(f"{name}: {dict(counts)}")
     assert counts.total() == MANY
 
 
-#: The samples of the formats that have a test file of their own.
-OTHERS: dict[str, tuple[Callable[[Path], Path | None], Callable[[Path], Any]]] = {
-    "arkitscenes": (test_arkitscenes.hostile_sample, test_arkitscenes.read_all),
-    "ca1m": (test_ca1m.hostile_sample, test_ca1m.read_all),
-    "record3d_archive": (test_record3d.write_archive, hostile.read_frames),
-    "record3d_exr": (test_record3d.write_exr, hostile.read_frames),
-    "record3d_mp4": (test_record3d.write_mp4, hostile.read_frames),
-    "stray": (test_stray.write, hostile.read_frames),
-    "lerobot_v3": (test_lerobot._v3, hostile.read_frames),
-    "lerobot_v2": (test_lerobot._v2, hostile.read_frames),
-    "rh20t": (test_rh20t._write, test_rh20t._read),
-    **{name: (write, test_focal_stacks.read_stacks) for name, write in test_focal_stacks.HOSTILE.items()},
-}
-
-
-@pytest.mark.parametrize("name", [*FORMATS, *OTHERS])
+@pytest.mark.parametrize("name", SAMPLES)
 def test_damage_that_hypothesis_looks_for(name: str, tmp_path: Path) -> None:
     """The same mutations with every choice in the hands of Hypothesis, which shrinks what it finds."""
-    write, read = (FORMATS | OTHERS)[name]
+    write, read = SAMPLES[name]
     with hostile.sample(write, read, tmp_path) as (good, outcome_of):
 
         @settings(max_examples=40, deadline=None, derandomize=True, database=None)
         @given(draw=st.randoms(use_true_random=False))
         def check(draw: random.Random) -> None:
-            what, want = hostile.mutate(good, draw)
+            what, want = mutations.mutate(good, draw)
             outcome = outcome_of(want)
             assert outcome.kind in hostile.FINE, f"{what}: {outcome}"
 
@@ -171,12 +178,12 @@ def test_harness_sees(
 
 
 def test_harness_repeats_a_mutant(tmp_path: Path) -> None:
-    good: hostile.Capture = {
+    good: mutations.Capture = {
         "a.json": b'{"a": [1, 2, 3]}',
         "b.txt": b"1 2\n3 4\n",
         "c/d.png": b"\x89PNG\r\n\x1a\n" + bytes(99),
     }
-    one, two = ([hostile.mutate(good, random.Random(f"3/{i}")) for i in range(200)] for _ in range(2))
+    one, two = ([mutations.mutate(good, random.Random(f"3/{i}")) for i in range(200)] for _ in range(2))
     assert one == two and len({what for what, _ in one}) > 15
     assert sum(want == good for _, want in one) < 20
 
@@ -186,7 +193,7 @@ def test_bomb_is_a_sound_archive(tmp_path: Path) -> None:
     with zipfile.ZipFile(out, "w") as archive:
         archive.writestr("a/b.bin", b"123")
         archive.writestr("a/c.bin", b"456")
-    with zipfile.ZipFile(io.BytesIO(hostile._with_bomb(out.getvalue(), "a/b.bin"))) as archive:
+    with zipfile.ZipFile(io.BytesIO(mutations._with_bomb(out.getvalue(), "a/b.bin"))) as archive:
         assert archive.read("a/c.bin") == b"456" and archive.getinfo("a/b.bin").file_size == 1 << 30
         with archive.open("a/b.bin") as member:
             assert member.read(1000) == bytes(1000)

@@ -13,11 +13,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import hostile
 import numpy as np
 import pytest
 import torch
-from test_data import disagreement, off_wall, pose, render, world_points
+from box import disagreement, off_wall, pose, render, world_points
 
 from dhtorch import data, tree
 from dhtorch.data import files, record3d_video, writers
@@ -32,11 +31,6 @@ pytest.importorskip("av")
 
 ROOT = os.environ.get("DHTORCH_DATA")
 HW, DEPTH_HW = (48, 64), (24, 32)
-
-
-@pytest.fixture(autouse=True)
-def _one_thread() -> None:
-    torch.set_num_threads(1)
 
 
 def camera_of(i: int, hw: tuple[int, int] = HW) -> Camera:
@@ -570,25 +564,13 @@ def test_real_export() -> None:
     assert disagreement(*gl)[0] > 0.15  # so the check above can tell
 
 
-def write_archive(root: Path) -> Path:
+def hostile_archive(root: Path) -> Path:
     return r3d(root)
 
 
-def write_exr(root: Path) -> None:
+def hostile_exr(root: Path) -> None:
     writers.write_record3d_exr(root, walk())
 
 
-def write_mp4(root: Path) -> Path:
+def hostile_mp4(root: Path) -> Path:
     return film(root)[0]
-
-
-@pytest.mark.parametrize("write", [write_archive, write_exr, write_mp4])
-def test_hostile(tmp_path: Path, write: Callable[[Path], Path | None]) -> None:
-    hostile.attack(write, hostile.read_frames, tmp_path, mutants=40)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(3600)
-@pytest.mark.parametrize("write", [write_archive, write_exr, write_mp4])
-def test_hostile_at_length(tmp_path: Path, write: Callable[[Path], Path | None]) -> None:
-    print(write.__name__, hostile.attack(write, hostile.read_frames, tmp_path, mutants=2000, seed=1))

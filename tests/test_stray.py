@@ -9,11 +9,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import hostile
 import numpy as np
 import pytest
 import torch
-from test_data import disagreement, off_wall, pose, render, world_points
+from box import disagreement, off_wall, pose, render, world_points
 
 from dhtorch import data, tree
 from dhtorch.data import codec_video, writers
@@ -27,11 +26,6 @@ pytest.importorskip("av")
 ROOT = os.environ.get("DHTORCH_DATA")
 HW, DEPTH_HW = (72, 96), (24, 32)
 STEP = 1e-3  # m, of the depth codes
-
-
-@pytest.fixture(autouse=True)
-def _one_thread() -> None:
-    torch.set_num_threads(1)
 
 
 def camera_of(i: int) -> Camera:
@@ -356,21 +350,9 @@ def test_real_capture() -> None:
     assert disagreement(*gl)[0] > 0.15  # so the check above can tell
 
 
-def write(root: Path) -> None:
+def hostile_new(root: Path) -> None:
     writers.write_stray(root, walk(), per_frame=True)
 
 
-def write_old(root: Path) -> None:
+def hostile_old(root: Path) -> None:
     writers.write_stray(root, walk(), depth_format="npy", codec="libx265", first_picture="lost")
-
-
-@pytest.mark.parametrize("write", [write, write_old])
-def test_hostile(tmp_path: Path, write: Callable[[Path], None]) -> None:
-    hostile.attack(write, hostile.read_frames, tmp_path, mutants=50)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(3600)
-@pytest.mark.parametrize("write", [write, write_old])
-def test_hostile_at_length(tmp_path: Path, write: Callable[[Path], None]) -> None:
-    print(write.__name__, hostile.attack(write, hostile.read_frames, tmp_path, mutants=1000, seed=1))
