@@ -32,6 +32,7 @@ from mutations import EXECUTED, Capture, mutate
 
 from dhtorch import data
 from dhtorch.data import FormatError, files
+from dhtorch.data.stacks import FocalStack
 
 SECONDS = 2.0  # wall clock for one mutant
 BYTES = 512 << 20  # resident, above the level before the call
@@ -47,16 +48,28 @@ class Outcome(NamedTuple):
     bytes: int  # peak resident memory above the level before the call
 
 
-def read_frames(path: Path) -> None:
-    """Open everything at ``path``, decode every frame and every truth, hold them against what they promise."""
-    for recording in data.open_all(path):
-        truth = getattr(recording, "truth", None)
-        for i, frame in enumerate(recording):
-            check_frame(frame)
+def read_all(path: Path) -> None:
+    """Open everything at ``path``, decode every frame, truth and stack, hold them against what they promise."""
+    for found in data.open_all(path):
+        truth = getattr(found, "truth", None)
+        for i, each in enumerate(found):
+            if isinstance(each, FocalStack):
+                check_stack(each)
+                continue
+            check_frame(each)
             if truth is not None:
                 depth = truth(i)["depth"]
-                assert depth.shape[1:] == frame.hw
+                assert depth.shape[1:] == each.hw
                 assert bool(torch.isfinite(depth).all()) and bool((depth >= 0).all())
+
+
+def check_stack(stack: FocalStack) -> None:
+    """Pictures in range, depth finite and not negative."""
+    assert stack.images.ndim == 5 and stack.images.shape[2] in (1, 3)
+    assert stack.images.dtype == torch.uint8 or 0 <= float(stack.images.min()) <= float(stack.images.max()) <= 1
+    if stack.depth is not None:
+        assert stack.depth.shape[1:] == stack.hw
+        assert bool(torch.isfinite(stack.depth).all()) and bool((stack.depth >= 0).all())
 
 
 def check_frame(frame: Any) -> None:
@@ -91,7 +104,7 @@ def attack(
 
     Args:
         write: makes a tiny sample below the folder it is given; returns what is to be opened (None = that folder).
-        read: opens a capture and reads all of it; raises FormatError or returns. ``read_frames`` does for recordings.
+        read: opens a capture and reads all of it; raises FormatError or returns. ``read_all`` does for recordings.
         tmp_path: an empty folder. The capture is ``capture/`` in it; an intact copy, ``intact/``, is the bait of paths
             that lead out of the capture.
         mutants: how many.

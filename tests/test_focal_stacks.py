@@ -378,15 +378,6 @@ def test_a_missing_library_names_the_extra(tmp_path: Path, monkeypatch: pytest.M
 # ------------------------------------------------------------------------------------------------------------ hostile
 
 
-def read_stacks(path: Path) -> None:
-    for got in data.open_stacks(path):
-        assert got.images.ndim == 5 and got.images.shape[2] in (1, 3)
-        assert got.images.dtype == torch.uint8 or 0 <= float(got.images.min()) <= float(got.images.max()) <= 1
-        if got.depth is not None:
-            assert got.depth.shape[1:] == got.hw
-            assert bool(torch.isfinite(got.depth).all()) and bool((got.depth >= 0).all())
-
-
 def _ddff12(root: Path) -> Path:
     writers.write_ddff12(
         root / "a.h5", {"train": [stack(0, 10), stack(1, 10)], "val": [stack(2, 10)]}, compression="gzip"

@@ -83,7 +83,7 @@ Sample = tuple[Callable[[Path], Path | None], Callable[[Path], Any]]
 #: and one that opens and reads all of it.
 SAMPLES: dict[str, Sample] = {
     **{
-        name: (write, hostile.read_frames)
+        name: (write, hostile.read_all)
         for name, write in {
             "tum": _tum,
             "named": _named,
@@ -101,10 +101,10 @@ SAMPLES: dict[str, Sample] = {
             "stray_old": test_stray.hostile_old,
             "lerobot_v3": test_lerobot.hostile_v3,
             "lerobot_v2": test_lerobot.hostile_v2,
+            **test_focal_stacks.HOSTILE,
         }.items()
     },
     "rh20t": (test_rh20t.hostile_sample, test_rh20t.read_all),
-    **{name: (write, test_focal_stacks.read_stacks) for name, write in test_focal_stacks.HOSTILE.items()},
     "pickle": (test_pickle.hostile_sample, codec_pickle.read_npy),
     "tiff": (test_ca1m.hostile_tiff, codec_tiff.read_tiff),
 }

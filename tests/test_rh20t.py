@@ -189,13 +189,62 @@ def test_outliers_of_a_lossy_high_byte_are_dropped(tmp_path: Path) -> None:
 
 def test_streams_at_their_own_clocks(tmp_path: Path) -> None:
     streams = rh20t.streams(scene(tmp_path))
-    assert streams.keys() == {"tcp_base", "joint", "gripper_command", "gripper_info"}
+    forces = {"force_torque_base", "force_torque_base_raw", "robot_ft"}
+    forces |= {f"{name}/{serial}" for name in ("force_torque", "force_torque_raw") for serial in (FIXED, HAND)}
+    assert streams.keys() == {"tcp_base", "joint", "gripper_command", "gripper_info"} | forces
     times = np.array([1_600_000_100.05, 1_600_000_100.15])
     joint, covered = streams["joint"].at(times)
     assert covered.all()
     np.testing.assert_allclose(joint, np.arange(7) + np.array([[0.05], [0.15]]), atol=1e-6)
     np.testing.assert_allclose(streams["gripper_command"].at(times)[0][:, 0], [49.95, 49.85], atol=1e-6)
     assert streams["tcp_base"].pose and streams["tcp_base"].values.shape == (3, 7)
+    for name, want in (("force_torque_base", 0.05), (f"force_torque/{HAND}", 0.1), (f"force_torque_raw/{FIXED}", 3.1)):
+        assert not streams[name].pose
+        np.testing.assert_allclose(streams[name].at(times)[0][0], np.full(6, want), atol=1e-6)
+
+
+def test_forces_that_are_none_and_forces_that_cannot_be(tmp_path: Path) -> None:
+    (tmp_path / "transformed").mkdir()
+    file, stamp = tmp_path / "transformed" / "force_torque_base.npy", 1_600_000_000_500
+    entries = [{"timestamp": stamp + i, "zeroed": value} for i, value in enumerate((np.full(6, np.nan), None, [0] * 6))]
+    np.save(file, {FIXED: entries}, allow_pickle=True)
+    streams = rh20t.streams(tmp_path)
+    assert streams.keys() == {"force_torque_base"} and streams["force_torque_base"].values.tolist() == [[0.0] * 6]
+    np.save(file, {FIXED: [{"timestamp": stamp, "zeroed": [0] * 5}]}, allow_pickle=True)
+    with pytest.raises(FormatError, match=r"force_torque_base.npy: zeroed: found 5 numbers, expected 6"):
+        rh20t.streams(tmp_path)
+    np.save(file, {FIXED: [{"zeroed": [0] * 6}]}, allow_pickle=True)
+    with pytest.raises(FormatError, match=r"force_torque_base.npy: entries: found something else, expected objects"):
+        rh20t.streams(tmp_path)
+
+
+@pytest.mark.parametrize("lacking", [(), ("transformed",), ("transformed", "calib")])
+def test_a_human_shows_the_task(tmp_path: Path, lacking: tuple[str, ...]) -> None:
+    """Which arrays such a scene lacks is not documented: without any the cameras that stand still are read in full."""
+    robot = scene(tmp_path)
+    root = robot.rename(robot.with_name(f"{robot.name}_human"))
+    assert data.recognise(root)[0] == "rh20t"
+    for name in lacking:
+        if name == "calib":
+            next(tmp_path.glob("calib/*/tcp.npy")).unlink()
+        else:
+            shutil.rmtree(root / name)
+    recordings = {r.name.split("/")[1]: r for r in data.open_all(root)}
+    same_scene(recordings[FIXED], still())
+    assert recordings[FIXED].report == ()
+    if lacking:
+        what = "tcp.npy" if "calib" in lacking else "tcp_base.npy"
+        assert recordings[HAND].poses is None and rh20t.streams(root) == {}
+        assert recordings[HAND].report == (f"camera {HAND} is on the hand and there is no {what}: no poses",)
+        torch.testing.assert_close(recordings[HAND][1].depth, moving()[1].depth, atol=0.5e-3 + 1e-6, rtol=0)
+    else:
+        same_scene(recordings[HAND], moving())
+
+
+def test_serials_that_begin_with_a_letter_are_in_millimetres_too(tmp_path: Path) -> None:
+    """The authors' tool writes the PNG of these cameras (L515) in quarters of a millimetre; the video is not a PNG."""
+    root = write_rh20t(tmp_path, {"f0172289": still(2)})
+    same_scene(data.open(root), still(2))
 
 
 def test_tcp_of_each_camera_is_a_stream(tmp_path: Path) -> None:
@@ -296,5 +345,5 @@ def hostile_sample(root: Path) -> Path:
 
 
 def read_all(root: Path) -> None:
-    hostile.read_frames(root)
+    hostile.read_all(root)
     rh20t.streams(root)

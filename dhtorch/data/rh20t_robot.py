@@ -6,7 +6,7 @@ tcp → camera, constant for a camera on the hand. Poses in files are x y z qw q
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -83,35 +83,41 @@ class Stream(NamedTuple):
         return values, inside | near
 
 
+#: Lists of entries by camera: the fields of an entry that are streams, what these are called, and their length (None =
+#: as stored). The name of a list that holds for all cameras ends in ``_base``.
+_FIELDS: dict[str, dict[str, tuple[str, int | None]]] = {
+    "tcp": {"tcp": ("tcp", 7)},
+    "tcp_base": {"tcp": ("tcp_base", 7), "robot_ft": ("robot_ft", None)},
+    "force_torque": {"zeroed": ("force_torque", 6), "raw": ("force_torque_raw", 6)},
+    "force_torque_base": {"zeroed": ("force_torque_base", 6), "raw": ("force_torque_base_raw", 6)},
+}
+
+
 def streams(root: str | Path) -> dict[str, Stream]:
     """What the robot recorded in one scene folder.
 
     Returns:
-        ``tcp_base`` (m, 7) in the robot's base frame and ``tcp/<serial>`` (m, 7) in that camera's frame; ``joint``
-        (m, d) rad, with velocities where the set-up has them; ``gripper_command`` and ``gripper_info`` (m, d) as
-        stored, element 0 the width, by its use in mm (unconfirmed). Entries of all cameras' clocks are merged, except
-        in ``tcp/<serial>``. What a scene lacks is absent.
+        ``tcp_base`` (m, 7) in the robot's base frame and ``tcp/<serial>`` (m, 7) in that camera's frame;
+        ``force_torque_base`` and ``force_torque/<serial>`` (m, 6) of the sensor at the wrist, its zero taken off, and
+        ``force_torque_base_raw``, ``force_torque_raw/<serial>`` without; ``robot_ft``, what the robot itself says;
+        ``joint`` (m, d) rad, with velocities where the set-up has them; ``gripper_command`` and ``gripper_info``
+        (m, d) as stored, element 0 the width, by its use in mm (unconfirmed). Entries of all cameras' clocks are
+        merged, except in streams of one camera. What a scene lacks is absent: where a human shows the task
+        (``_human``), perhaps all (unconfirmed). ``high_freq_data``, whose layout nobody describes, is not read.
 
     Raises:
         FormatError: a damaged file.
     """
     folder = Path(root) / "transformed"
     found: dict[str, Stream] = {}
-    for name in ("tcp", "tcp_base", "joint", "gripper"):
-        file = folder / f"{name}.npy"
-        if not file.is_file():
-            continue
-        by_camera = _mapping(read_npy(file), file, "content")
-        if name == "tcp":
-            for serial, entries in by_camera.items():
-                found[f"tcp/{serial}"] = _stream(file, _poses(file, entries), pose=True)
-        elif name == "tcp_base":
-            found[name] = tcp_base(Path(root))
-        elif name == "joint":
-            found[name] = _stream(file, _stamped(file, by_camera, None))
-        else:
-            for part in ("gripper_command", "gripper_info"):
-                found[part] = _stream(file, _stamped(file, by_camera, part))
+    for kind, fields in _FIELDS.items():
+        if (file := folder / f"{kind}.npy").is_file():
+            for field, (name, width) in fields.items():
+                found |= _by_field(file, field, name, width)
+    if (file := folder / "joint.npy").is_file():
+        found["joint"] = _stream(file, _stamped(file, None))
+    if (file := folder / "gripper.npy").is_file():
+        found |= {part: _stream(file, _stamped(file, part)) for part in ("gripper_command", "gripper_info")}
     return {name: stream for name, stream in found.items() if len(stream.times)}
 
 
@@ -121,9 +127,7 @@ def tcp_base(root: Path) -> Stream:
     Raises:
         FormatError: missing or damaged file.
     """
-    file = root / "transformed" / "tcp_base.npy"
-    by_camera = _mapping(read_npy(file), file, "content")
-    return _stream(file, (entry for entries in by_camera.values() for entry in _poses(file, entries)), pose=True)
+    return _by_field(root / "transformed" / "tcp_base.npy", "tcp", "tcp_base", 7)["tcp_base"]
 
 
 def hand_poses(
@@ -190,24 +194,38 @@ def _stream(file: Path, entries: Iterator[tuple[float, np.ndarray]], pose: bool 
     if len({len(value) for value in merged.values()}) > 1:
         raise FormatError(file, "entries", "vectors of several lengths", "one length")
     times = np.array(sorted(merged), dtype=np.float64)
-    return Stream(times, np.array([merged[t] for t in times.tolist()]).reshape(len(times), -1), pose)
+    return Stream(times, np.stack([merged[t] for t in times.tolist()]) if merged else np.zeros((0, 0)), pose)
 
 
-def _poses(file: Path, entries: Any) -> Iterator[tuple[float, np.ndarray]]:
-    if not isinstance(entries, list):
-        raise FormatError(file, "entries", type(entries).__name__, "a list for each camera")
-    for entry in entries:
-        if not isinstance(entry, dict) or not {"timestamp", "tcp"} <= entry.keys():
-            raise FormatError(file, "entries", "something else", "objects with timestamp and tcp")
-        time, value = seconds(entry["timestamp"], file, "timestamp"), _vector(entry["tcp"], file, "tcp")
-        if len(value) != 7:
-            raise FormatError(file, "tcp", f"{len(value)} numbers", "7")
-        if np.isfinite(value).all() and np.linalg.norm(value[3:]) > 1e-6:
-            yield time, value
+def _by_field(file: Path, field: str, name: str, width: int | None) -> dict[str, Stream]:
+    """One field of all entries as one stream, or as one for each camera."""
+    by_camera = _mapping(read_npy(file), file, "content")
+    every = {name: list(by_camera.values())}
+    groups = every if file.stem.endswith("_base") else {f"{name}/{s}": [entries] for s, entries in by_camera.items()}
+    pose = field == "tcp"
+    return {key: _stream(file, _entries(file, lists, field, width), pose) for key, lists in groups.items()}
 
 
-def _stamped(file: Path, by_camera: Mapping[str, Any], part: str | None) -> Iterator[tuple[float, np.ndarray]]:
-    for serial, entries in by_camera.items():
+def _entries(file: Path, lists: list[Any], field: str, width: int | None) -> Iterator[tuple[float, np.ndarray]]:
+    """(s, values) of the entries that have the field; numbers that are not finite, and poses of zeros, are none."""
+    for entries in lists:
+        if not isinstance(entries, list):
+            raise FormatError(file, "entries", type(entries).__name__, "a list for each camera")
+        for entry in entries:
+            if not isinstance(entry, dict) or "timestamp" not in entry:
+                raise FormatError(file, "entries", "something else", "objects with a timestamp")
+            time, value = seconds(entry["timestamp"], file, "timestamp"), entry.get(field)
+            if value is None:
+                continue
+            value = _vector(value, file, field)
+            if width is not None and len(value) != width:
+                raise FormatError(file, field, f"{len(value)} numbers", width)
+            if np.isfinite(value).all() and (field != "tcp" or np.linalg.norm(value[3:]) > 1e-6):
+                yield time, value
+
+
+def _stamped(file: Path, part: str | None) -> Iterator[tuple[float, np.ndarray]]:
+    for serial, entries in _mapping(read_npy(file), file, "content").items():
         for stamp, entry in _mapping(entries, file, serial, texts=False).items():
             value = entry.get(part) if part and isinstance(entry, dict) else entry
             yield seconds(stamp, file, "timestamp"), _vector(value, file, part or "entry")

@@ -116,7 +116,10 @@ def _full_K(frame: Frame, calibrated_hw: tuple[int, int]) -> np.ndarray:
 
 
 def _write_streams(folder: Path, stamps: Mapping[str, Sequence[int]]) -> None:
-    """Joints and gripper that follow a known law: joint j is j + t, the width 50 − t, with t in s since the start."""
+    """Streams that follow a known law of t, in s since the start: joint j is j + t, the width 50 − t, a force t.
+
+    The sensor at the wrist has a zero of 3; in the frame of a camera forces are twice those in the frame of the base.
+    """
     start = min(min(times) for times in stamps.values())
     joint: dict[str, dict[int, Any]] = {}
     gripper: dict[str, dict[int, Any]] = {}
@@ -124,6 +127,10 @@ def _write_streams(folder: Path, stamps: Mapping[str, Sequence[int]]) -> None:
         joint[serial] = {t: np.arange(7) + (t - start) / 1000 for t in times}
         width = {t: 50 - (t - start) / 1000 for t in times}
         gripper[serial] = {t: {"gripper_command": [w, 1, 2], "gripper_info": [w, 0, 0]} for t, w in width.items()}
+    for name, scale in (("force_torque", 2.0), ("force_torque_base", 1.0)):
+        loads = {s: [(t, scale * np.full(6, (t - start) / 1000)) for t in times] for s, times in stamps.items()}
+        entries = {s: [{"timestamp": t, "zeroed": x, "raw": x + 3} for t, x in load] for s, load in loads.items()}
+        _save(folder / f"{name}.npy", entries)
     _save(folder / "joint.npy", joint)
     _save(folder / "gripper.npy", gripper)
 
