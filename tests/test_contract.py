@@ -209,7 +209,7 @@ ROWS = [
     Row(pyramid.build_pyramid, lambda b, n, d: (shifted(b, n, d)[0], 2, 9), "dtype batch capture"),
     Row(track.lucas_kanade_affine, shifted, "dtype batch capture empty shuffle padding nan raises", (2,), bad=wrong_last_axis(2), atol=1e-4),
     Row(affine.register, lambda b, n, d: (*pyramids(b, n, d), *nearby(b, n, d)), "dtype batch capture empty shuffle padding nan raises", (2, 3), bad=wrong_last_axis(2), atol=1e-4),
-    Row(affine.step, lambda b, n, d: (*pyramids(b, n, d), *nearby(b, n, d), torch.eye(2, dtype=d).expand(b, n, 2, 2)), "dtype batch capture gradcheck empty shuffle padding nan raises", (2, 3), (0, 1, 2), bad=wrong_last_axis(2), atol=1e-4),
+    Row(affine.step, lambda b, n, d: (*pyramids(b, n, d), *nearby(b, n, d), torch.eye(2, dtype=d).expand(b, n, 2, 2)), "dtype batch capture gradcheck empty shuffle padding nan raises", (2, 3, 4), (0, 1), bad=wrong_last_axis(2), atol=1e-4),
     Row(p3p.p3p, triples, "dtype batch vmap capture shuffle padding", (0, 1), atol=1e-4),
     Row(least_squares.linearise, planes, "dtype batch vmap capture gradcheck empty raises", grad=(0, 1, 2, 3, 4), bad=lambda a: (*a[:4], a[4][..., 1:])),
     Row(least_squares.robust, lambda b, n, d: (uniform(b, n, dtype=d), "cauchy", 0.5), "dtype batch vmap capture gradcheck empty shuffle padding nan", (0,), (0,)),

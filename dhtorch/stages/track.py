@@ -21,6 +21,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from dhtorch.geometry import affine
 from dhtorch.geometry.pyramid import GRAD_X, GRAD_Y, GREY, REACH, Pyramid, build_pyramid
 from dhtorch.geometry.shapes import check
 from dhtorch.records import Tracks
@@ -440,3 +441,71 @@ def _check_pyramid(pyramid: Pyramid, image: Tensor, window: int) -> None:
             f"lucas_kanade: pyramid_0 is of (B, H, W) {found} with padding {pyramid.pad}, "
             f"expected {expected} with {window // 2 + REACH}"
         )
+
+
+def lucas_kanade_affine(
+    image_0: Tensor,  # (B, C, H, W) C 1 or 3; float in [0, 1] or uint8
+    image_1: Tensor,  # (B, C, H', W')
+    uv_0: Tensor,  # (B, N, 2) px
+    *,
+    uv_1_init: Tensor | None = None,  # (B, N, 2) px
+    pyramid_0: Pyramid | None = None,
+    track: Callable[..., Tracks] = lucas_kanade,
+    window: int = 21,
+    levels: int = 4,
+    iterations: int = 10,
+    epsilon_px: float = 0.01,
+    max_shift_px: float = 2.0,
+) -> Tracks:
+    """Track as ``track`` does, then register every window once more, free to shear and to change its brightness.
+
+    Args:
+        uv_1_init, pyramid_0: as in :func:`lucas_kanade`.
+        track: the search that finds the windows, a seat-4 function; it is given ``window`` and ``levels``.
+        window, levels: of both searches.
+        iterations, epsilon_px, max_shift_px: of the registration, see :func:`dhtorch.geometry.affine.register`.
+
+    Returns:
+        Tracks of ``track`` with new ``uv_1``, ``cov`` (right for white noise, see ``register``) and ``photometric``, a
+        residual with gain and bias taken out. A registration that is rejected leaves the position and
+        raises ``error`` to how far it went, at most ``max_shift_px``; ``photometric`` and ``cov`` are then those of the
+        unregistered window. ``valid`` is untouched.
+
+    Raises:
+        ValueError: as ``track``.
+
+    Gradient: as :func:`lucas_kanade`, by one more step of the registration; all other fields are detached.
+    Source: Baker and Matthews 2004, "Lucas-Kanade 20 years on", inverse composition with appearance variation.
+    """
+    check("lucas_kanade_affine", image_0=(image_0, "B C H W"), uv_0=(uv_0, "B N 2"), uv_1_init=(uv_1_init, "B N 2"))
+    check("lucas_kanade_affine", image_1=(image_1, "B C H W"), uv_0=(uv_0, "B N 2"))
+    with torch.no_grad():
+        source = build_pyramid(image_0, levels, window) if pyramid_0 is None else pyramid_0
+        tracks = track(image_0, image_1, uv_0, uv_1_init=uv_1_init, pyramid_0=source, window=window, levels=levels)
+        target = build_pyramid(image_1, 2, window)
+        found = affine.register(
+            source,
+            target,
+            uv_0,
+            tracks.uv_1,
+            window=window,
+            iterations=iterations,
+            epsilon_px=epsilon_px,
+            max_shift_px=max_shift_px,
+        )
+        moved, rejected = tracks.valid & found.ok, tracks.valid & ~found.ok
+        uv_1 = torch.where(moved[..., None], found.uv_1, tracks.uv_1)
+        error = torch.maximum(tracks.error, found.shift_px.clamp(max=max_shift_px))
+        tracks = tracks.replace(
+            uv_0=uv_0,
+            uv_1=uv_1,
+            error=torch.where(rejected, error, tracks.error),
+            photometric=torch.where(tracks.valid, found.rms, tracks.photometric),
+            cov=torch.where(tracks.valid[..., None, None], found.cov, tracks.cov),
+        )
+    if torch.is_grad_enabled() and (image_0.requires_grad or image_1.requires_grad or uv_0.requires_grad):
+        source, target = build_pyramid(image_0, 1, window), build_pyramid(image_1, 1, window)
+        again = affine.step(source, target, uv_0, tracks.uv_1, found.linear, window=window)
+        # The value is the search's, bit for bit; the step lends its derivative.
+        return tracks.replace(uv_1=torch.where(tracks.valid[..., None], uv_1 + (again - again.detach()), uv_1))
+    return tracks
