@@ -224,6 +224,9 @@ ROWS = [
     Row(ransac.usable_first, lambda b, n, d: (uniform(b, n, dtype=d) > 0.5, 16), "batch vmap capture"),
     Row(holdout.range_split, lambda b, n, d: (frames(b, n, d)[0], 1.02), "dtype batch vmap capture gradcheck", grad=(0,)),
     Row(holdout.truth_at, frames, ALL, (1,), (0,), bad=wrong_last_axis(1)),
+    Row(holdout.half, lambda b, n, d: (sampled(b, n, d)[1], 3), "dtype batch empty raises", (0,), bad=lambda a: (a[0].replace(trackability=a[0].trackability[:, 1:]), a[1])),
+    Row(holdout.without_returns, lambda b, n, d: (sampled(b, n, d)[1], torch.rand(b, n, generator=generator(3)) < 0.5), ALL, (0, 1), (0,), bad=lambda a: (a[0], a[1][:, 1:])),
+    Row(holdout.drop_outs, lambda b, n, d: (*sampled(b, n, d), holdout.truth_at(*frames(b, n, d))), "dtype batch vmap capture empty raises", (1, 2), bad=lambda a: (a[0], a[1], a[2].replace(depth=a[2].depth[:, 1:]))),
     Row(holdout.candidates, judged, "dtype batch vmap capture empty shuffle raises", (0, 1), bad=lambda a: (a[0], a[1].replace(depth=a[1].depth[:, 1:]), a[2])),
 ]  # fmt: skip
 

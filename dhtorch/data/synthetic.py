@@ -176,6 +176,27 @@ class SyntheticRoom(Sequence[Frame]):
         return Generator().manual_seed(Random(f"{self.seed} {i} {stream}").getrandbits(62))
 
 
+def open_rooms(
+    paths: Sequence[str] = tuple(PATHS),
+    *,
+    seed: int = 2,
+    n_frames: int = 12,
+    hw: tuple[int, int] = (480, 640),
+    lidar: str | None = "phone",
+    depth_noise: float = 1.0,
+    image_noise: float = 1.0,
+    near: float = 2.0,
+    gap: int = 6,
+) -> list[SyntheticRoom]:
+    """The room along several paths, one recording each, named after its path; options as :class:`SyntheticRoom`."""
+    options: dict[str, Any] = {"seed": seed, "n_frames": n_frames, "hw": hw, "lidar": lidar, "near": near, "gap": gap}
+    options |= {"depth_noise": depth_noise, "image_noise": image_noise}
+    rooms = [SyntheticRoom(path=path, **options) for path in paths]
+    for room in rooms:
+        room.name = f"synthetic_{room.path}"
+    return rooms
+
+
 def phone_lidar(
     scene: Scene,
     camera: Camera,

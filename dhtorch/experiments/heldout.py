@@ -40,7 +40,7 @@ def run(
 
     Rows: cohorts ``cyclic`` and ``heldout``; the held-out scene rows also say whether the scene ``passes``, how far
     recovered holes reach (``reach_p95_m``, ``reach_max_m``, of the pairs' values the median) beside the sensor's own
-    returns (``returns_p95_m``). The summary adds ``n_passes`` and ``n_scenes`` of each method.
+    returns (``returns_p95_m``). The summary adds ``<method>.n_passes`` and ``<method>.n_scenes``.
 
     Args and errors: as :func:`dhtorch.experiments.protocol.run`; ``methods`` is name → method.
     Source: paper, "Held-out triangulation on in-house captures" and "Cross-dataset geometry and calibration".
@@ -51,9 +51,7 @@ def run(
         cohorts = {"cyclic": split.cyclic, "heldout": split.heldout}
         asked = Protocol({name: split.variant()}, cohorts, everything, partial(reach, split))
         part = protocol.run(recordings, asked, pairs, settings, progress=progress)
-        prefix = f"{name}." if len(methods) > 1 else ""
-        part.summary = {prefix + k.removeprefix(f"{name}."): v for k, v in part.summary.items()}
-        part.summary |= {prefix + k: v for k, v in _judge(part.rows, name).items()}
+        part.summary |= {f"{name}.{k}": v for k, v in _judge(part.rows, name).items()}
         parts.append(part)
     outcome = protocol.join(parts)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, next(iter(methods))))
