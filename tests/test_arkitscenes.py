@@ -190,6 +190,24 @@ def test_no_pose_is_ever_taken_over(tmp_path: Path) -> None:
     torch.testing.assert_close(bridged.poses.t[4:5], true.t, atol=1e-9, rtol=0)
 
 
+def test_names_a_millisecond_apart_are_one_instant(tmp_path: Path) -> None:
+    """Names are cut to milliseconds, each by itself, and the trajectory has six decimals."""
+    root = tmp_path / "1"
+    frames = capture(root)
+    times = np.array([float(f.time) for f in frames])
+    writers.write_arkitscenes(root, {}, trajectory=shots(times + 0.0001))
+    rows = np.loadtxt(root / "lowres_wide.traj")
+    assert (rows[:, 0] * 1000 % 1).max() > 0.4  # the stamps are no whole milliseconds
+    recording = stored(root)
+    for got, want in zip(recording, shots(times + 0.0001), strict=True):  # its own pose, not one in between
+        torch.testing.assert_close(got.T_world_from_cam.t, want.T_world_from_cam.t, atol=1e-7, rtol=0)
+    first, second, *_ = sorted((root / "lowres_wide_intrinsics").iterdir())
+    first.rename(first.with_name(first.name.replace("100.000", "100.001")))
+    second.rename(second.with_name(second.name.replace("100.017", "100.019")))
+    recording = stored(root)
+    assert recording.number.tolist() == [0, 2, 3] and recording.report == ("1 images without intrinsics: left out",)
+
+
 def test_first_and_last_images_need_a_pose_too(tmp_path: Path) -> None:
     root = tmp_path / "1"
     frames = shots(100 + np.arange(6) / 60)

@@ -160,6 +160,18 @@ def test_lost_zeros_are_no_returns(tmp_path: Path) -> None:
     )
 
 
+def test_the_mark_of_depth_as_it_was_called_before(tmp_path: Path) -> None:
+    write_lerobot(tmp_path, episodes())
+
+    def older(info: dict[str, Any]) -> None:
+        feature = info["features"].pop(f"{KEY}_depth")
+        feature["info"] = {f"video.{k}" if k == "is_depth_map" else k: v for k, v in feature["info"].items()}
+        info["features"][f"{KEY}_depth"] = feature
+
+    edit(tmp_path, older)
+    same_scene(data.open(tmp_path, episode=0), episodes()[0], STEP["video"])
+
+
 @pytest.mark.parametrize("log", [True, False])
 def test_codes_to_metres(log: bool) -> None:
     feature = Feature("d", "video", (1, 4096, 1), {"video.depth_min": 0.2, "video.depth_max": 4, "video.use_log": log})

@@ -158,6 +158,16 @@ def test_frames_count_as_numbers(tmp_path: Path) -> None:
     same_scene(recording, frames)
 
 
+def test_what_means_nothing_changes_nothing(tmp_path: Path) -> None:
+    """``initPose`` (its meaning is not known; readers pass over it), the icon, a sound track, notes of the system."""
+
+    def change(members: dict[str, bytes]) -> None:
+        table(initPose=[0.5, 0.5, 0.5, 0.5, 1, 2, 3])(members)
+        members |= {"sound.m4a": b"1", "rgbd/.DS_Store": b"1", "rgbd/x.jpg": b"1", "__MACOSX/rgbd/._9.jpg": b"1"}
+
+    same_scene(data.open(rewrite(r3d(tmp_path), change)), walk())
+
+
 def test_K_is_stored_column_after_column(tmp_path: Path) -> None:
     frames = walk(2)
     archive = r3d(tmp_path, frames, per_frame=False)

@@ -98,6 +98,17 @@ def test_frames_may_start_anywhere(tmp_path: Path) -> None:
     same_scene(recording, frames)
 
 
+def test_frames_dropped_by_the_app_keep_their_times(tmp_path: Path) -> None:
+    """15 frames a second by leaving three of four out: pictures count on, the clock does not follow from them."""
+    frames = [f.replace(time=f.time + 3 * i / 60) for i, f in enumerate(walk())]
+    frames[3] = frames[3].replace(time=frames[3].time + 1)  # and a pause
+    writers.write_stray(tmp_path, frames, per_frame=True)
+    (tmp_path / "imu.csv").write_text("timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z\nno, number\n")
+    recording = data.open(tmp_path)
+    assert recording.rate_hz == pytest.approx(15, rel=1e-4) and recording.report == ()
+    same_scene(recording, frames)
+
+
 def test_old_odometry_has_the_K_of_the_last_frame(tmp_path: Path) -> None:
     writers.write_stray(tmp_path, walk())
     assert "fx" not in (tmp_path / "odometry.csv").read_text()

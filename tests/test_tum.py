@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from box import CAMERA, check_same, pose, walk
+from box import CAMERA, HW, check_same, pose, walk
 
 from dhtorch import data
 from dhtorch.data import tum, writers
@@ -25,6 +25,26 @@ def test_tum_gives_back_the_scene(tmp_path: Path) -> None:
     assert torch.equal(recording[0].camera.distortion, lens)
     torch.testing.assert_close(recording.times, torch.cat([f.time for f in frames]), atol=1e-6, rtol=0)
     check_same(recording, frames, 1 / 5000)
+
+
+def test_a_validation_twin_has_no_poses_and_other_files_are_passed_over(tmp_path: Path) -> None:
+    root = tmp_path / "rgbd_dataset_freiburg3_walking_xyz_validation"
+    writers.write_tum(root, blank(2), camera=3)
+    (root / "groundtruth.txt").unlink()
+    (root / "accelerometer.txt").write_text("# timestamp ax ay az\n100.0 0.1 9.8\nnot a number\n")
+    recording = data.open(root)
+    assert len(recording) == 2 and recording.poses is None and recording.report == ()
+    assert float(recording[0].camera.f[0, 0]) == pytest.approx(535.4)
+
+
+def test_every_code_but_zero_is_a_depth(tmp_path: Path) -> None:
+    """65535, elsewhere a mark for no return, is 13.1 m here."""
+    writers.write_tum(tmp_path, walk(1))
+    codes = np.tile(np.array([0, 1, 5000, 65535], np.uint16), (HW[0], HW[1] // 4))
+    next((tmp_path / "depth").iterdir()).write_bytes(parts.png(codes))
+    depth = data.open(tmp_path)[0].depth[0]
+    assert depth[0, :4].tolist() == pytest.approx([0, 0.0002, 1, 13.107])
+    assert data.open(tmp_path, units_per_metre=5208)[0].depth[0, 0, 2] == pytest.approx(5000 / 5208)
 
 
 def blank(n: int) -> list[Frame]:

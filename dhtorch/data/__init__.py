@@ -136,7 +136,7 @@ def recognise(root: str | Path) -> tuple[str, str]:
     inside = (
         sorted(entry.name for entry in root.iterdir())[:6] if root.is_dir() else [f"a {root.suffix or 'plain'} file"]
     )
-    expected = f"one of {', '.join((*FORMATS, *STACK_FORMATS))}"
+    expected = f"one of {', '.join((*FORMATS, *STACK_FORMATS))} (dhtorch inspect looks further down)"
     raise FormatError(root, "format", ", ".join(inside) or "an empty folder", expected)
 
 

@@ -66,7 +66,7 @@ def read(
         poses: take the device's poses. Captures of the front camera have none: theirs are all the identity.
         per_frame: take the intrinsics of each frame where the app wrote them, since autofocus and stabilisation move
             them; False = those of frame 0 for all.
-        exr_channel: that holds depth. None = R, else the only one.
+        exr_channel: that holds depth. None = R, else the only one (R is what the exports at hand have; unconfirmed).
         verify: decode every frame once while opening, and leave out those that do not decode. Without it only frames
             whose first or last bytes look wrong are tried.
         depth_range: m, nearest and furthest depth that the mp4's colours stand for. None = as the file says, else 0, 3.

@@ -7,6 +7,8 @@ are pickles: they are read as data (:mod:`dhtorch.data.codec_pickle`), no code i
 
 A depth picture is twice as high as the image, the low bytes above the high bytes, in millimetres. A camera on the hand
 moves: its pose follows the tool centre point (:mod:`dhtorch.data.rh20t_robot`). ``streams`` gives the robot's side.
+Scenes named ``…_human`` show a person at the same task; which arrays they lack is unconfirmed, so nothing but videos,
+time stamps and the calibration is needed of any scene.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@
 ``confidence/000000.png`` (0, 1, 2), ``odometry.csv`` with a row for every stored frame, and ``camera_matrix.csv``: K of
 the *last* frame. Newer captures have K in every row, which counts. Poses are camera-to-world with our axes in a world
 with y up. Pictures are kept as the sensor gave them, also where the phone was held upright: poses and K belong to them.
-Colour and depth are registered, so depth has the same K at its own size.
+Colour and depth are registered, so depth has the same K at its own size. ``imu.csv`` is not read.
 
 The ``n``-th row belongs to the ``n``-th picture *stored* in the video, shown or not: the app stamps the first one
 before time 0, where an edit list may hide it. If the video still has one picture less than there are rows, either the

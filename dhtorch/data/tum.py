@@ -60,7 +60,8 @@ def read(
             failing both, ``K`` and ``dist`` of a side-car ``meta.json``.
         poses: read the trajectory; frames that it does not cover are left out. False keeps every RGB-D frame.
         max_difference: s, largest distance in time of two things that belong together.
-        units_per_metre: of the depth codes.
+        units_per_metre: of the depth codes: 5000 as documented. ORB-SLAM2 takes 5208 for camera 2, and factors for each
+            camera are quoted elsewhere (unconfirmed, or applied in the files already).
 
     Returns:
         One recording at the stamps of the colour images. Poses are interpolated between the two neighbouring ones
