@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -65,36 +67,53 @@ def check_sheet(file: Path) -> np.ndarray:
 # ------------------------------------------------------------------------------------------------------ written samples
 
 
-def _driving(root: Path) -> None:
-    eye = Pose(torch.eye(3).double().expand(3, 3, 3), torch.zeros(3, 3).double())
-    writers.write_driving(root, {"FRONT": walk(3), "REAR": walk(3)}, eye)
+def _driving(root: Path, n: int) -> None:
+    eye = Pose(torch.eye(3).double().expand(n, 3, 3), torch.zeros(n, 3).double())
+    writers.write_driving(root, {"FRONT": walk(n), "REAR": walk(n)}, eye)
 
 
-def _arkitscenes(root: Path) -> None:
-    frames = with_conf(walk(3))
+def _arkitscenes(root: Path, n: int) -> None:
+    frames = with_conf(walk(n))
     writers.write_arkitscenes(root, {"lowres_wide": frames, "lowres_depth": frames}, trajectory=frames)
 
 
-WRITTEN: dict[str, tuple[Callable[[Path], object], str, int]] = {
-    "tum": (lambda root: writers.write_tum(root, walk(3)), "tum", 1),
-    "named": (lambda root: writers.write_named_frames(root, walk(3), fps=30), "frames_dir", 1),
-    "counted": (lambda root: writers.write_counted_frames(root, walk(3)), "frames_dir", 1),
+def _mp4(root: Path, n: int) -> None:
+    writers.write_record3d_mp4(root / "a.mp4", walk(n))
+
+
+def _rh20t(root: Path, n: int) -> None:
+    writers.write_rh20t(root, {"036422060909": walk(n, (36, 64))})
+
+
+#: How to write n frames, the format that they are recognised as, and the number of recordings.
+RECORDED: dict[str, tuple[Callable[[Path, int], object], str, int]] = {
+    "tum": (lambda root, n: writers.write_tum(root, walk(n)), "tum", 1),
+    "named": (lambda root, n: writers.write_named_frames(root, walk(n), fps=30), "frames_dir", 1),
+    "counted": (lambda root, n: writers.write_counted_frames(root, walk(n)), "frames_dir", 1),
     "driving": (_driving, "driving", 2),
-    "stray": (lambda root: writers.write_stray(root, with_conf(walk(3, hw=(48, 64)))), "stray", 1),
-    "stray_depth_only": (lambda root: writers.write_stray(root, with_conf(walk(3)), video=False), "stray", 1),
-    "r3d": (lambda root: writers.write_r3d(root / "a.r3d", with_conf(walk(3))), "record3d", 1),
-    "record3d_exr": (lambda root: writers.write_record3d_exr(root, walk(3)), "record3d", 1),
+    "stray": (lambda root, n: writers.write_stray(root, with_conf(walk(n))), "stray", 1),
+    "stray_depth_only": (lambda root, n: writers.write_stray(root, with_conf(walk(n)), video=False), "stray", 1),
+    "r3d": (lambda root, n: writers.write_r3d(root / "a.r3d", with_conf(walk(n))), "record3d", 1),
+    "record3d_exr": (lambda root, n: writers.write_record3d_exr(root, walk(n)), "record3d", 1),
+    "record3d_mp4": (_mp4, "record3d", 1),
     "arkitscenes": (_arkitscenes, "arkitscenes", 1),
-    "ca1m": (lambda root: writers.write_ca1m(root / "ca1m-val-42.tar", with_conf(walk(3)), walk(3)), "ca1m", 1),
-    "rh20t": (lambda root: writers.write_rh20t(root, {"036422060909": walk(3, (36, 64))}), "rh20t", 1),
-    "lerobot": (lambda root: writers.write_lerobot(root, [walk(3), walk(4)]), "lerobot", 2),
+    "ca1m": (lambda root, n: writers.write_ca1m(root / "ca1m-val-42.tar", with_conf(walk(n)), walk(n)), "ca1m", 1),
+    "rh20t": (_rh20t, "rh20t", 1),
+    "lerobot": (lambda root, n: writers.write_lerobot(root, [walk(n), walk(n + 1)]), "lerobot", 2),
+}
+WRITTEN: dict[str, tuple[Callable[[Path], object], str, int]] = {
+    **{name: (partial(write, n=3), format, count) for name, (write, format, count) in RECORDED.items()},
     "fod500": (lambda root: writers.write_fod500(root, {0: stack(0), 1: stack(1)}), "fod500", 1),
     "ddff12": (lambda root: writers.write_ddff12(root / "a.h5", {"val": [stack(0, 10)]}), "ddff12", 1),
     "images": (lambda root: writers.write_image_folder(root, stack(0, 5)), "images", 1),
 }
 
 
-@pytest.mark.parametrize(("name", "below"), [(n, ("", "one", "one/two")[k % 3]) for k, n in enumerate(WRITTEN)])
+#: How far down captures are laid: some make a folder of their own, or are named after a file.
+BELOW = {n: ("", "one", "one/two")[k % 3] for k, n in enumerate(WRITTEN)} | {"ca1m": "", "rh20t": "one"}
+
+
+@pytest.mark.parametrize(("name", "below"), BELOW.items())
 def test_written_captures_are_found_and_shown(
     name: str, below: str, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
@@ -243,11 +262,27 @@ def test_pictures_and_cameras_that_cannot_be() -> None:
 # ----------------------------------------------------------------------------------------------- nothing real is refused
 
 
-def test_one_frame_is_enough(tmp_path: Path) -> None:
-    writers.write_named_frames(tmp_path, walk(1))
-    survey = only(tmp_path)
-    assert facts(survey)["frames"] == "1" and len(survey.tiles) == 1
-    check_sheet(capture.write_sheet(survey, tmp_path / "out"))
+@pytest.mark.parametrize("name", RECORDED)
+def test_one_frame_is_enough(name: str, tmp_path: Path) -> None:
+    write, format, count = RECORDED[name]
+    write(tmp_path, 1)
+    (found,) = capture.find(tmp_path)
+    shown = list(capture.surveys(found))
+    assert found.format == format and len(shown) == count
+    assert facts(shown[0])["frames"] == "1" and len(shown[0].tiles) == 1
+    check_sheet(capture.write_sheet(shown[0], tmp_path / "out"))
+
+
+@pytest.mark.parametrize("name", sorted({*RECORDED} - {"stray_depth_only"}))
+def test_the_command_takes_what_inspect_finds(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Focal stacks, which have no pairs: test_focal_stacks."""
+    RECORDED[name][0](tmp_path, 3)
+    (found,) = capture.find(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    settings = ["data=auto", f"data.root={found.path}", "pairs.gap=1", "holdout.cutoff=1.5", "method.n=64"]
+    assert run.main([*settings, "figures=false", "hydra.run.dir=out"]) == 0
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert len(result["data"]["scenes"]) == RECORDED[name][2] and result["data"]["n_pairs"] >= RECORDED[name][2]
 
 
 def test_a_damaged_frame_is_a_warning(tmp_path: Path) -> None:
@@ -282,7 +317,7 @@ def test_loose_pictures_with_a_broken_one(tmp_path: Path) -> None:
 
 
 def test_many_recordings_are_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    _driving(tmp_path)
+    _driving(tmp_path, 3)
     monkeypatch.setattr(capture, "_MOST", 1)
     survey = only(tmp_path)
     assert "2 recordings in this capture: the first 1 are shown" in survey.warnings

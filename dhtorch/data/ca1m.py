@@ -24,7 +24,7 @@ from torch import Tensor
 from dhtorch.data import codec_tar, codec_tiff, convert, files
 from dhtorch.data.files import FormatError
 from dhtorch.data.laser import judged
-from dhtorch.data.recording import Recording, TruthRecording
+from dhtorch.data.recording import Recording, Recordings, TruthRecording
 from dhtorch.geometry.camera import resize
 from dhtorch.records import Camera, Frame
 
@@ -57,7 +57,7 @@ def read(
     confidence: str | None = "unit",
     truth: bool = True,
     max_disagreement: float = 0.05,
-) -> list[Recording]:
+) -> Recordings:
     """Open an archive, or a folder of them.
 
     Args:
@@ -69,12 +69,13 @@ def read(
             laser depth map is rejected.
 
     Returns:
-        One recording for each archive, at the capture's own frame rate. A frame that lacks its image, its depth, its
-        intrinsics or its pose is left out and reported; so is one without confidence, or without intrinsics of the
-        depth, where others have them (without any, the depth shares the camera of the image, scaled).
+        One recording for each archive, opened when that one is asked for, at the capture's own frame rate. A frame that
+        lacks its image, its depth, its intrinsics or its pose is left out and reported; so is one without confidence,
+        or without intrinsics of the depth, where others have them (without any, the depth shares the camera of the
+        image, scaled).
 
     Raises:
-        FormatError: no archive, no complete frame, a damaged archive or member.
+        FormatError: no archive; of a single one also no complete frame, a damaged archive or member.
     """
     root = Path(root)
     files.to_positive(max_disagreement, root, "option max_disagreement")
@@ -85,7 +86,23 @@ def read(
         raise FormatError(root, "archives", "none", "ca1m-<split>-<video id>.tar")
     skip = {"wide/depth/confidence"} if confidence is None else set()
     skip |= set() if truth else {"gt/depth"}
-    return [_recording(archive, _index(archive, skip), confidence, max_disagreement) for archive in archives]
+    return Recordings(
+        [archive.stem for archive in archives], _Make(tuple(archives), skip, confidence, max_disagreement)
+    )
+
+
+@dataclass(frozen=True)
+class _Make:
+    """Position → recording."""
+
+    archives: tuple[Path, ...]
+    skip: set[str]
+    confidence: str | None
+    max_disagreement: float
+
+    def __call__(self, i: int) -> Recording:
+        archive = self.archives[i]
+        return _recording(archive, _index(archive, self.skip), self.confidence, self.max_disagreement)
 
 
 @dataclass(frozen=True, eq=False)

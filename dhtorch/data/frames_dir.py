@@ -148,7 +148,7 @@ def _named_frames(root: Path) -> tuple[list[_Files], Pose, list[str]]:
     for file in root.iterdir() if root.is_dir() else ():
         if match := _PART.fullmatch(file.name):
             parts.setdefault(int(match[1]), {})[match[2]] = file
-    frames, poses, report = [], [], []
+    frames, poses, report = [], list[np.ndarray](), []
     for number, found in sorted(parts.items()):
         missing = [part for part in ("color", "depth", "pose") if part not in found]
         matrix = files.read_table(found["pose"], 4) if not missing else None
@@ -159,12 +159,17 @@ def _named_frames(root: Path) -> tuple[list[_Files], Pose, list[str]]:
         else:
             if matrix.shape != (4, 4):
                 raise FormatError(found["pose"], "pose", f"{len(matrix)} rows", "4 rows of 4 numbers")
-            poses.append(convert.to_poses(matrix[None], found["pose"]))
+            poses.append(matrix)
             frames.append(_Files(number, found["color"], found["depth"]))
     if not frames:
         found_instead = f"none complete among {len(parts)}" if parts else "none"
         raise FormatError(root, "frames", found_instead, "frame-XXXXXX.color.{jpg,png}, .depth.png and .pose.txt")
-    return frames, Pose(torch.cat([p.R for p in poses]), torch.cat([p.t for p in poses])), report
+    try:
+        return frames, convert.to_poses(np.stack(poses), root), report
+    except FormatError:  # once more, one by one, to name the file
+        for frame, matrix in zip(frames, poses, strict=True):
+            convert.to_poses(matrix[None], frame.image.with_name(f"{frame.image.name.split('.')[0]}.pose.txt"))
+        raise
 
 
 def _counted_frames(root: Path) -> tuple[list[_Files], Pose, list[str]]:

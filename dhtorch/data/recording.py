@@ -107,8 +107,9 @@ class TruthRecording(Recording):
 class Recordings(Sequence[Recording]):
     """Many recordings of one data set, each opened when it is asked for.
 
-    A set of robot episodes holds tens of thousands, with tables of their own: opening them all takes minutes, listing
-    them a second. Nothing is kept, so asking twice opens twice. What is wrong with one shows when that one is opened.
+    A set of robot episodes holds tens of thousands, with tables of their own, and a folder of archives hundreds of
+    gigabytes: opening all takes minutes, listing them does not. Nothing is kept, so asking twice opens twice. What is
+    wrong with one shows when that one is opened.
     """
 
     names: Sequence[str]  # of the recordings
