@@ -13,11 +13,15 @@ the machine's own and decide nothing.
 
 from __future__ import annotations
 
+import contextlib
+import os
+import platform
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -253,7 +257,7 @@ def _row(scene: str, branch: Branch, stage: str, settings: Settings, n: int) -> 
     times = sorted(branch.times(stage))
     row: Row = {"scene": scene, "pair": None, "method": branch.method, "stage": stage, "hw": list(branch.hw)}
     row |= {"n": None if branch.method == VISUAL else n, "repeats": len(times)}
-    row |= {"threads": torch.get_num_threads(), "device": settings.device}
+    row |= {"threads": torch.get_num_threads(), "device": settings.device, **_machine()}
     for name, (share, least) in TAILS.items():
         row[name] = _percentile(times, share) if len(times) >= least else None
     row |= {"low_ms": min(branch.medians(stage)), "high_ms": max(branch.medians(stage))}
@@ -287,6 +291,16 @@ def _summary(branches: Sequence[Branch]) -> dict[str, Any]:
 def _entry(value: float, spread: Sequence[float], n: int, unit: str) -> dict[str, Any]:
     low, high = (min(spread), max(spread)) if spread else (None, None)
     return {"value": value, "low": low, "high": high, "n": n, "unit": unit}
+
+
+def _machine() -> Row:
+    """What milliseconds depend on: processor, cores, and how busy it is (runnable processes, last minute)."""
+    name = ""
+    with contextlib.suppress(OSError):
+        found = [x for x in Path("/proc/cpuinfo").read_text().splitlines() if x.startswith("model name")]
+        name = found[0].partition(":")[2].strip() if found else ""
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+    return {"cpu": name or platform.processor() or platform.machine(), "cores": os.cpu_count(), "load": load}
 
 
 def _percentile(ordered: Sequence[float], share: float) -> float:
