@@ -15,15 +15,17 @@ LEVELS = [
     {"geometry"},
     {"records"},
     {"stages", "negative", "data", "evaluate", "baselines"},
-    {"pair", "window", "integrate"},
+    {"pair", "window", "integrate", "calibration"},
     {"transform", "extract", "experiments", "figures"},
-    {"run", "report", "viewer", "capture", "__main__"},
+    {"run", "job", "report", "viewer", "capture", "__main__"},
 ]
 LEVEL = {name: level for level, group in enumerate(LEVELS) for name in group}
 SIDEWAYS = {
     ("window", "pair"),
     ("extract", "transform"),
+    ("run", "job"),
     ("run", "report"),
+    ("job", "report"),
     ("run", "capture"),
     ("run", "viewer"),
     ("__main__", "run"),

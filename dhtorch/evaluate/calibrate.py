@@ -5,11 +5,12 @@ An answer is *good* where its relative error is below 10 %. Every scene weighs t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import torch
 from torch import Tensor
 
+from dhtorch.evaluate import bootstrap
 from dhtorch.evaluate.errors import Numbers, Points
 from dhtorch.geometry.shapes import check
 from dhtorch.tree import Record, record
@@ -95,6 +96,36 @@ def measure(scenes: Sequence[Points], *, bins: int = 10) -> Numbers:
         "ece": reliability(*pooled, bins=bins).ece,
         "ece_equal_mass": reliability(*pooled, bins=bins, equal_mass=True).ece,
     }
+
+
+def ece_interval(scenes: Sequence[Points], *, bins: int = 10, draws: int = 2000, seed: int = 0) -> bootstrap.Interval:
+    """``ece`` (bins of equal width) with its interval over scenes; scenes without answers are passed over."""
+    tables = [reliability(*pool([s]), bins=bins) for s in scenes if bool(s.keep.any())]
+    if not tables:
+        return bootstrap.Interval(None, None, None, 0)
+    gaps = torch.stack([(t.weight * (t.claimed - t.realised)).nan_to_num() for t in tables])
+
+    def ece(index: Tensor) -> Tensor:
+        return gaps[index].mean(1).abs().sum(-1)
+
+    return bootstrap.interval_of(ece, len(tables), draws=draws, seed=seed)
+
+
+def leave_one_room_out(
+    scenes: Mapping[str, Points], rooms: Mapping[str, str] | None = None
+) -> Iterator[tuple[dict[str, Points], dict[str, Points]]]:
+    """Folds (scenes of the other rooms, scenes of this room), each by name: learn on the first, judge the second.
+
+    Pieces of one room share walls, light and camera, so one of them must not teach the judgement of another.
+
+    Args:
+        scenes: by name.
+        rooms: scene → room; a scene that is not named is a room of its own.
+    """
+    room = {name: (rooms or {}).get(name, name) for name in scenes}
+    for held in dict.fromkeys(room.values()):
+        others = {name: s for name, s in scenes.items() if room[name] != held}
+        yield others, {name: s for name, s in scenes.items() if room[name] == held}
 
 
 def _mass_below(x: Tensor, weight: Tensor) -> Tensor:

@@ -55,11 +55,15 @@ def measure(pooled: Points, *, min_points: int = MIN_POINTS) -> Numbers:
         the answered candidates of their running *sum* of loss over their number (an early error is not counted over
         and over). ``coverage_at_5``, ``_10``, ``_20``: largest share of the candidates, at least ``min_points``, that a
         threshold on the score can accept at a risk of at most 5, 10, 20 %; 0 where none can. ``monotonicity``: share
-        of the nine steps between the tenths of the answers over which the risk does not fall. None where undefined
-        (no candidate; for all but ``aurc_full`` and the coverages also no answer).
+        of the nine steps between the tenths of the answers over which the risk does not fall. ``largest_fall``: the
+        most that the risk falls from one of these tenths to a later one, 0 for a curve that never does. None where
+        undefined (no candidate; for all but ``aurc_full`` and the coverages also no answer; for the last two fewer
+        than ten).
 
     Source: J. Traub et al., "Overcoming common flaws in the evaluation of selective classification systems", 2024
-    (AUGRC); Y. Geifman, G. Uziel, R. El-Yaniv, "Bias-reduced uncertainty estimation", 2019 (excess AURC).
+    (AUGRC); Y. Geifman, G. Uziel, R. El-Yaniv, "Bias-reduced uncertainty estimation", 2019 (excess AURC); A. Shah et
+    al., "Selective regression under fairness criteria", 2022 (a risk that should fall whenever less is answered; the
+    two numbers for how nearly it does are ours).
     """
     n, answered = pooled.keep.numel(), pooled.answered()
     loss, score = capped(answered.error), answered.score
@@ -78,8 +82,41 @@ def measure(pooled: Points, *, min_points: int = MIN_POINTS) -> Numbers:
         fits = cuts & (risk <= percent / 100) & (_count(loss) >= min_points)
         most = int((_count(loss) * fits).max()) if some else 0
         numbers[f"coverage_at_{percent}"] = most / n if n else None
-    numbers["monotonicity"] = _monotonicity(risk)
+    numbers["monotonicity"], numbers["largest_fall"] = _monotonicity(risk)
     return numbers
+
+
+def realised(pooled: Points, threshold: float | None) -> float | None:
+    """Mean capped error of the answers that score at least ``threshold`` (None answers nothing); None where silent."""
+    accepted = pooled.keep & (pooled.score >= (torch.inf if threshold is None else threshold))
+    return _mean(capped(pooled.error[accepted]))
+
+
+def surest(pooled: Points, n: int) -> Points:
+    """The same candidates with only the ``n`` surest answers kept: two methods cut so answer equally much.
+
+    Where the cut falls among answers of equal score, which cannot be told apart, those that stay are spread evenly
+    over the group's errors: their median and mean are the group's, whatever the order of the list.
+    """
+    answered = pooled.keep.nonzero()[:, 0]
+    if n >= answered.numel():
+        return pooled
+    keep = torch.zeros_like(pooled.keep)
+    if n > 0:
+        score = pooled.score[answered]
+        limit = score.sort(descending=True).values[n - 1]
+        keep[answered[score > limit]] = True
+        tied = answered[score == limit]
+        tied = tied[pooled.error[tied].argsort(stable=True)]
+        few = n - int(keep.sum())
+        keep[tied[(torch.arange(few, device=tied.device) * 2 + 1) * tied.numel() // (2 * few)]] = True
+    return pooled.replace(
+        keep=keep,
+        depth=torch.where(keep, pooled.depth, torch.nan),
+        sigma=torch.where(keep, pooled.sigma, torch.nan),
+        residual_px=torch.where(keep, pooled.residual_px, torch.nan),
+        score=torch.where(keep, pooled.score, 0.0),
+    )
 
 
 def capped(error: Tensor) -> Tensor:
@@ -106,13 +143,14 @@ def _ends_of_ties(score: Tensor) -> Tensor:
     return torch.cat((ordered[1:] < ordered[:-1], ordered.new_ones(min(1, ordered.numel()), dtype=torch.bool)))
 
 
-def _monotonicity(risk: Tensor) -> float | None:
+def _monotonicity(risk: Tensor) -> tuple[float | None, float | None]:
     n = risk.numel()
     if n < STEPS:
-        return None
+        return None, None
     at = torch.tensor([n * k // STEPS - 1 for k in range(1, STEPS + 1)], device=risk.device)
-    steps = risk[at].diff()
-    return float((steps >= -1e-12).double().mean())
+    tenths = risk[at]
+    fall = (tenths.cummax(0).values - tenths).max()
+    return float((tenths.diff() >= -1e-12).double().mean()), float(fall)
 
 
 def _mean(x: Tensor) -> float | None:

@@ -1,0 +1,211 @@
+"""Where to cut the score so that the error stays below a target: two controls, two kinds of promise.
+
+*Plug-in* looks at the error among the answers, on the scenes it is given, and leaves room for one standard error. It
+promises nothing about another scene. *Conformal* promises: if the scenes, the next one included, could have come in
+any order (are exchangeable), the loss of the next scene meets the target. The loss there is per candidate, capped
+error × answered / candidates, because it must not rise when less is answered; and a promise takes scenes: with fewer
+than it needs it says how many.
+
+Both need only scores, answers and truth, so any depth source will do; ``errors.points`` joins three arrays to a scene.
+The unit is the scene: points of one scene share its truth and its poses and are no independent witnesses.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dhtorch.evaluate.errors import Points
+from dhtorch.evaluate.risk import capped
+
+#: Thresholds tried at most; where there are more distinct scores, evenly spaced ones among them.
+MOST_THRESHOLDS = 4096
+
+
+@dataclass(frozen=True)
+class Control:
+    """A threshold and what it did on the scenes it was chosen on."""
+
+    threshold: float | None  # answer where score ≥ threshold; None = answer nothing
+    target: float
+    bound: float | None  # what was held against the target, at the threshold
+    risk: float  # mean over the scenes, at the threshold: of what the control calls risk
+    coverage: float  # mean over the scenes of answered / candidates, at the threshold
+    n: int  # scenes it was chosen on
+    needed: int | None = None  # scenes below which no threshold can meet the target; None = no such number
+    confidence: float | None = None
+
+    @property
+    def why(self) -> str:
+        """In words."""
+        if self.needed is not None and self.n < self.needed:
+            return f"{self.n} scenes are too few: a target of {self.target:g} takes at least {self.needed}"
+        if self.threshold is None:
+            return f"no threshold meets {self.target:g} on these {self.n} scenes"
+        return f"score ≥ {self.threshold:.4g} answers {self.coverage:.1%} of the candidates"
+
+
+def plug_in(scenes: Sequence[Points], target: float) -> Control:
+    """The largest coverage whose scene-mean risk plus one standard error over scenes meets the target.
+
+    The risk of a scene is the mean capped error of its answers, 0 where it is silent. No guarantee is claimed.
+
+    Args:
+        scenes: candidates with scores, one entry a scene; scenes without candidates are passed over.
+        target: mean capped error allowed, in (0, 1).
+
+    Returns:
+        Control; with fewer than two scenes there is no standard error and no threshold.
+
+    Raises:
+        ValueError: a target outside (0, 1).
+    """
+    scenes = _checked(scenes, target)
+    thresholds = _thresholds(scenes)
+    loss, answered = _accepted(scenes, thresholds)
+    risk = loss / answered.clamp_min(1)
+    coverage = answered / _sizes(scenes)
+    n = len(scenes)
+    spread = risk.std(0) / math.sqrt(n) if n > 1 else torch.full_like(thresholds, torch.inf)
+    bound = risk.mean(0) + spread
+    return _lowest(thresholds, bound <= target, bound, risk, coverage, target=target)
+
+
+def conformal(scenes: Sequence[Points], target: float, *, confidence: float | None = None) -> Control:
+    """A threshold under which the loss of the next scene meets the target, if scenes are exchangeable.
+
+    The loss of a scene is the sum of the capped errors of its answers over the number of its candidates: between 0
+    and 1, and never larger at a higher threshold. In expectation: n / (n + 1) · (mean loss) + 1 / (n + 1) ≤ target.
+    With a confidence: the Hoeffding–Bentkus p-value of "the expected loss exceeds the target" is at most
+    1 − confidence, here and at every higher threshold.
+
+    Args:
+        scenes: candidates with scores, one entry a scene; scenes without candidates are passed over.
+        target: loss allowed, in (0, 1).
+        confidence: None promises E(loss of the next scene) ≤ target, over the scenes here and the next one; a
+            probability in (0, 1) promises that, with it, the scenes here give a threshold whose expected loss is at
+            most the target.
+
+    Returns:
+        Control with ``needed`` = 1 / target − 1, or ln(1 − confidence) / ln(1 − target), rounded up; no threshold with
+        fewer scenes. Its ``bound`` is the left side of the inequality, or the p-value.
+
+    Raises:
+        ValueError: a target or confidence outside (0, 1).
+
+    Source: A. Angelopoulos et al., "Conformal risk control", 2024; S. Bates et al., "Distribution-free,
+    risk-controlling prediction sets", 2021 (with confidence).
+    """
+    scenes = _checked(scenes, target)
+    thresholds = _thresholds(scenes)
+    loss, answered = _accepted(scenes, thresholds)
+    sizes, n = _sizes(scenes), len(scenes)
+    risk = loss / sizes
+    needed = scenes_needed(target, confidence=confidence)
+    if confidence is None:
+        bound = (risk.sum(0) + 1) / (n + 1)
+        fits = bound <= target
+    else:
+        bound = torch.tensor([p_value(r, n, target) for r in risk.mean(0).tolist()], dtype=torch.float64)
+        fits = bound <= 1 - confidence
+    # Thresholds rise and so must "fits": rounding in the p-value must not open a gap below a threshold that fails.
+    fails_above = (~fits).long().flip(0).cumsum(0).flip(0) > 0
+    fits = ~fails_above & (n >= needed)
+    return _lowest(thresholds, fits, bound, risk, answered / sizes, target=target, needed=needed, confidence=confidence)
+
+
+def scenes_needed(target: float, *, confidence: float | None = None) -> int:
+    """Fewest scenes on which :func:`conformal` can meet a target, were they all without any error.
+
+    Raises:
+        ValueError: a target or confidence outside (0, 1).
+    """
+    _probability("target", target)
+    if confidence is None:
+        return math.ceil(1 / target - 1 - 1e-9)
+    _probability("confidence", confidence)
+    return math.ceil(math.log(1 - confidence) / math.log(1 - target) - 1e-9)
+
+
+def p_value(mean: float, n: int, target: float) -> float:
+    """Hoeffding–Bentkus: how probable a mean loss as small as ``mean`` over n scenes is where ``target`` is exceeded.
+
+    Losses lie in [0, 1] and are independent.
+    """
+    if n == 0 or mean >= target:
+        return 1.0
+    divergence = (1 - mean) * math.log((1 - mean) / (1 - target))
+    divergence += mean * math.log(mean / target) if mean > 0 else 0.0
+    bentkus = math.e * _binomial_cdf(math.ceil(n * mean - 1e-9), n, target)
+    return min(1.0, math.exp(-n * divergence), bentkus)
+
+
+def _accepted(scenes: Sequence[Points], thresholds: Tensor) -> tuple[Tensor, Tensor]:
+    """Sum of the capped errors of what is accepted, and its number: (scenes, thresholds) each."""
+    loss, count = [], []
+    for scene in scenes:
+        answered = scene.answered()
+        score, order = answered.score.sort()
+        total = torch.cat((score.new_zeros(1), capped(answered.error[order]).cumsum(0)))
+        below = torch.searchsorted(score, thresholds)
+        loss.append((total[-1] - total[below]).clamp_min(0))
+        count.append((score.numel() - below).double())
+    none = torch.zeros(0, thresholds.numel(), dtype=torch.float64)
+    return (torch.stack(loss), torch.stack(count)) if loss else (none, none)
+
+
+def _thresholds(scenes: Sequence[Points]) -> Tensor:
+    """Scores of answers, rising: every threshold that makes a difference, or evenly spaced ones among them."""
+    scores = torch.cat([s.answered().score for s in scenes] or [torch.zeros(0, dtype=torch.float64)]).unique()
+    if scores.numel() > MOST_THRESHOLDS:
+        scores = scores[torch.linspace(0, scores.numel() - 1, MOST_THRESHOLDS, dtype=torch.float64).round().long()]
+    return scores
+
+
+def _sizes(scenes: Sequence[Points]) -> Tensor:
+    return torch.tensor([s.keep.numel() for s in scenes], dtype=torch.float64)[:, None]
+
+
+def _lowest(
+    thresholds: Tensor,
+    fits: Tensor,
+    bound: Tensor,
+    risk: Tensor,
+    coverage: Tensor,
+    *,
+    target: float,
+    needed: int | None = None,
+    confidence: float | None = None,
+) -> Control:
+    """The lowest threshold that fits, which answers most; None of none."""
+    n = risk.shape[0]
+    if not bool(fits.any()):
+        return Control(None, target, None, 0.0, 0.0, n, needed, confidence)
+    k = int(fits.long().argmax())
+    means = float(risk[:, k].mean()), float(coverage[:, k].mean())
+    return Control(float(thresholds[k]), target, float(bound[k]), *means, n, needed, confidence)
+
+
+def _checked(scenes: Sequence[Points], target: float) -> list[Points]:
+    _probability("target", target)
+    return [s for s in scenes if s.keep.numel()]
+
+
+def _probability(name: str, value: float) -> None:
+    if not 0 < value < 1:
+        raise ValueError(f"control.{name}: found {value}, expected a number between 0 and 1")
+
+
+def _binomial_cdf(k: int, n: int, p: float) -> float:
+    """P(X ≤ k) of a binomial, summed from logarithms."""
+    if k >= n:
+        return 1.0
+    terms = (
+        math.lgamma(n + 1) - math.lgamma(i + 1) - math.lgamma(n - i + 1) + i * math.log(p) + (n - i) * math.log1p(-p)
+        for i in range(k + 1)
+    )
+    return min(1.0, math.fsum(math.exp(t) for t in terms))

@@ -1,0 +1,224 @@
+"""What scores and sigmas turned out to be worth on some scenes, so that they can be believed on others.
+
+A calibration is fitted on scenes with truth and travels as a small text: two tables of the score (probability of a
+good answer, error to expect), a sigmoid as the simple control, a factor for sigma, and thresholds chosen by the
+plug-in control, beside a note of where all that comes from.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dhtorch.evaluate import control
+from dhtorch.evaluate.calibrate import GOOD, pool
+from dhtorch.evaluate.errors import Points
+from dhtorch.evaluate.monotone import Sigmoid, Table, isotonic, platt
+from dhtorch.evaluate.risk import capped
+
+SCHEMA = 1
+
+#: Share of the fitting scenes' weight on which a step of a table must rest.
+MIN_SHARE = 0.02
+
+#: Probability that a normal variable lies within one standard deviation.
+ONE_SIGMA = 0.6826894921370859
+
+#: Targets, in per cent, for which thresholds are kept.
+TARGETS = (5, 10, 20)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What a score and a sigma mean, as measured on the scenes named in ``provenance``."""
+
+    probability: Table  # score → P(relative error < 10 %)
+    expected_error: Table  # score → mean capped relative error
+    sigmoid: Sigmoid  # score in [0, 1] → P(relative error < 10 %), the simple control
+    sigma_scale: float | None  # true standard deviation over the stated one; None = none was stated
+    thresholds: Mapping[int, float | None]  # per cent of mean error → plug-in threshold on the score; None = none fits
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def apply(self, scene: Points) -> Points:
+        """The same answers with calibrated score and sigma."""
+        score = torch.where(scene.keep, self.probability(scene.score), 0.0)
+        return scene.replace(score=score, sigma=scene.sigma * (1.0 if self.sigma_scale is None else self.sigma_scale))
+
+    def min_score(self, percent: int) -> float | None:
+        """The threshold for a mean error of ``percent``, on the calibrated score; None = answer nothing.
+
+        Raises:
+            KeyError: no threshold was fitted for that target.
+        """
+        threshold = self.thresholds[percent]
+        return None if threshold is None else float(self.probability(torch.tensor(threshold, dtype=torch.float64)))
+
+    def to_json(self) -> str:
+        """The calibration as strict JSON."""
+        content = {
+            "schema": SCHEMA,
+            "good_error": GOOD,
+            "probability": _corners(self.probability),
+            "expected_error": _corners(self.expected_error),
+            "sigmoid": {"slope": float(self.sigmoid.slope), "offset": float(self.sigmoid.offset)},
+            "sigma_scale": self.sigma_scale,
+            "thresholds": {str(k): v for k, v in self.thresholds.items()},
+            "provenance": dict(self.provenance),
+        }
+        return json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def fit(
+    scenes: Sequence[Points],
+    *,
+    min_share: float = MIN_SHARE,
+    targets: Sequence[int] = TARGETS,
+    provenance: Mapping[str, Any] | None = None,
+) -> Calibration:
+    """Learn from scenes with truth what their scores and sigmas are worth; every scene has the same weight.
+
+    Args:
+        scenes: candidates with answers, scores and, where stated, sigmas; any depth source.
+        min_share: share of the weight on which a step of a table must rest.
+        targets: mean errors, in per cent, for which :func:`dhtorch.evaluate.control.plug_in` chooses a threshold.
+        provenance: where the scenes come from, as JSON can hold it; ``n_scenes`` and ``n_answers`` are added. A file
+            that is shipped names ``method`` and ``scenes``.
+
+    Raises:
+        ValueError: no answer in any scene.
+    """
+    score, good, weight = pool(scenes)
+    if not score.numel():
+        raise ValueError("fit: found no answer in any scene, expected some")
+    loss = capped(torch.cat([s.answered().error for s in scenes]))
+    ends = (0.0, 1.0) if bool(((score >= 0) & (score <= 1)).all()) else None
+    note = {**(provenance or {}), "n_scenes": sum(bool(s.keep.any()) for s in scenes), "n_answers": score.numel()}
+    return Calibration(
+        probability=isotonic(score, good.double(), weight, min_share=min_share, ends=ends),
+        expected_error=isotonic(score, loss, weight, rising=False, min_share=min_share, ends=ends),
+        sigmoid=platt(score, good, weight),
+        sigma_scale=sigma_scale(scenes),
+        thresholds={percent: control.plug_in(scenes, percent / 100).threshold for percent in targets},
+        provenance=note,
+    )
+
+
+def sigma_scale(scenes: Sequence[Points]) -> float | None:
+    """The factor after which 68 % of the answers lie within one sigma, every scene of the same weight.
+
+    None where no sigma is stated.
+    """
+    ratios, weights = [], []
+    for scene in scenes:
+        answered = scene.answered()
+        ratio = (answered.depth - answered.true_depth).abs() / answered.sigma
+        ratio = ratio[answered.sigma.isfinite() & (answered.sigma > 0)]
+        ratios.append(ratio)
+        weights.append(torch.full_like(ratio, 1 / max(ratio.numel(), 1)))
+    if not sum(r.numel() for r in ratios):
+        return None
+    ratio, weight = torch.cat(ratios), torch.cat(weights)
+    order = ratio.argsort()
+    below = weight[order].cumsum(0) / weight.sum()
+    k = int(torch.searchsorted(below, torch.tensor(ONE_SIGMA, dtype=below.dtype)))
+    return float(ratio[order][min(k, ratio.numel() - 1)])
+
+
+def from_json(text: str, where: str = "calibration") -> Calibration:
+    """Read what :meth:`Calibration.to_json` wrote.
+
+    Args:
+        text: the file's content.
+        where: its name, for the message.
+
+    Raises:
+        ValueError: not strict JSON, or a field is missing, unknown or out of range; the message names file and field.
+    """
+    try:
+        content = json.loads(text, parse_constant=_refuse)
+    except ValueError as error:
+        raise ValueError(f"{where}: found no strict JSON ({error}), expected a calibration") from error
+    known = ("schema", "good_error", "probability", "expected_error", "sigmoid", "sigma_scale", "thresholds")
+    _fields(content, (*known, "provenance"), where)
+    for name, value in (("schema", SCHEMA), ("good_error", GOOD)):
+        _expect(content[name] == value, f"{where}.{name}", content[name], str(value))
+    _fields(content["sigmoid"], ("slope", "offset"), f"{where}.sigmoid")
+    slope, offset = (_number(content["sigmoid"][k], f"{where}.sigmoid.{k}") for k in ("slope", "offset"))
+    scale = content["sigma_scale"]
+    if scale is not None:
+        _expect(_number(scale, f"{where}.sigma_scale") > 0, f"{where}.sigma_scale", scale, "a positive number or null")
+    _expect(isinstance(content["provenance"], dict), f"{where}.provenance", content["provenance"], "an object")
+    return Calibration(
+        probability=_read_table(content["probability"], f"{where}.probability", rising=True),
+        expected_error=_read_table(content["expected_error"], f"{where}.expected_error", rising=False),
+        sigmoid=Sigmoid(torch.tensor(slope, dtype=torch.float64), torch.tensor(offset, dtype=torch.float64)),
+        sigma_scale=None if scale is None else float(scale),
+        thresholds=_read_thresholds(content["thresholds"], f"{where}.thresholds"),
+        provenance=content["provenance"],
+    )
+
+
+def _corners(table: Table) -> dict[str, list[float]]:
+    return {"score": table.x.tolist(), "value": table.y.tolist()}
+
+
+def _read_table(content: Any, where: str, *, rising: bool) -> Table:
+    _fields(content, ("score", "value"), where)
+    columns: dict[str, Tensor] = {}
+    for name in ("score", "value"):
+        _expect(isinstance(content[name], list) and content[name] != [], f"{where}.{name}", content[name], "a list")
+        numbers = [_number(v, f"{where}.{name}.{k}") for k, v in enumerate(content[name])]
+        columns[name] = torch.tensor(numbers, dtype=torch.float64)
+    x, y = content["score"], content["value"]
+    _expect(len(x) == len(y), f"{where}.value", f"{len(y)} numbers", f"{len(x)}, one for each score")
+    _expect(all(a < b for a, b in pairwise(x)), f"{where}.score", x, "rising numbers")
+    ordered = all((a <= b) if rising else (a >= b) for a, b in pairwise(y))
+    _expect(ordered and all(0 <= v <= 1 for v in y), f"{where}.value", y, f"{_direction(rising)} numbers from 0 to 1")
+    return Table(columns["score"], columns["value"])
+
+
+def _read_thresholds(content: Any, where: str) -> dict[int, float | None]:
+    _expect(isinstance(content, dict), where, content, "an object")
+    found: dict[int, float | None] = {}
+    for name, value in content.items():
+        _expect(
+            name.isdecimal() and len(name) <= 2 and int(name) > 0, f"{where}.{name}", name, "a whole number of per cent"
+        )
+        found[int(name)] = None if value is None else _number(value, f"{where}.{name}")
+    return found
+
+
+def _direction(rising: bool) -> str:
+    return "rising" if rising else "falling"
+
+
+def _fields(content: Any, names: Sequence[str], where: str) -> None:
+    _expect(isinstance(content, dict), where, content, "an object")
+    for name in names:
+        _expect(name in content, f"{where}.{name}", "nothing", "a value")
+    for name in content:
+        _expect(name in names, f"{where}.{name}", "an unknown field", ", ".join(names))
+
+
+def _number(value: Any, where: str) -> float:
+    plain = isinstance(value, int | float) and not isinstance(value, bool)
+    fine = plain and abs(value) <= sys.float_info.max
+    _expect(fine, where, value, "a finite number")
+    return float(value)
+
+
+def _expect(condition: bool, where: str, found: Any, expected: str) -> None:
+    if not condition:
+        shown = found if isinstance(found, str) else json.dumps(found)
+        raise ValueError(f"{where}: found {shown if len(shown) <= 60 else shown[:57] + '...'}, expected {expected}")
+
+
+def _refuse(word: str) -> None:
+    raise ValueError(f"the constant {word}")
