@@ -31,6 +31,12 @@ UNKEYED = frozenset(
 #: Bytes of a data file's head and tail that enter a digest: enough to tell recordings apart, cheap for large ones.
 EDGE_BYTES = 64 * 1024
 
+#: Options that say nothing about a result to its reader.
+_PLACES = ("hydra", "output")
+
+#: Ends the name of a file that is being written.
+_UNFINISHED = ".tmp"
+
 _PACKAGES = ("dhtorch", "torch", "kornia", "numpy", "opencv-python-headless", "hydra-core")
 
 #: Field → type, for the result and for its parts.
@@ -139,7 +145,7 @@ def write(path: str | Path, result: Mapping[str, Any]) -> Path:
     validate(result, str(path))
     text = json.dumps(result, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=_UNFINISHED, dir=path.parent)
     try:
         with os.fdopen(handle, "w", encoding="utf-8") as file:
             file.write(text)
@@ -152,6 +158,13 @@ def write(path: str | Path, result: Mapping[str, Any]) -> Path:
         raise
     _sync_folder(path.parent)
     return path
+
+
+def clear(path: str | Path) -> None:
+    """Remove what a writer of ``path`` left beside it when it was killed. Nobody may be writing ``path`` meanwhile."""
+    path = Path(path)
+    for left in path.parent.glob(f".{path.name}.*{_UNFINISHED}"):
+        left.unlink(missing_ok=True)
 
 
 def read(path: str | Path) -> dict[str, Any]:
@@ -185,11 +198,12 @@ def result_key(config: Mapping[str, Any], digest: str, *, code_dir: str | Path |
     """SHA-256 over everything that decides a result: the settings, the code and the data.
 
     Args:
-        config: resolved settings; the options in ``UNKEYED`` are left out at every depth.
+        config: resolved settings; the options in ``UNKEYED`` are left out at every depth, and of an absolute file
+            name only what :func:`portable` keeps counts.
         digest: of the data, from :func:`data_digest`.
         code_dir: the folder whose ``**/*.py`` count; None = this package.
     """
-    settings = json.dumps(_keyed(config), sort_keys=True, default=str)
+    settings = json.dumps(_keyed(portable(config)), sort_keys=True, default=str)
     total = hashlib.sha256()
     for part in (settings.encode(), digest.encode()):
         _add(total, part)
@@ -236,19 +250,19 @@ def portable(config: Mapping[str, Any], base: str | Path | None = None) -> dict[
     """Settings without what belongs to one machine.
 
     An absolute file name, and any ``root``, is written relative to ``base`` (None: the environment variable
-    DHTORCH_DATA) where it lies below it, else as its last component; ``hydra`` is left out.
+    DHTORCH_DATA) where it lies below it, else as its last component; ``hydra`` and ``output`` are left out.
     """
     base = os.environ.get("DHTORCH_DATA") if base is None else base
 
     def shorten(name: str, value: Any) -> Any:
         if isinstance(value, Mapping):
-            return {str(k): shorten(str(k), v) for k, v in value.items() if k != "hydra"}
+            return {str(k): shorten(str(k), v) for k, v in value.items() if k not in _PLACES}
         if isinstance(value, list | tuple):
             return [shorten(name, v) for v in value]
         is_place = isinstance(value, str | Path) and str(value) and (name == "root" or Path(value).is_absolute())
         return _shorter(Path(value), base) if is_place else value
 
-    return {str(k): shorten(str(k), v) for k, v in config.items() if k != "hydra"}
+    return {str(k): shorten(str(k), v) for k, v in config.items() if k not in _PLACES}
 
 
 def _fields(value: Any, kinds: Mapping[str, Any], where: str, more: bool = False) -> None:

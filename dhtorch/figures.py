@@ -13,6 +13,10 @@ from typing import Any
 import numpy as np
 
 from dhtorch.codes import ROUTE_OF_HOLE, Gate, Hole, Route, Source, names, words
+from dhtorch.evaluate import errors
+from dhtorch.evaluate.risk import risk_coverage
+from dhtorch.geometry.camera import unproject
+from dhtorch.pair import merge
 
 #: Colours that stay apart for the colour-blind (Okabe and Ito); what was silent is paler than what was answered.
 SENSOR, RECOVERED, SILENT, INK = "#0072B2", "#E69F00", "#B4B4B4", "#333333"
@@ -215,6 +219,32 @@ def draw_risk_coverage(
     axes.set(xlabel="answered share of the candidates, %", ylabel="mean relative error (at most 1), %")
     _legend(axes, *axes.get_legend_handles_labels())
     _save(figure, path)
+
+
+def draw_example(folder: str | Path, example: Any) -> list[Path]:
+    """Figures and the point cloud of one pair; returns the files written.
+
+    Args:
+        folder: made if need be.
+        example: a :class:`dhtorch.experiments.protocol.Example`.
+    """
+    e, folder = example.cpu(), Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    whole, image, uv = merge(e.samples, e.estimate), e.frame.image[0], e.samples.uv[0]
+    draw_samples(folder / "samples.png", image, uv, whole.source[0], e.estimate.gate[0])
+    draw_holes(folder / "holes.png", image, uv, e.samples.hole[0])
+    written = ["samples.png", "holes.png", "points.ply"]
+    pooled = errors.select(e.estimate, e.truth)
+    if pooled.keep.any():
+        draw_depth(folder / "depth.png", pooled.true_depth, pooled.depth, pooled.score)
+        curves, oracle = {e.method: risk_coverage(pooled)}, risk_coverage(pooled, oracle=True)
+        draw_risk_coverage(folder / "risk_coverage.png", curves, oracle=oracle)
+        written += ["depth.png", "risk_coverage.png"]
+    filled = whole.source[0] != Source.NONE
+    xyz = unproject(e.frame.camera, whole.uv, whole.depth)[0][filled]
+    columns = {name: getattr(whole, name)[0][filled] for name in ("source", "sigma", "score")}
+    write_ply(folder / "points.ply", xyz, **columns)
+    return [folder / name for name in written]
 
 
 def _array(x: Any) -> np.ndarray:

@@ -1,48 +1,63 @@
 """The ``dhtorch`` command: Hydra turns names into functions, everything else happens in the library.
 
-A first word that names a sub-command goes to that module; anything else is a list of Hydra overrides.
+A first word that names a sub-command goes to that module; anything else is a list of Hydra overrides. Every job has a
+folder of its own, named by its overrides inside a sweep, and reports how it ended instead of raising: one failing job
+stops no other, whichever launcher runs them.
 """
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import importlib
+import os
+import re
+import shlex
 import sys
 import traceback
-from collections.abc import Iterable, Iterator, Mapping
+import warnings
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 #: Sub-command → module with ``main(argv) -> int``.
 COMMANDS = {"inspect": "dhtorch.capture", "report": "dhtorch.report"}
 
+#: Exit codes, as ``dhtorch --help`` lists them.
+DONE, SOME_FAILED, FAILED, INTERRUPTED = 0, 1, 2, 130
+
 #: What bad input raises: reported in one line, without a traceback.
 USER_ERRORS = (ValueError, OSError, KeyError, ImportError)
 
-#: Flags of Hydra that do something else than run one job.
-NOT_ONE_JOB = {
-    "-m",
-    "--multirun",
-    "-h",
-    "--help",
-    "--hydra-help",
-    "-i",
-    "--info",
-    "-sc",
-    "--shell-completion",
-    "-c",
-    "--cfg",
-}
+#: Flags of Hydra that show something and run nothing.
+SHOW = {"-h", "--help", "--hydra-help", "--version", "-i", "--info", "-sc", "--shell-completion", "-c", "--cfg"}
+SWEEP = {"-m", "--multirun"}
+
+#: How a job may end, and in words.
+STATES = {"finished": "finished", "untouched": "left untouched", "failed": "failed"}
+
+#: Where results lie that are to be resumed, when no ``output`` is given.
+RESUMED = Path("outputs/resumed")
+
+#: A longer folder name is cut and told apart by a hash.
+LONGEST_NAME = 120
 
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point of the console script; returns the exit code."""
     argv = sys.argv[1:] if argv is None else argv
-    if argv and argv[0] in COMMANDS:
+    with warnings.catch_warnings():
+        _hush()
         try:
-            return int(importlib.import_module(COMMANDS[argv[0]]).main(argv[1:]) or 0)
+            if argv and argv[0] in COMMANDS:
+                return int(importlib.import_module(COMMANDS[argv[0]]).main(argv[1:]) or 0)
+            return _run_hydra(argv)
         except USER_ERRORS as error:
             return _fail(error, show="--traceback" in argv)
-    return _run_hydra(argv)
+        except KeyboardInterrupt:
+            print("dhtorch: interrupted", file=sys.stderr)
+            return INTERRUPTED
 
 
 def config_dir() -> Path:
@@ -54,142 +69,138 @@ def config_dir() -> Path:
     raise FileNotFoundError(f"settings folder: found neither {here / 'conf'} nor {here.parent / 'conf'}")
 
 
+def job_name(overrides: str) -> str:
+    """Folder name of a job: its overrides, where they are short and every file system takes them.
+
+    What a file system or a shell would trip over is left out, what is too long is cut; a hash of the whole text then
+    keeps different jobs apart. Data below the environment variable DHTORCH_DATA is named relative to it.
+    """
+    base = os.environ.get("DHTORCH_DATA")
+    text = overrides.replace(base.rstrip("/") + "/", "") if base else overrides
+    plain = re.sub(r"[^\w.,=+~@-]", "", text.replace("/", "-"), flags=re.ASCII)
+    if plain == text and len(plain) <= LONGEST_NAME:
+        return plain or "defaults"
+    return f"{plain[: LONGEST_NAME - 9]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+
+
 def _run_hydra(argv: list[str]) -> int:
     import hydra  # noqa: PLC0415  (a sub-command must not pay for it)
+    from hydra.core.global_hydra import GlobalHydra  # noqa: PLC0415
     from hydra.errors import HydraException  # noqa: PLC0415
+    from hydra.types import RunMode  # noqa: PLC0415
+    from omegaconf import OmegaConf  # noqa: PLC0415
     from omegaconf.errors import OmegaConfBaseException  # noqa: PLC0415
 
-    words = {a.split("=")[0] for a in argv}
-    single = not (NOT_ONE_JOB & words)
-    if single:
-        try:  # a misspelt option fails here, in one line, before anything is imported or run
-            with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
-                hydra.compose("run", [a for a in argv if not a.startswith("-")])
-        except (HydraException, OmegaConfBaseException) as error:
-            return _fail(error)
-    codes: list[int] = []
+    OmegaConf.register_new_resolver("dhtorch.job_name", job_name, replace=True)
+    if SHOW & {a.split("=")[0] for a in argv}:
+        sys.argv = [sys.argv[0], *argv]
+        hydra.main(config_path=str(config_dir()), config_name="run", version_base="1.3")(_job)()
+        return DONE
+    unknown = [a for a in argv if a.startswith("-") and a not in SWEEP]
+    if unknown:
+        return _fail(ValueError(f"{unknown[0]}: found an unknown flag, expected {', '.join(sorted(SWEEP | SHOW))}"))
+    overrides, sweep = [a for a in argv if a not in SWEEP], bool(SWEEP & set(argv))
+    try:
+        with hydra.initialize_config_dir(str(config_dir()), version_base="1.3", job_name="dhtorch"):
+            engine: Any = GlobalHydra.instance().hydra
+            mode = RunMode.MULTIRUN if sweep else RunMode.RUN
+            # A misspelt option fails here, in one line, before anything is imported or run.
+            cfg = engine.compose_config("run", overrides, run_mode=mode, with_log_configuration=False)
+            folder = _output(cfg, overrides, sweep)
+            overrides = [o for o in overrides if not o.startswith("output=")] + [f"output={_quote(str(folder))}"]
+            again = _again(argv, folder)
+            if sweep:
+                return _sweep(engine, overrides, again, show=cfg.traceback)
+            return _single(engine, overrides, again)
+    except (HydraException, OmegaConfBaseException) as error:
+        return _fail(error)
 
-    def job(cfg: Any) -> int:
-        code = _job(cfg)
-        codes.append(code)
-        if code and not single:
-            raise SystemExit(code)  # the launcher of a sweep reports which job failed
-        return code
 
-    sys.argv = [sys.argv[0], *argv]
-    hydra.main(config_path=str(config_dir()), config_name="run", version_base="1.3")(job)()
-    return max(codes, default=0)
+def _single(engine: Any, overrides: Sequence[str], again: str) -> int:
+    try:
+        ended = engine.run("run", _job, list(overrides)).return_value
+    except KeyboardInterrupt:
+        print(f"dhtorch: interrupted, nothing written. Once more:\n  {again}", file=sys.stderr)
+        return INTERRUPTED
+    return FAILED if ended.state == "failed" else DONE
 
 
-def _job(cfg: Any) -> int:
-    """One job: build what the settings name, run the experiment, write and show the result. Returns the exit code."""
+def _sweep(engine: Any, overrides: Sequence[str], again: str, show: bool) -> int:
+    """Run all jobs, then say how they ended."""
+    from hydra.errors import HydraException  # noqa: PLC0415
+
+    go_on = f"What is finished stays. To do the rest:\n  {again}"
+    try:
+        batches = engine.multirun("run", _job, list(overrides))
+    except KeyboardInterrupt:
+        print(f"\ndhtorch: interrupted. {go_on}", file=sys.stderr)
+        return INTERRUPTED
+    except HydraException:
+        raise
+    except Exception as error:  # the launcher broke, as when a worker process is killed
+        _fail(error, show)
+        print(go_on, file=sys.stderr)
+        return SOME_FAILED
+    jobs = [job for batch in batches for job in batch]
+    counts = Counter(job.return_value.state for job in jobs)
+    shares = ", ".join(f"{counts[state]} {words}" for state, words in STATES.items())
+    print(f"{len(jobs)} job{'s' * (len(jobs) != 1)}: {shares}", flush=True)
+    if not counts["failed"]:
+        return DONE
+    common = set.intersection(*(set(job.overrides) for job in jobs))
+    for job in jobs:
+        if job.return_value.state == "failed":
+            name = " ".join(o for o in job.overrides if o not in common) or Path(job.return_value.folder).name
+            print(f"failed: {name}: {job.return_value.error}", file=sys.stderr)
+    print(go_on, file=sys.stderr)
+    return SOME_FAILED
+
+
+def _job(cfg: Any) -> Any:
+    """One job, in whatever process a launcher runs it: build what the settings name and run it. Never raises."""
     from hydra.core.hydra_config import HydraConfig  # noqa: PLC0415
     from hydra.errors import InstantiationException  # noqa: PLC0415
     from hydra.utils import instantiate  # noqa: PLC0415
     from omegaconf import OmegaConf  # noqa: PLC0415
     from omegaconf.errors import OmegaConfBaseException  # noqa: PLC0415
 
+    _hush()
+    from dhtorch import job  # noqa: PLC0415
+
+    runtime = HydraConfig.get().runtime
+    alone = runtime.choices["hydra/launcher"] == "basic"
     try:
-        runtime = HydraConfig.get().runtime
         settings: Any = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
         parts = {k: instantiate(cfg[k], _convert_="all") for k in ("data", "method", "pairs", "experiment")}
-        _execute(settings, parts, dict(runtime.choices), Path(runtime.output_dir))
-    except InstantiationException as error:
-        return _fail(error.__cause__ or error, show=cfg.traceback)
-    except (*USER_ERRORS, OmegaConfBaseException) as error:
-        return _fail(error, show=cfg.traceback)
-    return 0
+        progress = _progress if alone else lambda items, _text, _total: items
+        return job.run(settings, parts, dict(runtime.choices), Path(runtime.output_dir), progress=progress)
+    except Exception as error:
+        cause = error.__cause__ if isinstance(error, InstantiationException) and error.__cause__ else error
+        expected = isinstance(cause, (*USER_ERRORS, OmegaConfBaseException, InstantiationException))
+        _fail(cause, show=cfg.traceback or not expected)
+        with contextlib.suppress(OSError):
+            Path(runtime.output_dir).rmdir()  # where nothing is in it
+        return job.Ended(runtime.output_dir, "failed", _line(cause))
 
 
-def _execute(settings: dict[str, Any], parts: dict[str, Any], choices: Mapping[str, str], folder: Path) -> None:
-    import torch  # noqa: PLC0415
-
-    from dhtorch import archive, report  # noqa: PLC0415
-    from dhtorch.data import files as data_files  # noqa: PLC0415
-    from dhtorch.experiments.protocol import MIN_CANDIDATES  # noqa: PLC0415
-
-    if settings["threads"] is not None:
-        torch.set_num_threads(settings["threads"])
-        data_files.set_opencv_threads(settings["threads"])
-    recordings = _recordings(parts["data"])
-    digest = archive.data_digest(_files(recordings))
-    key = archive.result_key(settings | {"choices": dict(choices)}, digest)
-    target = folder / "result.json"
-    if settings["resume"] and archive.finished(target, key):
-        print(f"{target}: finished and valid, left untouched")
-        return
-    outcome = parts["experiment"](
-        recordings, {choices["method"]: parts["method"]}, parts["pairs"], _common(settings), progress=_progress
-    )
-    meta = archive.meta(
-        device=settings["device"], dtype=settings["dtype"], threads=torch.get_num_threads(), seed=settings["seed"]
-    )
-    scenes = [r.name for r in recordings]
-    result = archive.build(
-        experiment=choices["experiment"],
-        key=key,
-        meta=meta,
-        config=settings,
-        data={
-            "name": choices["data"],
-            "scenes": scenes,
-            "n_pairs": outcome.n_pairs,
-            "digest": digest,
-        },
-        summary=outcome.summary,
-        rows=outcome.rows,
-        question=outcome.question,
-        expectation=outcome.expectation,
-        verdict=outcome.verdict,
-        why=outcome.why,
-    )
-    archive.write(target, result)
-    report.print_tables(result)
-    few = {r["scene"]: r["n_few"] for r in outcome.rows if r["pair"] is None and r["n_few"]}
-    for scene, n in few.items():
-        print(f"{scene}: {n} pair{'s' * (n > 1)} dropped, fewer than {MIN_CANDIDATES} candidates each")
-    written = [target, *(_draw(outcome.examples, folder) if settings["figures"] else ())]
-    if outcome.verdict:
-        print(f"{outcome.verdict}: {outcome.why}")
-    print("\n".join(["wrote", *(f"  {path}" for path in written)]))
+def _output(cfg: Any, overrides: Iterable[str], sweep: bool) -> Path:
+    """Folder of the job, or of the sweep, as an absolute name: workers may start elsewhere."""
+    if not cfg.resume or any(o.startswith("output=") for o in overrides):
+        return Path(str(cfg.output)).absolute()
+    return (RESUMED if sweep else RESUMED / job_name(cfg.hydra.job.override_dirname)).absolute()
 
 
-def _common(settings: Mapping[str, Any]) -> Any:
-    """The options that every pair of the job shares."""
-    import torch  # noqa: PLC0415
-
-    from dhtorch.experiments.protocol import Settings  # noqa: PLC0415
-
-    dtype = getattr(torch, str(settings["dtype"]), None)
-    if dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"dtype: found {settings['dtype']!r}, expected float32 or float64")
-    holdout = settings["holdout"]
-    for name, low in (("batch", 1), ("workers", 0)):
-        if not isinstance(settings[name], int) or settings[name] < low:
-            raise ValueError(f"{name}: found {settings[name]!r}, expected a whole number of at least {low}")
-    return Settings(
-        cutoff=holdout["cutoff"],
-        truth=(holdout["truth"],),
-        seed=settings["seed"],
-        device=settings["device"],
-        dtype=dtype,
-        batch=settings["batch"],
-        workers=settings["workers"],
-    )
+def _again(argv: Iterable[str], folder: Path) -> str:
+    """The command that goes on where this one ended."""
+    words = [a for a in argv if not a.startswith(("resume=", "output="))]
+    own = any(a.startswith(("hydra.run.dir=", "hydra.sweep.dir=")) for a in words)
+    place = folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
+    return shlex.join(["dhtorch", *words, "resume=true", *([] if own else [f"output={_quote(str(place))}"])])
 
 
-def _recordings(data: Any) -> list[Any]:
-    """A data set is one recording or a list of them."""
-    return data if isinstance(data, list) else [data]
-
-
-def _files(recordings: Iterable[Any]) -> dict[str, Path]:
-    """Relative name → file of everything below the recordings' folders."""
-    files: dict[str, Path] = {}
-    for root in {r.root for r in recordings if r.root is not None}:
-        below = sorted(p for p in root.rglob("*") if p.is_file()) if root.is_dir() else [root]
-        files |= {f"{root.name}/{p.relative_to(root)}" if p != root else root.name: p for p in below}
-    return files
+def _quote(text: str) -> str:
+    """A value as Hydra's grammar takes it."""
+    return text if re.fullmatch(r"[\w./-]+", text) else "'" + text.replace("'", r"\'") + "'"
 
 
 def _progress(items: Iterable[Any], text: str, total: int) -> Iterator[Any]:
@@ -199,42 +210,25 @@ def _progress(items: Iterable[Any], text: str, total: int) -> Iterator[Any]:
     yield from track(items, description=f"{text:24}", total=total, disable=not sys.stderr.isatty(), transient=True)
 
 
-def _draw(examples: Iterable[Any], folder: Path) -> list[Path]:
-    """Figures and the point cloud of the first pair of every scene."""
-    from dhtorch import figures  # noqa: PLC0415
-    from dhtorch.codes import Source  # noqa: PLC0415
-    from dhtorch.evaluate import errors, risk  # noqa: PLC0415
-    from dhtorch.geometry.camera import unproject  # noqa: PLC0415
-    from dhtorch.pair import merge  # noqa: PLC0415
-
-    written = []
-    for example in examples:
-        e, here = example.cpu(), folder / example.scene
-        here.mkdir(parents=True, exist_ok=True)
-        whole, image, uv = merge(e.samples, e.estimate), e.frame.image[0], e.samples.uv[0]
-        figures.draw_samples(here / "samples.png", image, uv, whole.source[0], e.estimate.gate[0])
-        figures.draw_holes(here / "holes.png", image, uv, e.samples.hole[0])
-        pooled = errors.select(e.estimate, e.truth)
-        if pooled.keep.any():
-            figures.draw_depth(here / "depth.png", pooled.true_depth, pooled.depth, pooled.score)
-            curves = {e.method: risk.risk_coverage(pooled)}
-            figures.draw_risk_coverage(
-                here / "risk_coverage.png", curves, oracle=risk.risk_coverage(pooled, oracle=True)
-            )
-        filled = whole.source[0] != Source.NONE
-        xyz = unproject(e.frame.camera, whole.uv, whole.depth)[0][filled]
-        columns = {name: getattr(whole, name)[0][filled] for name in ("source", "sigma", "score")}
-        figures.write_ply(here / "points.ply", xyz, **columns)
-        written += sorted(here.iterdir())
-    return written
+def _hush() -> None:
+    """Warnings that other libraries cause are not the user's business, unless Python's -W asks for them."""
+    if not sys.warnoptions:
+        warnings.filterwarnings("ignore", module=r"(?!dhtorch\b)")
 
 
 def _fail(error: BaseException, show: bool = False) -> int:
     if show:
         traceback.print_exception(error)
+    print(f"dhtorch: {_line(error)}", file=sys.stderr)
+    return FAILED
+
+
+def _line(error: BaseException) -> str:
+    """An error in one line."""
     lines = [line for line in str(error).splitlines() if line.strip()]
     if any("Original Traceback" in line for line in lines):  # a data-loader worker sends its whole traceback along
         lines = lines[-1:]
     message = " ".join(" ".join(lines).split())
-    print(f"dhtorch: {type(error).__name__}: {message}", file=sys.stderr)
-    return 2
+    if "hydra/launcher/" in message:
+        message += " (launchers come with the extras: pip install 'dhtorch[scale]', for Ray 'dhtorch[ray-launcher]')"
+    return f"{type(error).__name__}: {message}"

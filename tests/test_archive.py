@@ -158,6 +158,28 @@ def test_a_killed_writer_leaves_a_whole_file(tmp_path):
     assert archive.finished(path, KEY)
 
 
+def test_what_a_killed_writer_left_is_cleared(tmp_path):
+    path = archive.write(tmp_path / "result.json", result())
+    for name in (".result.json.abc.tmp", ".result.json.1.tmp", "result.json.tmp", ".other.json.1.tmp", "x.tmp"):
+        (tmp_path / name).write_text("{")
+    archive.clear(path)
+    archive.clear(tmp_path / "nowhere" / "result.json")
+    assert {p.name for p in tmp_path.iterdir()} == {"result.json", "result.json.tmp", ".other.json.1.tmp", "x.tmp"}
+    assert archive.finished(path, KEY)
+
+
+def test_rows_may_hold_what_an_experiment_needs(tmp_path):
+    rows = [
+        {"scene": "room", "pair": None, "method": "dinov2", "note": "too short", "ms": {"p50": 1.0, "p99": None}},
+        {"scene": "", "pair": [3, 1], "method": "a.b", "curve": [[0.1, 0.2], [0.3, math.nan]], "ok": np.bool_(True)},
+    ]
+    asked = {"experiment": "latency", "question": "Q", "expectation": "E", "why": "W", "verdict": "undecided"}
+    summary = {"a.b.median_rel": {"value": None, "low": None, "high": None, "n": 0, "unit": "1"}}
+    written = result(rows=rows, summary=summary, **asked)
+    archive.write(tmp_path / "result.json", written)
+    assert archive.read(tmp_path)["rows"][1] == {**rows[1], "curve": [[0.1, 0.2], [0.3, None]], "ok": True}
+
+
 def test_the_key_is_of_settings_code_and_data(tmp_path):
     code = tmp_path / "code"
     (code / "sub").mkdir(parents=True)
@@ -167,6 +189,9 @@ def test_the_key_is_of_settings_code_and_data(tmp_path):
     key = lambda c=config, d="digest": archive.result_key(c, d, code_dir=code)  # noqa: E731
     first = key()
     assert first == key({**config, "device": "cuda", "resume": True, "data": {"gap": 2, "root": "/data/b"}})
+    assert first == key({**config, "output": "elsewhere", "workers": 4, "traceback": True, "figures": False})
+    weights = [key({**config, "weights": name}) for name in ("/a/net.pt", "/b/net.pt", "/a/other.pt")]
+    assert weights[0] == weights[1] != weights[2], "of a file its name counts, not its folder"
     others = {
         key({**config, "seed": 1}),
         key({**config, "data": {"gap": 3}}),

@@ -1,6 +1,5 @@
-"""The command: a job end to end, sweeps, resuming, clear errors, the installed wheel."""
+"""The command: a job end to end, clear errors, help, the installed wheel. Sweeps and resuming: test_resume.py."""
 
-import json
 import os
 import re
 import subprocess
@@ -32,6 +31,7 @@ def job(tmp_path_factory):
     folder = tmp_path_factory.mktemp("job")
     done = dhtorch(folder, *TINY)
     assert done.returncode == 0, done.stderr
+    assert done.stderr == "", "neither warnings nor a progress bar"
     return folder, done
 
 
@@ -77,6 +77,8 @@ def test_one_job_writes_one_result_and_its_pictures(job):
     ):
         assert word in done.stdout, word
     assert str(path) in done.stdout
+    others = [p.stat().st_mtime_ns for p in path.parent.rglob("*.*") if p != path]
+    assert path.stat().st_mtime_ns >= max(others), "written last: with it the job is whole"
     rows = result["rows"]
     assert [r["pair"] for r in rows] == [[0, 2], None]
     assert {"coverage", "median_rel", "p90_rel", "corr", "residual_px", "pnp_success", "aurc", "ece"} <= set(
@@ -114,21 +116,6 @@ def test_report_reads_the_archive(job):
     assert missing.returncode == 2 and len(missing.stderr.strip().splitlines()) == 1 and "nowhere" in missing.stderr
 
 
-def test_sweep_and_resume(tmp_path):
-    sweep = ["--multirun", *TINY, "figures=false", "method=paper,opencv", "hydra.sweep.dir=sweep", "resume=true"]
-    first = dhtorch(tmp_path, *sweep)
-    assert first.returncode == 0, first.stderr
-    paths = results(tmp_path)
-    assert len(paths) == 2
-    before = [p.read_bytes() for p in paths]
-    assert {json.loads(b)["rows"][0]["method"] for b in before} == {"paper", "opencv"}
-    paths[1].write_text(paths[1].read_text()[:200])  # as after a kill: not a valid result
-    again = dhtorch(tmp_path, *sweep)
-    assert again.returncode == 0 and "left untouched" in again.stdout
-    assert paths[0].read_bytes() == before[0]
-    assert archive.read(paths[1])["key"] == json.loads(before[1])["key"]
-
-
 @pytest.mark.parametrize(
     ("args", "words"),
     [
@@ -143,6 +130,8 @@ def test_sweep_and_resume(tmp_path):
         ([*TINY, "pairs.gap=99"], ["pairs.gap", "99"]),
         ([*TINY, "dtype=int8"], ["dtype", "int8"]),
         ([*TINY, "batch=0"], ["batch", "0"]),
+        ([*TINY, "device=gpu"], ["device", "gpu"]),
+        (["--config-name=other"], ["--config-name", "--multirun"]),
         ([*TINY, "method.sample.foveation=-1"], ["foveation"]),
         (["data.lidar=radar"], ["radar", "phone"]),
     ],
@@ -187,7 +176,17 @@ def test_a_traceback_is_shown_when_asked_for(command):
 def test_help_reads_well(command):
     code, out, _ = command("--help")
     assert not code
-    for word in ("dhtorch", "data=auto", "method: ", "paper", "holdout", "--multirun"):
+    for word in (
+        "dhtorch",
+        "data=auto",
+        "method: ",
+        "paper",
+        "holdout",
+        "--multirun",
+        "resume=true",
+        "launch: ",
+        "130",
+    ):
         assert word in out, word
     assert max(len(line) for line in out.splitlines()) < 200
 
