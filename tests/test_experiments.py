@@ -13,7 +13,7 @@ from dhtorch import data
 from dhtorch.codes import Gate, names
 from dhtorch.data.pairs import by_gap
 from dhtorch.data.synthetic import SyntheticRoom
-from dhtorch.experiments import method_comparison, pair, protocol
+from dhtorch.experiments import opencv_twin, pair, protocol
 from dhtorch.run import config_dir
 from dhtorch.stages.track import lucas_kanade
 
@@ -132,7 +132,7 @@ def test_curves_of_a_scene_are_what_its_points_say():
 
 def test_candidates_do_not_depend_on_the_method():
     methods = {name: method(name) for name in ("paper", "opencv")}
-    outcome = method_comparison.run(
+    outcome = opencv_twin.run(
         [small(lidar="exact")], {}, partial(by_gap, gap=2), pair.Settings(), methods=methods
     )
     for truth in ("raw", "5x5", "full"):
@@ -162,12 +162,12 @@ def test_verdict_goes_either_way():
         row("b", "ours", 0.056, 0.5),
         row("b", "ref", 0.05, 0.5),
     ]
-    assert method_comparison.compare(rows[:2], "ours", "ref", "full", 0.1) == (1, [])
-    compared, worse = method_comparison.compare(rows, "ours", "ref", "full", 0.1)
+    assert opencv_twin.compare(rows[:2], "ours", "ref", "full", 0.1) == (1, [])
+    compared, worse = opencv_twin.compare(rows, "ours", "ref", "full", 0.1)
     assert compared == 2 and len(worse) == 1 and "b median_rel" in worse[0]
-    assert method_comparison.compare([*rows[:1], row("a", "ref", 0.05, 0.6)], "ours", "ref", "full", 0.1)[1]
+    assert opencv_twin.compare([*rows[:1], row("a", "ref", 0.05, 0.6)], "ours", "ref", "full", 0.1)[1]
     with pytest.raises(ValueError, match=r"experiment\.methods"):
-        method_comparison.run([], {"paper": method("paper")}, by_gap, pair.Settings())
+        opencv_twin.run([], {"paper": method("paper")}, by_gap, pair.Settings())
 
 
 @pytest.mark.data

@@ -76,6 +76,7 @@ def open_all(
     near: float | None = None,
     gap: int | None = None,
     levels: int | None = None,
+    room: str | None = None,
     role: str | None = None,
     **options: Any,
 ) -> Sequence[Recording] | Sequence[Stacks]:
@@ -87,6 +88,7 @@ def open_all(
         near: m, cutoff for a range split; kept in the recording.
         gap: frame step with a usable baseline; kept in the recording.
         levels: pyramid levels for the motion in this scene; kept in the recording.
+        room: name shared by the recordings of one place; kept in the recording.
         role: ``"rotation"`` for a scene without baseline; kept in the recording.
         options: keyword options of the reader, see ``dhtorch.data.<format>.read``.
 
@@ -105,7 +107,8 @@ def open_all(
         raise FormatError(root, "format", format, f"auto, {', '.join((*FORMATS, *STACK_FORMATS))}")
     elif not root.exists():
         raise FormatError(root, "path", "no such file or folder", f"a {format} capture")
-    kept = {k: v for k, v in {"near": near, "gap": gap, "levels": levels, "role": role}.items() if v is not None}
+    facts = {"near": near, "gap": gap, "levels": levels, "room": room, "role": role}
+    kept = {name: value for name, value in facts.items() if value is not None}
     if format in STACK_FORMATS:
         if kept:
             raise ValueError(f"data: {', '.join(kept)} given for {root}, which holds focal stacks ({format})")

@@ -43,6 +43,7 @@ class Recording(Sequence[Frame]):
     near: float | None = None  # m, the cutoff to use for a range split on this scene
     gap: int | None = None  # frame step that gives a usable baseline
     levels: int | None = None  # pyramid levels that the motion in this scene asks for
+    room: str | None = None  # recordings of one place bear one name: what is learnt on one says little about the others
     role: str | None = None  # "rotation" = almost no baseline: never enters a mean
     report: tuple[str, ...] = ()  # what was left out, and why
 
