@@ -152,18 +152,16 @@ FORMATS: dict[str, Callable[[Path, int], Path | None]] = {
     "fod500": _fod500,
     "ddff12": _ddff12,
 }
-STACKS = ("fod500", "ddff12")
 
 
 def measure(name: str, path: Path) -> dict[str, Any]:
     """Open and stream one capture; run in a process of its own."""
     torch.set_num_threads(1)
-    open_ = data.open_stacks if name in STACKS else data.open
-    _ = open_(path)[0]  # imports and file-system caches are not the reader's
+    _ = data.open(path)[0]  # imports and file-system caches are not the reader's
     before = _resident()
     _reset_peak()
     start = time.perf_counter()
-    recording = open_(path)
+    recording = data.open(path)
     opened = time.perf_counter() - start
     first = 0
     start = time.perf_counter()
@@ -173,7 +171,7 @@ def measure(name: str, path: Path) -> dict[str, Any]:
             first = _resident() - before
     seconds = time.perf_counter() - start
     frame = recording[0]
-    image = frame.images if name in STACKS else frame.image
+    image = frame.images if isinstance(frame, FocalStack) else frame.image
     return {
         "name": f"read {name}",
         "n": len(recording),

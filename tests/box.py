@@ -61,6 +61,17 @@ def world_points(frame: Frame) -> Tensor:
     return se3.apply(frame.T_world_from_cam, cameras.unproject(camera, uv, frame.depth[0, v, u].double()[None]))[0]
 
 
+def own_camera(frame: Frame) -> Frame:
+    """The same with the depth map's camera spelt out."""
+    return frame.replace(depth_camera=cameras.resize(frame.camera, frame.hw, tuple(frame.depth.shape[-2:])))
+
+
+def turned_over(frame: Frame) -> Frame:
+    """The frame with the axes of its camera mistaken (GL for ours), so that a check shows that it can tell."""
+    over = torch.diag(torch.tensor([1.0, -1.0, -1.0])).to(frame.T_world_from_cam.R)
+    return frame.replace(T_world_from_cam=Pose(frame.T_world_from_cam.R @ over, frame.T_world_from_cam.t))
+
+
 def disagreement(a: Frame, b: Frame, near: float = math.inf, reach: int = 0) -> tuple[float, int]:
     """Median of |z − z'| / z' between the points of ``a`` carried into ``b`` and the returns there, and their number.
 

@@ -203,9 +203,11 @@ def test_depth_unit_of_pictures(tmp_path: Path) -> None:
     torch.testing.assert_close(data.open(tmp_path, episode=0, depth_unit="m")[0].depth, exact * 1000)
     edit(tmp_path, lambda info: info["features"][f"{KEY}_depth"]["info"].update(depth_unit="m"))
     torch.testing.assert_close(data.open(tmp_path, episode=0)[0].depth, exact * 1000)
-    edit(tmp_path, lambda info: info["features"][f"{KEY}_depth"]["info"].update(depth_unit="ft"))
-    with pytest.raises(FormatError, match=r"depth_unit: found ft, expected m or mm"):
-        data.open(tmp_path, episode=0)[0]
+    for unit in ("ft", 1000, ["m"], {"m": 1}):
+        change = {"depth_unit": unit}
+        edit(tmp_path, lambda info, change=change: info["features"][f"{KEY}_depth"]["info"].update(change))
+        with pytest.raises(FormatError, match=r"depth_unit: found .*, expected m or mm"):
+            data.open(tmp_path, episode=0)[0]
 
 
 def edit(root: Path, change: Callable[[dict[str, Any]], object]) -> None:

@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from box import disagreement, off_wall, pose, render, world_points
+from box import disagreement, off_wall, own_camera, pose, render, turned_over, world_points
 
 from dhtorch import data, tree
 from dhtorch.data import files, record3d_video, writers
 from dhtorch.data.files import FormatError
 from dhtorch.data.record3d_live import LiveFrames
 from dhtorch.geometry import camera as cameras
-from dhtorch.records import Camera, Frame, Pose
+from dhtorch.records import Camera, Frame
 
 lzfse = pytest.importorskip("lzfse")
 OpenEXR = pytest.importorskip("OpenEXR")
@@ -49,11 +49,6 @@ def walk(n: int = 3, hw: tuple[int, int] = HW, depth_hw: tuple[int, int] = DEPTH
         conf = (torch.arange(math.prod(depth_hw)).view(1, *depth_hw) % 3).to(torch.uint8)
         frames.append(shot.replace(depth=small.depth, conf=conf))
     return frames
-
-
-def own_camera(frame: Frame) -> Frame:
-    """The same with the depth map's camera spelt out."""
-    return frame.replace(depth_camera=cameras.resize(frame.camera, frame.hw, tuple(frame.depth.shape[-2:])))
 
 
 def same_scene(recording: data.Recording, frames: list[Frame], relative: float = 1e-6) -> None:
@@ -569,9 +564,7 @@ def test_real_export() -> None:
     assert float(a.depth.min()) > 0.14 and float(a.depth.max()) < 0.43
     agree, count = disagreement(a, b)
     assert agree < 0.04 and count > 40_000
-    turned = torch.diag(torch.tensor([1.0, -1.0, -1.0])).double()
-    gl = [f.replace(T_world_from_cam=Pose(f.T_world_from_cam.R @ turned, f.T_world_from_cam.t)) for f in (a, b)]
-    assert disagreement(*gl)[0] > 0.15  # so the check above can tell
+    assert disagreement(turned_over(a), turned_over(b))[0] > 0.15  # so the check above can tell
 
 
 def hostile_archive(root: Path) -> Path:

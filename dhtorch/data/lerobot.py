@@ -154,7 +154,7 @@ class _Load:
             if values.size != feature.hw[0] * feature.hw[1] or values.dtype.kind not in "fiu":
                 raise FormatError(file, feature.key, f"shape {values.shape}", f"{feature.hw} numbers")
         unit = self.unit or feature.info.get("depth_unit") or ("m" if values.dtype.kind == "f" else "mm")
-        if unit not in _UNITS:
+        if not isinstance(unit, str) or unit not in _UNITS:
             raise FormatError(self.data, f"{feature.key} depth_unit", unit, "m or mm")
         return self._within(values.reshape(feature.hw).astype(np.float64) / _UNITS[unit])
 

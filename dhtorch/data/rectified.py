@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dhtorch.data import codec_numpy, convert, files
+from dhtorch.data import codec_numpy, codec_pfm, convert, files
 from dhtorch.data.files import FormatError
 from dhtorch.data.recording import Recording, numbers
 from dhtorch.records import Camera, Frame, Pose
@@ -131,7 +131,7 @@ def _checked(pair: _Pair, file: Path) -> _Pair:
 
 def _disparity(file: Path, hw: tuple[int, int]) -> np.ndarray:
     if file.suffix == ".pfm":
-        return files.read_pfm(file, hw)
+        return codec_pfm.read_pfm(file, hw)
     disparity = codec_numpy.read_npz(file, "arr_0")
     if disparity.shape != hw:
         raise FormatError(file, "arr_0", f"shape {disparity.shape}", f"{hw}, as the image")
