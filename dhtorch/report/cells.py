@@ -1,0 +1,136 @@
+"""How a number reads in a table: its heading, its style and its digits, decided by the metric's name alone."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from dhtorch.codes import words
+
+#: Where nothing is defined.
+NOTHING = "–"
+
+#: Metric → heading; the others are headed by their own name.
+HEADS = {
+    "n_candidates": "candidates",
+    "n_kept": "answers",
+    "n_scenes": "scenes",
+    "n_recovered": "holes recovered",
+    "n_views": "views",
+    "median_rel": "median",
+    "p90_rel": "p90",
+    "residual_px": "residual px",
+    "pnp_success": "pose found",
+    "wrong_share": "> 20 % off",
+    "aurc": "AURC",
+    "aurc_excess": "excess AURC",
+    "augrc": "AUGRC",
+    "ece": "ECE",
+    "ece_equal_mass": "ECE, equal mass",
+    "hole_share.trackable_no_lidar": "trackable, no LiDAR",
+    "trackability_hole": "trackability, holes",
+    "trackability_valid": "trackability, returns",
+    "rotation_deg": "rotation off, °",
+    "translation_m": "translation off, m",
+    "baseline_m": "baseline, m",
+    "cutoff_m": "cutoff, m",
+    "reach_m": "reach, m",
+    "p50_ms": "p50, ms",
+    "p95_ms": "p95, ms",
+    "p99_ms": "p99, ms",
+    "parameters": "learned parameters",
+    "weight_bytes": "weights",
+    "peak_mib": "peak memory",
+    "scale": "true scale?",
+    "metric": "metric?",
+}
+#: Metric → style, where its name does not give it away (see :func:`style`).
+STYLES = {"coverage": "percent", "pnp_success": "percent", "within_sigma": "percent", "within_2sigma": "percent"}
+STYLES |= {"corr": "ratio", "ece": "fine", "ece_equal_mass": "fine", "monotonicity": "fine"}
+STYLES |= {"parameters": "large", "weight_bytes": "bytes", "peak_mib": "mebibytes"}
+DECIMALS = {"count": 0, "number": 1, "ratio": 2, "fine": 3}
+_LARGE = ((1e9, "B"), (1e6, "M"), (1e3, "k"))
+_BYTES = ((1e9, "GB"), (1e6, "MB"), (1e3, "kB"))
+
+
+def head(metric: str) -> str:
+    """Heading of a metric."""
+    return HEADS.get(metric) or words(metric.replace(".", " "))
+
+
+def style(metric: str) -> str:
+    """percent | ratio | fine | number | count | large | bytes | mebibytes | plain, by a metric's name."""
+    group, _, last = metric.rpartition(".")
+    if last in STYLES:
+        return STYLES[last]
+    if last.startswith("n_") or group.endswith("n_dropped"):
+        return "count"
+    if last.startswith("coverage_") or last.endswith(("_rel", "_share", "_success")) or group.endswith("_share"):
+        return "percent"
+    if last.startswith(("aurc", "augrc")):
+        return "fine"
+    if group.split(".")[-1] == "ms":
+        return "number"
+    return "ratio" if last.endswith("_px") else "plain"
+
+
+def show(value: Any, metric: str = "", how: str | None = None) -> str:
+    """A value as a cell; ``how`` overrides the style of the metric's name."""
+    if value is None:
+        return NOTHING
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, str):
+        return value
+    if isinstance(value, list):
+        return "×".join(show(v, how="plain") for v in value)
+    return _number(float(value), how or style(metric)).replace("-", "−")
+
+
+def exact(value: Any) -> str:
+    """A value with five significant digits, for the tables that hold everything."""
+    if isinstance(value, list):
+        return ", ".join(map(exact, value))
+    if isinstance(value, float):
+        return f"{value:.5g}"
+    return show(value, how="plain")
+
+
+def between(low: float | None, high: float | None, metric: str) -> str:
+    """An interval as a cell, nothing where there is none."""
+    if low is None or high is None:
+        return ""
+    return f"{show(low, metric).removesuffix(' %')}–{show(high, metric)}"
+
+
+def _number(value: float, how: str) -> str:
+    if how == "percent":
+        return _percent(value)
+    if how == "count":
+        return f"{value:,.0f}" if abs(value) >= 10_000 else f"{value:.0f}"
+    if how in ("large", "bytes"):
+        return _with_unit(value, _LARGE if how == "large" else _BYTES)
+    if how == "mebibytes":
+        return _with_unit(value * 2**20, _BYTES)
+    return f"{value:.{DECIMALS[how]}f}" if how in DECIMALS else _three_digits(value)
+
+
+def _percent(value: float) -> str:
+    """Two decimals below 10 %, one above, none at 0 and 100."""
+    percent = 100 * value
+    decimals = 0 if percent in (0, 100) else 2 if abs(percent) < 9.995 else 1
+    return f"{percent:.{decimals}f} %"
+
+
+def _three_digits(value: float) -> str:
+    if value == int(value):
+        return f"{value:.0f}"
+    decimals = max(0, 2 - math.floor(math.log10(abs(value))))
+    return f"{value:.{decimals}f}" if decimals <= 5 else f"{value:.1e}"
+
+
+def _with_unit(value: float, units: tuple[tuple[float, str], ...]) -> str:
+    for size, unit in units:
+        if abs(value) >= size:
+            return f"{_three_digits(value / size)} {unit}"
+    return f"{value:.0f}"

@@ -1,0 +1,258 @@
+"""Known experiments in the layout of the paper's tables, ours beside the paper's figure."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+
+from dhtorch.report import published
+from dhtorch.report.cells import NOTHING, head, show
+from dhtorch.report.tables import (
+    DERIVED,
+    OURS,
+    PUBLISHED,
+    Line,
+    Result,
+    Row,
+    Table,
+    by_scene,
+    by_variant,
+    cohorts,
+    entry,
+    scene_rows,
+    source,
+    variants,
+)
+
+#: (pattern of our variant, its label or None = its own name, the paper's line)
+Known = Sequence[tuple[str, str | None, str | None]]
+
+CUTOFF = r"(?:gated,? )?cutoff .*"
+RANGE_SPLIT: Known = (
+    ("sensor_only", "sensor-only (after cutoff)", "sensor-only (after cutoff)"),
+    ("device_raw", "device pose (raw)", "device pose (raw)"),
+    ("device_gl_to_cv", "device pose (GL→CV)", "device pose (GL→CV)"),
+    ("no_gates", "no gates", "no gates"),
+    ("gated", "gated", "gated"),
+)
+CUTOFFS: Known = (
+    (r"gated, cutoff (?:[x×]0\.75|1\.5 m)", None, "1.5 m"),
+    (r"gated(?:, cutoff (?:[x×]1(?:\.0)?|2(?:\.0)? m))?", None, "2.0 m"),
+    (r"gated, cutoff (?:[x×]1\.25|2\.5 m)", None, "2.5 m"),
+)
+GATES: Known = (
+    (r"gap (?:[x×]0\.5|16)", None, "gap 16"),
+    (r"gap (?:[x×]1(?:\.0)?|30)", None, "gap 30 (default)"),
+    (r"gap (?:[x×]2(?:\.0)?|60)", None, "gap 60"),
+    (r"parallax gate off.*", None, "parallax gate OFF (gap 30)"),
+    (r"reprojection gate off.*", None, "reprojection gate OFF (gap 30)"),
+)
+REAL_HOLES: Known = (("no_gates", "no gates", "no gates"), ("gated", "gated", "gated"))
+LEARNED: Known = (
+    (r"paper|dhtorch", None, "DH-Active"),
+    (r"dust3r.*", None, "DUSt3R"),
+    (r"vggt.*", None, "VGGT-1B"),
+)
+
+
+def in_layout(result: Result) -> list[Table]:
+    """The tables of a known experiment as the paper has them; of another with several variants, one by variant."""
+    known = LAYOUTS.get(result["experiment"])
+    if known:
+        return known(result)
+    columns = ("n_scenes", "coverage", "median_rel", "p90_rel", "corr", "pnp_success")
+    measured = [m for m in columns[1:] if any(entry(result, v, m) for v in variants(result))]
+    if len(variants(result)) < 3 or not measured:
+        return []
+    return [by_variant(result, "Medians over scenes", ("n_scenes", *measured))]
+
+
+def lines(result: Result, known: Known, without: str = r"(?!)") -> list[Line]:
+    """The paper's lines in its order, each with our variant of that kind, then what else we ran."""
+    names = [v for v in variants(result) if not re.fullmatch(without, v)]
+    found, used = [], set()
+    for pattern, label, paper in known:
+        matching = [v for v in names if v not in used and re.fullmatch(pattern, v)]
+        used.update(matching)
+        for v in matching:
+            alike = paper is None or paper.lower().startswith(v.lower())
+            shown = label or (v if alike else f"{v} ({PUBLISHED}: {paper})")
+            found.append(Line(shown, v, paper))
+        if not matching:
+            found.append(Line(label or paper or pattern, None, paper))
+    return found + [Line(v, v) for v in names if v not in used]
+
+
+def _range_split(result: Result) -> list[Table]:
+    title = "Controlled far-field recovery, medians over scenes"
+    columns = ("n_scenes", "coverage", "corr", "median_rel", "p90_rel")
+    mine = lines(result, RANGE_SPLIT, without=CUTOFF)
+    found = [by_variant(result, title, columns, mine, published.RANGE_SPLIT)]
+    if any(re.fullmatch(CUTOFF, v) for v in variants(result)):
+        title = "Cutoff sensitivity, gated, medians over scenes; candidates added up"
+        swept = ("cutoff_m", "pnp_success", "n_candidates", "coverage", "median_rel")
+        mine = [line for line in lines(result, CUTOFFS) if line.paper or re.fullmatch(CUTOFF, line.variant or "")]
+        found.append(by_variant(result, title, swept, mine, published.CUTOFF))
+    return found
+
+
+def _real_holes(result: Result) -> list[Table]:
+    columns = ("n_scenes", "n_candidates", "coverage", "median_rel", "p90_rel")
+    title = "The sensor's true drop-outs, medians over scenes"
+    return [by_variant(result, title, columns, lines(result, REAL_HOLES), published.REAL_HOLES)]
+
+
+def _gate_ablation(result: Result) -> list[Table]:
+    columns = ("n_scenes", "corr", "median_rel", "coverage", "p90_rel")
+    return [by_variant(result, "Gate ablation, medians over scenes", columns, lines(result, GATES), published.GATES)]
+
+
+def _held_out(result: Result) -> list[Table]:
+    truth = "heldout" if "heldout" in cohorts(result) else None
+    columns = ("n_kept", "corr", "median_rel", "residual_px", "coverage", "n_recovered", "reach_m", "passes")
+    title = "Hold-out triangulation (set B never sees the pose calibration)"
+    found = [by_scene(result, title, columns, truth, published.HELD_OUT)]
+    if "cyclic" in cohorts(result):
+        found.append(_cyclic(result))
+    across = ("n_scenes", "median_rel", "range", "corr", "ece", "coverage", "passes")
+    title = "Cross-dataset depth-anchored geometry, medians over scenes"
+    name = result["data"]["name"]
+    mine = [Line(name if len(variants(result)) == 1 else f"{name}, {v}", v) for v in variants(result)]
+    return [*found, by_variant(result, title, across, mine, published.CROSS_DATA, truth)]
+
+
+def _cyclic(result: Result) -> Table:
+    """What the naive protocol hides: the pose's own inliers against points it never saw."""
+    rows = []
+    for v in variants(result):
+        naive, honest = (entry(result, v, "median_rel", t).get("value") for t in ("cyclic", "heldout"))
+        ratio = show(honest / naive, how="number") + "×" if naive and honest is not None else NOTHING
+        rows.append([v, show(naive, "median_rel"), show(honest, "median_rel"), ratio])
+    cited = [
+        [f"{PUBLISHED}: {name}", *(c.get(m, NOTHING) for m in ("cyclic", "heldout", "ratio"))]
+        for name, c in published.CYCLIC.lines.items()
+    ]
+    title = "Median error on the pose's own inliers (cyclic) against the hold-out, medians over scenes"
+    heads = ["", "cyclic", "held out", "ratio"]
+    return Table(title, heads, rows + cited, quoted=len(cited), note=source(result, published.CYCLIC))
+
+
+def _calibration(result: Result) -> list[Table]:
+    columns = ("n_scenes", "ece", "ece_equal_mass", "aurc", "aurc_excess", "monotonicity")
+    found = [by_variant(result, "Calibration, medians over scenes", columns, None, published.CALIBRATION)]
+    for v in variants(result):
+        steps = thresholds(result, v)
+        if not steps:
+            continue
+        rows = []
+        for step in steps:
+            theirs = published.THRESHOLDS.lines.get(f"{float(step):g}", {})
+            cells = []
+            for m in ("coverage", "median_rel"):
+                cells += [show(entry(result, v, f"at_{step}.{m}").get("value"), m), theirs.get(m, NOTHING)]
+            rows.append([step, *cells])
+        over = (("", 1), ("coverage", 2), ("median", 2))
+        title = f"Selective threshold, {v}, medians over scenes"
+        heads = ["score above", OURS, PUBLISHED, OURS, PUBLISHED]
+        found.append(Table(title, heads, rows, over=over, note=source(result, published.THRESHOLDS)))
+    return found
+
+
+def thresholds(result: Result, variant: str) -> list[str]:
+    """Thresholds on the score at which a variant was measured, rising, as the result writes them."""
+    found = {m[1] for name in result["summary"] if (m := re.search(r"(?:^|\.)at_(\d+(?:\.\d+)?)\.coverage$", name))}
+    mine = [step for step in found if entry(result, variant, f"at_{step}.coverage")]
+    return sorted(mine, key=float)
+
+
+def _census(result: Result) -> list[Table]:
+    columns = ("hole_share.trackable_no_lidar", "trackability_hole", "trackability_valid")
+    return [by_scene(result, "Why returns are missing: the key class", columns, None, published.CENSUS)]
+
+
+def _device_pose(result: Result) -> list[Table]:
+    columns = ("n_scenes", "rotation_deg", "translation_m", "corr", "coverage", "median_rel")
+    title = "Triangulation from the device's trajectory and from the anchored pose, medians over scenes"
+    return [by_variant(result, title, columns, None, published.POSE)]
+
+
+def _motion(result: Result) -> list[Table]:
+    columns = ("n_scenes", "baseline_m", "coverage", "median_rel", "n_recovered")
+    return [by_variant(result, "Motion dependence, medians over scenes", columns, None, published.MOTION)]
+
+
+def _learned(result: Result) -> list[Table]:
+    columns = ("n_scenes", "median_rel", "corr", "coverage", "parameters")
+    title = "Reference results under different inputs and scale protocols, medians over scenes"
+    return [by_variant(result, title, columns, lines(result, LEARNED), published.LEARNED)]
+
+
+def _ablation(result: Result) -> list[Table]:
+    columns = ("n_scenes", "coverage", "median_rel", "p90_rel", "corr", "aurc", "pnp_success")
+    return [by_variant(result, "Ablation, medians over scenes", columns)]
+
+
+def _latency(result: Result) -> list[Table]:
+    """The paper's branches, then every stage."""
+    columns = ("device", "p50_ms", "p95_ms", "p99_ms", "parameters", "weight_bytes", "peak_mib")
+    rows: list[list[str]] = []
+    stages: list[list[str]] = []
+    for row in scene_rows(result):
+        label = branch(row)
+        missing = row.get("note", NOTHING)
+        cells = [missing if row.get(m) is None else show(row[m], m) for m in columns]
+        whole = row.get("stage") in ("front_end", "pair", "forward") or "parameters" in row
+        (rows if whole else stages).append([label, *cells] if whole else [label, *cells[1:4]])
+    cited = [
+        [f"{PUBLISHED}: {name}", *(cells.get(m, NOTHING) for m in columns)]
+        for name, cells in published.LATENCY.lines.items()
+    ]
+    threads = dict.fromkeys(show(row.get("threads")) for row in scene_rows(result) if row.get("threads"))
+    note = f"{source(result, published.LATENCY)} Threads in ours: {', '.join(threads) or NOTHING}."
+    heads = ["branch", *map(head, columns)]
+    found = [Table("Measured latency", heads, rows + cited, quoted=len(cited), note=note)]
+    if stages:
+        found.append(Table("Latency by stage", ["stage", *map(head, columns[1:4])], stages))
+    return found
+
+
+def branch(row: Row) -> str:
+    """What a row of timings is about."""
+    size = f", {show(row['hw'])}" if row.get("hw") else ""
+    return f"{row['method']} {row.get('stage', '').replace('_', ' ')}".strip() + size
+
+
+LAYOUTS: dict[str, Callable[[Result], list[Table]]] = {
+    "range_split": _range_split,
+    "real_holes": _real_holes,
+    "gate_ablation": _gate_ablation,
+    "heldout": _held_out,
+    "calibration": _calibration,
+    "hole_census": _census,
+    "device_pose": _device_pose,
+    "motion": _motion,
+    "learned": _learned,
+    "ablation": _ablation,
+    "latency": _latency,
+}
+#: Columns that stand in these tables and need not be repeated.
+SHOWN = ("trackability_hole", "trackability_valid", "reach_m", "passes", "baseline_m", *DERIVED)
+
+#: Experiments whose variants have a counterpart in the paper.
+_COUNTERPARTS: dict[str, tuple[Known, published.Published]] = {
+    "range_split": (RANGE_SPLIT, published.RANGE_SPLIT),
+    "real_holes": (REAL_HOLES, published.REAL_HOLES),
+    "gate_ablation": (GATES, published.GATES),
+    "learned": (LEARNED, published.LEARNED),
+}
+
+
+def counterparts(result: Result) -> dict[str, dict[str, float]]:
+    """Variant → metric → the paper's figure, for figures that show both."""
+    known, theirs = _COUNTERPARTS.get(result["experiment"], ((), None))
+    found: dict[str, dict[str, float]] = {}
+    for line in lines(result, known):
+        if theirs and line.variant and line.paper:
+            cells = {m: published.number(cell) for m, cell in theirs.lines[line.paper].items()}
+            found[line.variant] = {m: number for m, number in cells.items() if number is not None}
+    return found

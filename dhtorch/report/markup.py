@@ -1,0 +1,47 @@
+"""HTML and SVG as text that cannot be broken by what is put into it."""
+
+from __future__ import annotations
+
+import html
+import re
+from collections.abc import Iterable
+
+#: What XML cannot hold at all.
+_FORBIDDEN = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff]")
+
+
+class Markup(str):
+    """Text that is markup already and is not escaped again."""
+
+    __slots__ = ()
+
+
+def escape(text: object) -> Markup:
+    """Text as it stands in markup; markup stays as it is."""
+    if isinstance(text, Markup):
+        return text
+    plain = str(text).encode("utf-8", "replace").decode()  # half a surrogate pair cannot be written to a file
+    return Markup(html.escape(_FORBIDDEN.sub("\ufffd", plain)))
+
+
+def tag(name: str, /, *children: object, **attributes: object) -> Markup:
+    """An element: children are escaped unless they are markup, attributes that are None are left out.
+
+    An underscore at the end of an attribute's name is dropped (``class_``), others become hyphens.
+    """
+    said = "".join(
+        f' {key.removesuffix("_").replace("_", "-")}="{escape(value)}"'
+        for key, value in attributes.items()
+        if value is not None
+    )
+    inner = join(children)
+    return Markup(f"<{name}{said}>{inner}</{name}>" if inner or name not in _EMPTY else f"<{name}{said}/>")
+
+
+def join(parts: Iterable[object], between: str = "") -> Markup:
+    """Parts one after the other, escaped unless they are markup."""
+    return Markup(between.join(escape(part) for part in parts))
+
+
+#: Elements that have no content; any other without content keeps its closing tag.
+_EMPTY = frozenset(["meta", "link", "br", "hr", "path", "line", "circle", "rect", "polyline", "polygon"])
