@@ -121,6 +121,7 @@ def test_thousands_of_episodes_are_listed_and_none_is_opened(
     same_scene(recordings[-1], episodes()[1], STEP["video"])
     assert recordings[-1].gap == 3 and len(opened) == 2 and recordings[n - 1].name == recordings.names[-1]
     assert pickle.loads(pickle.dumps(recordings)).names == recordings.names
+    assert [r.name for r in recordings[n - 1 :]] == recordings.names[n - 1 :]
     with pytest.raises(IndexError):
         recordings[n]
     with pytest.raises(FormatError, match=r"20000 recordings: .*episode_000000/front, .*…, expected one"):

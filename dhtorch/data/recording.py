@@ -10,7 +10,7 @@ import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, overload
 
 import torch
 from torch import Tensor
@@ -120,8 +120,15 @@ class Recordings(Sequence[Recording]):
     def __len__(self) -> int:
         return len(self.names)
 
-    def __getitem__(self, index: int) -> Recording:  # type: ignore[override]  # one at a time: slices would open all
-        return replace(self.make(range(len(self))[operator.index(index)]), **self.kept)
+    @overload
+    def __getitem__(self, index: int) -> Recording: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Recording]: ...
+    def __getitem__(self, index: int | slice) -> Recording | list[Recording]:
+        places = range(len(self))
+        if isinstance(index, slice):
+            return [self[i] for i in places[index]]
+        return replace(self.make(places[index]), **self.kept)
 
     def __repr__(self) -> str:
         return f"Recordings({len(self)}, {self.names[0]!r} …)"
