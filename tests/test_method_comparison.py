@@ -1,0 +1,77 @@
+"""Methods against the paper's, several seeds: what is compared, what is named, and a verdict that goes either way."""
+
+from dataclasses import replace
+
+import pytest
+from hydra import compose as compose_settings
+from hydra import initialize_config_dir
+from hydra.utils import instantiate
+
+from dhtorch.data.pairs import by_gap
+from dhtorch.data.synthetic import open_rooms
+from dhtorch.evaluate import compare
+from dhtorch.experiments import method_comparison
+from dhtorch.experiments.protocol import Settings, refill
+from dhtorch.run import config_dir
+
+
+def method(name="paper"):
+    with initialize_config_dir(str(config_dir()), version_base="1.3"):
+        return instantiate(compose_settings("run", [f"method={name}", "method.n=768"]).method, _convert_="all")
+
+
+@pytest.fixture(scope="module")
+def outcome():
+    rooms = open_rooms(("walk", "lateral", "rotation"), n_frames=5, hw=(192, 256), gap=3, lidar="exact")
+    methods = {"paper": method(), "strict": refill(method(), triangulate={"max_residual_px": 0.5})}
+    methods["opencv"] = method("opencv")
+    return method_comparison.run(rooms, {}, by_gap, Settings(), methods=methods, seeds=2)
+
+
+def test_rows_are_those_of_the_first_seed(outcome):
+    assert {r["method"] for r in outcome.rows} == {"paper", "strict", "opencv"}
+    assert not any("seed" in k for k in outcome.summary)
+    row = outcome.scenes("strict")["synthetic_walk"]
+    numbers = row["against_paper"]
+    assert numbers["median_rel_ratio"] > 0 and "against_paper" not in outcome.scenes("paper")["synthetic_walk"]
+    assert "synthetic_rotation" not in outcome.scenes("strict")
+
+
+def test_summary_has_every_number_of_the_bars(outcome):
+    assert {f"strict.{number}" for number in method_comparison.BARS} <= set(outcome.summary)
+    assert "strict.median_rel_ratio_at_equal_coverage" in outcome.summary
+    assert outcome.summary["strict.median_rel_ratio"]["n"] == 2, "the rotation stays out"
+    assert outcome.verdict == "refuted" and "bars met" in outcome.why
+    ratios = [outcome.scenes("strict")[s]["against_paper"]["median_rel_ratio"] for s in outcome.scenes("strict")]
+    assert outcome.summary["strict.median_rel_ratio"]["value"] == pytest.approx((ratios[0] * ratios[1]) ** 0.5)
+
+
+def judged(**changes):
+    good = {"median_rel_ratio": 0.6, "worst_scene_ratio": 1.0, "aurc_ratio": 0.5, "coverage_at_5": 0.3}
+    good |= {"within_sigma": 0.7, "within_2sigma": 0.95, "ece": 0.05, "realised_risk_10": 0.08}
+    values = good | {"realised_risk_5": 0.04} | changes
+    return compare.Comparison(summary={f"map.{k}": {"value": v} for k, v in values.items()})
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [({}, True), ({"within_sigma": 0.76}, False), ({"coverage_at_5": 0.25}, False), ({"aurc_ratio": None}, None)],
+)
+def test_verdict_goes_either_way(changes, expected):
+    assert method_comparison.verdict(judged(**changes), ["map"], set())[0] is expected
+
+
+def test_bars_of_many_views_are_higher():
+    assert method_comparison.verdict(judged(median_rel_ratio=0.65), ["map"], set())[0] is True
+    assert method_comparison.verdict(judged(median_rel_ratio=0.65), ["map"], {"map"})[0] is False
+
+
+def test_silent_and_left_out_scenes_are_named():
+    found = replace(judged(), left_out={"map": ["terrace"]}, silent={"map.5": ["desk"]})
+    why = method_comparison.verdict(found, ["map"], set())[1]
+    assert "without ratio: terrace" in why and "map.5 % risk silences desk" in why
+
+
+def test_nothing_to_compare_is_an_error():
+    with pytest.raises(ValueError, match=r"experiment\.methods: found paper, opencv"):
+        method_comparison.run([], {}, by_gap, Settings(), methods={"paper": method(), "opencv": method("opencv")})
