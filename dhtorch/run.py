@@ -99,7 +99,7 @@ def _run_hydra(argv: list[str]) -> int:
     unknown = [a for a in argv if a.startswith("-") and a not in SWEEP]
     if unknown:
         return _fail(ValueError(f"{unknown[0]}: found an unknown flag, expected {', '.join(sorted(SWEEP | SHOW))}"))
-    overrides, sweep = [a for a in argv if a not in SWEEP], bool(SWEEP & set(argv))
+    overrides, sweep = [a for a in argv if a not in SWEEP], bool({*SWEEP, "hydra.mode=MULTIRUN"} & set(argv))
     try:
         with hydra.initialize_config_dir(str(config_dir()), version_base="1.3", job_name="dhtorch"):
             engine: Any = GlobalHydra.instance().hydra
@@ -120,7 +120,7 @@ def _single(engine: Any, overrides: Sequence[str], again: str) -> int:
     try:
         ended = engine.run("run", _job, list(overrides)).return_value
     except KeyboardInterrupt:
-        print(f"dhtorch: interrupted, nothing written. Once more:\n  {again}", file=sys.stderr)
+        print(f"dhtorch: interrupted, no result written. Once more:\n  {again}", file=sys.stderr)
         return INTERRUPTED
     return FAILED if ended.state == "failed" else DONE
 
