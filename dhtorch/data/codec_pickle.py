@@ -8,7 +8,6 @@ believed before the bytes for it are there. Protocols 2 to 5, the module paths o
 
 from __future__ import annotations
 
-import math
 import re
 import struct
 from collections.abc import Callable
@@ -20,45 +19,13 @@ import numpy as np
 from dhtorch.data import files
 from dhtorch.data.codec_numpy import npy_header
 from dhtorch.data.files import FormatError
+from dhtorch.data.pickled_arrays import CALLS, NAMES, SCALARS, Name, Shell, built, filled, scalar
 
 MAX_PICKLE_BYTES: Final = 128_000_000
 MAX_STEPS: Final = 10_000_000  # instructions of one pickle
 MAX_DEPTH: Final = 32  # containers inside containers
 
-_DTYPE = re.compile(r"[<>|=]?(?:b1|[iu][1248]|f[248]|[SU]\d{1,4}|O8?)")
-#: The only names a pickle may mention; ``numpy._core`` of numpy 2 counts as ``numpy.core``, ``__builtin__`` of Python 2
-#: as ``builtins``.
-_NAMES: Final = {
-    "numpy.ndarray",
-    "numpy.dtype",
-    "numpy.core.multiarray._reconstruct",
-    "numpy.core.multiarray.scalar",
-    "numpy.core.numeric._frombuffer",
-    "collections.OrderedDict",
-    "_codecs.encode",  # how protocol 2 writes bytes
-    "builtins.bytes",
-    "builtins.set",  # how protocols 2 and 3 write sets
-}
-_SCALARS = (str, int, float, bool, bytes, type(None))
 _MARK = object()
-
-
-class _Name(str):
-    """A permitted name. Nothing stands behind it."""
-
-
-class _Dtype:
-    """Element type under construction: code such as ``f8`` and byte order."""
-
-    def __init__(self, code: str) -> None:
-        self.code, self.order = code, "="
-
-
-class _Array:
-    """An array under construction: an empty shell until its state arrives."""
-
-    value: np.ndarray | list[Any] | None = None
-    shape: tuple[int, ...] = ()
 
 
 def read_npy(file: Path) -> Any:
@@ -78,7 +45,7 @@ def read_npy(file: Path) -> Any:
     if dtype.hasobject:
         return loads(body, file)
     try:
-        return _filled(dtype, shape, fortran, body)
+        return filled(dtype, shape, fortran, body)
     except (ValueError, TypeError, OverflowError) as error:
         raise FormatError(file, "data", error, f"numbers of type {dtype}") from None
 
@@ -96,19 +63,6 @@ def loads(data: bytes, file: Path) -> Any:
     except (IndexError, KeyError, TypeError, ValueError, AttributeError, OverflowError, struct.error) as error:
         found = f"{type(error).__name__} {error}"
         raise FormatError(file, "pickle", found, "a whole pickle of arrays and plain containers") from None
-
-
-def _filled(dtype: np.dtype, shape: tuple[int, ...], fortran: bool, raw: bytes) -> np.ndarray:
-    """An array of raw bytes; its size is what the bytes say, not what the header says."""
-    if dtype.kind not in "biufSU" or dtype.itemsize == 0 or dtype.names or dtype.subdtype:
-        raise ValueError(f"array of {dtype}")
-    # Beside a zero any other number would fit no bytes at all, and whoever walks along that axis would not come back.
-    if len(shape) > 8 or any(type(n) is not int or not 0 <= n <= max(len(raw), 4096) for n in shape):
-        raise ValueError(f"array shape {shape}")
-    if math.prod(shape) * dtype.itemsize != len(raw):
-        raise ValueError(f"{len(raw)} bytes for an array of {shape}")
-    array = np.frombuffer(raw, dtype).reshape(shape, order="F" if fortran else "C")
-    return array if dtype.isnative else array.astype(dtype.newbyteorder("="))
 
 
 class _Machine:
@@ -179,7 +133,7 @@ class _Machine:
         if len(items) % 2:
             raise ValueError("a key without a value")
         for key, value in zip(items[::2], items[1::2], strict=True):
-            target[_scalar(key)] = value
+            target[scalar(key)] = value
 
     def integer(self, n: int) -> None:
         if not 0 <= n <= 16:
@@ -189,9 +143,9 @@ class _Machine:
     def name(self, module: Any, attribute: Any) -> None:
         text = re.sub(r"^numpy\._core\b", "numpy.core", f"{module}.{attribute}")
         text = re.sub(r"^__builtin__\b", "builtins", text)
-        if text not in _NAMES or type(module) is not str or type(attribute) is not str:
+        if text not in NAMES or type(module) is not str or type(attribute) is not str:
             raise FormatError(self.file, "pickle", f"the name {text}", "numpy arrays and plain containers only")
-        self.push(_Name(text))
+        self.push(Name(text))
 
     def line(self) -> str:
         end = self.data.index(b"\n", self.at, self.at + 256)
@@ -199,38 +153,13 @@ class _Machine:
 
     def call(self) -> None:
         function, args = self.pop_n(2)
-        if type(function) is not _Name or type(args) is not tuple:
+        if type(function) is not Name or type(args) is not tuple:
             raise TypeError("a call of something else than a permitted name")
-        self.push(_CALLS[function](self, *args))
+        self.push(CALLS[function](self.spend, *args))
 
     def build(self) -> None:
         target, state = self.pop_n(2)
-        if type(target) is _Dtype:
-            _, order, subarray, names = state[:4]
-            if order not in ("<", ">", "|", "=") or subarray is not None or names is not None:
-                raise ValueError("a structured element type")
-            target.order = order
-        elif type(target) is _Array:
-            _, shape, dtype, fortran, raw = state
-            self.fill(target, shape, dtype, fortran, raw)
-        else:
-            raise TypeError("state for something else than an array or its element type")
-        self.push(target)
-
-    def fill(self, target: _Array, shape: Any, dtype: Any, fortran: Any, raw: Any) -> _Array:
-        if target.value is not None or type(dtype) is not _Dtype or type(shape) is not tuple:
-            raise TypeError("an array with a state that is none")
-        if dtype.code.lstrip("<>|=").startswith("O"):
-            count = math.prod(shape)
-            if type(raw) is not list or len(shape) > 1 or len(raw) != count:
-                raise ValueError(f"an object array of shape {shape}")
-            target.value, target.shape = raw, shape
-        else:
-            if not isinstance(raw, bytes | bytearray) or type(fortran) is not bool:
-                raise TypeError("an array without bytes")
-            self.spend(len(raw))
-            target.value = _filled(_numpy_dtype(dtype), shape, fortran, bytes(raw))
-        return target
+        self.push(built(self.spend, target, state))
 
     def spend(self, n: int) -> None:
         self.budget -= n
@@ -249,77 +178,18 @@ class _Machine:
         if depth > MAX_DEPTH or self.nodes > 8 * self.steps + 64:
             raise FormatError(self.file, "pickle", "containers nested beyond measure", f"at most {MAX_DEPTH} deep")
         kind = type(value)
-        if kind in _SCALARS or kind is bytearray:
+        if kind in SCALARS or kind is bytearray:
             return value
         if kind in (list, tuple, set):
             return kind(self._plain(item, depth + 1) for item in value)
         if kind is dict:
             return {key: self._plain(item, depth + 1) for key, item in value.items()}
-        if kind is _Array and value.value is not None:
+        if kind is Shell and value.value is not None:
             if isinstance(value.value, np.ndarray):
                 return value.value
             items = [self._plain(item, depth + 1) for item in value.value]
             return items if value.shape else items[0]
         raise TypeError(f"a bare {kind.__name__} is no data")
-
-
-def _scalar(value: Any) -> Any:
-    """A key or a member of a set: nothing whose hash could run long or deep."""
-    if type(value) not in _SCALARS or (type(value) is int and abs(value) >= 1 << 63):
-        raise TypeError(f"a key of type {type(value).__name__}")
-    return value
-
-
-def _numpy_dtype(dtype: _Dtype) -> np.dtype:
-    return np.dtype(dtype.order + dtype.code.lstrip("<>|="))
-
-
-def _new_dtype(_machine: _Machine, code: Any, *_flags: Any) -> _Dtype:
-    if type(code) is not str or not _DTYPE.fullmatch(code):
-        raise ValueError("an element type that is no plain number, text or object")
-    return _Dtype(code)
-
-
-def _new_array(_machine: _Machine, kind: Any, _shape: Any, _code: Any) -> _Array:
-    if kind != "numpy.ndarray" or type(kind) is not _Name:
-        raise TypeError("an array of another class")
-    return _Array()
-
-
-def _new_scalar(machine: _Machine, dtype: Any, raw: Any) -> Any:
-    array = machine.fill(_Array(), (), dtype, False, raw).value
-    if not isinstance(array, np.ndarray):
-        raise TypeError("a scalar of objects")
-    return array.item()
-
-
-def _from_buffer(machine: _Machine, raw: Any, dtype: Any, shape: Any, order: Any) -> _Array:
-    return machine.fill(_Array(), shape, dtype, order == "F", raw)
-
-
-def _encode(machine: _Machine, text: Any, encoding: Any) -> bytes:
-    if type(text) is not str or encoding != "latin1":
-        raise TypeError("an encoding other than latin1")
-    machine.spend(len(text))
-    return text.encode("latin-1")
-
-
-def _new_set(_machine: _Machine, items: Any = ()) -> set[Any]:
-    if type(items) not in (list, tuple):
-        raise TypeError("a set of something else than a list")
-    return set(map(_scalar, items))
-
-
-_CALLS: Final[dict[str, Callable[..., Any]]] = {
-    "numpy.dtype": _new_dtype,
-    "numpy.core.multiarray._reconstruct": _new_array,
-    "numpy.core.multiarray.scalar": _new_scalar,
-    "numpy.core.numeric._frombuffer": _from_buffer,
-    "_codecs.encode": _encode,
-    "collections.OrderedDict": lambda _machine: {},
-    "builtins.bytes": lambda _machine: b"",
-    "builtins.set": _new_set,
-}
 
 
 def _pushes(form: str) -> Callable[[_Machine], None]:
@@ -363,7 +233,7 @@ def _extend(machine: _Machine) -> None:
 
 def _add(machine: _Machine) -> None:
     items = machine.since_mark()
-    machine.top(set).update(map(_scalar, items))
+    machine.top(set).update(map(scalar, items))
 
 
 _STEPS: Final[dict[int, Callable[[_Machine], Any]]] = {

@@ -1,0 +1,146 @@
+"""What a pickle may call, as functions of our own: arrays and other plain data, rebuilt from their parts.
+
+A pickle makes an array in steps: an empty shell, an element type, then the state that fills the shell with bytes.
+Nothing of numpy's own unpickling is used. ``spend(n)`` is called before ``n`` bytes are made; it raises when a file makes
+more than a file of its size can hold.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from typing import Any, Final
+
+import numpy as np
+
+SCALARS: Final = (str, int, float, bool, bytes, type(None))
+
+_DTYPE = re.compile(r"[<>|=]?(?:b1|[iu][1248]|f[248]|[SU]\d{1,4}|O8?)")
+_ARRAY: Final = "numpy.ndarray"
+Spend = Callable[[int], None]
+
+
+class Name(str):
+    """A permitted name. Nothing stands behind it."""
+
+
+class _Dtype:
+    """Element type under construction: code such as ``f8`` and byte order."""
+
+    def __init__(self, code: str) -> None:
+        self.code, self.order = code, "="
+
+
+class Shell:
+    """An array under construction: an empty shell until its state arrives."""
+
+    value: np.ndarray | list[Any] | None = None
+    shape: tuple[int, ...] = ()
+
+
+def built(spend: Spend, target: Any, state: Any) -> Any:
+    """``target``, an array or an element type under construction, with its state.
+
+    Raises:
+        ValueError, TypeError: anything else, or a state that does not fit.
+    """
+    if type(target) is _Dtype:
+        _, order, subarray, names = state[:4]
+        if order not in ("<", ">", "|", "=") or subarray is not None or names is not None:
+            raise ValueError("a structured element type")
+        target.order = order
+    elif type(target) is Shell:
+        _, shape, dtype, fortran, raw = state
+        _fill(spend, target, shape, dtype, fortran, raw)
+    else:
+        raise TypeError("state for something else than an array or its element type")
+    return target
+
+
+def filled(dtype: np.dtype, shape: tuple[int, ...], fortran: bool, raw: bytes) -> np.ndarray:
+    """An array of raw bytes; its size is what the bytes say, not what the header says."""
+    if dtype.kind not in "biufSU" or dtype.itemsize == 0 or dtype.names or dtype.subdtype:
+        raise ValueError(f"array of {dtype}")
+    # Beside a zero any other number would fit no bytes at all, and whoever walks along that axis would not come back.
+    if len(shape) > 8 or any(type(n) is not int or not 0 <= n <= max(len(raw), 4096) for n in shape):
+        raise ValueError(f"array shape {shape}")
+    if math.prod(shape) * dtype.itemsize != len(raw):
+        raise ValueError(f"{len(raw)} bytes for an array of {shape}")
+    array = np.frombuffer(raw, dtype).reshape(shape, order="F" if fortran else "C")
+    return array if dtype.isnative else array.astype(dtype.newbyteorder("="))
+
+
+def scalar(value: Any) -> Any:
+    """A key or a member of a set: nothing whose hash could run long or deep."""
+    if type(value) not in SCALARS or (type(value) is int and abs(value) >= 1 << 63):
+        raise TypeError(f"a key of type {type(value).__name__}")
+    return value
+
+
+def _fill(spend: Spend, target: Shell, shape: Any, dtype: Any, fortran: Any, raw: Any) -> Shell:
+    if target.value is not None or type(dtype) is not _Dtype or type(shape) is not tuple:
+        raise TypeError("an array with a state that is none")
+    if dtype.code.lstrip("<>|=").startswith("O"):
+        if type(raw) is not list or len(shape) > 1 or len(raw) != math.prod(shape):
+            raise ValueError(f"an object array of shape {shape}")
+        target.value, target.shape = raw, shape
+    else:
+        if not isinstance(raw, bytes | bytearray) or type(fortran) is not bool:
+            raise TypeError("an array without bytes")
+        spend(len(raw))
+        target.value = filled(np.dtype(dtype.order + dtype.code.lstrip("<>|=")), shape, fortran, bytes(raw))
+    return target
+
+
+def _new_dtype(_spend: Spend, code: Any, *_flags: Any) -> _Dtype:
+    if type(code) is not str or not _DTYPE.fullmatch(code):
+        raise ValueError("an element type that is no plain number, text or object")
+    return _Dtype(code)
+
+
+def _new_array(_spend: Spend, kind: Any, _shape: Any, _code: Any) -> Shell:
+    if kind != _ARRAY or type(kind) is not Name:
+        raise TypeError("an array of another class")
+    return Shell()
+
+
+def _new_scalar(spend: Spend, dtype: Any, raw: Any) -> Any:
+    array = _fill(spend, Shell(), (), dtype, False, raw).value
+    if not isinstance(array, np.ndarray):
+        raise TypeError("a scalar of objects")
+    return array.item()
+
+
+def _from_buffer(spend: Spend, raw: Any, dtype: Any, shape: Any, order: Any) -> Shell:
+    return _fill(spend, Shell(), shape, dtype, order == "F", raw)
+
+
+def _encode(spend: Spend, text: Any, encoding: Any) -> bytes:
+    if type(text) is not str or encoding != "latin1":
+        raise TypeError("an encoding other than latin1")
+    spend(len(text))
+    return text.encode("latin-1")
+
+
+def _new_set(_spend: Spend, items: Any = ()) -> set[Any]:
+    if type(items) not in (list, tuple):
+        raise TypeError("a set of something else than a list")
+    return set(map(scalar, items))
+
+
+#: What stands behind the names of functions.
+CALLS: Final[dict[str, Callable[..., Any]]] = {
+    "numpy.dtype": _new_dtype,
+    "numpy.core.multiarray._reconstruct": _new_array,
+    "numpy.core.multiarray.scalar": _new_scalar,
+    "numpy.core.numeric._frombuffer": _from_buffer,
+    "_codecs.encode": _encode,  # how protocol 2 writes bytes
+    "collections.OrderedDict": lambda _spend: {},
+    "builtins.bytes": lambda _spend: b"",
+    "builtins.set": _new_set,  # how protocols 2 and 3 write sets
+}
+
+#: The only names a pickle may mention; ``numpy._core`` of numpy 2 counts as ``numpy.core``, ``__builtin__`` of Python 2
+#: as ``builtins``.
+NAMES: Final = {*CALLS, _ARRAY}
