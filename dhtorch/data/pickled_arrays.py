@@ -1,8 +1,8 @@
 """What a pickle may call, as functions of our own: arrays and other plain data, rebuilt from their parts.
 
 A pickle makes an array in steps: an empty shell, an element type, then the state that fills the shell with bytes.
-Nothing of numpy's own unpickling is used. ``spend(n)`` is called before ``n`` bytes are made; it raises when a file makes
-more than a file of its size can hold.
+Nothing of numpy's own unpickling is used. ``spend(n)`` is called before ``n`` bytes are made; it raises when a file
+makes more than a file of its size can hold.
 """
 
 from __future__ import annotations
@@ -59,7 +59,11 @@ def built(spend: Spend, target: Any, state: Any) -> Any:
 
 
 def filled(dtype: np.dtype, shape: tuple[int, ...], fortran: bool, raw: bytes) -> np.ndarray:
-    """An array of raw bytes; its size is what the bytes say, not what the header says."""
+    """An array of raw bytes; its size is what the bytes say, not what the header says.
+
+    Raises:
+        ValueError: no plain numbers or texts, or a shape that the bytes do not fill.
+    """
     if dtype.kind not in "biufSU" or dtype.itemsize == 0 or dtype.names or dtype.subdtype:
         raise ValueError(f"array of {dtype}")
     # Beside a zero any other number would fit no bytes at all, and whoever walks along that axis would not come back.
@@ -72,7 +76,11 @@ def filled(dtype: np.dtype, shape: tuple[int, ...], fortran: bool, raw: bytes) -
 
 
 def scalar(value: Any) -> Any:
-    """A key or a member of a set: nothing whose hash could run long or deep."""
+    """A key or a member of a set: nothing whose hash could run long or deep.
+
+    Raises:
+        TypeError: anything else.
+    """
     if type(value) not in SCALARS or (type(value) is int and abs(value) >= 1 << 63):
         raise TypeError(f"a key of type {type(value).__name__}")
     return value
