@@ -65,13 +65,15 @@ def plug_in(scenes: Sequence[Points], target: float) -> Control:
         ValueError: a target outside (0, 1).
     """
     scenes = _checked(scenes, target)
-    thresholds = _thresholds(scenes)
-    loss, answered = _accepted(scenes, thresholds)
+    answers = [_ordered(scene) for scene in scenes]
+    thresholds = _thresholds(answers)
+    loss, answered = _accepted(answers, thresholds)
     risk = loss / answered.clamp_min(1)
     coverage = answered / _sizes(scenes)
     n = len(scenes)
-    spread = risk.std(0) / math.sqrt(n) if n > 1 else torch.full_like(thresholds, torch.inf)
-    bound = risk.mean(0) + spread
+    mean = risk.sum(0) / max(n, 1)
+    variance = (risk - mean).square().sum(0) / (n - 1) if n > 1 else torch.full_like(thresholds, torch.inf)
+    bound = mean + (variance / max(n, 1)).sqrt()
     return _lowest(thresholds, bound <= target, bound, risk, coverage, target=target)
 
 
@@ -92,7 +94,7 @@ def conformal(scenes: Sequence[Points], target: float, *, confidence: float | No
 
     Returns:
         Control with ``needed`` = 1 / target − 1, or ln(1 − confidence) / ln(1 − target), rounded up; no threshold with
-        fewer scenes. Its ``bound`` is the left side of the inequality, or the p-value.
+        fewer scenes. Its ``bound`` is the left side of the inequality, or the limit of the p-value.
 
     Raises:
         ValueError: a target or confidence outside (0, 1).
@@ -101,20 +103,20 @@ def conformal(scenes: Sequence[Points], target: float, *, confidence: float | No
     risk-controlling prediction sets", 2021 (with confidence).
     """
     scenes = _checked(scenes, target)
-    thresholds = _thresholds(scenes)
-    loss, answered = _accepted(scenes, thresholds)
+    answers = [_ordered(scene) for scene in scenes]
+    thresholds = _thresholds(answers)
+    loss, answered = _accepted(answers, thresholds)
     sizes, n = _sizes(scenes), len(scenes)
     risk = loss / sizes
     needed = scenes_needed(target, confidence=confidence)
+    # The loss does not rise with the threshold, so neither do its bounds: whatever lies above one that fits, fits.
     if confidence is None:
         bound = (risk.sum(0) + 1) / (n + 1)
         fits = bound <= target
     else:
-        bound = torch.tensor([p_value(r, n, target) for r in risk.mean(0).tolist()], dtype=torch.float64)
-        fits = bound <= 1 - confidence
-    # Thresholds rise and so must "fits": rounding in the p-value must not open a gap below a threshold that fails.
-    fails_above = (~fits).long().flip(0).cumsum(0).flip(0) > 0
-    fits = ~fails_above & (n >= needed)
+        bound = torch.full_like(thresholds, 1 - confidence)
+        fits = risk.sum(0) / max(n, 1) <= _largest_mean(n, target, 1 - confidence)
+    fits = fits & (n >= needed)
     return _lowest(thresholds, fits, bound, risk, answered / sizes, target=target, needed=needed, confidence=confidence)
 
 
@@ -144,23 +146,27 @@ def p_value(mean: float, n: int, target: float) -> float:
     return min(1.0, math.exp(-n * divergence), bentkus)
 
 
-def _accepted(scenes: Sequence[Points], thresholds: Tensor) -> tuple[Tensor, Tensor]:
+def _ordered(scene: Points) -> tuple[Tensor, Tensor]:
+    """Scores of a scene's answers, rising, and the sum of the capped errors of the first 0, 1, … of them."""
+    score, order = scene.score[scene.keep].sort()
+    loss = capped(scene.error[scene.keep])[order]
+    return score, torch.cat((loss.new_zeros(1), loss.cumsum(0)))
+
+
+def _accepted(answers: Sequence[tuple[Tensor, Tensor]], thresholds: Tensor) -> tuple[Tensor, Tensor]:
     """Sum of the capped errors of what is accepted, and its number: (scenes, thresholds) each."""
-    loss, count = [], []
-    for scene in scenes:
-        answered = scene.answered()
-        score, order = answered.score.sort()
-        total = torch.cat((score.new_zeros(1), capped(answered.error[order]).cumsum(0)))
-        below = torch.searchsorted(score, thresholds)
-        loss.append((total[-1] - total[below]).clamp_min(0))
-        count.append((score.numel() - below).double())
     none = torch.zeros(0, thresholds.numel(), dtype=torch.float64)
-    return (torch.stack(loss), torch.stack(count)) if loss else (none, none)
+    loss, count = [none], [none]
+    for score, total in answers:
+        below = torch.searchsorted(score, thresholds)
+        loss.append((total[-1] - total[below])[None])
+        count.append((score.numel() - below)[None])
+    return torch.cat(loss).clamp_min(0), torch.cat(count)
 
 
-def _thresholds(scenes: Sequence[Points]) -> Tensor:
+def _thresholds(answers: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
     """Scores of answers, rising: every threshold that makes a difference, or evenly spaced ones among them."""
-    scores = torch.cat([s.answered().score for s in scenes] or [torch.zeros(0, dtype=torch.float64)]).unique()
+    scores = torch.cat([torch.zeros(0, dtype=torch.float64), *(score for score, _ in answers)]).unique()
     if scores.numel() > MOST_THRESHOLDS:
         scores = scores[torch.linspace(0, scores.numel() - 1, MOST_THRESHOLDS, dtype=torch.float64).round().long()]
     return scores
@@ -198,6 +204,17 @@ def _checked(scenes: Sequence[Points], target: float) -> list[Points]:
 def _probability(name: str, value: float) -> None:
     if not 0 < value < 1:
         raise ValueError(f"control.{name}: found {value}, expected a number between 0 and 1")
+
+
+def _largest_mean(n: int, target: float, level: float) -> float:
+    """Largest mean loss whose p-value is at most ``level``, to rounding and never above it; −1 where none is."""
+    if p_value(0.0, n, target) > level:
+        return -1.0
+    low, high = 0.0, target
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (middle, high) if p_value(middle, n, target) <= level else (low, middle)
+    return low
 
 
 def _binomial_cdf(k: int, n: int, p: float) -> float:
