@@ -9,6 +9,7 @@ import torch
 from contract import PROMISES, Row, equal, leaves, reorder, take, tensor_map
 
 import dhtorch
+from dhtorch import window
 from dhtorch.baselines.device_pose import given_pose
 from dhtorch.evaluate import holdout
 from dhtorch.geometry import (
@@ -235,6 +236,7 @@ ROWS = [
 ELSEWHERE = {
     *(f"dhtorch.stages.sample.{name}" for name in ("spiral", "vogel", "grid")),
     "dhtorch.geometry.shapes.check",
+    *(f"dhtorch.window.{name}" for name in ("inverse_variance", "extend_window")),
     "dhtorch.geometry.least_squares.minimise",
     *(f"dhtorch.geometry.ransac.{name}" for name in ("msac_cost", "search")),
     *(f"dhtorch.evaluate.errors.{name}" for name in ("points", "select", "measure", "summarise", "unit")),
@@ -383,6 +385,7 @@ def public_functions():
             for name, fn in inspect.getmembers(part, inspect.isfunction):
                 if not name.startswith("_") and fn.__module__ == info.name:
                     yield f"{info.name}.{name}"
+    yield from (f"dhtorch.window.{n}" for n, f in inspect.getmembers(window, inspect.isfunction) if n[0] != "_" and f.__module__ == "dhtorch.window")
 
 
 def test_every_public_function_has_a_row():
