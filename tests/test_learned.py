@@ -238,6 +238,15 @@ def test_a_network_is_asked_once_for_all_its_scales(room, installed):
     assert len(times) == 2 and times[0] == times[1] > 0
 
 
+def test_the_control_is_worth_its_scale_alone(room, installed):
+    """The same depth everywhere times an oracle's scale is the median depth of what the oracle saw."""
+    outcome = asked(room, installed, models={"constant": relative.Constant}, scales=("oracle",))
+    (row,) = (r for r in outcome.rows if r["pair"] == [0, 6] and r["method"] == "constant_oracle")
+    truth = room.truth(0)["depth"]
+    assert abs(row["scale_factor"] / float(truth.median()) - 1) < 0.05 and row["coverage"] == 1
+    assert row["parameters"] == 0 and row["median_rel"] > 0.1 and outcome.verdict == "undecided"
+
+
 def test_without_vggt_nothing_is_decided(room, installed):
     outcome = asked(
         room, installed, models={"dust3r": partial(dust3r.DUSt3R, weights=installed["dust3r"])}, scales=("oracle",)

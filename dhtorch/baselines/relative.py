@@ -12,7 +12,7 @@ from torch import Tensor
 from dhtorch.codes import Gate
 from dhtorch.geometry.lookup import nearest
 from dhtorch.geometry.shapes import check
-from dhtorch.records import Estimate
+from dhtorch.records import Estimate, Frame
 from dhtorch.tree import Record, record
 
 
@@ -24,6 +24,22 @@ class RelativeDepth(Record):
     confidence: Tensor  # (B, h, w) at least 1, larger is surer
     gain: Tensor  # (B, 2) network pixel (u, v) = gain · image pixel + shift
     shift: Tensor  # (B, 2)
+
+
+class Constant:
+    """The control: a "network" without weights that says the same depth everywhere.
+
+    With an oracle's scale it shows what the oracle alone is worth on a scene.
+    """
+
+    def __init__(self, *, device: str = "cpu") -> None:
+        self.device = device
+
+    def __call__(self, frame_0: Frame, _frame_1: Frame) -> RelativeDepth:
+        """One for every pixel, all equally sure."""
+        like = frame_0.camera.f
+        one = like.new_ones(like.shape[0], 1, 1)
+        return RelativeDepth(one, 2 * one, torch.zeros_like(like), torch.zeros_like(like))
 
 
 def fitted(image: Tensor, hw: tuple[int, int], crop_hw: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:

@@ -4,7 +4,8 @@ DUSt3R and VGGT answer with dense depth up to scale. Beside our metric answers t
 median ratio to the truth over pixels of the anchor that no sample reads, one scale for each pair, as in the paper; and
 (b), beyond the paper, the scale of the sensor: the same ratio over the near returns that our method sees too. Only (b)
 is metric. The inputs are not equal (networks see no depth, ours sees near depth), and neither is silence: ours
-abstains, so the networks are also scored on exactly the candidates that ours answered.
+abstains, so the networks are also scored on exactly the candidates that ours answered. The control ``constant`` says
+the same depth everywhere: its error is what an oracle's scale is worth without any network.
 
 Expectation (written before the run): with the oracle's scale, VGGT has the smaller median error on most scenes, also on
 the candidates that ours answered (the paper: 2.5 % against 6.7 %).
@@ -75,7 +76,7 @@ def run(
         recordings, chosen, pairs, settings, progress: as :func:`dhtorch.experiments.pair.run`; of the methods, the
             first one is compared with.
         models: name → builder of a network (``device=`` → pair of frames → :class:`RelativeDepth`). A partial whose
-            option ``weights`` is None is left out.
+            option ``weights`` is None is left out; ``constant`` has none.
         scales: ``oracle``, ``near`` or both; a network's variants are called ``<name>_<scale>``.
         scale_pixels: pixels drawn to fix a scale; those without a return, or read by a sample, do not count.
 
@@ -86,7 +87,7 @@ def run(
 
     Raises:
         ImportError: a package is missing; the message says what to install.
-        ValueError: no network with weights, or an unknown scale.
+        ValueError: no network at all, or an unknown scale.
     """
     for scale in scales:
         if scale not in SCALES:
@@ -198,7 +199,7 @@ def judge(outcome: Outcome, ours: str, theirs: str) -> tuple[bool | None, str]:
         if mine[scene].get("median_rel") is not None and row.get("median_rel") is not None:
             both[scene] = (row["median_rel"], mine[scene]["median_rel"])
     if not both:
-        return None, f"{theirs} was not run" if not yours else "no scene on which both answered"
+        return None, "no scene on which both answered" if yours else f"{theirs} was not run: give its weights"
     better = [scene for scene, (a, b) in both.items() if a < b]
     a, b = (median([pair[k] for pair in both.values()]) or 0.0 for k in (0, 1))
     why = f"{theirs} is more accurate on {len(better)} of {len(both)} scenes, median of medians {a:.2%} against {b:.2%}"
