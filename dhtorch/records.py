@@ -15,7 +15,7 @@ from dhtorch.geometry.camera import Camera
 from dhtorch.geometry.se3 import Pose
 from dhtorch.tree import KEEP_DTYPE, Record, record
 
-__all__ = ["Camera", "Estimate", "Frame", "Map", "Pose", "PoseFit", "Samples", "Tracks"]
+__all__ = ["Camera", "Estimate", "Frame", "Map", "Pose", "PoseFit", "Samples", "Shutter", "Tracks"]
 
 
 @record
@@ -63,6 +63,14 @@ class Tracks(Record):
 
 
 @record
+class Shutter(Record):
+    """How much further camera 1 is turned, row by row: y · turn, y the height of the anchor's ray (z = 1)."""
+
+    turn: Tensor  # (B, 3) rad per unit of y; 0 for a global shutter
+    cov: Tensor  # (B, 9, 9) of rotation (rad), translation (m) and turn together
+
+
+@record
 class PoseFit(Record):
     """Metric relative pose and how well it is known. Not ok: R, t and cov are NaN."""
 
@@ -74,6 +82,7 @@ class PoseFit(Record):
     sigma_px: Tensor  # (B,) estimated noise of one pixel coordinate
     t_snr: Tensor  # (B,) translation over its standard deviation, sqrt(tᵀ Σ_t⁻¹ t)
     code: Tensor  # (B,) int32, codes.PoseCode
+    shutter: Shutter | None = None  # absent: one pose for all rows
 
     @property
     def ok(self) -> Tensor:

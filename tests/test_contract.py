@@ -19,6 +19,8 @@ from dhtorch.geometry import (
     epipolar,
     least_squares,
     lookup,
+    most_probable,
+    near_far,
     p3p,
     pyramid,
     ransac,
@@ -144,6 +146,34 @@ def positive(batch, n, dtype):
     return A @ A.mT + 0.1 * torch.eye(6, dtype=dtype)
 
 
+def problems(batch, n, dtype):
+    """Near and far tracks of a few pairs as planes, the unknowns near their optimum, and a noise."""
+    n = n + -n % least_squares.LANES
+    samples, tracks, fit, camera_0, camera_1 = tracked(batch, n, dtype)
+    near = torch.arange(n) % 3 > 0
+    samples = samples.replace(xyz=torch.where(near[:, None], samples.xyz, torch.nan))
+    problem = pose._near_far(samples, tracks, camera_0, camera_1, 0.3)
+    turn = uniform(batch, 3, dtype=dtype, low=-0.01, high=0.01, seed=9)
+    return problem, near_far.Unknowns(fit.T_1_from_0, turn), uniform(*problem.near.shape, dtype=dtype, low=0.1)
+
+
+def linear(batch, n, dtype):
+    problem, at, noise = problems(batch, n, dtype)
+    return problem, near_far.linearise_tracks(problem, at), noise
+
+
+def weighed(batch, n, dtype):
+    problem, at, noise = problems(batch, n, dtype)
+    weights = uniform(batch, dtype=dtype), uniform(batch, dtype=dtype, low=1e4, high=1e5)
+    return problem, at, noise, *weights, "geman_mcclure", 2.0
+
+
+def nine(batch, n, dtype):
+    A = uniform(batch, 9, 12, dtype=dtype)
+    at = near_far.Unknowns(poses(batch, dtype), uniform(batch, 3, dtype=dtype))
+    return at, A @ A.mT + 0.1 * torch.eye(9, dtype=dtype), uniform(batch, 9, dtype=dtype)
+
+
 def symmetric_solve(M, b):
     return least_squares.solve_spd(M + M.mT, b)
 
@@ -205,6 +235,7 @@ ROWS = [
     Row(score.rank, estimated, ALL, (0, 1, 2), (0,), bad=lambda a: (a[0], a[1].replace(uv=a[1].uv[:, 1:]), *a[2:])),
     Row(score.rank_by_error, estimated, ALL, (0, 1, 2), (0,), bad=lambda a: (a[0], a[1].replace(uv=a[1].uv[:, 1:]), *a[2:])),
     Row(pose.pnp_ransac, posed, "dtype batch vmap capture empty padding raises", (0, 1), bad=lambda a: (a[0], a[1].replace(uv_1=a[1].uv_1[:, 1:]), *a[2:]), atol=1e-4),
+    Row(pose.map_pose, posed, "dtype batch vmap capture empty padding raises", (0, 1), bad=lambda a: (a[0], a[1].replace(uv_1=a[1].uv_1[:, 1:]), *a[2:]), atol=1e-4),
     Row(track.lucas_kanade, shifted, "dtype batch capture empty shuffle padding nan raises", (2,), bad=wrong_last_axis(2), atol=1e-4),
     Row(track.refine, lambda b, n, d: (*shifted(b, n, d), shifted(b, n, d)[2] + 0.3), "dtype batch capture gradcheck empty shuffle padding nan raises", (2, 3), (0, 1), bad=wrong_last_axis(2), atol=1e-4),
     Row(pyramid.build_pyramid, lambda b, n, d: (shifted(b, n, d)[0], 2, 9), "dtype batch capture"),
@@ -217,6 +248,21 @@ ROWS = [
     Row(least_squares.gauss_newton_step, lambda b, n, d: (poses(b, d), positive(b, n, d), uniform(b, 6, dtype=d)), "dtype batch vmap capture"),
     Row(least_squares.solve_spd, lambda b, n, d: (positive(b, n, d), uniform(b, 6, 1, dtype=d)), "dtype batch vmap capture"),
     Row(least_squares.normal_equations, lambda b, n, d: (uniform(b, 7, 2, n - n % 16 + 16, dtype=d), uniform(b, n - n % 16 + 16, dtype=d)), "dtype batch vmap capture gradcheck", grad=(0, 1)),
+    Row(least_squares.move, lambda b, n, d: (poses(b, d), uniform(b, 6, dtype=d, low=-0.2, high=0.2)), POINTLESS + " raises", grad=(0, 1), bad=wrong_last_axis(1)),
+    Row(least_squares.choose, lambda b, n, d: (uniform(b, dtype=d) > 0.5, poses(b, d), poses(b, d, seed=1)), POINTLESS, grad=(1, 2)),
+    Row(least_squares.weight_slope, lambda b, n, d: (uniform(b, n, dtype=d), "geman_mcclure", 0.5), "dtype batch vmap capture gradcheck empty shuffle padding nan", (0,), (0,)),
+    Row(near_far.step, nine, "dtype batch vmap capture raises", bad=wrong_last_axis(2)),
+    Row(near_far.straighten, lambda b, n, d: (pixels(b, n, d).mT, cameras(b, d).f, cameras(b, d).c, uniform(b, n, dtype=d, low=-0.5, high=0.5), uniform(b, 3, dtype=d, high=0.02)), "dtype batch vmap capture gradcheck empty raises", grad=(0, 1, 2, 3, 4), bad=wrong_last_axis(3)),
+    Row(near_far.linearise_tracks, lambda b, n, d: problems(b, n, d)[:2], "dtype batch vmap capture raises", bad=lambda a: (a[0].replace(uv=a[0].uv[..., 1:]), a[1])),
+    Row(near_far.residuals, linear, "dtype batch vmap capture gradcheck raises", grad=(2,), bad=wrong_last_axis(2)),
+    Row(near_far.squares, linear, "dtype batch vmap capture gradcheck raises", grad=(2,), bad=wrong_last_axis(2)),
+    Row(near_far.normal, weighed, "dtype batch vmap capture"),
+    Row(near_far.prior, lambda b, n, d: (uniform(b, dtype=d),), POINTLESS, grad=(0,)),
+    Row(most_probable.noise_scale, lambda b, n, d: problems(b, n, d)[:2], "dtype batch vmap capture"),
+    Row(most_probable.most_probable, lambda b, n, d: (problems(b, n, d)[0], problems(b, n, d)[1].T, most_probable.Options()), "batch vmap capture"),
+    Row(most_probable.covariance, lambda b, n, d: (problems(b, n, d)[0], most_probable.Solution(*weighed(b, n, d)[1:5]), most_probable.Options()), "batch vmap capture"),
+    Row(covariance.noise_shape, lambda b, n, d: (tracked(b, n, d)[1].cov * uniform(b, n, 1, 1, dtype=d, low=0.5), torch.ones(b, n, dtype=torch.bool), 0.1), "dtype batch vmap capture gradcheck empty shuffle raises", (0, 1), (0,), bad=wrong_last_axis(0)),
+    Row(covariance.median, lambda b, n, d: (uniform(b, n, dtype=d), uniform(b, n, dtype=d, seed=1) > 0.3), "dtype batch vmap capture gradcheck empty shuffle raises", (0, 1), (0,), bad=wrong_last_axis(1)),
     Row(covariance.from_normal, lambda b, n, d: (positive(b, n, d), uniform(b, dtype=d, low=0.1)), "dtype batch vmap capture"),
     Row(covariance.mahalanobis, lambda b, n, d: (uniform(b, 6, dtype=d), positive(b, n, d)), "dtype batch vmap capture"),
     Row(ransac.collinear, lambda b, n, d: (uniform(b, 3, n, dtype=d), torch.ones(b, n, dtype=torch.bool)), "batch capture"),
@@ -238,10 +284,17 @@ ELSEWHERE = {
     "dhtorch.geometry.shapes.check",
     *(f"dhtorch.window.{name}" for name in ("inverse_variance", "extend_window")),
     "dhtorch.geometry.least_squares.minimise",
+    *(f"dhtorch.geometry.lucas_kanade.{n}" for n in ("search", "step", "squares", "covariance", "for_some", "within")),
     *(f"dhtorch.geometry.ransac.{name}" for name in ("msac_cost", "search")),
     *(f"dhtorch.evaluate.errors.{name}" for name in ("points", "select", "measure", "summarise", "unit")),
-    *(f"dhtorch.evaluate.risk.{name}" for name in ("curve", "risk_coverage", "measure", "capped", "realised", "surest")),
-    *(f"dhtorch.evaluate.calibrate.{n}" for n in ("reliability", "pool", "measure", "ece_interval", "leave_one_room_out")),
+    *(
+        f"dhtorch.evaluate.risk.{name}"
+        for name in ("curve", "risk_coverage", "measure", "capped", "realised", "surest")
+    ),
+    *(
+        f"dhtorch.evaluate.calibrate.{n}"
+        for n in ("reliability", "pool", "measure", "ece_interval", "leave_one_room_out")
+    ),
     *(f"dhtorch.evaluate.recalibrate.{name}" for name in ("fit", "sigma_scale", "from_json")),
     *(f"dhtorch.evaluate.monotone.{name}" for name in ("isotonic", "pool_adjacent_violators", "platt")),
     *(f"dhtorch.evaluate.control.{name}" for name in ("plug_in", "conformal", "scenes_needed", "p_value")),
@@ -385,7 +438,11 @@ def public_functions():
             for name, fn in inspect.getmembers(part, inspect.isfunction):
                 if not name.startswith("_") and fn.__module__ == info.name:
                     yield f"{info.name}.{name}"
-    yield from (f"dhtorch.window.{n}" for n, f in inspect.getmembers(window, inspect.isfunction) if n[0] != "_" and f.__module__ == "dhtorch.window")
+    yield from (
+        f"dhtorch.window.{n}"
+        for n, f in inspect.getmembers(window, inspect.isfunction)
+        if n[0] != "_" and f.__module__ == "dhtorch.window"
+    )
 
 
 def test_every_public_function_has_a_row():

@@ -40,3 +40,47 @@ def mahalanobis(
     check("mahalanobis", x=(x, "B n"), cov=(cov, "B n n"))
     whitened, _ = solve_spd(cov, x[..., None])
     return (x * whitened[..., 0]).sum(-1).clamp_min(0).sqrt()
+
+
+def noise_shape(
+    cov: Tensor,  # (B, N, 2, 2) px²
+    used: Tensor,  # (B, N) bool
+    isotropic: float,
+) -> Tensor:
+    """Shape of the noise of tracks without its scale: covariances over the median of their mean variance (B, N, 2, 2).
+
+    A tracker's covariance says along which direction a patch is held and where better than elsewhere; how large its
+    errors really are is another question (a patch that sees two depths, a lens that is not quite the model's), asked
+    of residuals. ``isotropic`` of the shape is replaced by the unit matrix, so that no track and no direction counts as
+    free of such errors.
+
+    Returns:
+        The unit matrix where a track is not used or its covariance is not positive and finite.
+
+    Gradient: to cov, the median's choice excepted. Raises ValueError for wrong shapes.
+    """
+    check("noise_shape", cov=(cov, "B N 2 2"), used=(used, "B N"))
+    xx, xy, yy = cov[..., 0, 0], cov[..., 0, 1], cov[..., 1, 1]
+    good = used & (xx > 0) & (yy > 0) & (xx * yy > xy * xy) & (xx + yy < torch.inf)
+    size = torch.where(good, 0.5 * (xx + yy), torch.ones_like(xx))
+    scale = median(size, good)[..., None, None]
+    eye = torch.eye(2, dtype=cov.dtype, device=cov.device)
+    shape = (1 - isotropic) * cov / scale + isotropic * eye
+    return torch.where(good[..., None, None], shape, eye)
+
+
+def median(
+    x: Tensor,  # (B, N)
+    used: Tensor,  # (B, N) bool
+) -> Tensor:
+    """Median (B, 1) of the used entries, the lower of the middle two; 1 where none is used.
+
+    Gradient: to the entry that is the median. Raises ValueError for wrong shapes.
+    """
+    check("median", x=(x, "B N"), used=(used, "B N"))
+    if x.shape[-1] == 0:
+        return x.new_ones((*x.shape[:-1], 1))
+    ordered = x.masked_fill(~used, torch.inf).sort(-1).values
+    count = used.sum(-1, keepdim=True)
+    middle = ordered.gather(-1, ((count - 1) // 2).clamp_min(0))
+    return torch.where(count > 0, middle, torch.ones_like(middle))

@@ -117,7 +117,7 @@ def point_jacobians(
 def depth_variance(
     geometry: TwoView,
     cov_uv_1: Tensor,  # (B, N, 2, 2) px²
-    cov_pose: Tensor,  # (B, 6, 6)
+    cov_pose: Tensor,  # (B, k, k), k columns of J_pose
 ) -> tuple[Tensor, Tensor]:
     """First-order variance of depth (B, N) m²: the point's own part (its track) and the part shared through the pose.
 
@@ -131,8 +131,8 @@ def depth_variance(
     gain = slope / torch.where(defined, steep, torch.ones_like(steep))[..., None]  # d(depth) / d(uv_1), m/px
     g0, g1 = gain.unbind(-1)
     own = g0 * g0 * cov_uv_1[..., 0, 0] + 2 * g0 * g1 * cov_uv_1[..., 0, 1] + g1 * g1 * cov_uv_1[..., 1, 1]
-    row = g0[..., None] * geometry.J_pose[..., 0, :] + g1[..., None] * geometry.J_pose[..., 1, :]  # (B, N, 6)
-    carried = sum(row[..., k, None] * cov_pose[:, None, k] for k in range(6))
+    row = g0[..., None] * geometry.J_pose[..., 0, :] + g1[..., None] * geometry.J_pose[..., 1, :]  # (B, N, k)
+    carried = sum(row[..., k, None] * cov_pose[:, None, k] for k in range(cov_pose.shape[-1]))
     shared = (carried * row).sum(-1)
     infinite = torch.full_like(own, torch.inf)
     return torch.where(defined, own, infinite), torch.where(defined, shared.clamp_min(0), infinite)

@@ -9,10 +9,12 @@ is contiguous over points.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 from dhtorch.geometry import se3
 from dhtorch.geometry.se3 import Pose
@@ -28,12 +30,16 @@ MIN_PIVOT = 1e-6
 LANES = 16
 
 
+#: A pose, or another tree of unknowns with a leading batch dimension.
+S = TypeVar("S")
+
+
 class Normal(NamedTuple):
-    """A cost and its normal equations at one pose per batch element."""
+    """A cost and its normal equations at one place per batch element."""
 
     cost: Tensor  # (B,)
-    H: Tensor  # (B, 6, 6)
-    g: Tensor  # (B, 6)
+    H: Tensor  # (B, n, n); n = 6 for a pose
+    g: Tensor  # (B, n)
 
 
 def linearise(
@@ -104,18 +110,38 @@ def robust(square: Tensor, kernel: str | None, scale: float) -> tuple[Tensor, Te
     raise ValueError(f"robust: kernel is {kernel!r}, expected None, 'huber', 'cauchy' or 'geman_mcclure'")
 
 
+def weight_slope(square: Tensor, kernel: str | None, scale: float) -> Tensor:
+    """d weight / d square of :func:`robust`: how fast a kernel lets go; ≤ 0.
+
+    Raises:
+        ValueError: an unknown kernel.
+
+    Gradient: to ``square``.
+    """
+    _, weight = robust(square, kernel, scale)
+    if kernel is None:
+        return torch.zeros_like(square)
+    k2 = scale * scale
+    if kernel == "huber":
+        outside = square > k2
+        return torch.where(outside, -0.5 * weight / torch.where(outside, square, torch.ones_like(square)), 0.0)
+    if kernel == "cauchy":
+        return -weight * weight / k2
+    return -2 / k2 * weight / (1 + square / k2)
+
+
 def normal_equations(
-    rows: Tensor,  # (B, 7, 2, N) of linearise; N a multiple of LANES for answers that do not depend on the batch
+    rows: Tensor,  # (B, n + 1, 2, N), of linearise; N a multiple of LANES for answers that do not depend on the batch
     weight: Tensor,  # (B, N) ≥ 0, one per point
 ) -> tuple[Tensor, Tensor]:
-    """H = Σ w Jᵀ J (B, 6, 6) and g = Σ w Jᵀ r (B, 6).
+    """H = Σ w Jᵀ J (B, n, n) and g = Σ w Jᵀ r (B, n), for n unknowns: six of a pose, or more.
 
     Gradient: to rows and weights. Raises ValueError for wrong shapes.
     """
-    check("normal_equations", rows=(rows, "B 7 2 N"), weight=(weight, "B N"))
-    weighted = (rows[:, :6] * weight[:, None, None]).flatten(2)
+    check("normal_equations", rows=(rows, "B n 2 N"), weight=(weight, "B N"))
+    weighted = (rows[:, :-1] * weight[:, None, None]).flatten(2)
     product = torch.bmm(weighted, rows.flatten(2).transpose(1, 2))
-    return product[..., :6], product[..., 6]
+    return product[..., :-1], product[..., -1]
 
 
 def solve_spd(
@@ -135,9 +161,14 @@ def solve_spd(
 
     Gradient: exact to H and b, first order only; zero where not ok.
     """
-    check("solve_spd", H=(H, "B n n"), b=(b, "B n k"))
+    n = check("solve_spd", H=(H, "B n n"), b=(b, "B n k"))["n"]
     A, rhs = H.double(), b.double()
-    eye = torch.eye(H.shape[-1], dtype=A.dtype, device=A.device)
+    if n % 2:
+        # LAPACK rounds by how a matrix lies in memory: filled up to a multiple of 4, all of a batch lie alike.
+        more = -n % 4
+        A, rhs = F.pad(A, (0, more, 0, more)), F.pad(rhs, (0, 0, 0, more))
+        A = A + torch.diag(F.pad(A.new_zeros(n), (0, more), value=1.0))
+    eye = torch.eye(A.shape[-1], dtype=A.dtype, device=A.device)
     diagonal = A.detach().diagonal(dim1=-2, dim2=-1)
     s = diagonal.masked_fill(~(diagonal > 0), 1.0).rsqrt()[..., None]
     A, rhs = A * (s * s.transpose(1, 2)), rhs * s
@@ -150,7 +181,7 @@ def solve_spd(
     A, rhs = torch.where(bad, eye, A), rhs.masked_fill(bad, 0.0)
     start = torch.cholesky_solve(rhs.detach(), L)
     x = start + torch.cholesky_solve(rhs - _product(A, start), L)
-    return (x * s).to(b.dtype), ok
+    return (x * s)[:, :n].to(b.dtype), ok
 
 
 def _product(A: Tensor, x: Tensor) -> Tensor:
@@ -168,22 +199,42 @@ def gauss_newton_step(T: Pose, H: Tensor, g: Tensor) -> tuple[Pose, Tensor]:
     Gradient: to T, H and g. Raises ValueError for wrong shapes.
     """
     xi, ok = solve_spd(H, -g[..., None])
-    omega, upsilon = xi[:, :3, 0], xi[:, 3:]
+    return move(T, xi[..., 0]), ok
+
+
+def move(
+    T: Pose,
+    xi: Tensor,  # (B, 6)
+) -> Pose:
+    """The pose displaced by a tangent vector, to second order in the rotation and without transcendental functions.
+
+    Gradient: to T and xi. Raises ValueError for wrong shapes.
+    """
+    check("move", R=(T.R, "B 3 3"), xi=(xi, "B 6"))
+    omega, upsilon = xi[:, :3], xi[:, 3:]
     W = se3.hat(omega)
     M = torch.cat((T.R, T.t[..., None]), -1)
     WM = W @ M
     M = M + (WM + 0.5 * (W @ WM)) / (1 + 0.25 * (omega * omega).sum(-1))[:, None, None]
-    return Pose(M[..., :3], M[..., 3] + upsilon[..., 0]), ok
+    return Pose(M[..., :3], M[..., 3] + upsilon)
 
 
-def minimise(evaluate: Callable[[Pose], Normal], T: Pose, steps: int, *, damping: float = 1e-4) -> tuple[Pose, Tensor]:
+def minimise(
+    evaluate: Callable[[S], Normal],
+    T: S,
+    steps: int,
+    *,
+    damping: float = 1e-4,
+    step: Callable[[Any, Tensor, Tensor], tuple[Any, Tensor]] = gauss_newton_step,
+) -> tuple[S, Tensor]:
     """Levenberg–Marquardt with a fixed number of steps; each batch element accepts or rejects its own.
 
     Args:
         evaluate: cost and normal equations at a pose; its mask or weights may be recomputed there.
-        T: start.
+        T: start; a pose, or another record of unknowns that ``step`` can move.
         steps: how many proposals.
         damping: initial factor of the diagonal; ×0.1 after an accepted step, ×10 after a rejected one.
+        step: ``(T, H, g) -> (T, ok)``, the Gauss–Newton step.
 
     Returns:
         The best pose seen and its cost (B,); the cost never rises above the start's.
@@ -194,15 +245,17 @@ def minimise(evaluate: Callable[[Pose], Normal], T: Pose, steps: int, *, damping
     factor = torch.full_like(best.cost, damping)
     for _ in range(steps):
         diagonal = torch.diag_embed(best.H.diagonal(dim1=-2, dim2=-1))
-        proposal, ok = gauss_newton_step(T, best.H + factor[:, None, None] * diagonal, best.g)
+        proposal, ok = step(T, best.H + factor[:, None, None] * diagonal, best.g)
         found = evaluate(proposal)
         better = ok & (found.cost < best.cost)
-        choose = better[:, None]
-        T = Pose(torch.where(choose[..., None], proposal.R, T.R), torch.where(choose, proposal.t, T.t))
-        best = Normal(
-            torch.where(better, found.cost, best.cost),
-            torch.where(choose[..., None], found.H, best.H),
-            torch.where(choose, found.g, best.g),
-        )
+        T, best = choose(better, proposal, T), choose(better, found, best)
         factor = torch.where(better, factor * 0.1, factor * 10)
     return T, best.cost
+
+
+def choose(mask: Tensor, new: S, old: S) -> S:
+    """Batch elements of ``new`` where ``mask`` (B,) holds, of ``old`` elsewhere; trees of tensors (B, …).
+
+    Gradient: to the chosen ones.
+    """
+    return pytree.tree_map(lambda a, b: torch.where(mask.view(-1, *[1] * (a.ndim - 1)), a, b), new, old)

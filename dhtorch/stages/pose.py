@@ -7,25 +7,34 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 from dhtorch.codes import PoseCode
-from dhtorch.geometry import covariance, ransac, se3
+from dhtorch.geometry import camera as cam
+from dhtorch.geometry import covariance, near_far, ransac, se3
 from dhtorch.geometry.least_squares import (
     LANES,
     MIN_DEPTH,
     Normal,
+    choose,
     gauss_newton_step,
     linearise,
     minimise,
     normal_equations,
     robust,
 )
+from dhtorch.geometry.most_probable import Options, most_probable
+from dhtorch.geometry.most_probable import covariance as m_covariance
+from dhtorch.geometry.near_far import Problem
 from dhtorch.geometry.shapes import check
-from dhtorch.records import Camera, Pose, PoseFit, Samples, Tracks
+from dhtorch.records import Camera, Pose, PoseFit, Samples, Shutter, Tracks
 from dhtorch.tree import collate
 
 #: Pairs solved together: few enough for their temporaries to stay in cache.
 PAIRS = 16
+
+#: Pairs whose near and far tracks are solved together: a track has ten columns there.
+MAP_PAIRS = 4
 
 #: Points the search looks at; a pair with more is thinned evenly. The last steps see all points.
 SEARCH_POINTS = 256
@@ -218,3 +227,153 @@ def _orthonormal(R: Tensor) -> Tensor:
     z = torch.linalg.cross(x, R[:, 1])
     z = z / z.norm(dim=-1, keepdim=True)
     return torch.stack((x, torch.linalg.cross(z, x), z), 1)
+
+
+def map_pose(
+    samples: Samples,
+    tracks: Tracks,
+    camera_0: Camera,
+    camera_1: Camera,
+    draws: Tensor,  # (B, H, 3) uniform in [0, 1)
+    *,
+    start: Callable[..., PoseFit] = pnp_ransac,
+    far_weight: float = 0.1,
+    max_rise: float = 0.1,
+    isotropic: float = 0.1,
+    turn_sigma: float = 0.01,
+    min_drop: float = 0.02,
+    kernel: str | None = "geman_mcclure",
+    bend: float = 2.0,
+    near_steps: int = 8,
+    steps: int = 10,
+    threshold_px: float = 3.0,
+) -> PoseFit:
+    """The most probable pose under all tracks: near ones hold the scale, far ones, without depth, the rotation.
+
+    One least-squares problem per pair (:mod:`dhtorch.geometry.near_far`). A near residual is weighed by the noise of
+    its track and of its depth; a far track has an inverse depth of its own, which is eliminated. First the near tracks
+    alone are solved from the pose of ``start``, then all of them. The second answer is kept unless it fits the near
+    tracks clearly worse: far tracks are many, and what is not a rigid scene seen by two pinhole cameras speaks through
+    them first. The scale of the noise is estimated from the residuals, near and far apart. Where it explains much of
+    the residuals, rows of the image get a rotation each, as a rolling shutter gives them.
+
+    Args:
+        samples: near points are those with finite ``xyz`` (camera 0, m) and their noise ``sigma`` (m).
+        tracks: ``uv_0``, ``uv_1`` in ideal pixels, ``cov`` up to scale (px²); only ``valid`` ones are used.
+        camera_0, camera_1: intrinsics, ideal; they may differ.
+        draws: the randomness of ``start``.
+        start: another function of this seat.
+        far_weight: weight of a far track's cost: not its inverse variance, because neighbours share their errors.
+        max_rise: share by which the near cost may rise over that of the near tracks alone.
+        isotropic: share of a track's noise that does not depend on its patch, see ``covariance.noise_shape``.
+        turn_sigma: one standard deviation of how far rows may turn against each other, rad per unit of height (of a
+            ray with z = 1); 0 for a global shutter.
+        min_drop: share of the cost that such a turn must take away to be believed.
+        kernel, bend: robust kernel and the residual, in standard deviations, at which it bends.
+        near_steps, steps: Levenberg–Marquardt steps of the two solutions.
+        threshold_px: largest reprojection error of a near track that is reported as an inlier.
+
+    Returns:
+        PoseFit with ``shutter``. ``cov`` is the sandwich of an M-estimator with inverse depths and turn eliminated, in
+        which residuals with heavy tails widen the answer; ``sigma_px`` is the scale of the noise of the far tracks, to
+        be multiplied with their shape. Codes: those of ``start`` where it found no pose; DEGENERATE: the near tracks
+        leave the pose undetermined; KEPT_PNP: far tracks contradict the near ones, which alone are answered.
+
+    Raises:
+        ValueError: wrong shapes, an unknown kernel; else as ``start``.
+
+    Gradient: R, t and turn to near ``xyz``, ``uv_0``, ``uv_1`` and both cameras, through one last step from the
+    detached optimum: exact to first order for small residuals. Noise, weights, cov and codes are detached.
+    Cost: linear in B and N. Float64 in the last step and the covariance, the inputs' dtype elsewhere.
+    Source: see :mod:`dhtorch.geometry.near_far`.
+    """
+    B = check("map_pose", xyz=(samples.xyz, "B N 3"), uv_1=(tracks.uv_1, "B N 2"), cov=(tracks.cov, "B N 2 2"))["B"]
+    first = start(samples, tracks, camera_0, camera_1, draws)
+    options = Options(far_weight, max_rise, turn_sigma, min_drop, kernel, bend, near_steps, steps)
+    parts = [slice(b, b + MAP_PAIRS) for b in range(0, B, MAP_PAIRS)]
+    problem = _near_far(samples, tracks, camera_0, camera_1, isotropic)
+    fits = [_fit_all(options, threshold_px, first[p], problem[p], tracks[p]) for p in parts]
+    return collate(fits) if len(fits) != 1 else fits[0]
+
+
+def _fit_all(o: Options, threshold_px: float, first: PoseFit, problem: Problem, tracks: Tracks) -> PoseFit:
+    N = tracks.uv_1.shape[1]
+    eye = se3.identity(len(first.code), problem.f)
+    found = most_probable(problem.detach(), choose(first.ok, first.T_1_from_0.detach(), eye), o)
+    # The last step, in float64 and with the graph on.
+    problem = problem.to(torch.float64)
+    found = pytree.tree_map(torch.Tensor.double, found)
+    found = found._replace(at=found.at._replace(T=Pose(_orthonormal(found.at.T.R), found.at.T.t)))
+    weights = (found.noise, found.far_weight, found.turn_precision)
+    _, H, g = near_far.normal(problem, found.at, *weights, o.kernel, o.bend)
+    at, solved = near_far.step(found.at, H, g)
+    with torch.no_grad():
+        cov, known = m_covariance(problem, found, o)
+        finite = at.T.R.isfinite().flatten(1).all(1) & at.T.t.isfinite().all(1)
+        code = torch.where(found.far_weight < o.far_weight, PoseCode.KEPT_PNP, PoseCode.OK)
+        code = torch.where(solved & known & finite, code, PoseCode.DEGENERATE)
+        code = torch.where(first.ok, code, first.code).to(torch.int32)
+        ok = (code == PoseCode.OK) | (code == PoseCode.KEPT_PNP)
+        inlier, rms_px = _reprojection(problem, at, threshold_px)
+        variance = torch.where(problem.far.any(-1), (found.noise * problem.far).amax(-1), found.noise.amax(-1))
+        t_snr = covariance.mahalanobis(at.T.t, cov[:, 3:6, 3:6])
+
+    def answer(x: Tensor) -> Tensor:
+        return torch.where(ok.view(-1, *[1] * (x.ndim - 1)), x, torch.nan).to(tracks.uv_1.dtype)
+
+    return PoseFit(
+        T_1_from_0=Pose(answer(at.T.R), answer(at.T.t)),
+        cov=answer(cov[:, :6, :6]),
+        inlier=(inlier & ok[:, None])[:, :N],
+        n_inlier=torch.where(ok, inlier.sum(-1), first.n_inlier),
+        rms_px=answer(rms_px),
+        sigma_px=answer(variance.sqrt()),
+        t_snr=answer(t_snr),
+        code=code,
+        shutter=Shutter(answer(at.turn), answer(cov)),
+    )
+
+
+def _near_far(samples: Samples, tracks: Tracks, camera_0: Camera, camera_1: Camera, isotropic: float) -> Problem:
+    """The tracks as planes, N' > 0 a multiple of LANES; unused ones at a safe place."""
+    usable = tracks.valid & tracks.uv_1.isfinite().all(-1) & tracks.uv_0.isfinite().all(-1)
+    xyz, sigma = samples.xyz, samples.sigma.detach()
+    near = usable & xyz.isfinite().all(-1) & (xyz[..., 2] > 0) & (sigma > 0) & sigma.isfinite()
+    far = usable & ~xyz.isfinite().all(-1)
+    z = torch.where(near, xyz[..., 2], torch.ones_like(sigma))
+    shape = covariance.noise_shape(tracks.cov.detach(), usable, isotropic)
+    ray = cam.rays(cam.ideal(camera_0), torch.where(usable[..., None], tracks.uv_0, torch.zeros_like(tracks.uv_0)))
+    ray = torch.where(near[..., None], torch.where(near[..., None], xyz, torch.ones_like(xyz)) / z[..., None], ray)
+    spread = torch.where(near, sigma, torch.ones_like(sigma)) / (z * z).detach()
+    uv = torch.where(usable[..., None], tracks.uv_1, torch.zeros_like(tracks.uv_1))
+    N = usable.shape[1]
+    padding = max(N + -N % LANES, LANES) - N
+
+    def plane(x: Tensor, value: float = 0.0) -> Tensor:
+        x = x.transpose(1, 2) if x.ndim == 3 else x
+        return torch.nn.functional.pad(x, (0, padding), value=value)
+
+    shape = torch.stack((shape[..., 0, 0], shape[..., 0, 1], shape[..., 1, 1]), 1)
+    filled = torch.eye(1, dtype=shape.dtype, device=shape.device).expand(1, padding)
+    ends = torch.cat((filled, 0 * filled, filled)).expand(len(shape), 3, padding)
+    return Problem(
+        f=camera_1.f,
+        c=camera_1.c,
+        ray=plane(ray, 1.0),
+        uv=plane(uv),
+        inverse=plane(1 / z, 1.0),
+        variance=plane(spread * spread, 1.0),
+        shape=torch.cat((shape, ends), -1),
+        near=torch.nn.functional.pad(near, (0, padding)),
+        far=torch.nn.functional.pad(far, (0, padding)),
+    )
+
+
+def _reprojection(problem: Problem, at: near_far.Unknowns, threshold_px: float) -> tuple[Tensor, Tensor]:
+    """Near tracks (B, N) whose point, at the sensor's depth, falls close to where they were seen; rms px of these."""
+    y = problem.ray[:, 1]
+    uv = near_far.straighten(problem.uv, problem.f, problem.c, y, at.turn)
+    rows, depth = linearise(at.T, problem.f, problem.c, problem.ray / problem.inverse[:, None], uv)
+    square = (rows[:, 6] * rows[:, 6]).sum(1)
+    inlier = problem.near & (depth > MIN_DEPTH) & (square < threshold_px**2)
+    return inlier, ((square * inlier).sum(-1) / inlier.sum(-1).clamp_min(1)).sqrt()

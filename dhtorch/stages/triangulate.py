@@ -9,7 +9,10 @@ import torch
 from torch import Tensor
 
 from dhtorch.codes import Gate, first_reason
+from dhtorch.geometry import camera as cam
 from dhtorch.geometry import epipolar
+from dhtorch.geometry.covariance import noise_shape
+from dhtorch.geometry.near_far import straighten
 from dhtorch.geometry.shapes import check
 from dhtorch.records import Camera, Estimate, PoseFit, Samples, Tracks
 
@@ -23,6 +26,12 @@ def two_view(
     *,
     min_parallax_deg: float | None = 0.3,
     max_residual_px: float | None = 3.0,
+    max_sigma_rel: float | None = None,
+    min_t_snr: float | None = None,
+    max_photometric: float | None = None,
+    fitted_noise: bool = False,
+    isotropic: float = 0.1,
+    sigma_scale: float = 1.0,
     solver: Callable[..., epipolar.TwoView] = epipolar.triangulate,
 ) -> Estimate:
     """Triangulate every track under the anchored pose and abstain where the geometry is weak.
@@ -35,13 +44,24 @@ def two_view(
         min_parallax_deg: rays closer to parallel than this are not answered; None asks nothing.
         max_residual_px: reprojection error above which a point is not answered; None asks nothing. Triangulation is
             one-sided, so the residual in view 0 is zero and the one in view 1 is the larger of the two.
+        max_sigma_rel: sigma / depth above which a point is not answered; None asks nothing.
+        min_t_snr: length of the translation, in its own standard deviations, below which no point of the pair is
+            answered; None asks nothing.
+        max_photometric: grey difference (rms, image in [0, 1]) of a track's patches above which it may have slid to
+            another place of its epipolar line, and is not answered; None asks nothing.
+        fitted_noise: take the scale of the tracks' noise from the pose's residuals (``fit.sigma_px``), and from the
+            tracks' covariances only its shape; else the covariances as they are.
+        isotropic: share of that shape which does not depend on the patch, see ``covariance.noise_shape``.
+        sigma_scale: factor on sigma and sigma_shared, as a calibration found it.
         solver: ``(uv_0, uv_1, camera_0, camera_1, T_1_from_0) -> TwoView``, how two rays become a depth.
 
     Returns:
         Estimate with score 1 where answered (the next stage ranks). ``sigma`` combines the track's covariance and
-        the pose's; ``sigma_shared`` is the pose's part, common to the pair's points.
+        the pose's (with it the sensor's noise, which the pose has from the near points); ``sigma_shared`` is the pose's
+        part, common to the pair's points.
 
-    Gates, first reason wins: NO_TRACK, NO_POSE, BEHIND, PARALLAX, RESIDUAL.
+    Gates, first reason wins: NO_TRACK, NO_POSE, NO_BASELINE, BEHIND, PARALLAX, RESIDUAL, INCONSISTENT, UNCERTAIN.
+    A rolling shutter that the pose found (``fit.shutter``) is undone in ``uv_1`` and counts in sigma.
 
     Raises:
         ValueError: wrong shapes.
@@ -53,19 +73,32 @@ def two_view(
     check("two_view", uv_0=(tracks.uv_0, "B N 2"), uv=(samples.uv, "B N 2"), R=(fit.T_1_from_0.R, "B 3 3"))
     posed = fit.ok[:, None]
     tracked = tracks.valid & tracks.uv_0.isfinite().all(-1) & tracks.uv_1.isfinite().all(-1)
-    geometry = solver(
-        _silence(tracks.uv_0, tracked), _silence(tracks.uv_1, tracked), camera_0, camera_1, _stand_in(fit)
-    )
+    uv_0, uv_1 = _silence(tracks.uv_0, tracked), _silence(tracks.uv_1, tracked)
+    y = None
+    if fit.shutter is not None:
+        y = cam.rays(cam.ideal(camera_0), uv_0)[..., 1]
+        turn = torch.where(posed, fit.shutter.turn, torch.zeros_like(fit.shutter.turn))
+        uv_1 = straighten(uv_1.transpose(1, 2), camera_1.f, camera_1.c, y, turn).transpose(1, 2)
+    geometry = solver(uv_0, uv_1, camera_0, camera_1, _stand_in(fit))
     parallax_deg = geometry.parallax * (180 / math.pi)
+    cov = tracks.cov
+    if fitted_noise:
+        scale = torch.where(posed, fit.sigma_px[:, None], 1.0).to(cov.dtype)
+        cov = noise_shape(cov, tracked, isotropic) * (scale * scale)[..., None, None]
+    own, shared = _variance(geometry, cov, fit, y)
+    own, shared = own * sigma_scale**2, shared * sigma_scale**2
     behind = ~((geometry.depth > 0) & (geometry.depth_1 > 0))
+    limit = None if max_sigma_rel is None else (max_sigma_rel * geometry.depth) ** 2
     gate = first_reason(
         (~tracked, Gate.NO_TRACK),
         (~posed, Gate.NO_POSE),
+        (_below(fit.t_snr[:, None].expand_as(tracked), min_t_snr), Gate.NO_BASELINE),
         (behind, Gate.BEHIND),
         (parallax_deg <= (min_parallax_deg if min_parallax_deg is not None else -1.0), Gate.PARALLAX),
         (geometry.residual_px >= (max_residual_px if max_residual_px is not None else torch.inf), Gate.RESIDUAL),
+        (_above(tracks.photometric, max_photometric), Gate.INCONSISTENT),
+        (_above(own + shared, limit), Gate.UNCERTAIN),
     )
-    own, shared = epipolar.depth_variance(geometry, tracks.cov, fit.cov.nan_to_num())
     keep, measured = gate == Gate.ANSWER, tracked & posed
     return Estimate(
         uv=samples.uv,
@@ -78,6 +111,23 @@ def two_view(
         score=keep.to(geometry.depth.dtype),
         gate=gate,
     )
+
+
+def _variance(geometry: epipolar.TwoView, cov: Tensor, fit: PoseFit, y: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Own and shared variance of depth; with a shutter its turn is three more columns of the pose."""
+    if fit.shutter is None or y is None:
+        return epipolar.depth_variance(geometry, cov, fit.cov.nan_to_num())
+    J = torch.cat((geometry.J_pose, geometry.J_pose[..., :3] * y[..., None, None]), -1)
+    return epipolar.depth_variance(geometry._replace(J_pose=J), cov, fit.shutter.cov.nan_to_num())
+
+
+def _above(x: Tensor, limit: Tensor | float | None) -> Tensor:
+    """Where ``x`` exceeds the limit or is not a number; nowhere without a limit."""
+    return torch.zeros_like(x, dtype=torch.bool) if limit is None else ~(x <= limit)
+
+
+def _below(x: Tensor, limit: float | None) -> Tensor:
+    return torch.zeros_like(x, dtype=torch.bool) if limit is None else ~(x >= limit)
 
 
 def _stand_in(fit: PoseFit) -> epipolar.Pose:

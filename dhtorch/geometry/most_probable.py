@@ -1,0 +1,174 @@
+"""The most probable pose of near and far tracks, and how well it is known: steps, noise, choices, covariance.
+
+Alphabet: that of :mod:`dhtorch.geometry.near_far`; ``noise`` (B, N) px² is the scale of each track's noise; ``psi`` =
+w r a residual after its robust weight w, in standard deviations.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dhtorch.geometry.covariance import median
+from dhtorch.geometry.least_squares import (
+    Normal,
+    choose,
+    minimise,
+    normal_equations,
+    robust,
+    solve_spd,
+    weight_slope,
+)
+from dhtorch.geometry.near_far import Problem, Unknowns, linearise_tracks, normal, prior, residuals, squares, step
+from dhtorch.geometry.se3 import Pose
+
+#: Standard deviations of a residual coordinate, px, that are believed.
+MIN_NOISE_PX, MAX_NOISE_PX = 0.1, 5.0
+
+#: Medians of |r| / sigma for normal noise: of a vector of two coordinates, and of one coordinate.
+MEDIAN_2D, MEDIAN_1D = 1.17741, 0.67449
+
+#: Precision (1/rad²) of a turn that is held at zero.
+RIGID = 1e18
+
+#: Least believed ratio of mean psi′ to mean w: residuals all beyond the bend would make it negative.
+MIN_RISE = 0.1
+
+#: Near cost (in units of its variance) that may be gained or lost without being asked why.
+SLACK = 1.0
+
+
+class Options(NamedTuple):
+    """What the solution of one problem may be told; see ``stages.pose.map_pose``."""
+
+    far_weight: float = 0.1
+    max_rise: float = 0.1
+    turn_sigma: float = 0.01
+    min_drop: float = 0.02
+    kernel: str | None = "geman_mcclure"
+    bend: float = 2.0
+    near_steps: int = 8
+    steps: int = 10
+
+
+class Solution(NamedTuple):
+    """The unknowns at the optimum, and the weights under which it is one."""
+
+    at: Unknowns
+    noise: Tensor  # (B, N) px²
+    far_weight: Tensor  # (B,) 0 where far tracks were not believed
+    turn_precision: Tensor  # (B,) 1/rad²
+
+
+@torch.no_grad()
+def most_probable(problem: Problem, start: Pose, o: Options) -> Solution:
+    """Solve for the near tracks, then for all, then for all with a turn; go on only where that is borne out.
+
+    *Far tracks* are believed unless the near tracks' robust cost rises by more than ``max_rise`` with them. A *turn* is
+    believed where it lowers the whole cost by more than ``min_drop`` of it: three more parameters always fit better,
+    and by how much they do without a turn is a matter of systematic errors, not of the number of tracks.
+
+    Raises:
+        ValueError: wrong shapes, an unknown kernel.
+
+    Cost: ``near_steps`` + 2.5 ``steps`` evaluations of the problem. Fixed: nothing depends on values.
+    """
+    at = Unknowns(start, torch.zeros_like(start.t))
+    none, far, rigid = (torch.full_like(start.t[:, 0], x) for x in (0.0, o.far_weight, RIGID))
+
+    def solve(at: Unknowns, noise: Tensor, far: Tensor, precision: Tensor, steps: int) -> tuple[Unknowns, Tensor]:
+        def evaluate(at: Unknowns) -> Normal:
+            return normal(problem, at, noise, far, precision, o.kernel, o.bend)
+
+        return minimise(evaluate, at, steps, step=step)
+
+    half = o.near_steps // 2
+    near, _ = solve(at, noise_scale(problem, at), none, rigid, half)
+    near, _ = solve(near, noise_scale(problem, near), none, rigid, o.near_steps - half)
+    both, cost = solve(near, noise_scale(problem, near), far, rigid, o.steps)
+    noise, precision = noise_scale(problem, both), rigid
+    if o.turn_sigma > 0:
+        both, cost = solve(both, noise, far, rigid, o.steps // 2)
+        loose = torch.full_like(rigid, o.turn_sigma**-2)
+        turned, lower = solve(both, noise, far, loose, o.steps)
+        worth = lower < cost * (1 - o.min_drop)
+        both, precision = choose(worth, turned, both), torch.where(worth, loose, rigid)
+    cost_near, cost_both = (_near_cost(problem, x, noise, o) for x in (near, both))
+    believed = cost_both <= cost_near * (1 + o.max_rise) + SLACK
+    at = choose(believed, both, near)
+    return Solution(
+        at,
+        noise_scale(problem, at),
+        torch.where(believed, far, none),
+        torch.where(believed, precision, rigid),
+    )
+
+
+@torch.no_grad()
+def noise_scale(problem: Problem, at: Unknowns, rounds: int = 3) -> Tensor:
+    """Variance (B, N) px² of a residual coordinate, estimated from medians; one for the near, one for the far tracks.
+
+    Medians know nothing of the scale that the sensor's noise adds to a near residual; so the estimate is repeated with
+    what the last one found.
+    """
+    noise, linear = torch.ones_like(problem.inverse), linearise_tracks(problem, at)
+    for _ in range(rounds):
+        size = squares(problem, linear, noise).sqrt()
+        near = median(size, problem.near & linear.front) / MEDIAN_2D
+        far = median(size, problem.far & linear.front) / MEDIAN_1D
+        far = torch.where(problem.far.any(-1, keepdim=True), far, near)
+        factor = torch.where(problem.far, far, near)
+        noise = (noise * factor * factor).clamp(MIN_NOISE_PX**2, MAX_NOISE_PX**2)
+    return noise
+
+
+@torch.no_grad()
+def covariance(problem: Problem, solution: Solution, o: Options) -> tuple[Tensor, Tensor]:
+    """Covariance (B, 9, 9) of (rotation, translation, turn), and ``ok`` (B,); zero where not ok.
+
+    Neither the far weight nor a robust weight is an inverse variance, so this is the sandwich A⁻¹ M A⁻¹ of an
+    M-estimator: A = Σ ω ψ′ Jᵀ S⁻¹ J is how steeply the equations rise, M = Σ ω² ψ² Jᵀ S⁻¹ J how much they scatter, with
+    the inverse depths eliminated from both. ψ′ and ψ² are taken as means over each kind of track, so residuals that
+    are heavier in their tails than assumed widen the answer.
+
+    Source: P. Huber, "Robust Statistics", 1981, section 7.6.
+    """
+    linear = linearise_tracks(problem, solution.at)
+    square = squares(problem, linear, solution.noise)
+    _, weight = robust(square, o.kernel, o.bend)
+    bread, meat = torch.zeros_like(square), torch.zeros_like(square)
+    near_weight = torch.ones_like(solution.far_weight)
+    for mask, omega, size in ((problem.near, near_weight, 2), (problem.far, solution.far_weight, 1)):
+        used = mask & linear.front
+        rise, scatter = _rise_and_scatter(square, weight, used, size, o)
+        bread = torch.where(used, weight * (omega * rise)[:, None], bread)
+        meat = torch.where(used, weight * weight * (omega * omega * scatter)[:, None], meat)
+    rows = residuals(problem, linear, solution.noise).double()
+    A, _ = normal_equations(rows, bread.double())
+    M, _ = normal_equations(rows, meat.double())
+    known = torch.diag_embed(prior(solution.turn_precision.double()))
+    A, M = A + known, M + known
+    inverse, ok = solve_spd(A, torch.eye(9, dtype=A.dtype, device=A.device).expand_as(A))
+    half = (inverse[:, :, :, None] * M[:, None]).sum(2)
+    whole = (half[:, :, :, None] * inverse[:, None]).sum(2)
+    return 0.5 * (whole + whole.transpose(1, 2)), ok
+
+
+def _near_cost(problem: Problem, at: Unknowns, noise: Tensor, o: Options) -> Tensor:
+    """Robust cost (B,) of the near tracks alone."""
+    rho, _ = robust(squares(problem, linearise_tracks(problem, at), noise), o.kernel, o.bend)
+    return (rho * problem.near).sum(-1)
+
+
+def _rise_and_scatter(square: Tensor, weight: Tensor, used: Tensor, size: int, o: Options) -> tuple[Tensor, Tensor]:
+    """mean psi′ / mean w and mean psi² / mean w² (B,) of the used tracks, whose residuals have ``size`` coordinates."""
+    steeper = weight_slope(square, o.kernel, o.bend) * square * (2 / size) + weight
+
+    def total(x: Tensor) -> Tensor:
+        return (x * used).sum(-1)
+
+    rise = total(steeper) / total(weight).clamp_min(1e-9)
+    scatter = total(weight * weight * square) / size / total(weight * weight).clamp_min(1e-9)
+    return rise.clamp_min(MIN_RISE), scatter

@@ -1,0 +1,243 @@
+"""One least-squares problem from two kinds of tracks: near ones, whose depth a sensor knows, and far ones, without.
+
+Alphabet: view 0 is the anchor; ``x`` its viewing ray with z = 1 and ``q`` the inverse depth along it (1/m), so that the
+point seen from camera 1 is R x + q t, up to scale, and q = 0 is a point at infinity. ``r`` = projected − measured (px),
+``S`` its covariance, ``s`` = d r / d q. Every track has its own q, which is eliminated from the problem (a Schur
+complement that is one number): with a sensor that states variance v of q, r has the covariance S + v s sᵀ; a far track
+has v = ∞ and keeps only the part of r across its epipolar line. So both kinds end as two rows per track, whitened.
+
+Unknowns of a pair: the pose T (left perturbation) and the *turn* b (rad): a camera that reads row by row while it moves
+sees each row from a place of its own, which for short exposures is mainly a rotation y · b more, y being the height of
+x in the anchor. A turn of zero is a global shutter.
+
+Source: bundle adjustment with one free camera (B. Triggs et al., "Bundle adjustment: a modern synthesis", 2000);
+tracks with and without depth in one problem: J. Zhang, M. Kaess, S. Singh, "Real-time depth enhanced monocular
+odometry", 2014, and P. Proença, Y. Gao, "SPLODE", 2018; rows with a motion of their own: J. Hedborg et al., "Rolling
+shutter bundle adjustment", 2012.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dhtorch.geometry.least_squares import MIN_DEPTH, Normal, move, normal_equations, robust, solve_spd
+from dhtorch.geometry.se3 import Pose
+from dhtorch.geometry.shapes import check
+from dhtorch.tree import Record, record
+
+#: Squared residual (in units of its variance) of a point behind a camera: far beyond every kernel.
+BEHIND = 1e4
+
+
+@record
+class Problem(Record):
+    """Tracks of B pairs as planes, N a multiple of ``least_squares.LANES``; unused ones at any finite place."""
+
+    f: Tensor  # (B, 2) px, camera 1
+    c: Tensor  # (B, 2) px, camera 1
+    ray: Tensor  # (B, 3, N) x in camera 0
+    uv: Tensor  # (B, 2, N) ideal px, measured in camera 1
+    inverse: Tensor  # (B, N) 1/m, the sensor's q; not read for far tracks
+    variance: Tensor  # (B, N) 1/m², of the sensor's q
+    shape: Tensor  # (B, 3, N) the noise's covariance in view 1 up to scale: xx, xy, yy
+    near: Tensor  # (B, N) bool
+    far: Tensor  # (B, N) bool
+
+
+class Unknowns(NamedTuple):
+    """What is solved for."""
+
+    T: Pose
+    turn: Tensor  # (B, 3) rad per unit of y
+
+
+def step(at: Unknowns, H: Tensor, g: Tensor) -> tuple[Unknowns, Tensor]:
+    """The unknowns after one Gauss–Newton step, H (B, 9, 9) and g (B, 9), and ``ok`` (B,); unmoved where H is singular.
+
+    Gradient: to all three. Raises ValueError for wrong shapes.
+    """
+    check("step", turn=(at.turn, "B 3"), H=(H, "B 9 9"), g=(g, "B 9"))
+    xi, ok = solve_spd(H, -g[..., None])
+    return Unknowns(move(at.T, xi[:, :6, 0]), at.turn + xi[:, 6:, 0]), ok
+
+
+def straighten(
+    uv: Tensor,  # (B, 2, N) ideal px of camera 1, planes
+    f: Tensor,  # (B, 2) px
+    c: Tensor,  # (B, 2) px
+    y: Tensor,  # (B, N) height of the anchor's ray
+    turn: Tensor,  # (B, 3) rad per unit of y
+) -> Tensor:
+    """Pixels as a camera without rolling shutter would have seen them: each ray is turned back by y · turn.
+
+    Gradient: to all. Raises ValueError for wrong shapes.
+    """
+    check("straighten", uv=(uv, "B 2 N"), f=(f, "B 2"), c=(c, "B 2"), y=(y, "B N"), turn=(turn, "B 3"))
+    u, v = ((uv - c[..., None]) / f[..., None]).unbind(1)
+    b0, b1, b2 = (turn[:, k, None] * y for k in range(3))
+    z = 1 - (b0 * v - b1 * u)
+    z = torch.where(z.abs() < 0.1, torch.full_like(z, 0.1), z)  # beyond any shutter: stays finite
+    turned = torch.stack(((u - (b1 - b2 * v)) / z, (v - (b2 * u - b0)) / z), 1)
+    return turned * f[..., None] + c[..., None]
+
+
+class Linear(NamedTuple):
+    """The tracks of a problem, linearised: two equations each, before their inverse depth is eliminated."""
+
+    u: Tensor  # (B, 7, N) px, along u: six columns of the pose, then the residual
+    v: Tensor  # (B, 7, N) px, along v
+    slope: Tensor  # (B, 2, N) px m, d r / d q
+    precision: Tensor  # (B, N) m², of q before this track is read: 0 for far tracks, infinite for one at infinity
+    front: Tensor  # (B, N) bool, in front of camera 1; others are finite and have no meaning
+
+
+def linearise_tracks(problem: Problem, at: Unknowns) -> Linear:
+    """Residuals and their Jacobian at the sensor's inverse depths, and at the most probable ones of far tracks.
+
+    Gradient: to measurements, cameras, rays and the sensor's q; the far tracks' q is held at its optimum, where it has
+    no first-order effect. Raises ValueError for wrong shapes.
+    """
+    check("linearise_tracks", ray=(problem.ray, "B 3 N"), uv=(problem.uv, "B 2 N"), turn=(at.turn, "B 3"))
+    f, c = problem.f, problem.c
+    uv = straighten(problem.uv, f, c, _height(problem), at.turn)
+    a, t = _turned(at.T.R, problem.ray), at.T.t[..., None]
+    with torch.no_grad():
+        free = _inverse_depth(a, t, uv, f, c, problem.shape)
+        infinite = free < 0  # a point cannot lie beyond infinity: there q is known, and nothing is eliminated
+    q = torch.where(problem.near, problem.inverse, free.clamp_min(0))
+    precision = torch.where(problem.near, 1 / problem.variance, torch.where(infinite, torch.inf, 0.0))
+    Y = a + q[:, None] * t
+    front = Y[:, 2] > MIN_DEPTH
+    w = 1 / torch.where(front, Y[:, 2], torch.ones_like(q))
+    x, y, k = Y[:, 0] * w, Y[:, 1] * w, q * w
+    seen = (uv - c[..., None]) / f[..., None]
+    xy, zero = x * y, torch.zeros_like(x)
+    u = torch.stack((-xy, 1 + x * x, -y, k, zero, -x * k, x - seen[:, 0]), 1) * f[:, :1, None]
+    v = torch.stack((-1 - y * y, xy, x, zero, k, -y * k, y - seen[:, 1]), 1) * f[:, 1:, None]
+    slope = torch.stack(((t[:, 0] - x * t[:, 2]) * w, (t[:, 1] - y * t[:, 2]) * w), 1) * f[..., None]
+    return Linear(u, v, slope, precision, front)
+
+
+def residuals(
+    problem: Problem,
+    linear: Linear,
+    noise: Tensor,  # (B, N) px²
+) -> Tensor:
+    """Whitened rows (B, 10, 2, N), inverse depths eliminated: six columns of the pose, three of the turn, the residual.
+
+    Args:
+        problem, linear: tracks and :func:`linearise_tracks` of them.
+        noise: scale of the tracks' ``shape``.
+
+    Gradient: to ``linear``, precision excepted, and noise. Raises ValueError for wrong shapes.
+    """
+    check("residuals", u=(linear.u, "B 7 N"), noise=(noise, "B N"))
+    m = _whitener(linear.slope, problem.shape * noise[:, None], linear.precision)
+    (m00, m01), (m10, m11) = ([x[:, None] for x in row] for row in m)
+    rows = torch.stack((m00 * linear.u + m01 * linear.v, m10 * linear.u + m11 * linear.v), 2)
+    turn = rows[:, :3] * _height(problem)[:, None, None]
+    return torch.cat((rows[:, :6], turn, rows[:, 6:]), 1)
+
+
+def squares(
+    problem: Problem,
+    linear: Linear,
+    noise: Tensor,  # (B, N) px²
+) -> Tensor:
+    """Squared length (B, N) of the whitened residuals; :data:`BEHIND` for points not in front of camera 1.
+
+    Gradient: as :func:`residuals`. Raises ValueError for wrong shapes.
+    """
+    check("squares", u=(linear.u, "B 7 N"), noise=(noise, "B N"))
+    (m00, m01), (m10, m11) = _whitener(linear.slope, problem.shape * noise[:, None], linear.precision)
+    r, s = linear.u[:, 6], linear.v[:, 6]
+    along, across = m00 * r + m01 * s, m10 * r + m11 * s
+    return torch.where(linear.front, along * along + across * across, torch.full_like(r, BEHIND))
+
+
+def normal(
+    problem: Problem,
+    at: Unknowns,
+    noise: Tensor,  # (B, N) px²
+    far_weight: Tensor,  # (B,)
+    turn_precision: Tensor,  # (B,) 1/rad²
+    kernel: str | None,
+    bend: float,
+) -> Normal:
+    """Cost and normal equations (n = 9) of near tracks with weight 1, far tracks with ``far_weight``, turns near zero.
+
+    Args:
+        problem, at, noise: as in :func:`linearise_tracks` and :func:`residuals`.
+        far_weight: of a far track's robust cost; 0 leaves them out.
+        turn_precision: of the turn around zero; a huge one holds it there.
+        kernel, bend: robust kernel of a whitened residual and where it bends, see ``least_squares.robust``.
+
+    Gradient: as :func:`residuals`. Raises ValueError for wrong shapes or an unknown kernel.
+    """
+    linear = linearise_tracks(problem, at)
+    rho, weight = robust(squares(problem, linear, noise), kernel, bend)
+    share = problem.near + far_weight[:, None] * problem.far
+    H, g = normal_equations(residuals(problem, linear, noise), weight * share * linear.front)
+    known = prior(turn_precision.to(g.dtype))
+    turn = torch.cat((torch.zeros_like(g[:, :6]), at.turn), -1)
+    cost = (rho * share).sum(-1) + turn_precision * (at.turn * at.turn).sum(-1)
+    return Normal(cost, H + torch.diag_embed(known), g + known * turn)
+
+
+def prior(turn_precision: Tensor) -> Tensor:
+    """Information (B, 9) that is there before any track: none on the pose."""
+    zero = torch.zeros_like(turn_precision)
+    return torch.stack((*[zero] * 6, *[turn_precision] * 3), -1)
+
+
+def _turned(R: Tensor, ray: Tensor) -> Tensor:
+    x, y, z = ray[:, None].unbind(2)
+    R = R[..., None]
+    return R[:, :, 0] * x + R[:, :, 1] * y + R[:, :, 2] * z
+
+
+def _inverse_depth(a: Tensor, t: Tensor, uv: Tensor, f: Tensor, c: Tensor, shape: Tensor) -> Tensor:
+    """Maximum-likelihood q (B, N) of a track without depth: its pixel, moved onto the epipolar line along the noise.
+
+    ``a`` (B, 3, N) is the anchor's ray turned into camera 1. Negative where the rays part; 0 without baseline.
+    """
+    u, v = ((uv - c[..., None]) / f[..., None]).unbind(1)
+    line = (t[:, 1] * a[:, 2] - t[:, 2] * a[:, 1], t[:, 2] * a[:, 0] - t[:, 0] * a[:, 2])
+    last = t[:, 0] * a[:, 1] - t[:, 1] * a[:, 0]
+    n0, n1 = line[0] / f[:, :1], line[1] / f[:, 1:]
+    m0, m1 = shape[:, 0] * n0 + shape[:, 1] * n1, shape[:, 1] * n0 + shape[:, 2] * n1
+    lift = (line[0] * u + line[1] * v + last) / (n0 * m0 + n1 * m1).clamp_min(1e-24)
+    u, v = u - lift * m0 / f[:, :1], v - lift * m1 / f[:, 1:]
+    p0, p1 = a[:, 0] - a[:, 2] * u, a[:, 1] - a[:, 2] * v
+    d0, d1 = t[:, 0] - t[:, 2] * u, t[:, 1] - t[:, 2] * v
+    return -(p0 * d0 + p1 * d1) / (d0 * d0 + d1 * d1).clamp_min(1e-24)
+
+
+def _whitener(slope: Tensor, cov: Tensor, precision: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+    """A matrix M (2×2 planes) with MᵀM = (S + s sᵀ / precision)⁻¹, singular where the precision is 0.
+
+    With S = L Lᵀ the whitened slope e = L⁻¹ s is a vector of the plane. Only the residual along it depends on q: of its
+    weight, precision / (|e|² + precision) is left. M turns e to the first axis and scales that.
+    """
+    xx, xy, yy = cov.unbind(1)
+    a = 1 / xx.sqrt()
+    b = xy / xx
+    d = 1 / (yy - b * xy).sqrt()  # L⁻¹ = [[a, 0], [−b d, d]]
+    e0, e1 = a * slope[:, 0], d * (slope[:, 1] - b * slope[:, 0])
+    square = e0 * e0 + e1 * e1
+    flat = square < 1e-12  # the pixel does not depend on q
+    length = torch.where(flat, torch.ones_like(square), square).sqrt()
+    e0 = torch.where(flat, torch.ones_like(e0), e0 / length)
+    e1 = torch.where(flat, torch.zeros_like(e1), e1 / length)
+    whole = flat | precision.isinf()
+    some = ~whole & (precision > 0)
+    safe = torch.where(some, precision, torch.ones_like(precision))
+    left = torch.where(some, (safe / (square + safe)).sqrt(), whole.to(square.dtype))
+    return (left * (e0 * a - e1 * b * d), left * e1 * d), (-e1 * a - e0 * b * d, e0 * d)
+
+
+def _height(problem: Problem) -> Tensor:
+    return problem.ray[:, 1] / problem.ray[:, 2]
