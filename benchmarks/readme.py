@@ -11,8 +11,12 @@ import argparse
 import json
 import re
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+from dhtorch import archive
+from dhtorch.report import Table, layouts, text
 
 HERE = Path(__file__).resolve().parent
 README = HERE.parent / "README.md"
@@ -31,8 +35,7 @@ def number(value: float | None) -> str:
 
 def table(head: list[str], rows: list[list[str]]) -> str:
     """A Markdown table, words left and numbers right."""
-    align = [":--", *["--:"] * (len(head) - 1)]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, align, *rows))
+    return text.grid(Table("", head, rows))
 
 
 def scenes(name: str, truth: str) -> dict[str, dict[str, dict[str, Any]]]:
@@ -151,14 +154,26 @@ def picture(path: Path) -> None:
 TABLES = {"room": room, "shared": shared, "truths": truths, "speed": speed}
 
 
-def fill(text: str) -> str:
-    """README with the tables as the result files have them."""
-    for name, make in TABLES.items():
-        pattern = rf"(<!-- {name} -->\n).*?(<!-- end -->)"
-        text, count = re.subn(pattern, lambda m, make=make: f"{m[1]}{make()}\n{m[2]}", text, flags=re.DOTALL)
+def in_layout(name: str) -> str:
+    """The tables of ``results/<name>.json`` in the paper's layout, the paper's figures beside ours."""
+    found = layouts.in_layout(archive.read(RESULTS / f"{name}.json"))
+    if not found:
+        raise ValueError(f"{RESULTS / name}.json: found an experiment without tables of its own, expected a known one")
+    return text.markdown(found).rstrip()
+
+
+def fill(whole: str) -> str:
+    """README with the tables as the result files have them.
+
+    ``<!-- name -->`` up to ``<!-- end -->`` is one of TABLES; ``<!-- results name -->`` the tables of a result file.
+    """
+    known = {f"results {name}": partial(in_layout, name) for name in re.findall(r"<!-- results ([\w.-]+) -->", whole)}
+    for name, make in (TABLES | known).items():
+        pattern = rf"(<!-- {re.escape(name)} -->\n).*?(<!-- end -->)"
+        whole, count = re.subn(pattern, lambda m, make=make: f"{m[1]}{make()}\n{m[2]}", whole, flags=re.DOTALL)
         if count != 1:
             raise ValueError(f"{README}: marker <!-- {name} -->: found {count}, expected one")
-    return text
+    return whole
 
 
 def main() -> int:

@@ -30,23 +30,31 @@ HEADS = {
     "hole_share.trackable_no_lidar": "trackable, no LiDAR",
     "trackability_hole": "trackability, holes",
     "trackability_valid": "trackability, returns",
-    "rotation_deg": "rotation off, °",
-    "translation_m": "translation off, m",
-    "baseline_m": "baseline, m",
-    "cutoff_m": "cutoff, m",
-    "reach_m": "reach, m",
-    "p50_ms": "p50, ms",
-    "p95_ms": "p95, ms",
-    "p99_ms": "p99, ms",
+    "rotation_deg": "rotation off °",
+    "translation_m": "translation off m",
+    "baseline_m": "baseline m",
+    "cutoff_m": "cutoff m",
+    "direction_deg": "direction off °",
+    "reach_p95_m": "reach p95 m",
+    "reach_max_m": "reach m",
+    "returns_p95_m": "sensor p95 m",
+    "recovered_share": "share of holes",
+    "median_rel_ratio": "error ratio",
+    "seconds_per_video": "s per video",
+    "ece_pooled": "ECE, pooled",
+    "range": "median, range over scenes",
+    "p50_ms": "p50 ms",
+    "p95_ms": "p95 ms",
+    "p99_ms": "p99 ms",
     "parameters": "learned parameters",
     "weight_bytes": "weights",
     "peak_mib": "peak memory",
-    "scale": "true scale?",
+    "scale": "scale from",
     "metric": "metric?",
 }
 #: Metric → style, where its name does not give it away (see :func:`style`).
 STYLES = {"coverage": "percent", "pnp_success": "percent", "within_sigma": "percent", "within_2sigma": "percent"}
-STYLES |= {"corr": "ratio", "ece": "fine", "ece_equal_mass": "fine", "monotonicity": "fine"}
+STYLES |= {"corr": "ratio", "ece": "fine", "ece_equal_mass": "fine", "ece_pooled": "fine", "monotonicity": "fine"}
 STYLES |= {"parameters": "large", "weight_bytes": "bytes", "peak_mib": "mebibytes"}
 DECIMALS = {"count": 0, "number": 1, "ratio": 2, "fine": 3}
 _LARGE = ((1e9, "B"), (1e6, "M"), (1e3, "k"))
@@ -71,7 +79,7 @@ def style(metric: str) -> str:
         return "fine"
     if group.split(".")[-1] == "ms":
         return "number"
-    return "ratio" if last.endswith("_px") else "plain"
+    return "ratio" if last.endswith(("_px", "_ratio")) else "plain"
 
 
 def show(value: Any, metric: str = "", how: str | None = None) -> str:

@@ -32,7 +32,8 @@ def risk(result: Result) -> Figure | None:
         return spanning(drawn, "mean error, %", log=True, percent=True, floor=FLOOR, cap=1.0)
 
     def draw(panel: Panel, curve: Curve, row: Row, style: str) -> None:
-        enough = [c * row["n_candidates"] >= FEWEST - 0.5 for c in curve["coverage"]]
+        n = row.get("n_candidates") or 0
+        enough = [(c or 0.0) * n >= FEWEST - 0.5 for c in curve["coverage"]]
         x, y, best = ([v for v, ok in zip(curve[k], enough, strict=True) if ok] for k in ("coverage", "risk", "oracle"))
         if ordered:
             panel.line(x, best, f"{style} oracle")

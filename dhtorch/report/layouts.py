@@ -19,6 +19,7 @@ from dhtorch.report.tables import (
     by_variant,
     cohorts,
     entry,
+    last_cohort,
     scene_rows,
     source,
     variants,
@@ -42,16 +43,16 @@ CUTOFFS: Known = (
 )
 GATES: Known = (
     (r"gap (?:[x×]0\.5|16)", None, "gap 16"),
-    (r"gap (?:[x×]1(?:\.0)?|30)", None, "gap 30 (default)"),
+    (r"both gates|gap (?:[x×]1(?:\.0)?|30)", None, "gap 30 (default)"),
     (r"gap (?:[x×]2(?:\.0)?|60)", None, "gap 60"),
     (r"parallax gate off.*", None, "parallax gate OFF (gap 30)"),
     (r"reprojection gate off.*", None, "reprojection gate OFF (gap 30)"),
 )
 REAL_HOLES: Known = (("no_gates", "no gates", "no gates"), ("gated", "gated", "gated"))
 LEARNED: Known = (
-    (r"paper|dhtorch", None, "DH-Active"),
-    (r"dust3r.*", None, "DUSt3R"),
-    (r"vggt.*", None, "VGGT-1B"),
+    (r"(?!dust3r|vggt).*", None, "DH-Active"),
+    (r"dust3r(?:_oracle)?", None, "DUSt3R"),
+    (r"vggt(?:_oracle)?", None, "VGGT-1B"),
 )
 
 
@@ -98,8 +99,11 @@ def _range_split(result: Result) -> list[Table]:
 
 def _real_holes(result: Result) -> list[Table]:
     columns = ("n_scenes", "n_candidates", "coverage", "median_rel", "p90_rel")
-    title = "The sensor's true drop-outs, medians over scenes"
-    return [by_variant(result, title, columns, lines(result, REAL_HOLES), published.REAL_HOLES)]
+    found, title = [], "The sensor's true drop-outs, medians over scenes"
+    found.append(by_variant(result, title, columns, lines(result, REAL_HOLES), published.REAL_HOLES))
+    if "full" in cohorts(result) and last_cohort(result) != "full":
+        found.append(by_variant(result, "The same on hidden far returns", columns, truth="full"))
+    return found
 
 
 def _gate_ablation(result: Result) -> list[Table]:
@@ -109,7 +113,8 @@ def _gate_ablation(result: Result) -> list[Table]:
 
 def _held_out(result: Result) -> list[Table]:
     truth = "heldout" if "heldout" in cohorts(result) else None
-    columns = ("n_kept", "corr", "median_rel", "residual_px", "coverage", "n_recovered", "reach_m", "passes")
+    columns: tuple[str, ...] = ("n_kept", "corr", "median_rel", "residual_px", "coverage", "n_recovered")
+    columns += ("reach_p95_m", "reach_max_m", "returns_p95_m", "passes")
     title = "Hold-out triangulation (set B never sees the pose calibration)"
     found = [by_scene(result, title, columns, truth, published.HELD_OUT)]
     if "cyclic" in cohorts(result):
@@ -138,31 +143,39 @@ def _cyclic(result: Result) -> Table:
 
 
 def _calibration(result: Result) -> list[Table]:
-    columns = ("n_scenes", "ece", "ece_equal_mass", "aurc", "aurc_excess", "monotonicity")
-    found = [by_variant(result, "Calibration, medians over scenes", columns, None, published.CALIBRATION)]
-    for v in variants(result):
-        steps = thresholds(result, v)
-        if not steps:
-            continue
-        rows = []
-        for step in steps:
-            theirs = published.THRESHOLDS.lines.get(f"{float(step):g}", {})
-            cells = []
-            for m in ("coverage", "median_rel"):
-                cells += [show(entry(result, v, f"at_{step}.{m}").get("value"), m), theirs.get(m, NOTHING)]
-            rows.append([step, *cells])
-        over = (("", 1), ("coverage", 2), ("median", 2))
-        title = f"Selective threshold, {v}, medians over scenes"
-        heads = ["score above", OURS, PUBLISHED, OURS, PUBLISHED]
-        found.append(Table(title, heads, rows, over=over, note=source(result, published.THRESHOLDS)))
-    return found
+    """The paper gives the calibration error of its hold-outs and the thresholds of its range split."""
+    columns = ("n_scenes", "ece", "ece_pooled", "aurc", "aurc_excess", "mean_risk", "monotonicity")
+    found = []
+    for truth in reversed(cohorts(result)):
+        held_out = truth == "heldout" or len(cohorts(result)) == 1
+        title = f"Calibration, held against {truth}, medians over scenes"
+        found.append(by_variant(result, title, columns, None, published.CALIBRATION if held_out else None, truth))
+    return found + [table for v in variants(result) if (table := _thresholds(result, v))]
 
 
-def thresholds(result: Result, variant: str) -> list[str]:
-    """Thresholds on the score at which a variant was measured, rising, as the result writes them."""
+def _thresholds(result: Result, variant: str) -> Table | None:
+    """What a threshold on the score leaves, and how wrong that is."""
+    rows = []
+    for name, numbers in thresholds(result, variant):
+        theirs, cells = published.THRESHOLDS.lines.get(name, {}), [name]
+        for m in ("coverage", "median_rel"):
+            cells += [show(numbers[m], m), theirs.get(m, NOTHING)]
+        rows.append([*cells, show(numbers["p90_rel"], "p90_rel")])
+    over = (("", 1), (head("coverage"), 2), (head("median_rel"), 2), ("", 1))
+    heads = ["score from", OURS, PUBLISHED, OURS, PUBLISHED, head("p90_rel")]
+    title = f"Selective threshold, {variant}, medians over scenes"
+    return Table(title, heads, rows, over=over, note=source(result, published.THRESHOLDS)) if len(rows) > 1 else None
+
+
+def thresholds(result: Result, variant: str) -> list[tuple[str, dict[str, float | None]]]:
+    """Thresholds on the score, rising, with coverage and errors of the answers that reach them; 0 keeps all."""
     found = {m[1] for name in result["summary"] if (m := re.search(r"(?:^|\.)at_(\d+(?:\.\d+)?)\.coverage$", name))}
-    mine = [step for step in found if entry(result, variant, f"at_{step}.coverage")]
-    return sorted(mine, key=float)
+    at = {f"{float(name):g}": f"at_{name}." for name in sorted(found, key=float)}
+    at = {"0": "", **at} if at else {}
+    metrics = ("coverage", "median_rel", "p90_rel")
+    return [
+        (name, {m: entry(result, variant, prefix + m).get("value") for m in metrics}) for name, prefix in at.items()
+    ]
 
 
 def _census(result: Result) -> list[Table]:
@@ -171,25 +184,34 @@ def _census(result: Result) -> list[Table]:
 
 
 def _device_pose(result: Result) -> list[Table]:
-    columns = ("n_scenes", "rotation_deg", "translation_m", "corr", "coverage", "median_rel")
+    columns = ("n_scenes", "rotation_deg", "translation_m", "direction_deg", "corr", "coverage", "median_rel")
     title = "Triangulation from the device's trajectory and from the anchored pose, medians over scenes"
     return [by_variant(result, title, columns, None, published.POSE)]
 
 
 def _motion(result: Result) -> list[Table]:
-    columns = ("n_scenes", "baseline_m", "coverage", "median_rel", "n_recovered")
+    columns = ("n_scenes", "baseline_m", "coverage", "median_rel", "n_recovered", "recovered_share")
     return [by_variant(result, "Motion dependence, medians over scenes", columns, None, published.MOTION)]
 
 
 def _learned(result: Result) -> list[Table]:
-    columns = ("n_scenes", "median_rel", "corr", "coverage", "parameters")
+    columns: tuple[str, ...] = ("n_scenes", "median_rel", "corr", "coverage", "scale", "metric", "parameters")
+    columns += ("weight_bytes", "device", "seconds_per_video")
     title = "Reference results under different inputs and scale protocols, medians over scenes"
     return [by_variant(result, title, columns, lines(result, LEARNED), published.LEARNED)]
 
 
 def _ablation(result: Result) -> list[Table]:
-    columns = ("n_scenes", "coverage", "median_rel", "p90_rel", "corr", "aurc", "pnp_success")
+    columns = ("n_scenes", "coverage", "median_rel", "p90_rel", "corr", "aurc", "median_rel_ratio")
     return [by_variant(result, "Ablation, medians over scenes", columns)]
+
+
+def _comparison(result: Result) -> list[Table]:
+    """Methods, and the ratios of their numbers to those of the reference."""
+    columns = ["coverage", "median_rel", "median_rel_ratio", "worst_scene_ratio", "aurc", "aurc_ratio", "coverage_at_5"]
+    columns += ["within_sigma", "within_2sigma", "ece", "realised_risk_5", "realised_risk_10"]
+    measured = [m for m in columns if any(entry(result, v, m) for v in variants(result))]
+    return [by_variant(result, "Methods, over scenes", ["n_scenes", *measured])]
 
 
 def _latency(result: Result) -> list[Table]:
@@ -234,9 +256,10 @@ LAYOUTS: dict[str, Callable[[Result], list[Table]]] = {
     "learned": _learned,
     "ablation": _ablation,
     "latency": _latency,
+    "method_comparison": _comparison,
 }
 #: Columns that stand in these tables and need not be repeated.
-SHOWN = ("trackability_hole", "trackability_valid", "reach_m", "passes", "baseline_m", *DERIVED)
+SHOWN = ("trackability_hole", "trackability_valid", "passes", "parameters", "weight_bytes", *DERIVED)
 
 #: Experiments whose variants have a counterpart in the paper.
 _COUNTERPARTS: dict[str, tuple[Known, published.Published]] = {

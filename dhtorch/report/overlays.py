@@ -12,7 +12,7 @@ from dhtorch.report.svg import picture
 from dhtorch.report.tables import Result, scene_rows, variants
 
 #: The variant whose samples are shown first, where a result has it.
-FIRST = ("gated", "anchored", "gap x1", "paper")
+FIRST = ("gated", "anchored", "both gates", "gap x1", "map", "paper")
 
 #: Layers from bottom to top: reasons for silence, sensor, recovered.
 LAYERS = [f"gate{code}" for code in names(Gate)] + [f"source{Source.SENSOR}", f"source{Source.RECOVERED}"]
@@ -20,7 +20,9 @@ LAYERS = [f"gate{code}" for code in names(Gate)] + [f"source{Source.SENSOR}", f"
 
 def overlays(result: Result) -> list[Figure]:
     """One figure per variant, one panel per scene; all but the variant of most interest are folded away."""
-    having = [row for row in scene_rows(result) if (row.get("overlay") or {}).get("u")]
+    shown = [row for row in scene_rows(result) if (row.get("overlay") or {}).get("u")]
+    once = {(row["method"], row["scene"]): row for row in shown}  # cohorts of one variant show the same
+    having = list(once.values())
     order = [v for v in variants(result) if any(row["method"] == v for row in having)]
     order.sort(key=lambda v: FIRST.index(v) if v in FIRST else len(FIRST))
     found: list[Figure] = []

@@ -64,7 +64,7 @@ def side_by_side(result: Result) -> Figure | None:
 
 def latency(result: Result) -> Figure | None:
     """Milliseconds on a logarithmic axis."""
-    rows = {branch(row): row for row in scene_rows(result) if row.get("p50_ms")}
+    rows = [(branch(row), row) for row in scene_rows(result) if row.get("p50_ms")]
     if not rows:
         return None
     cited = {
@@ -72,11 +72,11 @@ def latency(result: Result) -> Figure | None:
         for name, cells in published.LATENCY.lines.items()
         if (number := published.number(cells["p50_ms"]))
     }
-    labels = [*rows, *cited]
-    times = [t for row in rows.values() for t in (row["p50_ms"], _slow(row))]
+    labels = [*(name for name, _ in rows), *cited]
+    times = [t for _, row in rows for t in (row["p50_ms"], _slow(row))]
     x = spanning([*times, *cited.values()], "milliseconds (logarithmic)", log=True)
     panel = Panel("", x, None, size=(720, AROUND + ROW * len(labels)), rows=labels)
-    for k, (name, row) in enumerate(rows.items()):
+    for k, (name, row) in enumerate(rows):
         style = "s1" if row.get("stage") == "forward" else "s0" if "parameters" in row else "s7"
         panel.line([row["p50_ms"], _slow(row)], [k, k], style)
         panel.dot(row["p50_ms"], k, style, f"{name}: {show(row['p50_ms'])} ms")
@@ -91,11 +91,11 @@ def holes(result: Result) -> Figure | None:
     """Classes of holes by scene, as stacked bars."""
     if result["experiment"] != "hole_census":
         return None
-    first = variants(result)[0]
+    first = next(iter(variants(result)), None)
     bars: dict[str, Mapping[str, float | None]] = {
         named(row): row["hole_share"]
         for row in deciding(result)
-        if row["method"] == first and sum((row.get("hole_share") or {}).values())
+        if row["method"] == first and any((row.get("hole_share") or {}).values())
     }
     if not bars:
         return None

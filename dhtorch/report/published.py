@@ -52,7 +52,7 @@ HELD_OUT = Published(
     "Table 2, section 6.2",
     "two iPhone captures of its own",
     _table(
-        "n_kept corr median_rel residual_px n_recovered reach_m passes",
+        "n_kept corr median_rel residual_px n_recovered reach_max_m passes",
         {
             "indoor (near-static)": "225 | 0.963 | 3.5 % | 0.96 | 105 | – | yes",
             "outdoor (walking)": "2,010 | 0.974 | 1.4 % | 0.74 | 663 | 6.1 | yes",
@@ -141,9 +141,9 @@ LEARNED = Published(
     "Table 7, section 6.6",
     ARKIT,
     _table(
-        "median_rel corr scale metric parameters seconds",
+        "median_rel corr scale metric parameters seconds_per_video",
         {
-            "DH-Active": "6.7 % | 0.745 | no | yes | 0 | –",
+            "DH-Active": "6.7 % | 0.745 | sensor | yes | 0 | –",
             "DUSt3R": "7.2 % | 0.802 | oracle | no | 571 M | 78",
             "VGGT-1B": "2.5 % | 0.967 | oracle | no | 1.26 B | 235",
         },

@@ -36,19 +36,21 @@ class Axis:
 
     def ticks(self, most: int = 5) -> list[float]:
         """Round numbers within the range, about as many as asked for."""
-        if self.log:
-            decades = range(math.floor(math.log10(self.low)), math.ceil(math.log10(self.high)) + 1)
-            for steps in (range(1, 10), (1, 2, 3, 5), (1, 2, 5), (1, 3), (1,)):
-                found = [s * 10.0**d for d in decades for s in steps]
-                found = [t for t in found if self.low * 0.999 <= t <= self.high * 1.001]
-                if len(found) <= most + 1:
-                    return found
-            return found[:: math.ceil(len(found) / most)]
+        if self.log and len(self._in_decades(range(1, 10))) > 1:
+            sets = (range(1, 10), (1, 2, 3, 5), (1, 2, 5), (1, 3), (1,))
+            found = next((t for steps in sets if len(t := self._in_decades(steps)) <= most + 1), self._in_decades((1,)))
+            return found[:: math.ceil(len(found) / (most + 1))]
         raw = (self.high - self.low) / most
         size = 10.0 ** math.floor(math.log10(raw))
         step = next(size * s for s in (1, 2, 5, 10) if size * s >= raw * 0.999)
         first = math.ceil(self.low / step - 1e-9)
         return [k * step for k in range(first, math.floor(self.high / step + 1e-9) + 1)]
+
+    def _in_decades(self, steps: Sequence[int]) -> list[float]:
+        """Multiples of the powers of ten within the range."""
+        decades = range(math.floor(math.log10(self.low)), math.ceil(math.log10(self.high)) + 1)
+        found = (s * 10.0**d for d in decades for s in steps)
+        return [t for t in found if self.low * 0.999 <= t <= self.high * 1.001]
 
     def write(self, tick: float) -> str:
         """A tick as text."""
@@ -147,7 +149,7 @@ class Panel:
             frame.append(tag("text", self.y.label, x=10, y=middle, transform=turn, class_="label middle"))
         box, size = f"0 0 {self.width:g} {self.height:g}", f"--width: {self.width:g}px"
         said = self.title or f"{self.y.label if self.y else ', '.join(self.rows)} against {self.x.label}"
-        return tag("svg", *frame, *self.parts, viewBox=box, role="img", aria_label=said, class_="panel", style=size)
+        return tag("svg", *frame, *self.parts, viewBox=box, role="img", aria_label=said, style=size)
 
     @staticmethod
     def _text(text: str, u: float, v: float, style: str, said: str = "") -> Markup:

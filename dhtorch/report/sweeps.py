@@ -41,7 +41,7 @@ def motion(result: Result) -> Figure | None:
 
 def threshold(result: Result) -> Figure | None:
     """What a threshold on the score buys: the paper's figure of selective risk against coverage."""
-    paths = {v: path for v in variants(result) if (path := _path(result, v))}
+    paths = {v: path for v in variants(result) if len(path := _path(result, v)) > 1}
     if not paths:
         return None
     cited = {
@@ -63,14 +63,14 @@ def threshold(result: Result) -> Figure | None:
 
 
 def _at(name: str, coverage: float, error: float) -> str:
-    return f"score above {name}: {show(error, 'median_rel')} at {show(coverage, 'coverage')}"
+    return f"score from {name}: {show(error, 'median_rel')} at {show(coverage, 'coverage')}"
 
 
 def _path(result: Result, variant: str) -> list[tuple[str, float, float]]:
     """(threshold, coverage, median error) where both are known."""
     found = []
-    for name in thresholds(result, variant):
-        c, e = (entry(result, variant, f"at_{name}.{m}").get("value") for m, _ in METRICS)
+    for name, numbers in thresholds(result, variant):
+        c, e = numbers["coverage"], numbers["median_rel"]
         if c is not None and e is not None:
             found.append((name, c, e))
     return found

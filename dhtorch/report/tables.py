@@ -27,6 +27,14 @@ OPTIONAL = ("wrong_share", "aurc", "ece")
 DETAILS = {"within_sigma", "within_2sigma", "aurc_excess", "aurc_full", "augrc", "monotonicity", "ece_equal_mass"}
 DETAILS |= {"coverage_at_5", "coverage_at_10", "coverage_at_20", "cutoff_m", "n_pairs", "n_few", "n_kept", "n_holes"}
 DETAILS |= {"n_recovered"}
+#: Groups of metrics that get a table of their own: name and title.
+GROUPS = (
+    ("n_dropped", "truth dropped"),
+    ("hole_share", "holes by class"),
+    ("route_share", "what could fill the holes"),
+    ("gate_share", "what became of samples"),
+    ("ms", "milliseconds per pair"),
+)
 #: Fields of a row that are no measurement.
 NAMES = ("scene", "pair", "method", "truth", "role", "note", "curves", "overlay")
 
@@ -63,7 +71,7 @@ def generic(result: Result, shown: Sequence[str] = ()) -> list[Table]:
     """Errors by scene for every cohort, what else was measured, and the groups; ``shown`` stands elsewhere already."""
     rows = scene_rows(result)
     found = []
-    if any(metric in row for row in rows for metric in COLUMNS):
+    if any(metric in row for row in rows for metric in COLUMNS) or (rows and all(row.get("note") for row in rows)):
         several = len(cohorts(result)) > 1
         for truth in cohorts(result):
             columns = (*COLUMNS, *(m for m in OPTIONAL if any(row.get(m) is not None for row in rows)))
@@ -74,8 +82,7 @@ def generic(result: Result, shown: Sequence[str] = ()) -> list[Table]:
         found += [by_scene(result, "further columns", more)] if more else []
     elif rows:
         found.append(_plain(result, rows))
-    named = (("n_dropped", "truth dropped"), ("hole_share", "holes by class"), ("gate_share", "what became of samples"))
-    groups = [_group(result, *g) for g in (*named, ("ms", "milliseconds per pair"))]
+    groups = [_group(result, *group) for group in GROUPS]
     return found + [table for table in (_apart(result), *groups) if table]
 
 
@@ -111,7 +118,8 @@ def by_scene(
         spread = [_spread(entry(result, method, m, truth), m) for m in columns]
         footer += [line(INTERVAL, method, "", spread)] if any(spread) else []
     cited = _cited(quoted, columns, (quoted.lines if quoted else {}), 1 + several)
-    heads = ["scene", *(["method"] if several else []), "pairs", *map(head, columns)]
+    single = all(r["pair"][0] == r["pair"][1] for r in result["rows"] if r["pair"] is not None)
+    heads = ["scene", *(["method"] if several else []), "frames" if single and pairs else "pairs", *map(head, columns)]
     note = source(result, quoted) if quoted else ""
     return Table(title, heads, body + footer + cited, 1 + several, len(footer), len(cited), note=note)
 
@@ -176,13 +184,15 @@ def variants(result: Result) -> list[str]:
 
 
 def cohorts(result: Result) -> list[str | None]:
-    """What answers are held against; the last one decides."""
+    """What answers are held against, in the order of the rows."""
     return list(dict.fromkeys(row.get("truth") for row in result["rows"]))
 
 
 def last_cohort(result: Result) -> str | None:
-    """The cohort that decides."""
-    return (cohorts(result) or [None])[-1]
+    """The cohort that decides: the one whose name the summary leaves out."""
+    found = cohorts(result) or [None]
+    named = [t for t in found if any(f"{v}.{t}." in name for v in variants(result) for name in result["summary"])]
+    return next((t for t in reversed(found) if t not in named), found[-1])
 
 
 def scene_rows(result: Result, truth: str | None = None, variant: str | None = None) -> list[Row]:
@@ -234,8 +244,8 @@ def source(result: Result, quoted: Published) -> str:
     """Where the paper's figures are from, and that ours are from elsewhere."""
     data = result["data"]
     n = len(data["scenes"])
-    said = f"Published: {quoted.where}, {quoted.data}. Ours: {data['name']}, {n} scene{'s' * (n != 1)}."
-    return " ".join((said, *quoted.notes))
+    ours = f"Ours: {data['name']}, {n} scene{'s' * (n != 1)}."
+    return " ".join((f"Published: {quoted.where}, {quoted.data}.", *quoted.notes, ours))
 
 
 # ---------------------------------------------------------------------------------------------- cells over scenes
@@ -263,6 +273,9 @@ def _over(result: Result, variant: str, metric: str, truth: str | None) -> str:
     """One number over scenes without a role; where nothing was measured on any, why."""
     rows = [row for row in scene_rows(result, truth, variant) if not row.get("role")]
     found = entry(result, variant, metric, truth).get("value")
+    if found is None:  # words, such as a device, are in the rows alone
+        said = {row[metric] for row in rows if isinstance(row.get(metric), str)}
+        found = said.pop() if len(said) == 1 else None
     cell = show(found, metric) if metric not in DERIVED else DERIVED[metric](rows)
     notes = [row["note"] for row in rows if row.get("note")]
     silent = cell == NOTHING and len(notes) == len(rows) > 0

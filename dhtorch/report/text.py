@@ -17,12 +17,12 @@ def print_table(table: Table, console: Any = None) -> None:
 
     console = console or Console()
     if not console.is_terminal:
-        console.width = max(console.width, 180)  # a file has no edge to wrap at
+        console.width = max(console.width, 240)  # a file has no edge to wrap at
     shown = RichTable(
         title=escape(table.title), box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False
     )
     for k, head in enumerate(table.flat_head()):
-        shown.add_column(escape(head), justify="left" if k < table.n_label else "right")
+        shown.add_column(escape(head), justify="left" if k < table.n_label else "right", overflow="fold")
     n_body = len(table.rows) - table.footer - table.quoted
     for k, cells in enumerate(table.rows):
         summed = n_body <= k < n_body + table.footer
@@ -30,6 +30,8 @@ def print_table(table: Table, console: Any = None) -> None:
         last_of_part = k + 1 in (n_body, n_body + table.footer) and k + 1 < len(table.rows)
         shown.add_row(*map(escape, cells), style=style, end_section=last_of_part)
     console.print(shown)
+    if table.note:
+        console.print(f"{escape(table.note)}\n", style="dim", highlight=False)
 
 
 def markdown(tables: Iterable[Table]) -> str:
