@@ -50,7 +50,7 @@ GATES: Known = (
 )
 REAL_HOLES: Known = (("no_gates", "no gates", "no gates"), ("gated", "gated", "gated"))
 LEARNED: Known = (
-    (r"(?!dust3r|vggt).*", None, "DH-Active"),
+    (r"(?!dust3r|vggt|constant).*", None, "DH-Active"),
     (r"dust3r(?:_oracle)?", None, "DUSt3R"),
     (r"vggt(?:_oracle)?", None, "VGGT-1B"),
 )
