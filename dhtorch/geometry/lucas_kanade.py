@@ -1,0 +1,323 @@
+"""Pyramidal Lucas-Kanade between two pyramids: the search, without a graph.
+
+Alphabet: ``x`` a point of the first image (the source) and ``d`` its displacement to the second (the target), (2, M) px
+of the level at hand, the M points of all pairs in one row; ``batch`` (M,) the pair a point belongs to; T the window at
+x, J the target, g = (dT/dx, dT/dy), A = sum g gᵀ; ``moments`` (5 or 6, M): sum g T, A_xx, A_xy, A_yy and, where the
+gain is estimated, sum T².
+
+Why it is fast. A Gauss-Newton step solves A step = sum g (J(d) - T). J between pixels is a weighted mean of J at
+pixels, and the sum over the window is linear in J; so sum g J(d) is the same weighted mean of a few numbers
+C[o] = sum_p g(p) J(p + o), o an offset in whole pixels. This *map* C is computed once for a small square of offsets, by
+a depthwise convolution whose channels are the points. After that a step touches eight numbers per point, and no pixel.
+Coarse levels only provide a start: there the points of a small *cell* of the image share one search.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from dhtorch.geometry.pyramid import GRAD_X, GRAD_Y, GREY, Pyramid
+
+#: Points whose windows are read at once: few enough for the windows to stay in the cache.
+CHUNK = 256
+
+#: Rows of points are filled up to multiples of this, so that vector instructions leave no remainder and a point's
+#: rounding does not depend on how many others there are.
+LANES = 64
+
+#: Radii of the maps that a point may use up on one level; one of radius r covers the offsets from -r to r + 1. On the
+#: coarsest level nothing is known yet.
+RADII, RADII_TOP = (1, 2, 2, 2, 2), (2, 2, 2, 2, 2, 2, 2)
+
+#: Steps between two looks at who still moves.
+BLOCK = 5
+
+#: Width of a cell, px of the finest level, and the finest level whose points share a search per cell.
+CELL, CELL_LEVEL = 16, 3
+
+#: On coarse levels a step has converged at so many times ``epsilon_px``.
+COARSE_EPSILON = 4.0
+
+#: A ratio of contrasts beyond these limits is not believed.
+GAIN = (0.2, 5.0)
+
+
+#: Variance of rounding grey values to 8 bits; no residual is believed to be smaller.
+QUANTISATION = 1 / (12 * 255**2)
+
+
+class Options(NamedTuple):
+    """How to search; see :func:`dhtorch.stages.track.lucas_kanade`."""
+
+    window: int
+    iterations: int
+    epsilon_px: float
+    min_eigenvalue: float
+    normalise: str
+
+
+class _Pair(NamedTuple):
+    """One level of two pyramids, and where points may be on it."""
+
+    source: Pyramid
+    target: Pyramid
+    level: int
+    low: Tensor  # (2, 1) px of the level
+    high: Tensor  # (2, 1) px of the level
+
+
+def search(
+    source: Pyramid, target: Pyramid, o: Options, alike: bool, x: Tensor, d: Tensor, batch: Tensor, known: Tensor
+):
+    """Coarse to fine from ``d`` for the points that are ``known`` (M,), M a multiple of ``LANES``.
+
+    ``alike``: all ``d`` are equal, so that the points of a cell may share a search.
+
+    Returns the displacement (2, M), whether it was found (M,), and A (3, M) of the finest level.
+    """
+    top = min(len(source.levels), len(target.levels)) - 1
+    rough = o._replace(epsilon_px=o.epsilon_px * COARSE_EPSILON)
+
+    def descend(level: int, o: Options, x: Tensor, d: Tensor, batch: Tensor, known: Tensor):
+        pair = _Pair(source, target, level, *target.bounds(level))
+        return _descend(pair, o, RADII_TOP if level == top else RADII, x, d, batch, known)
+
+    def coarse(levels: range, x: Tensor, d: Tensor, batch: Tensor, known: Tensor) -> tuple[Tensor]:
+        for level in levels:
+            pixel = source.corner(level, x * 0.5**level + 0.5)  # read between pixels only where it decides the answer
+            d = descend(level, rough, pixel, d, batch, known)[0] * 2
+        return (d,)
+
+    cell = (x / CELL + 0.5).floor() * CELL
+    shared, own = range(top, CELL_LEVEL - 1, -1), range(min(top, CELL_LEVEL - 1), 0, -1)
+    columns = (cell, d * 0.5**top, batch, torch.ones_like(known))
+    if alike and shared:
+        (d,) = _once_each(torch.cat([cell, batch[None]]).long(), partial(coarse, shared), columns)
+    else:
+        (d,) = coarse(shared, *columns)
+    (d,) = coarse(own, x, d, batch, known)
+    d, textured, A = descend(0, o, x, d, batch, known)
+    low, high = target.bounds(0)
+    return d, known & textured & within(x + d, low, high), A
+
+
+def step(source: Pyramid, target: Pyramid, o: Options, x: Tensor, x_1: Tensor, batch: Tensor) -> tuple[Tensor, Tensor]:
+    """One Gauss-Newton step (2, M), to be subtracted from ``x_1``, read from pixels of the finest level and carrying a
+    graph; and who is textured (M,)."""
+    G = _project(source.windows(0, x, batch, o.window), o.normalise)
+    J = target.windows(0, x_1, batch, o.window, (GREY,))
+    moments = _moments(G, o.normalise)
+    A_inv, textured = _inverse(moments[2:5], o.min_eigenvalue * o.window**2)
+    found = _steps((_kernels(G, o.normalise) * J).sum(-1), moments, A_inv)
+    return found if o.normalise != "gain_bias" else found[:2] / found[2].clamp(*GAIN), textured
+
+
+def squares(source: Pyramid, target: Pyramid, o: Options, x: Tensor, d: Tensor, batch: Tensor) -> Tensor:
+    """Squared grey differences between the windows at ``x`` and ``x + d`` after normalisation, summed: (M,)."""
+    sums = []
+    for p, q, b in zip(*(y.split(CHUNK, -1) for y in (x, x + d, batch)), strict=True):
+        T = source.windows(0, p, b, o.window, (GREY,))[0]
+        J = target.windows(0, q, b, o.window, (GREY,))[0]
+        if o.normalise != "none":
+            T, J = T - T.mean(-1, keepdim=True), J - J.mean(-1, keepdim=True)
+        if o.normalise == "gain_bias":
+            J = J / _gain((T * J).sum(-1), (T * T).sum(-1)).clamp(*GAIN)[:, None]
+        sums.append((J - T).square().sum(-1))
+    total = torch.cat(sums)
+    return torch.where(total.isfinite(), total, torch.full_like(total, o.window**2))
+
+
+def covariance(A: Tensor, variance: Tensor) -> Tensor:
+    """s² A⁻¹ (2, 2, M). The small eigenvalue of A is raised to 1e-5 of the large one, which float32 can represent."""
+    a, b, c = torch.where(A.isfinite(), A, torch.zeros_like(A)).double()
+    small = _small_eigenvalue(a, b, c)
+    lift = (1e-5 * (a + c - small).clamp_min(1e-4) - small).clamp_min(0)
+    a, c = a + lift, c + lift
+    scale = variance.double().clamp_min(QUANTISATION) / (a * c - b * b)
+    return (torch.stack([c, -b, -b, a]) * scale).to(A.dtype).unflatten(0, (2, 2))
+
+
+def for_some(wanted: Tensor, fn: Callable, values: tuple[Tensor, ...], columns: tuple[Tensor, ...]):
+    """``values`` (each (..., M)), replaced where ``wanted`` (M,) by what ``fn(*columns)`` returns.
+
+    Where shapes may depend on values, ``fn`` sees only the wanted points, filled up by copies of the first.
+    """
+    if _static(wanted):
+        return tuple(torch.where(wanted, new, old) for new, old in zip(fn(*columns), values, strict=True))
+    some = wanted.nonzero()[:, 0]
+    if not len(some):
+        return values
+    some = torch.cat([some, some[:1].expand(-len(some) % LANES)])
+    new = fn(*(column.index_select(-1, some) for column in columns))
+    return tuple(old.index_copy(-1, some, n) for old, n in zip(values, new, strict=True))
+
+
+def _once_each(key: Tensor, fn: Callable, columns: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    """``fn(*columns)`` for columns (..., M) that are equal where the columns of ``key`` (K, M) are, computed once."""
+    if _static(key) or not key.shape[1]:
+        return fn(*columns)
+    size = key.amax(1).tolist()
+    flat = (key[2] * (size[1] + 1) + key[1]) * (size[0] + 1) + key[0]
+    distinct, place = flat.unique(return_inverse=True)
+    some = torch.empty_like(distinct).scatter_(0, place, torch.arange(len(flat), device=flat.device))
+    some = torch.cat([some, some[:1].expand(-len(some) % LANES)])
+    return tuple(y.index_select(-1, place) for y in fn(*(column.index_select(-1, some) for column in columns)))
+
+
+def _descend(pair: _Pair, o: Options, radii: tuple[int, ...], x: Tensor, d: Tensor, batch: Tensor, known: Tensor):
+    """One level: all points on a first map, then those that outran it on further ones.
+
+    Returns the displacement, whether the window is textured (M,), and A (3, M).
+    """
+    corner = pair.target.corner(pair.level, x + d) - radii[0]
+    C, moments = _map(pair, o, radii[0], x, corner, batch)
+    A_inv, textured = _inverse(moments[2:5], o.min_eigenvalue * o.window**2)
+    live = known & textured & within(x + d, pair.low, pair.high)
+    state = _on_map(pair, o, _steps(C, moments, A_inv), corner, x, d, torch.zeros_like(d[0]), live)
+    for radius in radii[1:]:
+        state = for_some(state[2], partial(_on_new_map, pair, o, radius), state, (x, *state, batch, moments, A_inv))
+    return state[0], textured, moments[2:5]
+
+
+def _on_new_map(pair: _Pair, o: Options, radius: int, x, d, taken, live, batch, moments, A_inv):  # noqa: PLR0917
+    """:func:`_on_map` with a map around where the points are, of windows whose moments are known."""
+    corner = pair.target.corner(pair.level, x + d) - radius
+    C, _ = _map(pair, o, radius, x, corner, batch, moments)
+    return _on_map(pair, o, _steps(C, moments, A_inv), corner, x, d, taken, live)
+
+
+def _on_map(
+    pair: _Pair,
+    o: Options,
+    field: Tensor,  # (2 or 3, n, n, M) see _steps
+    corner: Tensor,  # (2, M) the target's pixel where the map begins
+    x: Tensor,  # (2, M)
+    d: Tensor,  # (2, M)
+    taken: Tensor,  # (M,) steps so far
+    live: Tensor,  # (M,) wants to move
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The displacement after all steps on one map, the number of steps, and who left the map and wants another.
+
+    A point stops for good at a short step, outside the level's bounds and after ``iterations`` steps.
+    """
+    low, high, end = pair.low - corner, pair.high - corner, field.shape[1] - 1.0  # all positions are on the map now
+    start = x + d - corner
+    still = (field, low.clamp_min(0), high.clamp_max(end))
+    state = start, taken, live
+    for done in range(0, o.iterations, BLOCK):
+        walk = partial(_walk, o, min(BLOCK, o.iterations - done))
+        columns = (*state, *still)
+        state = for_some(state[2], walk, state, columns) if done else walk(*columns)
+    p, taken, _ = state
+    p = torch.where(p.isfinite(), p, start)
+    outran = (p != p.clamp(0, end)).any(0) & within(p, low, high)
+    return p + corner - x, taken, live & outran & (taken < o.iterations)
+
+
+def _walk(o: Options, steps: int, p: Tensor, taken: Tensor, moving: Tensor, field: Tensor, low: Tensor, high: Tensor):
+    """``steps`` Gauss-Newton steps of map positions ``p`` (2, M) that are ``moving`` (M,), and who still is afterwards.
+
+    Beyond a map's border its field fades to zero, so that a point that leaves is held near it.
+    """
+    moving = moving & (taken + steps <= o.iterations)
+    node = torch.arange(field.shape[1], dtype=p.dtype, device=p.device)[:, None]
+    step = torch.zeros_like(p)
+    for _ in range(steps):
+        hat = (1 - (p[:, None] - node).abs()).clamp_min(0)  # (2, n, M) bilinear weights
+        step = ((field * hat[0]).sum(2) * hat[1]).sum(1)
+        if len(field) == 3:
+            step = step[:2] / step[2].clamp(*GAIN)
+        p = torch.where(moving, p - step, p)
+    taken = torch.where(moving, taken + steps, taken)
+    return p, taken, moving & ((step * step).sum(0) > o.epsilon_px**2) & (p == p.clamp(low, high)).all(0)
+
+
+def _steps(C: Tensor, moments: Tensor, A_inv: Tensor) -> Tensor:
+    """Gauss-Newton steps (2, ..., M) from correlations (K, ..., M), as linear in them as a map is between its nodes.
+
+    With K = 3 the steps are those for equal contrast, and a third plane is the gain they are to be divided by.
+    """
+    shape = (2, *(1,) * (C.ndim - 2), C.shape[-1])
+    change = C[:2] - moments[:2].view(shape)
+    steps = A_inv[:, 0].view(shape) * change[0] + A_inv[:, 1].view(shape) * change[1]
+    return steps if len(C) == 2 else torch.cat([steps, _gain(C[2:], moments[5])])
+
+
+def _map(pair: _Pair, o: Options, radius: int, x: Tensor, corner: Tensor, batch: Tensor, moments: Tensor | None = None):
+    """Map (K, n, n, M) of the windows at ``x`` (2, M) that begins at the target's pixels ``corner``; the moments."""
+    w, side = o.window, o.window + 2 * radius + 1
+    planes = (GRAD_X, GRAD_Y) if moments is not None and o.normalise != "gain_bias" else (GRAD_X, GRAD_Y, GREY)
+    first_0, fraction = pair.source.locate(pair.level, x, batch, w // 2, planes)
+    first_1, _ = pair.target.locate(pair.level, corner + radius, batch, w // 2 + radius, (GREY,))
+    maps, sums = [], []
+    for i, j, f in zip(*(y.split(CHUNK, -1) for y in (first_0, first_1, fraction)), strict=True):
+        G = _project(pair.source.read(pair.level, i, w, None if pair.level else f), o.normalise)
+        if moments is None:
+            sums.append(_moments(G, o.normalise))
+        kernel = _kernels(G, o.normalise)
+        K, m = kernel.shape[:2]
+        J = pair.target.read(pair.level, j.expand(K, m), side).view(1, K * m, side, side)
+        maps.append(F.conv2d(J, kernel.reshape(K * m, 1, w, w), groups=K * m).view(K, m, side - w + 1, side - w + 1))
+    C = torch.cat(maps, 1).permute(0, 2, 3, 1).contiguous()
+    return C, torch.cat(sums, -1) if moments is None else moments
+
+
+def _project(G: Tensor, normalise: str) -> Tensor:
+    """Windows (3, M, w²) of g_x, g_y and T with what the normalisation leaves free (bias, gain) taken out of them."""
+    if normalise == "none":
+        return G
+    G = G - G.mean(-1, keepdim=True)
+    if normalise == "bias":
+        return G
+    g, T = G[:2], G[2:]
+    energy = (T * T).sum(-1, keepdim=True)
+    share = (g * T).sum(-1, keepdim=True) / torch.where(energy > 0, energy, torch.ones_like(energy))
+    return torch.cat([g - share * T, T])
+
+
+def _kernels(G: Tensor, normalise: str) -> Tensor:
+    """What a step needs correlated with J, (K, M, w²): g, and T where the gain is estimated."""
+    return G if normalise == "gain_bias" else G[:2]
+
+
+def _moments(G: Tensor, normalise: str) -> Tensor:
+    """Sums over the windows (3, M, w²) of g_x, g_y and T: (5 or 6, M), see the alphabet."""
+    last = 3 if normalise == "gain_bias" else 2
+    return torch.cat([(G[:2] * G[2]).sum(-1), (G[:2] * G[0]).sum(-1), (G[1:last] * G[1:last]).sum(-1)])
+
+
+def _gain(correlation: Tensor, energy: Tensor) -> Tensor:
+    """Contrast of J in units of T's."""
+    ratio = correlation / torch.where(energy > 0, energy, torch.ones_like(energy))
+    return torch.where(energy > 0, ratio, torch.ones_like(ratio))
+
+
+def _inverse(A: Tensor, min_eigenvalue: float) -> tuple[Tensor, Tensor]:
+    """Inverse (2, 2, M) of A (3, M), zero where its small eigenvalue is not above the limit; and where it is (M,)."""
+    a, b, c = A.double()
+    textured = _small_eigenvalue(a, b, c) > min_eigenvalue
+    det = torch.where(textured, a * c - b * b, torch.ones_like(a))
+    adjugate = torch.stack([c, -b, -b, a]) / det
+    return torch.where(textured, adjugate, torch.zeros_like(adjugate)).to(A.dtype).unflatten(0, (2, 2)), textured
+
+
+def _small_eigenvalue(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    """Of the matrices ((a, b), (b, c))."""
+    half = (a - c) / 2
+    return (a + c) / 2 - (half * half + b * b).sqrt()
+
+
+def within(x: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Whether points (2, M) lie between bounds; NaN does not."""
+    return ((x >= low) & (x <= high)).all(0)
+
+
+def _static(x: Tensor) -> bool:
+    """Whether shapes must not depend on values."""
+    return torch.compiler.is_compiling() or torch._C._functorch.is_functorch_wrapped_tensor(x)
