@@ -15,7 +15,8 @@ from dhtorch import archive, report
 from dhtorch.codes import Gate, Source
 from dhtorch.report import curves, layouts, page, plots, published, svg, text
 from dhtorch.report.markup import Markup, escape, tag
-from dhtorch.report.tables import COLUMNS, every_number, flatten, scene_rows
+from dhtorch.report.reading import flatten, scene_rows
+from dhtorch.report.tables import COLUMNS, every_number
 
 REPO = Path(__file__).resolve().parents[1]
 RESULTS = [make() for make in archived.ALL]

@@ -2,8 +2,9 @@
 
 So ``dhtorch report`` shows a result of any age and machine exactly as the job that wrote it did.
 
-``cells`` says how a number reads, ``tables`` which numbers stand together, ``layouts`` how the paper lays them out,
-``published`` what the paper has there, ``plots`` which figures the curves make, ``text`` and ``page`` are the media.
+``reading`` knows the schema, ``cells`` how a number reads, ``tables`` which numbers stand together; ``layouts`` (and
+``timings``) lay them out as the paper does, beside the figures in ``published``; ``plots`` lists the figures (made by
+``curves``, ``sweeps`` and ``overlays``, drawn with ``figure`` and ``svg``); ``text`` and ``page`` are the media.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from typing import Any
 from dhtorch import archive
 from dhtorch.report import page, text
 from dhtorch.report.layouts import SHOWN, in_layout
-from dhtorch.report.tables import INTERVAL, Result, Table, describe, generic
+from dhtorch.report.reading import Result, describe
+from dhtorch.report.tables import INTERVAL, Table, generic
 
 __all__ = ["INTERVAL", "Result", "Table", "describe", "main", "markdown", "print_tables", "tables"]
 

@@ -7,8 +7,8 @@ from typing import Any
 
 from dhtorch.report.cells import show
 from dhtorch.report.figure import CAP, FLOOR, Figure, deciding, legend, missing, named, series, share
+from dhtorch.report.reading import Result, Row, variants
 from dhtorch.report.svg import Axis, Panel, spanning
-from dhtorch.report.tables import Result, Row, variants
 
 #: Fewest answers whose mean error is drawn.
 FEWEST = 10

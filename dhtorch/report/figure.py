@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from dhtorch.report.markup import Markup
+from dhtorch.report.reading import Result, Row, last_cohort, scene_rows, variants
 from dhtorch.report.svg import COLOURS, Axis, spanning
-from dhtorch.report.tables import Result, Row, last_cohort, scene_rows, variants
 
 #: Relative errors are drawn between these.
 FLOOR, CAP = 1e-3, 10.0

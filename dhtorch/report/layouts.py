@@ -5,25 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 
-from dhtorch.report import published
+from dhtorch.report import published, timings
 from dhtorch.report.cells import NOTHING, head, show
-from dhtorch.report.tables import (
-    DERIVED,
-    OURS,
-    PUBLISHED,
-    Line,
-    Result,
-    Row,
-    Table,
-    by_scene,
-    by_variant,
-    cohorts,
-    entry,
-    last_cohort,
-    scene_rows,
-    source,
-    variants,
-)
+from dhtorch.report.reading import Result, cohorts, entry, last_cohort, variants
+from dhtorch.report.tables import DERIVED, OURS, PUBLISHED, Line, Table, by_scene, by_variant, source
 
 #: (pattern of our variant, its label or None = its own name, the paper's line)
 Known = Sequence[tuple[str, str | None, str | None]]
@@ -214,36 +199,6 @@ def _comparison(result: Result) -> list[Table]:
     return [by_variant(result, "Methods, over scenes", ["n_scenes", *measured])]
 
 
-def _latency(result: Result) -> list[Table]:
-    """The paper's branches, then every stage."""
-    columns = ("device", "p50_ms", "p95_ms", "p99_ms", "parameters", "weight_bytes", "peak_mib")
-    rows: list[list[str]] = []
-    stages: list[list[str]] = []
-    for row in scene_rows(result):
-        label = branch(row)
-        missing = row.get("note", NOTHING)
-        cells = [missing if row.get(m) is None else show(row[m], m) for m in columns]
-        whole = row.get("stage") in ("front_end", "pair", "forward") or "parameters" in row
-        (rows if whole else stages).append([label, *cells] if whole else [label, *cells[1:4]])
-    cited = [
-        [f"{PUBLISHED}: {name}", *(cells.get(m, NOTHING) for m in columns)]
-        for name, cells in published.LATENCY.lines.items()
-    ]
-    threads = dict.fromkeys(show(row.get("threads")) for row in scene_rows(result) if row.get("threads"))
-    note = f"{source(result, published.LATENCY)} Threads in ours: {', '.join(threads) or NOTHING}."
-    heads = ["branch", *map(head, columns)]
-    found = [Table("Measured latency", heads, rows + cited, quoted=len(cited), note=note)]
-    if stages:
-        found.append(Table("Latency by stage", ["stage", *map(head, columns[1:4])], stages))
-    return found
-
-
-def branch(row: Row) -> str:
-    """What a row of timings is about."""
-    size = f", {show(row['hw'])}" if row.get("hw") else ""
-    return f"{row['method']} {row.get('stage', '').replace('_', ' ')}".strip() + size
-
-
 LAYOUTS: dict[str, Callable[[Result], list[Table]]] = {
     "range_split": _range_split,
     "real_holes": _real_holes,
@@ -255,7 +210,7 @@ LAYOUTS: dict[str, Callable[[Result], list[Table]]] = {
     "motion": _motion,
     "learned": _learned,
     "ablation": _ablation,
-    "latency": _latency,
+    "latency": timings.latency,
     "method_comparison": _comparison,
 }
 #: Columns that stand in these tables and need not be repeated.

@@ -8,8 +8,8 @@ from typing import Any
 from dhtorch.codes import Gate, Source, names, words
 from dhtorch.report.figure import Figure, missing, named
 from dhtorch.report.markup import Markup, tag
+from dhtorch.report.reading import Result, scene_rows, variants
 from dhtorch.report.svg import picture
-from dhtorch.report.tables import Result, scene_rows, variants
 
 #: The variant whose samples are shown first, where a result has it.
 FIRST = ("gated", "anchored", "both gates", "gap x1", "map", "paper")

@@ -13,7 +13,8 @@ from dhtorch.report.figure import Figure
 from dhtorch.report.layouts import SHOWN, in_layout
 from dhtorch.report.markup import Markup, join, tag
 from dhtorch.report.plots import figures
-from dhtorch.report.tables import INTERVAL, PUBLISHED, Result, Table, every_number, generic
+from dhtorch.report.reading import Result
+from dhtorch.report.tables import INTERVAL, PUBLISHED, Table, every_number, generic
 
 STYLE = Path(__file__).with_name("page.css")
 

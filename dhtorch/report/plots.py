@@ -8,10 +8,11 @@ from dhtorch.codes import Hole, names, words
 from dhtorch.report import curves, published, sweeps
 from dhtorch.report.cells import show
 from dhtorch.report.figure import PUBLISHED, Figure, axis_of, deciding, named, series, share
-from dhtorch.report.layouts import branch, counterparts
+from dhtorch.report.layouts import counterparts
 from dhtorch.report.overlays import overlays
+from dhtorch.report.reading import Result, Row, entry, scene_rows, variants
 from dhtorch.report.svg import Panel, spanning
-from dhtorch.report.tables import Result, Row, entry, scene_rows, variants
+from dhtorch.report.timings import branch, is_whole
 
 #: Height of a named row, and of what lies around them.
 ROW, AROUND = 19, 66
@@ -77,7 +78,7 @@ def latency(result: Result) -> Figure | None:
     x = spanning([*times, *cited.values()], "milliseconds (logarithmic)", log=True)
     panel = Panel("", x, None, size=(720, AROUND + ROW * len(labels)), rows=labels)
     for k, (name, row) in enumerate(rows):
-        style = "s1" if row.get("stage") == "forward" else "s0" if "parameters" in row else "s7"
+        style = "s1" if row.get("stage") == "forward" else "s0" if is_whole(row) else "s7"
         panel.line([row["p50_ms"], _slow(row)], [k, k], style)
         panel.dot(row["p50_ms"], k, style, f"{name}: {show(row['p50_ms'])} ms")
     for k, (name, number) in enumerate(cited.items()):

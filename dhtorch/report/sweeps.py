@@ -10,8 +10,8 @@ from dhtorch.report.cells import show
 from dhtorch.report.figure import PUBLISHED, Figure, axis_of, deciding, legend, series, share
 from dhtorch.report.layouts import thresholds
 from dhtorch.report.markup import Markup
+from dhtorch.report.reading import Result, Row, entry, value, variants
 from dhtorch.report.svg import Panel, spanning
-from dhtorch.report.tables import Result, Row, entry, value, variants
 
 METRICS = (("coverage", "coverage, %"), ("median_rel", "median error, %"))
 #: The paper's usual cutoff, m.
