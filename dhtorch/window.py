@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dhtorch.codes import Gate
+from dhtorch.codes import Gate, first_reason
 from dhtorch.geometry.pyramid import build_pyramid
 from dhtorch.geometry.shapes import check
 from dhtorch.pair import Trace, extend
@@ -42,7 +42,8 @@ def inverse_variance(
     *,
     min_views: int = 2,
     max_chi2: float = 9.0,
-    correlation: float = 0.5,
+    correlation: float = 1.0,
+    max_sigma_rel: float | None = 0.1,
 ) -> Estimate:
     """Join the answers of several views of the same samples; where they contradict each other, say nothing.
 
@@ -53,15 +54,18 @@ def inverse_variance(
     Args:
         min_views: fewer answering views (or all, where there are not so many) make no answer.
         max_chi2: sum of squared differences from the mean, in variances, per view beyond the first.
-        correlation: of the views' own errors: they share the anchor's window. The poses' parts are taken to be wholly
-            common to the views: all poses rest on the same near returns.
+        correlation: of the views' own errors, which share the anchor's window. At 1 sigma is the weighted mean of the
+            views', at 0 it shrinks with the root of their number. The poses' parts are always taken to be common to the
+            views: all poses rest on the same near returns.
+        max_sigma_rel: sigma / depth of the fused answer above which it is withheld; None asks nothing. Views may answer
+            far less surely than that.
 
     Returns:
-        Estimate (B, N). ``n_views`` counts the anchor; ``parallax_deg`` is the largest of all views,
-        ``residual_px`` the weighted rms of those that answered (of none: the last view's); ``score`` is 1 where
-        answered.
+        Estimate (B, N); a single view's as it is. ``n_views`` counts the anchor; ``parallax_deg`` is the largest of
+        all views, ``residual_px`` the weighted rms of those that answered (of none: the last view's); ``score`` is 1
+        where answered.
 
-    Gates: INCONSISTENT; with too few views, the reason of the last view that is silent.
+    Gates: with too few views, the reason of the last view that is silent; INCONSISTENT, UNCERTAIN.
 
     Raises:
         ValueError: wrong shapes, or no view.
@@ -72,6 +76,8 @@ def inverse_variance(
     V = check("inverse_variance", gate=(estimates.gate, "V B N"), depth=(estimates.depth, "V B N"))["V"]
     if V < 1:
         raise ValueError("inverse_variance: expected at least one view")
+    if V == 1:
+        return estimates[0]
     said = estimates.keep & (estimates.depth > 0) & (estimates.sigma > 0) & estimates.sigma.isfinite()
     inverse, own, shared = _inverse_depth(estimates, said)
     variance = own * own + shared * shared
@@ -83,13 +89,15 @@ def inverse_variance(
     mean = torch.where(n > 0, mean, torch.ones_like(mean))
     chi2 = torch.where(said, (inverse - mean).square() / variance, torch.zeros_like(variance)).sum(0)
     chi2 = chi2 / (n - 1).clamp_min(1)
-    gate = torch.where((n > 1) & ~(chi2 <= max_chi2), Gate.INCONSISTENT, Gate.ANSWER)
+    widening = chi2.clamp_min(1)
+    own_2 = correlation * (weight * own).sum(0).square() + (1 - correlation) * (weight * own).square().sum(0)
+    shared_2 = (weight * shared).sum(0).square() * widening
+    depth = 1 / mean
+    sigma = depth * depth * (own_2 * widening + shared_2).sqrt()
+    unsure = torch.zeros_like(n, dtype=torch.bool) if max_sigma_rel is None else sigma > max_sigma_rel * depth
+    gate = first_reason((~(chi2 <= max_chi2), Gate.INCONSISTENT), (unsure, Gate.UNCERTAIN))
     gate = torch.where(n < min(max(min_views, 1), V), _last_reason(estimates.gate, said), gate).to(torch.int32)
     keep = gate == Gate.ANSWER
-    widening = torch.where(n > 1, chi2.clamp_min(1), torch.ones_like(chi2))
-    own_2 = correlation * (weight * own).sum(0).square() + (1 - correlation) * (weight * own).square().sum(0)
-    shared_2 = (weight * shared).sum(0).square()
-    depth = 1 / mean
     residual_px = torch.where(said, estimates.residual_px, torch.zeros_like(estimates.residual_px))
     residual_px = _root((weight * residual_px.square()).sum(0)).to(estimates.depth.dtype)
 
@@ -99,8 +107,8 @@ def inverse_variance(
     return Estimate(
         uv=estimates.uv[-1],
         depth=answer(depth),
-        sigma=answer(depth * depth * ((own_2 + shared_2) * widening).sqrt()),
-        sigma_shared=answer(depth * depth * _root(shared_2 * widening)),
+        sigma=answer(sigma),
+        sigma_shared=answer(depth * depth * _root(shared_2)),
         parallax_deg=estimates.parallax_deg.amax(0),
         residual_px=torch.where(n > 0, residual_px, estimates.residual_px[-1]),
         n_views=(n + 1).to(torch.int32),
