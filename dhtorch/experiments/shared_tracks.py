@@ -33,7 +33,9 @@ class SharedTracks:
 
     def charge(self, ms: dict[str, float]) -> None:
         """Add to ``ms["track"]`` what the tracks that were remembered had cost."""
-        ms["track"] = ms.get("track", 0.0) + self._owed
+        if self._owed:
+            ms["track"] = ms.get("track", 0.0) + self._owed
+            self._owed = 0.0
 
     def _track(self, track: Track, image_0: Tensor, image_1: Tensor, uv_0: Tensor, **options: Any) -> Tracks:
         if options:  # initial values or a pyramid of the caller's own: not the same question
