@@ -87,6 +87,9 @@ def test_several_results_stand_on_one_page_in_their_order():
     assert [a.text for a in links] == [r["experiment"] for r in RESULTS]
     assert [a.get("href")[1:] for a in links] == [s.get("id") for s in sections]
     assert "could not be downloaded" in "".join(tree.find("body/header/p").itertext())
+    benchmark = {**RESULTS[0], "data": {**RESULTS[0]["data"], "name": "tum11"}}
+    said = "".join(parse(page.page([benchmark])).find("body/header/p").itertext())
+    assert "does not name the sequences" in said and "could not be downloaded" not in said
 
 
 HOSTILE = '</td><script>alert("&amp;")</script>\x00\x1b|\n`${x}` ]]> \ud800 é'

@@ -92,7 +92,9 @@ def show(value: Any, metric: str = "", how: str | None = None) -> str:
         return value
     if isinstance(value, list):
         return "×".join(show(v, how="plain") for v in value)
-    return _number(float(value), how or style(metric)).replace("-", "−")
+    how = how or style(metric)
+    whole = isinstance(value, int) and how == "plain"
+    return (str(value) if whole else _number(float(value), how)).replace("-", "−")
 
 
 def exact(value: Any) -> str:
@@ -115,7 +117,7 @@ def _number(value: float, how: str) -> str:
     if how == "percent":
         return _percent(value)
     if how == "count":
-        return f"{value:,.0f}" if abs(value) >= 10_000 else f"{value:.0f}"
+        return f"{value:,.0f}"
     if how in ("large", "bytes"):
         return _with_unit(value, _LARGE if how == "large" else _BYTES)
     if how == "mebibytes":
@@ -131,8 +133,8 @@ def _percent(value: float) -> str:
 
 
 def _three_digits(value: float) -> str:
-    if value == int(value):
-        return f"{value:.0f}"
+    if value == 0:
+        return "0"
     decimals = max(0, 2 - math.floor(math.log10(abs(value))))
     return f"{value:.{decimals}f}" if decimals <= 5 else f"{value:.1e}"
 

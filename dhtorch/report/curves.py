@@ -127,6 +127,7 @@ def _by_scene(
             draw(panel, row["curves"][kind], row, series(result, row["method"]))
         panels.append(panel.render())
     drawn = legend(result, [row["method"] for row in having])
+    caption += " Of lines that coincide the last is seen." * (len(drawn) > 2)
     return Figure(title, caption + missing(result, scenes), panels, drawn)
 
 

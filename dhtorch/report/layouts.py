@@ -98,8 +98,8 @@ def _gate_ablation(result: Result) -> list[Table]:
 
 def _held_out(result: Result) -> list[Table]:
     truth = "heldout" if "heldout" in cohorts(result) else None
-    columns: tuple[str, ...] = ("n_kept", "corr", "median_rel", "residual_px", "coverage", "n_recovered")
-    columns += ("reach_p95_m", "reach_max_m", "returns_p95_m", "passes")
+    columns: tuple[str, ...] = ("n_kept", "corr", "median_rel", "residual_px", "passes", "coverage")
+    columns += ("n_recovered", "reach_p95_m", "reach_max_m", "returns_p95_m")
     title = "Hold-out triangulation (set B never sees the pose calibration)"
     found = [by_scene(result, title, columns, truth, published.HELD_OUT)]
     if "cyclic" in cohorts(result):
@@ -122,7 +122,7 @@ def _cyclic(result: Result) -> Table:
         [f"{PUBLISHED}: {name}", *(c.get(m, NOTHING) for m in ("cyclic", "heldout", "ratio"))]
         for name, c in published.CYCLIC.lines.items()
     ]
-    title = "Median error on the pose's own inliers (cyclic) against the hold-out, medians over scenes"
+    title = "Median error: cyclic, held out"
     heads = ["", "cyclic", "held out", "ratio"]
     return Table(title, heads, rows + cited, quoted=len(cited), note=source(result, published.CYCLIC))
 

@@ -18,6 +18,9 @@ from dhtorch.report.tables import INTERVAL, PUBLISHED, Table, every_number, gene
 
 STYLE = Path(__file__).with_name("page.css")
 
+#: Data settings that list sequences of a benchmark that the paper uses.
+BENCHMARKS = ("tum11", "arkit5")
+
 VERDICTS = {"supported": "good", "refuted": "bad", "undecided": "open"}
 
 
@@ -68,16 +71,18 @@ def _anchors(results: Sequence[Result]) -> list[str]:
 
 
 def _about(results: Sequence[Result]) -> Markup:
-    data = ", ".join(dict.fromkeys(result["data"]["name"] for result in results))
-    return join(
-        (
-            f"Everything on this page comes from {len(results)} archived result file{'s' * (len(results) != 1)}. ",
-            tag("span", PUBLISHED, class_="theirs-word"),
-            f" marks figures quoted from “{published.PAPER}”. They were measured on the paper’s own data, which could "
-            f"not be downloaded for these results; ours are from other scenes ({data}). The two stand side by side "
-            "for orientation: no line reproduces a line of the paper.",
+    names = dict.fromkeys(result["data"]["name"] for result in results)
+    same, other = ([n for n in names if (n in BENCHMARKS) == known] for known in (True, False))
+    said = [f" marks figures quoted from “{published.PAPER}”, measured on the paper’s own data."]
+    if other:
+        said.append(
+            f"Those could not be downloaded for these results: ours are from other scenes ({', '.join(other)})."
         )
-    )
+    if same:
+        said.append(f"Of its benchmarks the paper does not name the sequences; ours are {', '.join(same)}.")
+    said.append("The two stand side by side for orientation: no line reproduces a line of the paper.")
+    count = f"Everything on this page comes from {_many(len(results), 'archived result file')}. "
+    return join((count, tag("span", PUBLISHED, class_="theirs-word"), " ".join(said)))
 
 
 def _overview(results: Sequence[Result], anchors: Sequence[str]) -> Markup:
@@ -207,7 +212,7 @@ def _heading(k: int, name: str, n_label: int, theirs: bool) -> Markup:
 
 def _short(cell: str) -> bool:
     """Numbers stand to the right; reasons for their absence are set as words."""
-    return len(cell) < 4 or any(c.isdigit() for c in cell)
+    return " " not in cell or any(c.isdigit() for c in cell)
 
 
 def _scrolling(table: Markup, label: str) -> Markup:
