@@ -22,6 +22,7 @@ from torch import Tensor
 from dhtorch.codes import Gate, first_reason
 from dhtorch.geometry.pyramid import build_pyramid
 from dhtorch.geometry.shapes import check
+from dhtorch.geometry.steady import steady
 from dhtorch.pair import Trace, extend
 from dhtorch.records import Estimate, Frame, PoseFit, Samples, Tracks
 from dhtorch.stages import backproject as _backproject
@@ -35,6 +36,9 @@ from dhtorch.tree import stack
 
 #: Least share of a variance that is put down to the point's own track, whatever the pose's part.
 OWN_SHARE = 1e-3
+
+#: Samples, about, by which key views are chosen.
+PROBES = 256
 
 
 def inverse_variance(
@@ -148,8 +152,8 @@ def extend_window(
         sample, backproject, classify, track, pose, triangulate, score: the seven seats, as in ``extend``. The first
             three see the anchor once; ``score`` sees the fused estimate, with tracks and pose of the last view.
         fuse: estimates of all views (V, B, N) → Estimate.
-        views: how many other views a caller with a recording hands over, spread evenly from the anchor to the other
-            view of the pair; the last so many are used where there are more.
+        views: how many other views are used. Of more the best are chosen (:func:`key_views`), by a few of the samples.
+            A caller with a recording hands over as many, spread evenly from the anchor to the other view of a pair.
         chain: begin the search in each view where its predecessor was found, further on at the same pace. It only is
             a start: what is searched for is always the anchor's window.
         n, hypotheses, min_trackability, seed: as in ``extend``; all views have the same draws.
@@ -169,26 +173,18 @@ def extend_window(
     check("extend_window", f_0=(anchor.camera.f, "B 2"), f=(others.camera.f, "V B 2"))
     if not others.image.shape[0]:
         raise ValueError("extend_window: found no other view, expected at least one")
-    others = others[-views:]
-    began = time.perf_counter()
+    began, ms = time.perf_counter(), {}
     uv = sample(anchor.hw, n, device=anchor.camera.f.device, dtype=anchor.camera.f.dtype)
     samples = classify(anchor, backproject(anchor, uv))
-    seats: dict[str, Any] = {"pose": pose, "triangulate": triangulate, "n": n, "hypotheses": hypotheses, "seed": seed}
-    seats |= {"min_trackability": min_trackability, "score": _no_score}
-    seats |= {
-        "sample": partial(_given, uv),
-        "backproject": partial(_given, samples),
-        "classify": partial(_given, samples),
-    }
-    known = _pyramid(track, anchor.image)
-    ms = {"samples": 1e3 * (time.perf_counter() - began)}
-    traces: list[Trace] = []
-    for k in range(len(others.image)):
-        if chain and traces:
-            known |= _start(track, traces[-1]["tracks"], (k + 1) / k)
-        traces.append({"ms": ms})
-        own = None if fit is None else fit[k]
-        extend(anchor, others[k], track=partial(track, **known), fit=own, trace=traces[-1], **seats)
+    ms["samples"] = 1e3 * (time.perf_counter() - began)
+    common: dict[str, Any] = {"track": track, "chain": chain, "pose": pose, "triangulate": triangulate, "ms": ms}
+    common |= {"hypotheses": hypotheses, "min_trackability": min_trackability, "seed": seed}
+    if len(others.image) > views:
+        thin = samples[:, :: max(1, n // PROBES)]
+        index = key_views(stack([t["estimate"] for t in _ask_views(anchor, others, thin, fit=fit, **common)]), views)
+        pick = index, torch.arange(index.shape[1], device=index.device)
+        others, fit = others[pick], None if fit is None else fit[pick]
+    traces = _ask_views(anchor, others, samples, fit=fit, **common)
     last, began = traces[-1], time.perf_counter()
     estimate = fuse(stack([t["estimate"] for t in traces]))
     estimate = score(estimate, samples, last["tracks_ideal"], last["fit"])
@@ -196,6 +192,62 @@ def extend_window(
     if trace is not None:
         trace.update({**last, "estimate": estimate, "ms": ms, "views": traces})
     return estimate
+
+
+def key_views(
+    estimates: Estimate,  # (V, B, N), one per view
+    views: int,
+    *,
+    good_sigma_rel: float = 0.1,
+) -> Tensor:
+    """Which views to keep, by the sigma to expect of the points together: (views, B) indices, rising.
+
+    A wide view is sure of what it sees, a near one sees more. What a set of views is worth is the sum over the points
+    of log(1 + sum of (good_sigma_rel · depth / sigma)² over its views); views are added one by one, each the one that
+    adds most, the wider of equals.
+
+    Raises:
+        ValueError: wrong shapes, or not 1 <= views <= V.
+    """
+    V = check("key_views", gate=(estimates.gate, "V B N"), sigma=(estimates.sigma, "V B N"))["V"]
+    if not 1 <= views <= V:
+        raise ValueError(f"key_views: views is {views}, expected 1 to {V}")
+    said = estimates.keep & (estimates.sigma > 0) & estimates.sigma.isfinite()
+    ratio = good_sigma_rel * estimates.depth / torch.where(said, estimates.sigma, 1.0)
+    worth = torch.where(said, ratio, 0.0).detach().double().square().flip(0)  # argmax takes the first of equals
+    known = torch.zeros_like(worth[0])
+    free = torch.ones_like(worth[:, :, 0], dtype=torch.bool)
+    for _ in range(views):
+        gain = steady(torch.log1p, known + worth).sum(-1).masked_fill(~free, -torch.inf)
+        best = torch.nn.functional.one_hot(gain.argmax(0), V).T.bool()
+        known = known + (worth * best[..., None]).sum(0)
+        free = free & ~best
+    return free.flip(0).long().argsort(dim=0, stable=True)[:views]
+
+
+def _ask_views(
+    anchor: Frame,
+    others: Frame,
+    samples: Samples,
+    *,
+    track: Callable[..., Tracks],
+    chain: bool,
+    fit: PoseFit | None,
+    ms: dict[str, float],
+    **seats: Any,
+) -> list[Trace]:
+    """The anchor's samples in each of the views, as a pair."""
+    given: dict[str, Any] = {"sample": partial(_given, samples.uv), "score": _no_score, "n": samples.uv.shape[1]}
+    given |= {"backproject": partial(_given, samples), "classify": partial(_given, samples)}
+    known = _pyramid(track, anchor.image)
+    traces: list[Trace] = []
+    for k in range(len(others.image)):
+        if chain and traces:
+            known |= _start(track, traces[-1]["tracks"], (k + 1) / k)
+        traces.append({"ms": ms})
+        own = None if fit is None else fit[k]
+        extend(anchor, others[k], track=partial(track, **known), fit=own, trace=traces[-1], **given, **seats)
+    return traces
 
 
 def _inverse_depth(estimates: Estimate, said: Tensor) -> tuple[Tensor, Tensor, Tensor]:

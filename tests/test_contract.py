@@ -282,7 +282,7 @@ ROWS = [
 ELSEWHERE = {
     *(f"dhtorch.stages.sample.{name}" for name in ("spiral", "vogel", "grid")),
     "dhtorch.geometry.shapes.check",
-    *(f"dhtorch.window.{name}" for name in ("inverse_variance", "extend_window")),
+    *(f"dhtorch.window.{name}" for name in ("inverse_variance", "key_views", "extend_window")),
     "dhtorch.geometry.least_squares.minimise",
     *(f"dhtorch.geometry.lucas_kanade.{n}" for n in ("search", "step", "squares", "covariance", "for_some", "within")),
     *(f"dhtorch.geometry.ransac.{name}" for name in ("msac_cost", "search")),

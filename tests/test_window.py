@@ -14,7 +14,7 @@ from dhtorch.evaluate import holdout
 from dhtorch.pair import extend
 from dhtorch.records import Estimate
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
-from dhtorch.window import extend_window, inverse_variance
+from dhtorch.window import extend_window, inverse_variance, key_views
 
 FLOATS = ("depth", "sigma", "sigma_shared", "parallax_deg", "residual_px", "score")
 PAIR = {"n": 200, "hypotheses": 64}
@@ -154,6 +154,24 @@ def test_gradients_are_finite_and_right():
     assert torch.autograd.gradcheck(fused, (depth, sigma))
 
 
+def test_key_views_are_those_that_leave_the_smallest_sigma():
+    """View 0 sees all points badly, 1 and 2 half of them each, well; 3 repeats 2 a little worse; 4 sees nothing."""
+    sigma = torch.full((5, 10), 0.4)
+    sigma[1, :5], sigma[2, 5:], sigma[3, 5:] = 0.02, 0.02, 0.03
+    gate = torch.zeros(5, 10, dtype=torch.int32)
+    gate[1, 5:], gate[2, :5], gate[3, :5], gate[4] = (Gate.NO_TRACK,) * 4
+    views = answers(torch.full((5, 10), 4.0), sigma, gate=gate.tolist())
+    assert key_views(views, 2)[:, 0].tolist() == [1, 2]
+    assert key_views(views, 3)[:, 0].tolist() == [1, 2, 3]
+    assert key_views(views, 5)[:, 0].tolist() == [0, 1, 2, 3, 4]
+    both = tree.stack([views[:, 0], views[[4, 3, 2, 1, 0], 0]], 1)  # a batch of two, each with its own choice
+    assert key_views(both, 2).T.tolist() == [[1, 2], [2, 3]]
+    same = answers(torch.full((3, 10), 4.0), torch.full((3, 10), 0.1))
+    assert key_views(same, 1)[:, 0].tolist() == [2]
+    with pytest.raises(ValueError, match="key_views"):
+        key_views(views, 6)
+
+
 def test_it_captures():
     views, _ = noisy(N=8)
     compiled = torch.compile(inverse_variance, fullgraph=True, backend="eager")
@@ -225,6 +243,15 @@ def test_any_tracker_and_given_poses(room):
     assert torch.equal(given.gate, found.gate)
     plain = extend_window(anchor, others, track=opencv.lucas_kanade, **PAIR)  # takes neither start nor pyramid
     assert (plain.gate > 0).all()  # it states no covariance: nothing to weigh its answers by
+
+
+def test_of_many_views_the_widest_is_kept_and_copies_of_the_anchor_are_not(room):
+    anchor, others = room
+    more = tree.stack([anchor, others[0], anchor, others[2]])
+    few, trace = extend_window(anchor, others[[0, 2]], **PAIR), {}
+    chosen = extend_window(anchor, more, views=2, trace=trace, **PAIR)
+    assert torch.equal(chosen.gate, few.gate) and len(trace["views"]) == 2
+    assert torch.equal(chosen.depth.nan_to_num(), few.depth.nan_to_num())
 
 
 def test_wrong_shapes_raise(room):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import time
 from collections.abc import Callable
 from functools import partial
@@ -29,7 +30,9 @@ class SharedTracks:
     def seat(self, track: Track) -> Track:
         """The track seat of one variant."""
         self._owed = 0.0
-        return partial(self._track, track)
+        seat = partial(self._track, track)
+        seat.__signature__ = inspect.signature(track)  # type: ignore[attr-defined]  # what it may be asked for is seen
+        return seat
 
     def charge(self, ms: dict[str, float]) -> None:
         """Add to ``ms["track"]`` what the tracks that were remembered had cost."""
