@@ -8,6 +8,7 @@ from hydra.utils import instantiate
 from dhtorch.data.pairs import by_gap
 from dhtorch.data.synthetic import SyntheticRoom, open_rooms
 from dhtorch.evaluate import holdout
+from dhtorch.evaluate.correlation import ranks
 from dhtorch.experiments import (
     ablation,
     calibration,
@@ -248,7 +249,7 @@ def test_recovery_rises_with_the_baseline():
 
 
 def test_ranks_share_ties():
-    assert motion._ranks(torch.tensor([3.0, 1.0, 3.0, 2.0])).tolist() == [2.5, 0.0, 2.5, 1.0]
+    assert ranks(torch.tensor([3.0, 1.0, 3.0, 2.0])).tolist() == [2.5, 0.0, 2.5, 1.0]
 
 
 def test_census_counts_every_class_once():

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.evaluate import bootstrap
+from dhtorch.evaluate.correlation import pearson
 from dhtorch.evaluate.holdout import Truth
 from dhtorch.geometry.shapes import check
 from dhtorch.records import Estimate
@@ -139,7 +140,7 @@ def measure(pooled: Points) -> Numbers:
         "median_rel": _quantile(error, 0.5),
         "p90_rel": _quantile(error, 0.9),
         "wrong_share": _share(error > WRONG),
-        "corr": _pearson(answered.depth, answered.true_depth),
+        "corr": pearson(answered.depth, answered.true_depth),
         "residual_px": _quantile(answered.residual_px[answered.residual_px.isfinite()], 0.5),
         "within_sigma": _share((off <= sigma)[stated]),
         "within_2sigma": _share((off <= 2 * sigma)[stated]),
@@ -211,11 +212,3 @@ def _quantile(x: Tensor, q: float) -> float | None:
 
 def _share(mask: Tensor) -> float | None:
     return float(mask.double().mean()) if mask.numel() else None
-
-
-def _pearson(x: Tensor, y: Tensor) -> float | None:
-    if x.numel() < 2:
-        return None
-    x, y = x - x.mean(), y - y.mean()
-    scale = float((x * x).sum().sqrt() * (y * y).sum().sqrt())
-    return float((x * y).sum()) / scale if scale > 0 else None

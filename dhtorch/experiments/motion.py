@@ -14,9 +14,9 @@ from functools import partial
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from dhtorch.evaluate import bootstrap
+from dhtorch.evaluate.correlation import spearman
 from dhtorch.experiments import protocol
 from dhtorch.experiments.cohorts import HeldOut
 from dhtorch.experiments.gate_ablation import at_gaps, sweep
@@ -95,14 +95,5 @@ def _spearman(rows: Sequence[Row], metric: str) -> float | None:
     both = [(r["baseline_m"], r[metric]) for r in rows if None not in (r.get("baseline_m"), r.get(metric))]
     if len(both) < 4:
         return None
-    x, y = (_ranks(torch.tensor(v, dtype=torch.float64)) for v in zip(*both, strict=True))
-    x, y = x - x.mean(), y - y.mean()
-    size = float((x.square().sum() * y.square().sum()).sqrt())
-    return float((x * y).sum()) / size if size > 0 else None
-
-
-def _ranks(x: Tensor) -> Tensor:
-    """Ranks, ties by their mean."""
-    values, group = x.unique(return_inverse=True)
-    count = torch.bincount(group, minlength=values.numel()).double()
-    return (count.cumsum(0) - (count + 1) / 2)[group]
+    x, y = (torch.tensor(v, dtype=torch.float64) for v in zip(*both, strict=True))
+    return spearman(x, y)
