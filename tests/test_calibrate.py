@@ -25,12 +25,13 @@ def uniform(*shape, seed=0):
     return torch.rand(*shape, generator=generator(seed), dtype=torch.float64)
 
 
-def scene_of(n, seed=0, spread=1.0, silent=0.2, boast=1.0):
+def scene_of(n, seed=0, spread=1.0, silent=0.2, boast=1.0, floor=0.0):
     """Answers whose error is normal with a known relative sigma, and a score that falls with it."""
     g = generator(seed)
     rel = 0.02 + 0.3 * torch.rand(n, generator=g, dtype=torch.float64) ** 2
     true = 2 + 4 * torch.rand(n, generator=g, dtype=torch.float64)
-    depth = (true * (1 + spread * rel * torch.randn(n, generator=g, dtype=torch.float64))).clamp_min(0.01)
+    noise = ((spread * rel) ** 2 + floor**2).sqrt() * torch.randn(n, generator=g, dtype=torch.float64)
+    depth = (true * (1 + noise)).clamp_min(0.01)
     keep = torch.rand(n, generator=g, dtype=torch.float64) >= silent
     return errors.points(depth, true, (0.1 / (0.1 + rel)) ** boast, sigma=rel * true, keep=keep)
 
@@ -179,14 +180,27 @@ def test_every_scene_teaches_equally():
     torch.testing.assert_close(once.expected_error(at), copied.expected_error(at))
 
 
-@pytest.mark.parametrize("spread", [0.5, 1.0, 2.0])
-def test_the_factor_for_sigma_is_found(spread):
-    scenes = [scene_of(n, seed, spread=spread) for seed, n in enumerate((500, 5000, 2000))]
-    scale = recalibrate.sigma_scale(scenes)
-    assert scale == pytest.approx(spread, rel=0.06)
-    share = statistics.mean(errors.measure(recalibrate.fit(scenes).apply(s))["within_sigma"] for s in scenes)
-    assert share == pytest.approx(0.683, abs=0.002)
-    assert recalibrate.sigma_scale([errors.points(torch.ones(3), torch.ones(3))]) is None
+@pytest.mark.parametrize(("spread", "floor"), [(0.5, 0.0), (1.0, 0.0), (2.0, 0.0), (1.5, 0.03), (0.7, 0.1)])
+def test_the_correction_of_sigma_is_found(spread, floor):
+    scenes = [scene_of(n, seed, spread=spread, floor=floor) for seed, n in enumerate((2000, 9000, 5000))]
+    found = recalibrate.fit_sigma(scenes)
+    stated, one = torch.linspace(0.02, 0.32, 30, dtype=torch.float64), torch.ones(30, dtype=torch.float64)
+    torch.testing.assert_close(
+        found(stated, one), recalibrate.SigmaModel(spread, floor)(stated, one), rtol=0.08, atol=0
+    )
+    learnt = [errors.measure(recalibrate.fit(scenes).apply(s)) for s in scenes]
+    assert statistics.mean(m["within_sigma"] for m in learnt) == pytest.approx(0.683, abs=0.002)
+    assert statistics.mean(m["within_2sigma"] for m in learnt) == pytest.approx(0.954, abs=0.01)
+    assert found(torch.tensor(3.0), torch.tensor(2.0)) == pytest.approx(math.hypot(3 * found.scale, 2 * found.floor))
+    assert recalibrate.fit_sigma([errors.points(torch.ones(3), torch.ones(3))]) is None
+
+
+def test_the_correction_of_sigma_weighs_scenes_and_survives_exact_ones():
+    few, many = scene_of(300, 1), scene_of(3000, 2, spread=3.0)
+    once, copied = recalibrate.fit_sigma([few, many]), recalibrate.fit_sigma([few, many[torch.arange(3000).repeat(3)]])
+    assert (once.scale, once.floor) == pytest.approx((copied.scale, copied.floor), rel=1e-9)
+    exact = recalibrate.fit_sigma([errors.points(torch.ones(30), torch.ones(30), sigma=torch.ones(30))])
+    assert math.isfinite(exact.scale) and math.isfinite(exact.floor)
 
 
 def test_calibration_changes_no_order_and_keeps_silence():
@@ -214,11 +228,8 @@ def test_json_there_and_back(tmp_path):
     at = torch.linspace(-0.1, 1.1, 200, dtype=torch.float64)
     for name in ("probability", "expected_error", "sigmoid"):
         assert torch.equal(getattr(back, name)(at), getattr(learnt, name)(at)), name
-    assert (back.sigma_scale, back.thresholds, back.provenance) == (
-        learnt.sigma_scale,
-        learnt.thresholds,
-        learnt.provenance,
-    )
+    assert (back.sigma, back.thresholds) == (learnt.sigma, learnt.thresholds)
+    assert back.provenance == learnt.provenance
     assert back.provenance["n_scenes"] == 3 and back.to_json() == learnt.to_json()
 
 
@@ -247,8 +258,9 @@ def broken(path, value):
         (("probability", "score", 1), "0.1", r"mine\.json\.probability\.score\.1: found 0\.1, expected a finite"),
         (("expected_error", "score"), [], r"mine\.json\.expected_error\.score: found \[\], expected a list"),
         (("sigmoid", "slope"), True, r"mine\.json\.sigmoid\.slope: found true"),
-        (("sigma_scale",), -1, r"mine\.json\.sigma_scale: found -1, expected a positive"),
-        (("sigma_scale",), 10**400, r"mine\.json\.sigma_scale: found 1000"),
+        (("sigma", "floor"), -1, r"mine\.json\.sigma\.floor: found -1, expected no negative"),
+        (("sigma", "scale"), 10**400, r"mine\.json\.sigma\.scale: found 1000"),
+        (("sigma",), {"scale": 1}, r"mine\.json\.sigma\.floor: found nothing"),
         (("thresholds", "ten"), 0.5, r"mine\.json\.thresholds\.ten: found ten, expected a whole number"),
         (("provenance",), [], r"mine\.json\.provenance: found \[\], expected an object"),
     ],
@@ -517,7 +529,7 @@ def test_the_score_falls_with_every_reason_to_doubt():
             score.rank_by_error(*answers([0.1], **{name: x}), **{option: 0.5}).score.item() for x in (0, 0.1, 1, 9)
         ]
         assert worse == sorted(worse, reverse=True) and len(set(worse)) == 4, name
-    ignored = score.rank_by_error(*answers([0.1], photometric=3.0, error=2.0)).score
+    ignored = score.rank_by_error(*answers([0.1], photometric=3.0, error=2.0), round_trip_scale_px=None).score
     assert ignored == score.rank_by_error(*answers([0.1])).score
 
 

@@ -295,11 +295,12 @@ ELSEWHERE = {
         f"dhtorch.evaluate.calibrate.{n}"
         for n in ("reliability", "pool", "measure", "ece_interval", "leave_one_room_out")
     ),
-    *(f"dhtorch.evaluate.recalibrate.{name}" for name in ("fit", "sigma_scale", "from_json")),
+    *(f"dhtorch.evaluate.recalibrate.{name}" for name in ("fit", "fit_sigma", "from_json")),
     *(f"dhtorch.evaluate.monotone.{name}" for name in ("isotonic", "pool_adjacent_violators", "platt")),
     *(f"dhtorch.evaluate.control.{name}" for name in ("plug_in", "conformal", "scenes_needed", "p_value")),
     *(f"dhtorch.evaluate.compare.{name}" for name in ("method_ratios", "ratio_over_seeds", "equal_coverage")),
     "dhtorch.evaluate.curves.sampled",
+    *(f"dhtorch.evaluate.correlation.{name}" for name in ("pearson", "spearman", "ranks")),
     *(f"dhtorch.evaluate.bootstrap.{name}" for name in ("interval", "interval_of", "resample")),
 }
 

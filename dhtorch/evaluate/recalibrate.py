@@ -1,13 +1,14 @@
 """What scores and sigmas turned out to be worth on some scenes, so that they can be believed on others.
 
 A calibration is fitted on scenes with truth and travels as a small text: two tables of the score (probability of a
-good answer, error to expect), a sigmoid as the simple control, a factor for sigma, and thresholds chosen by the
+good answer, error to expect), a sigmoid as the simple control, a correction of sigma, and thresholds chosen by the
 plug-in control, beside a note of where all that comes from.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -35,6 +36,22 @@ ONE_SIGMA = 0.6826894921370859
 TARGETS = (5, 10, 20)
 
 
+#: Floors of sigma tried, as shares of the depth.
+FLOORS = (0.0, *(1e-4 * 10 ** (k / 10) for k in range(31)))
+
+
+@dataclass(frozen=True)
+class SigmaModel:
+    """A stated sigma made honest: scaled, and never below a share of the depth."""
+
+    scale: float  # noise that was stated too small, or shared
+    floor: float  # what no stated noise knows: lens, calibration, the place that a patch stands for
+
+    def __call__(self, sigma: Tensor, depth: Tensor) -> Tensor:
+        """sqrt((scale · sigma)² + (floor · depth)²), in the unit of both."""
+        return ((self.scale * sigma).square() + (self.floor * depth).square()).sqrt()
+
+
 @dataclass(frozen=True)
 class Calibration:
     """What a score and a sigma mean, as measured on the scenes named in ``provenance``."""
@@ -42,14 +59,14 @@ class Calibration:
     probability: Table  # score → P(relative error < 10 %)
     expected_error: Table  # score → mean capped relative error
     sigmoid: Sigmoid  # score in [0, 1] → P(relative error < 10 %), the simple control
-    sigma_scale: float | None  # true standard deviation over the stated one; None = none was stated
+    sigma: SigmaModel | None  # None = no sigma was stated
     thresholds: Mapping[int, float | None]  # per cent of mean error → plug-in threshold on the score; None = none fits
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def apply(self, scene: Points) -> Points:
         """The same answers with calibrated score and sigma."""
         score = torch.where(scene.keep, self.probability(scene.score), 0.0)
-        return scene.replace(score=score, sigma=scene.sigma * (1.0 if self.sigma_scale is None else self.sigma_scale))
+        return scene.replace(score=score, sigma=self.sigma(scene.sigma, scene.depth) if self.sigma else scene.sigma)
 
     def min_score(self, percent: int) -> float | None:
         """The threshold for a mean error of ``percent``, on the calibrated score; None = answer nothing.
@@ -68,7 +85,7 @@ class Calibration:
             "probability": _corners(self.probability),
             "expected_error": _corners(self.expected_error),
             "sigmoid": {"slope": float(self.sigmoid.slope), "offset": float(self.sigmoid.offset)},
-            "sigma_scale": self.sigma_scale,
+            "sigma": None if self.sigma is None else {"scale": self.sigma.scale, "floor": self.sigma.floor},
             "thresholds": {str(k): v for k, v in self.thresholds.items()},
             "provenance": dict(self.provenance),
         }
@@ -104,31 +121,48 @@ def fit(
         probability=isotonic(score, good.double(), weight, min_share=min_share, ends=ends),
         expected_error=isotonic(score, loss, weight, rising=False, min_share=min_share, ends=ends),
         sigmoid=platt(score, good, weight),
-        sigma_scale=sigma_scale(scenes),
+        sigma=fit_sigma(scenes),
         thresholds={percent: control.plug_in(scenes, percent / 100).threshold for percent in targets},
         provenance=note,
     )
 
 
-def sigma_scale(scenes: Sequence[Points]) -> float | None:
-    """The factor after which 68 % of the answers lie within one sigma, every scene of the same weight.
+def fit_sigma(scenes: Sequence[Points]) -> SigmaModel | None:
+    """The correction after which 68 % of the answers lie within one sigma, every scene of the same weight.
 
-    None where no sigma is stated.
+    For every floor the scale follows from that share; of all these pairs the one is taken under which the errors are
+    most probable (Student's t with three degrees of freedom, which gross errors do not rule).
+
+    Returns:
+        SigmaModel; None where no sigma is stated.
     """
-    ratios, weights = [], []
+    errors, sigmas, weights = [], [], []
     for scene in scenes:
         answered = scene.answered()
-        ratio = (answered.depth - answered.true_depth).abs() / answered.sigma
-        ratio = ratio[answered.sigma.isfinite() & (answered.sigma > 0)]
-        ratios.append(ratio)
-        weights.append(torch.full_like(ratio, 1 / max(ratio.numel(), 1)))
-    if not sum(r.numel() for r in ratios):
+        stated = answered.sigma.isfinite() & (answered.sigma > 0)
+        error = ((answered.depth - answered.true_depth).abs() / answered.depth)[stated]
+        errors.append(error)
+        sigmas.append((answered.sigma / answered.depth)[stated])
+        weights.append(torch.full_like(error, 1 / max(error.numel(), 1)))
+    if not sum(e.numel() for e in errors):
         return None
-    ratio, weight = torch.cat(ratios), torch.cat(weights)
-    order = ratio.argsort()
+    error, sigma, weight = torch.cat(errors), torch.cat(sigmas), torch.cat(weights)
+    best, least = SigmaModel(1.0, 0.0), math.inf
+    for floor in FLOORS:
+        scale = _quantile((error.square() - floor * floor) / sigma.square(), weight, ONE_SIGMA).clamp_min(0).sqrt()
+        model = SigmaModel(float(scale), floor)
+        spread = model(sigma, torch.ones_like(sigma)).clamp_min(torch.finfo(sigma.dtype).tiny)
+        cost = float((weight * (2 * torch.log1p((error / spread).square() / 3) + spread.log())).sum())
+        best, least = (model, cost) if cost < least else (best, least)
+    return best
+
+
+def _quantile(x: Tensor, weight: Tensor, share: float) -> Tensor:
+    """The smallest value below or at which that share of the weight lies."""
+    order = x.argsort()
     below = weight[order].cumsum(0) / weight.sum()
-    k = int(torch.searchsorted(below, torch.tensor(ONE_SIGMA, dtype=below.dtype)))
-    return float(ratio[order][min(k, ratio.numel() - 1)])
+    k = torch.searchsorted(below, torch.tensor(share, dtype=below.dtype, device=below.device))
+    return x[order][k.clamp(max=x.numel() - 1)]
 
 
 def from_json(text: str, where: str = "calibration") -> Calibration:
@@ -145,21 +179,18 @@ def from_json(text: str, where: str = "calibration") -> Calibration:
         content = json.loads(text, parse_constant=_refuse)
     except ValueError as error:
         raise ValueError(f"{where}: found no strict JSON ({error}), expected a calibration") from error
-    known = ("schema", "good_error", "probability", "expected_error", "sigmoid", "sigma_scale", "thresholds")
+    known = ("schema", "good_error", "probability", "expected_error", "sigmoid", "sigma", "thresholds")
     _fields(content, (*known, "provenance"), where)
     for name, value in (("schema", SCHEMA), ("good_error", GOOD)):
         _expect(content[name] == value, f"{where}.{name}", content[name], str(value))
     _fields(content["sigmoid"], ("slope", "offset"), f"{where}.sigmoid")
     slope, offset = (_number(content["sigmoid"][k], f"{where}.sigmoid.{k}") for k in ("slope", "offset"))
-    scale = content["sigma_scale"]
-    if scale is not None:
-        _expect(_number(scale, f"{where}.sigma_scale") > 0, f"{where}.sigma_scale", scale, "a positive number or null")
     _expect(isinstance(content["provenance"], dict), f"{where}.provenance", content["provenance"], "an object")
     return Calibration(
         probability=_read_table(content["probability"], f"{where}.probability", rising=True),
         expected_error=_read_table(content["expected_error"], f"{where}.expected_error", rising=False),
         sigmoid=Sigmoid(torch.tensor(slope, dtype=torch.float64), torch.tensor(offset, dtype=torch.float64)),
-        sigma_scale=None if scale is None else float(scale),
+        sigma=None if content["sigma"] is None else _read_sigma(content["sigma"], f"{where}.sigma"),
         thresholds=_read_thresholds(content["thresholds"], f"{where}.thresholds"),
         provenance=content["provenance"],
     )
@@ -182,6 +213,13 @@ def _read_table(content: Any, where: str, *, rising: bool) -> Table:
     ordered = all((a <= b) if rising else (a >= b) for a, b in pairwise(y))
     _expect(ordered and all(0 <= v <= 1 for v in y), f"{where}.value", y, f"{_direction(rising)} numbers from 0 to 1")
     return Table(columns["score"], columns["value"])
+
+
+def _read_sigma(content: Any, where: str) -> SigmaModel:
+    _fields(content, ("scale", "floor"), where)
+    for name in ("scale", "floor"):
+        _expect(_number(content[name], f"{where}.{name}") >= 0, f"{where}.{name}", content[name], "no negative number")
+    return SigmaModel(float(content["scale"]), float(content["floor"]))
 
 
 def _read_thresholds(content: Any, where: str) -> dict[int, float | None]:
