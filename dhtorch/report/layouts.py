@@ -123,7 +123,7 @@ def _cyclic(result: Result) -> Table:
         for name, c in published.CYCLIC.lines.items()
     ]
     title = "Median error: cyclic, held out"
-    heads = ["", "cyclic", "held out", "ratio"]
+    heads = ["", "cyclic", "held out", "ratio of the two"]
     return Table(title, heads, rows + cited, quoted=len(cited), note=source(result, published.CYCLIC))
 
 

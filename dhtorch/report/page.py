@@ -76,7 +76,7 @@ def _about(results: Sequence[Result]) -> Markup:
     said = [f" marks figures quoted from “{published.PAPER}”, measured on the paper’s own data."]
     if other:
         said.append(
-            f"Those could not be downloaded for these results: ours are from other scenes ({', '.join(other)})."
+            f"That data could not be downloaded for these results: ours are from other scenes ({', '.join(other)})."
         )
     if same:
         said.append(f"Of its benchmarks the paper does not name the sequences; ours are {', '.join(same)}.")
