@@ -310,19 +310,17 @@ def _patch(target: Pyramid, level: int, x: Tensor, batch: Tensor, window: int) -
     return target.read(level, first, side)[0].unflatten(-1, (side, side))[:, None], middle - reach
 
 
-def _places(x: Tensor, A: Tensor, window: int) -> tuple[Tensor, Tensor]:
-    """Where the window's pixels lie: x + A p as two planes (M, w, w)."""
+def _places(x: Tensor, A: Tensor, window: int) -> Tensor:
+    """Where the window's pixels lie: the planes (2, M, w, w) of x + A p."""
     half = window // 2
     p = torch.arange(-half, half + 1, dtype=x.dtype, device=x.device)
-    x, A = x[..., None, None], A[..., None, None]
-    u, v = (x[i] + A[i, 1] * p[:, None] + A[i, 0] * p for i in range(2))
-    return u, v
+    return (x[..., None, None] + A[:, 1, :, None, None] * p[:, None]) + A[:, 0, :, None, None] * p
 
 
 def _read(patch: Tensor, x: Tensor, A: Tensor, window: int) -> Tensor:
     """J (M, w, w) at x + A p, x (2, M) px of the patch; beyond its border the border's value."""
     scale = 2 / (patch.shape[-1] - 1)
-    grid = torch.stack(_places(x * scale - 1, A * scale, window), -1)
+    grid = _places(x * scale - 1, A * scale, window).permute(1, 2, 3, 0)
     return F.grid_sample(patch, grid, padding_mode="border", align_corners=True)[:, 0]
 
 
@@ -333,8 +331,10 @@ def _quality(T: Tensor, J: Tensor, x: Tensor, A: Tensor) -> Tensor:
     energy = (T * T).sum((-2, -1))
     gain = (T * J).sum((-2, -1)) / torch.where(energy > 0, energy, torch.ones_like(energy))
     variance = (J - gain[:, None, None] * T).square().mean((-2, -1))
-    f, g = (y - y.floor() for y in _places(x, A, T.shape[-1]))
-    share = ((1 - 2 * f * (1 - f)) * (1 - 2 * g * (1 - g))).mean((-2, -1))
+    f = _places(x, A, T.shape[-1])
+    f = f - f.floor()
+    share = 1 - 2 * f * (1 - f)
+    share = (share[0] * share[1]).mean((-2, -1))
     return torch.stack((gain, variance, share))
 
 
@@ -347,16 +347,14 @@ def _noise(fit: Tensor) -> Tensor:
 def _moments(Q: Tensor) -> Tensor:
     """Sums (M, 3, k) of pictures (k, M, w, w) times 1, u and v; u and v run from -1 to 1."""
     s = torch.linspace(-1, 1, Q.shape[-1], dtype=Q.dtype, device=Q.device)
-    rows = Q.sum(-1)
-    sums = (rows.sum(-1), (Q * s).sum((-2, -1)), (rows * s).sum(-1))
-    return torch.stack(sums).permute(2, 0, 1)
+    rows, columns = Q.sum(-1), Q.sum(-2)
+    return torch.stack((rows.sum(-1), (columns * s).sum(-1), (rows * s).sum(-1))).permute(2, 0, 1)
 
 
 def _right_side(G: Tensor, J: Tensor) -> Tensor:
-    """Sums (M, 8) of J, its mean taken out, times the eight pictures."""
-    J = J - J.mean((-2, -1), keepdim=True)
-    T = (G[2] * J).sum((-2, -1))
-    return torch.cat((_moments(G[:2] * J).flatten(1), T[:, None], torch.zeros_like(T)[:, None]), 1)
+    """Sums (M, 8) of J times the eight pictures."""
+    ends = torch.stack(((G[2] * J).sum((-2, -1)), J.sum((-2, -1))), 1)
+    return torch.cat((_moments(G[:2] * J).flatten(1), ends), 1)
 
 
 def _normal(G: Tensor) -> Tensor:
@@ -364,8 +362,8 @@ def _normal(G: Tensor) -> Tensor:
     g, T = G[:2], G[2]
     Q = torch.stack((g[0] * g[0], g[0] * g[1], g[1] * g[1]))
     s = torch.linspace(-1, 1, Q.shape[-1], dtype=Q.dtype, device=Q.device)
-    r0, r1, r2 = Q.sum(-1), (Q * s).sum(-1), (Q * (s * s)).sum(-1)
-    sums = torch.stack((r0, r1, r0 * s, r2, r1 * s, r0 * s * s)).sum(-1)  # (6, 3, M)
+    rows, columns, mixed = Q.sum(-1), Q.sum(-2), (Q * s).sum(-1)
+    sums = torch.stack((rows, columns * s, rows * s, columns * s * s, mixed * s, rows * s * s)).sum(-1)  # (6, 3, M)
     product, pair = (torch.tensor(t, device=Q.device) for t in (_PRODUCT, ((0, 1), (1, 2))))
     H = sums[product][:, :, pair].permute(4, 0, 2, 1, 3).reshape(-1, 6, 6)
     damping = torch.tensor([0.0, 0.0, 1.0, 1.0, 1.0, 1.0], dtype=H.dtype, device=H.device) * DAMPING
