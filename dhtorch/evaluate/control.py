@@ -7,7 +7,8 @@ error × answered / candidates, because it must not rise when less is answered; 
 than it needs it says how many.
 
 Both need only scores, answers and truth, so any depth source will do; ``errors.points`` joins three arrays to a scene.
-The unit is the scene: points of one scene share its truth and its poses and are no independent witnesses.
+The unit is the scene: points of one scene share its truth and its poses and are no independent witnesses. Pieces of
+one room are no exchangeable scenes either: join them to one first (``dhtorch.tree.collate``).
 """
 
 from __future__ import annotations
