@@ -11,6 +11,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from dhtorch.geometry.lucas_kanade import CELL_LEVEL
 from dhtorch.geometry.pyramid import GRAD_X, GRAD_Y, GREY, build_pyramid
 from dhtorch.stages.track import lucas_kanade, refine
 
@@ -301,6 +302,23 @@ def test_a_point_does_not_depend_on_its_company(normalise):
     padded = run(src, dst, torch.cat([uv, torch.full((3, 40, 2), float("nan"))], 1))
     assert all(torch.equal(getattr(padded, f)[:, :300], getattr(whole, f)) for f in FIELDS)
     assert not padded.valid[:, 300:].any()
+
+
+def test_points_that_share_a_coarse_search_do_not_depend_on_each_other():
+    """On four levels points of one cell are searched for together: bit for bit as alone, and as where nothing is shared
+    (under vmap)."""
+    H, W = 176, 200
+    src, dst = (scene(2, H, W, shift, dtype=torch.float32) for shift in ((0.0, 0.0), (11.3, -6.2)))
+    uv = points(2, 200, H, W, dtype=torch.float32)
+    assert len(build_pyramid(src).levels) > CELL_LEVEL
+    whole = lucas_kanade(src, dst, uv)
+    assert whole.valid.float().mean() > 0.5
+    for b, n in ((0, 3), (1, 77)):
+        alone = lucas_kanade(src[b : b + 1], dst[b : b + 1], uv[b : b + 1, n : n + 1])
+        assert all(torch.equal(getattr(alone, f)[0, 0], getattr(whole, f)[b, n]) for f in FIELDS)
+    part = uv[:, :20]
+    mapped = torch.func.vmap(lambda i, j, x: lucas_kanade(i[None], j[None], x[None])[0])(src, dst, part)
+    assert all(torch.equal(getattr(mapped, f), getattr(whole, f)[:, :20]) for f in FIELDS)
 
 
 def test_no_points():

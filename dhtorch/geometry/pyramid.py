@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch.geometry.lookup import luma, windows
@@ -116,9 +115,8 @@ def build_pyramid(
     grey = grey.to(torch.promote_types(grey.dtype, torch.float32))
     chain: list[Tensor] = []
     while len(chain) < levels and min(grey.shape[-2:]) > smallest:
-        padded = F.pad(grey, (pad,) * 4, mode="reflect")
-        chain.append(_with_gradients(padded, pad))
-        grey = _half(padded, pad)
+        chain.append(_with_gradients(grey, pad))
+        grey = _half(chain[-1][:, GREY:], pad)
     return Pyramid(tuple(chain), pad)
 
 
@@ -138,19 +136,29 @@ def _binomial(a: Tensor, b: Tensor, c: Tensor, d: Tensor, e: Tensor) -> Tensor:
     return torch.add(torch.add(a + e, b + d, alpha=4), c, alpha=6) * (1 / 16)
 
 
-def _with_gradients(padded: Tensor, pad: int) -> Tensor:
-    """A level (B, 3, rows, width) from its mirrored grey plane: Scharr's filter (3 10 3) x (-1 0 1) / 32 beside it.
+def _with_gradients(grey: Tensor, pad: int) -> Tensor:
+    """A level (B, 3, rows, width) from its pixels (B, 1, h, w): Scharr's filter (3 10 3) x (-1 0 1) / 32 beside them.
 
     Written into one new buffer, a band of rows at a time: fresh memory costs more than the arithmetic.
     """
-    level = padded.new_zeros(padded.shape[0], 3, *padded.shape[-2:])
-    level[:, GREY:] = padded
-    end, columns = padded.shape[-2] - pad, slice(pad, -pad)
-    for top in range(pad, end, BAND):
-        bottom = min(top + BAND, end)
-        above, here, below = (
-            padded[..., top + k : bottom + k, pad - 1 : padded.shape[-1] - pad + 1] for k in (-1, 0, 1)
-        )
+    B, _, h, w = grey.shape
+    level = grey.new_empty(B, 3, h + 2 * pad, w + 2 * pad)
+    gradients, padded, columns = level[:, :GREY], level[:, GREY:], slice(pad, pad + w)
+    padded[..., pad : pad + h, columns] = grey
+    padded[..., pad : pad + h, :pad] = grey[..., 1 : pad + 1].flip(-1)
+    padded[..., pad : pad + h, pad + w :] = grey[..., w - pad - 1 : w - 1].flip(-1)
+    padded[..., :pad, :] = padded[..., pad + 1 : 2 * pad + 1, :].flip(-2)
+    padded[..., pad + h :, :] = padded[..., h - 1 : pad + h - 1, :].flip(-2)
+    for border in (
+        gradients[..., :pad, :],
+        gradients[..., pad + h :, :],
+        gradients[..., :pad],
+        gradients[..., pad + w :],
+    ):
+        border.zero_()
+    for top in range(pad, pad + h, BAND):
+        bottom = min(top + BAND, pad + h)
+        above, here, below = (padded[..., top + k : bottom + k, pad - 1 : pad + w + 1] for k in (-1, 0, 1))
         across = torch.add(here * (10 / 32), above + below, alpha=3 / 32)
         slope = below - above
         down = torch.add(slope[..., 1:-1] * (10 / 32), slope[..., :-2] + slope[..., 2:], alpha=3 / 32)

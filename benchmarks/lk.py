@@ -1,0 +1,168 @@
+"""Time per pair of the search for points, against ``cv2.calcOpticalFlowPyrLK``, and how well both find them.
+
+    python benchmarks/lk.py --json benchmarks/results/lk.json
+
+*Forward* is both pyramids and one search; mode ``cached`` has the pyramid of image 0 made before, as for an anchor seen
+from many views. *Forward-backward* is ``lucas_kanade`` with all its fields against two calls of OpenCV. Times are of
+real pairs where DHTORCH_DATA is set, else of the built-in room; both sides take turns in one process.
+
+Errors of forward rows: share of points more than 1 px from where a known warp of the same images, with noise, put them.
+Errors of forward-backward rows: share of points of the real pairs on which the two verdicts differ.
+"""
+
+from __future__ import annotations
+
+import os
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import harness
+import numpy as np
+import torch
+from torch import Tensor
+
+from dhtorch import data
+from dhtorch.baselines import opencv
+from dhtorch.data.pairs import by_gap
+from dhtorch.data.synthetic import SyntheticRoom
+from dhtorch.geometry import lucas_kanade as lk
+from dhtorch.geometry.lookup import luma
+from dhtorch.geometry.pyramid import Pyramid, build_pyramid
+from dhtorch.stages import track
+from dhtorch.stages.sample import spiral
+
+#: Real pairs: folder, near limit, gap; all 640x480.
+SCENES = (
+    ("tum_fr1_desk9", 1.0, 4),
+    ("7s_redkitchen_000", 2.0, 20),
+    ("7s_redkitchen_200", 2.0, 20),
+    ("7s_redkitchen_600", 2.0, 20),
+)
+LEVELS = 4
+
+
+def pairs(count: int) -> tuple[Tensor, Tensor]:
+    """Grey images 0 and 1 (count, 1, H, W) uint8, taken from the scenes in turn."""
+    root = os.environ.get("DHTORCH_DATA")
+    recordings: list[Any] = (
+        [data.open(Path(root) / name, near=near, gap=gap) for name, near, gap in SCENES] if root else [SyntheticRoom()]
+    )
+    chosen = [(recording, by_gap(recording)) for recording in recordings]
+    views: list[list[Tensor]] = [[], []]
+    for k in range(count):
+        recording, found = chosen[k % len(chosen)]
+        pair = found[k // len(chosen) % len(found)]
+        for side, i in zip(views, pair, strict=True):
+            grey = luma(recording[i].image, -3) * 255
+            side.append(grey.round().to(torch.uint8).reshape(1, *grey.shape[-2:]))
+    return torch.stack(views[0]), torch.stack(views[1])
+
+
+def forward(image_0: Tensor, image_1: Tensor, uv: Tensor, window: int, pyramid_0: Pyramid | None = None):
+    """Positions (B, N, 2) and whether they were found (B, N)."""
+    B, N, _ = uv.shape
+    assert B * N % lk.LANES == 0
+    o = lk.Options(window, 30, 0.01, track.MIN_EIGENVALUE, "none")
+    with torch.no_grad():
+        source = build_pyramid(image_0, LEVELS, window) if pyramid_0 is None else pyramid_0
+        target = build_pyramid(image_1, LEVELS, window)
+        x = uv.permute(2, 0, 1).reshape(2, B * N)
+        batch = torch.arange(B).repeat_interleave(N)
+        known = lk.within(x, *source.bounds())
+        d, found, _ = lk.search(source, target, o, True, x, torch.zeros_like(x), batch, known)
+    return (x + d).reshape(2, B, N).permute(1, 2, 0), found.reshape(B, N)
+
+
+def forward_opencv(image_0: Tensor, image_1: Tensor, uv: Tensor, window: int):
+    """The same by OpenCV, pair after pair."""
+    options: Any = {"winSize": (window, window), "maxLevel": LEVELS - 1, "criteria": (3, 30, 0.01)}
+    flow: Any = cv2.calcOpticalFlowPyrLK
+    results = [
+        flow(a[0].numpy(), b[0].numpy(), x.numpy()[:, None], None, **options)[:2]
+        for a, b, x in zip(image_0, image_1, uv, strict=True)
+    ]
+    return tuple(
+        torch.from_numpy(np.stack(y)).squeeze(-1 if k else 2) for k, y in enumerate(zip(*results, strict=True))
+    )
+
+
+def warped(images: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
+    """Each image turned, scaled, shifted by up to 4°, 5 % and 12 px with noise of 2 grey values; where points went."""
+    draw = np.random.default_rng(0)
+    H, W = images.shape[-2:]
+    moved, truth = [], []
+    for image, x in zip(images[:, 0].numpy(), uv.numpy(), strict=True):
+        M = cv2.getRotationMatrix2D((W / 2, H / 2), draw.uniform(-4, 4), draw.uniform(0.95, 1.05))
+        M[:, 2] += draw.uniform(-12, 12, 2)
+        b = cv2.warpAffine(image, M, (W, H), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101)
+        moved.append(np.clip(b + draw.normal(0, 2, b.shape), 0, 255).round().astype(np.uint8))
+        truth.append(x @ M[:, :2].T + M[:, 2])
+    return torch.from_numpy(np.stack(moved))[:, None], torch.from_numpy(np.stack(truth))
+
+
+def accuracy(images: Tensor, uv: Tensor, window: int) -> list[tuple[float, float]]:
+    """Ours and OpenCV's misses (share beyond 1 px) and median distance, of points that stay inside the image."""
+    moved, truth = warped(images, uv)
+    high = torch.tensor([images.shape[-1] - 1, images.shape[-2] - 1])
+    inside = ((truth >= 0) & (truth <= high)).all(-1)
+    found = []
+    for method in (forward, forward_opencv):
+        uv_1, ok = method(images, moved, uv, window)
+        distance = (uv_1 - truth).norm(dim=-1)
+        missed = ~ok.bool() | (distance > 1)
+        found.append((missed[inside].double().mean().item(), distance[inside].median().item()))
+    return found
+
+
+def measure(n: int, batch: int, window: int, repeats: int) -> list[dict[str, Any]]:
+    """Rows of one size: forward, forward with the anchor's pyramid cached, forward-backward."""
+    image_0, image_1 = pairs(batch)
+    uv = spiral(tuple(image_0.shape[-2:]), n).float().expand(batch, n, 2).contiguous()
+    views, suffix = (image_0, image_1, uv), f"_w{window}_n{n}" + (f"_b{batch}" if batch > 1 else "")
+    anchor = build_pyramid(image_0, LEVELS, window)
+    options: Any = {"window": window, "levels": LEVELS}
+    calls = [
+        partial(forward, *views, window),
+        partial(forward, *views, window, anchor),
+        partial(forward_opencv, *views, window),
+        partial(track.lucas_kanade, *views, **options),
+        partial(track.lucas_kanade, *views, pyramid_0=anchor, **options),
+        partial(opencv.lucas_kanade, *views, **options),
+    ]
+    times = [[t / batch for t in side] for side in harness.in_turn(calls, repeats=repeats, warm_up=2)]
+    (missed, median), (peer_missed, peer_median) = accuracy(image_0, uv, window)
+    differ = (calls[3]().valid != calls[5]().valid).double().mean().item()
+    print(
+        f"{suffix[1:]}: misses {missed:.4f}, OpenCV {peer_missed:.4f}; median distance {median:.4f}, {peer_median:.4f}"
+        f" px; same verdict {1 - differ:.3f}"
+    )
+    common: dict[str, Any] = {"n": n, "batch": batch, "bar": window == 21}
+    rows = []
+    for k, mode in enumerate(("eager", "cached")):
+        more = {"mode": mode, **common, "ours_error": missed, "peer_error": peer_missed}
+        rows.append(harness.row(f"lk{suffix}", times[k], "opencv", times[2], **more))
+        more = {"mode": mode, **common, "ours_error": differ}
+        rows.append(harness.row(f"lk_fb{suffix}", times[3 + k], "opencv", times[5], **more))
+    return rows
+
+
+def main() -> None:
+    """Print the tables; write the rows with ``--json``."""
+    options = harness.arguments(__doc__ or "").parse_args()
+    rows = []
+    for threads in (1, 2):
+        harness.set_threads(threads)
+        windows = (21, 15, 11) if options.full or threads == 1 else (21,)
+        sizes = [(2048, 1, w) for w in windows] + [(512, 8, 21)]
+        if options.full:
+            sizes = [(n, B, w) for w in windows for n in (512, 2048) for B in (1, 8, 32)]
+        for size in sizes:
+            rows += measure(*size, options.repeats)
+    print(f"milliseconds per pair, medians of {options.repeats}; errors: see above")
+    harness.report(rows, options.json)
+
+
+if __name__ == "__main__":
+    main()
