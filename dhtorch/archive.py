@@ -201,14 +201,15 @@ def result_key(config: Mapping[str, Any], digest: str, *, code_dir: str | Path |
         config: resolved settings; the options in ``UNKEYED`` are left out at every depth, and of an absolute file
             name only what :func:`portable` keeps counts.
         digest: of the data, from :func:`data_digest`.
-        code_dir: the folder whose ``**/*.py`` count; None = this package.
+        code_dir: the folder whose ``**/*.py`` and ``calibration/*.json`` count; None = this package.
     """
     settings = json.dumps(_keyed(portable(config)), sort_keys=True, default=str)
     total = hashlib.sha256()
-    for part in (settings.encode(), digest.encode()):
-        _add(total, part)
+    for text in (settings, digest):
+        _add(total, text.encode())
     folder = Path(__file__).parent if code_dir is None else Path(code_dir)
-    for file in sorted(folder.rglob("*.py"), key=lambda f: f.relative_to(folder).as_posix()):
+    parts = [*folder.rglob("*.py"), *folder.glob("calibration/*.json")]
+    for file in sorted(parts, key=lambda f: f.relative_to(folder).as_posix()):
         _add(total, file.relative_to(folder).as_posix().encode())
         _add(total, file.read_bytes())
     return total.hexdigest()
