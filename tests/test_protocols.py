@@ -245,7 +245,8 @@ def test_recovery_rises_with_the_baseline():
         row = {"rank_corr_recovered": recovered, "rank_corr_error": error}
         return motion.verdict(rows(("a", "gap x1", "heldout", row)))[0]
 
-    assert verdict(0.5, 0.5) is True and verdict(-0.5, 0.5) is False and verdict(None, None) is None
+    assert verdict(0.5, -0.5) is True and verdict(None, None) is None
+    assert verdict(-0.5, -0.5) is False and verdict(0.5, 0.5) is False
 
 
 def test_ranks_share_ties():

@@ -3,8 +3,8 @@
 Expectation (written before the run): yes; with a longer baseline more of the candidates are answered and more holes
 are recovered until tracking suffers, and answers err less; a nearly static camera recovers little (the paper: 663
 against 105 hole candidates, 1.4 against 3.5 %).
-What would refute it: over the pairs of the median scene neither the share of recovered holes rises nor the error falls
-with the baseline.
+What would refute it: over the pairs of the median scene the share of recovered holes does not rise, or the error does
+not fall, with the baseline.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def verdict(outcome: Outcome) -> tuple[bool | None, str]:
     error = bootstrap.interval([r["rank_corr_error"] for r in scenes])
     if recovered.value is None or error.value is None:
         return None, "no scene with pairs of different baselines"
-    return recovered.value > 0 or error.value < 0, (
+    return recovered.value > 0 and error.value < 0, (
         f"rank correlation with the baseline, median over {recovered.n} scenes: recovered share "
         f"{recovered.value:+.2f}, error {error.value:+.2f}"
     )
