@@ -6,6 +6,7 @@ under that pose; weak geometry stays a hole that says why. ``extend`` is the met
 
 from dhtorch.pair import extend, merge
 from dhtorch.records import Camera, Estimate, Frame, Map, Pose, PoseFit, Samples, Tracks
+from dhtorch.transform import ExtendDepth
 from dhtorch.tree import collate
 
 __version__ = "0.1.0"
@@ -13,6 +14,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Camera",
     "Estimate",
+    "ExtendDepth",
     "Frame",
     "Map",
     "Pose",

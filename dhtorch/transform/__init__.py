@@ -1,0 +1,36 @@
+"""dhtorch inside a data loader: :class:`ExtendDepth` takes a sample dict and returns it with what the depth tells.
+
+transform = ExtendDepth(image="observation.images.wrist", depth="observation.depth.wrist", depth_unit="mm")
+loader = DataLoader(ExtendedDataset(dataset, transform), num_workers=2, worker_init_fn=one_thread)
+"""
+
+from dhtorch.transform.adapters import (
+    AddedCollate,
+    ExtendedDataset,
+    ExtendedStream,
+    NumpyTransform,
+    RldsBatchTransform,
+    collate_kept,
+    one_thread,
+)
+from dhtorch.transform.extend_depth import ExtendDepth
+from dhtorch.transform.problems import Problem
+from dhtorch.transform.tokens import CHANNELS, grid, patch_tokens
+from dhtorch.transform.views import SampleError, Views
+
+__all__ = [
+    "CHANNELS",
+    "AddedCollate",
+    "ExtendDepth",
+    "ExtendedDataset",
+    "ExtendedStream",
+    "NumpyTransform",
+    "Problem",
+    "RldsBatchTransform",
+    "SampleError",
+    "Views",
+    "collate_kept",
+    "grid",
+    "one_thread",
+    "patch_tokens",
+]

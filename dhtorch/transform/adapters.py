@@ -1,0 +1,197 @@
+"""The transform in other people's pipelines: each adapter fits a hook that exists there, and imports nothing of theirs.
+
+LeRobot hands samples out one by one, map-style or as a stream: :class:`ExtendedDataset`, :class:`ExtendedStream` wrap
+the data set (its own ``image_transforms`` sees one picture and no depth). openpi calls ``dict → dict`` with numpy
+leaves: :class:`NumpyTransform`. OpenVLA calls ``batch_transform`` on an RLDS frame and then a collator that knows its
+keys: :class:`RldsBatchTransform`, :class:`AddedCollate`. In ``torchvision.transforms.v2.Compose`` the transform itself
+stands as it is, before anything that crops: a crop would not move the intrinsics.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset, IterableDataset, default_collate
+
+from dhtorch.transform.extend_depth import ExtendDepth
+from dhtorch.transform.views import SampleError, find
+
+#: Neighbours asked for the shapes of a sample that could not be loaded.
+_NEIGHBOURS = 16
+
+
+class ExtendedDataset(Dataset[Any]):
+    """A map-style data set whose items went through the transform; everything else is the data set's own.
+
+    With ``gap`` the other view is the item so many places before, of the same episode; it is put under the
+    transform's ``other_image`` while the transform runs. Where an episode has no such item the front end runs alone.
+
+    A corrupt item, whose loading raises, is treated as the transform's ``on_error`` says: with ``flag`` it is replaced
+    by zeros in the shapes of a neighbour, and its ``problem`` is UNREADABLE.
+
+    Args:
+        dataset: ``dataset[i]`` is a dict.
+        transform: for single samples.
+        gap: places from the other view to the anchor; None = the sample itself holds both.
+        episode_key: key of a number that items of one episode share; None = there is one episode.
+
+    Raises:
+        ValueError: a gap without ``other_image``, or a transform for batches.
+    """
+
+    def __init__(
+        self,
+        dataset: Any,
+        transform: ExtendDepth,
+        *,
+        gap: int | None = None,
+        episode_key: str | None = "episode_index",
+    ) -> None:
+        if gap is not None and (gap < 1 or transform.views.other_image is None):
+            raise ValueError(f"gap is {gap}: expected a positive one, and a transform with other_image")
+        if transform.batched:
+            raise ValueError("found a transform for batches, expected one for single samples")
+        self.dataset, self.transform, self.gap, self.episode_key = dataset, transform, gap, episode_key
+        other = transform.views.other_image
+        self._lent = (f"{other}", f"{other}_is_pad")  # keys that a gap puts in, for the transform alone
+
+    def __len__(self) -> int:
+        return len(self.dataset)
+
+    def __getitem__(self, index: int) -> dict[str, Any] | None:
+        i = range(len(self))[index]
+        try:
+            sample = self._loaded(i)
+        except Exception as error:  # whatever a decoder raises; lack of memory is no property of a sample
+            if self.transform.on_error == "raise" or isinstance(error, MemoryError | torch.OutOfMemoryError):
+                raise
+            zeros = {} if self.transform.on_error == "skip" else self._zeros_like_neighbour(i, error)
+            return self.transform.left_out(zeros, SampleError(f"item {i} cannot be loaded: {error}"))
+        out: dict[str, Any] | None = self.transform(sample)
+        if out is None or self.gap is None:
+            return out
+        return {key: value for key, value in out.items() if key not in self._lent}
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or name == "dataset":
+            raise AttributeError(name)
+        return getattr(self.dataset, name)
+
+    def _loaded(self, i: int) -> dict[str, Any]:
+        """The item, with the other view where it comes from another item."""
+        sample = self.dataset[i]
+        if self.gap is None:
+            return sample
+        earlier = self.dataset[i - self.gap] if i >= self.gap else sample
+        same = i >= self.gap and self._episode(earlier) == self._episode(sample)
+        image = find(earlier if same else sample, self.transform.views.image)
+        key, pad = self._lent
+        return {**sample, key: image, pad: torch.tensor([not same])}
+
+    def _episode(self, sample: Mapping[str, Any]) -> int:
+        return 0 if self.episode_key is None else int(find(sample, self.episode_key))
+
+    def _zeros_like_neighbour(self, i: int, error: Exception) -> dict[str, Any]:
+        """Zeros in the shapes of the nearest item that can be loaded."""
+        for k in (i + sign * step for step in range(1, _NEIGHBOURS) for sign in (1, -1)):
+            if not 0 <= k < len(self):
+                continue
+            try:
+                return {key: _zero(value) for key, value in self.dataset[k].items()}
+            except Exception:
+                continue  # as corrupt as the first
+        raise SampleError(f"neither item {i} nor its neighbours can be loaded: {error}") from error
+
+
+class ExtendedStream(IterableDataset[Any]):
+    """An iterable data set whose samples went through the transform; skipped ones are left out of the stream."""
+
+    def __init__(self, dataset: Iterable[Any], transform: Callable[[Any], dict[str, Any] | None]) -> None:
+        self.dataset, self.transform = dataset, transform
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        for sample in self.dataset:
+            out = self.transform(sample)
+            if out is not None:
+                yield out
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or name == "dataset":
+            raise AttributeError(name)
+        return getattr(self.dataset, name)
+
+
+class NumpyTransform:
+    """openpi's ``DataTransformFn``: the same dict → dict, what is added as numpy arrays."""
+
+    def __init__(self, transform: ExtendDepth) -> None:
+        self.transform = transform
+
+    def __call__(self, data: Mapping[str, Any]) -> dict[str, Any]:
+        """The dict with our keys. Raises SampleError where the transform would skip: openpi knows no None."""
+        out = self.transform(data)
+        if out is None:
+            raise SampleError("a sample cannot be skipped here: use on_error='flag'")
+        return {k: v.numpy(force=True) if k.startswith(self.transform.prefix) else v for k, v in out.items()}
+
+
+class RldsBatchTransform:
+    """OpenVLA's ``batch_transform``: the given one, and what ours adds to the same frame."""
+
+    def __init__(self, batch_transform: Callable[[Any], Mapping[str, Any]], transform: ExtendDepth) -> None:
+        self.batch_transform, self.transform = batch_transform, transform
+
+    def __call__(self, rlds_batch: Mapping[str, Any]) -> dict[str, Any]:
+        """The given transform's dict with our keys."""
+        out = self.transform(rlds_batch)
+        if out is None:
+            raise SampleError("a sample cannot be skipped here: use on_error='flag'")
+        mine = {k: v for k, v in out.items() if k.startswith(self.transform.prefix)}
+        return {**self.batch_transform(rlds_batch), **mine}
+
+
+class AddedCollate:
+    """A collator that knows its own keys only, and the stacked keys that the transform added."""
+
+    def __init__(self, collate: Callable[[Sequence[Any]], Mapping[str, Any]], prefix: str = "dhtorch.") -> None:
+        self.collate, self.prefix = collate, prefix
+
+    def __call__(self, instances: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        """One batch."""
+        mine = [{k: v for k, v in one.items() if k.startswith(self.prefix)} for one in instances]
+        return {**self.collate(instances), **default_collate(mine)}
+
+
+def collate_kept(samples: Sequence[dict[str, Any] | None]) -> dict[str, Any]:
+    """torch's default collate without the samples that were skipped; ``skipped`` tells how many.
+
+    A batch of which every sample was skipped holds nothing but that number.
+    """
+    kept = [sample for sample in samples if sample is not None]
+    skipped = torch.tensor(len(samples) - len(kept))
+    return {**(default_collate(kept) if kept else {}), "dhtorch.skipped": skipped}
+
+
+def one_thread(worker: int = 0) -> None:
+    """One thread for torch and OpenCV: the ``worker_init_fn`` of a data loader. Workers are the parallelism there."""
+    torch.set_num_threads(1)
+    opencv = sys.modules.get("cv2")
+    if opencv is not None:
+        opencv.setNumThreads(1)
+
+
+def _zero(value: Any) -> Any:
+    """Nothing, in the shape and type of a value."""
+    if isinstance(value, Mapping):
+        return {k: _zero(v) for k, v in value.items()}
+    if isinstance(value, str | bytes):
+        return type(value)()
+    if isinstance(value, list | tuple):
+        return type(value)(_zero(v) for v in value)
+    if isinstance(value, bool | int | float):
+        return type(value)(0)
+    return torch.zeros_like(value) if isinstance(value, torch.Tensor) else np.zeros_like(value)

@@ -1,0 +1,250 @@
+"""Sample dict → the same sample with far depth: the whole method as a transform for data loaders."""
+
+from __future__ import annotations
+
+import inspect
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils.data import get_worker_info
+
+from dhtorch.codes import Gate, Source
+from dhtorch.geometry import camera as cam
+from dhtorch.pair import extend, merge
+from dhtorch.records import Estimate, Frame, PoseFit, Samples
+from dhtorch.stages.backproject import backproject
+from dhtorch.stages.holes import classify
+from dhtorch.stages.sample import spiral
+from dhtorch.transform.problems import Problem, Tally
+from dhtorch.transform.tokens import CHANNELS, grid, patch_tokens
+from dhtorch.transform.views import Read, SampleError, Views, find, to_tensor
+
+#: Methods that have a name; any function called and answering like :func:`dhtorch.extend` will do as well.
+METHODS: dict[str, Callable[..., Estimate]] = {"paper": extend}
+
+#: Seats of the front end: what a method that does not name its own is given.
+FRONT_END: dict[str, Callable[..., Any]] = {"sample": spiral, "backproject": backproject, "classify": classify}
+
+ON_ERROR = ("raise", "skip", "flag")
+
+
+class ExtendDepth(torch.nn.Module):
+    """Add to each sample what its depth and a second view tell: sparse metric points, the pose, and depth tokens.
+
+    A new dict is returned, other keys untouched. Shapes are fixed by the options and the size of the image, every
+    number is finite, and masks say what is meant: so samples collate, and an answer depends neither on the worker nor
+    on the batch. Without a second view only the front end runs: the sensor's own returns, flags and hole classes.
+
+    Args:
+        method: a name (:data:`METHODS`), or a function called as :func:`dhtorch.extend`, such as a partial of it.
+        n: samples per image; None = the method's own default.
+        seed: of the pose search. With ``index_key`` each sample has the seed ``seed + sample[index_key]``.
+        index_key: key of a whole number that tells samples apart; None = the same draws for all.
+        patch, tokens_hw, fit: the network's patches, see :func:`dhtorch.transform.patch_tokens`.
+        on_error: what to do with a sample that cannot be read, or whose values contradict what was stated. ``raise``;
+            ``skip`` = return None, see :func:`dhtorch.transform.collate_kept`; ``flag`` = add zeros, and ``problem``
+            says so. Skipped and flagged samples are counted (:meth:`report`) and warned of.
+        batched: samples are collated batches. A batch with a missing key or a wrong shape raises in any case.
+        prefix: of the keys that are added.
+        **views: where the images, the depth and the intrinsics are, and their units: see
+            :class:`dhtorch.transform.Views`. ``depth_unit`` must be given.
+
+    Returns:
+        The sample and, behind the prefix (N = n, P patches, with B in front of a batch): ``uv`` (N, 2) px;
+        ``xyz`` (N, 3) m in the anchor's camera; ``depth``, ``sigma`` (N,) m; ``score`` (N,) in [0, 1]; ``valid`` (N,)
+        there is a depth; ``source``, ``flag``, ``hole``, ``gate`` (N,) codes of ``dhtorch.codes``; ``T_1_from_0``
+        (4, 4) and its ``pose_cov`` (6, 6), ``pose_ok``, ``pose_code``; ``tokens`` (P, 10) of
+        :data:`dhtorch.transform.CHANNELS` and ``tokens_valid`` (P,); ``problem``. What is not valid is 0.
+
+    Raises:
+        ValueError: options that cannot be, or a method that takes no ``n`` where none is given.
+        SampleError: a bad sample, where ``on_error`` says so.
+
+    Gradient: points, tokens and pose to images, depth and intrinsics, as ``dhtorch.extend``; none in a worker, whose
+    samples cannot carry a graph.
+    Cost: as the method. In workers use one thread (``worker_init_fn=one_thread``). A process that has used several
+    threads should not be forked: set one thread before, or spawn the workers.
+    """
+
+    def __init__(
+        self,
+        *,
+        method: str | Callable[..., Estimate] = "paper",
+        n: int | None = None,
+        seed: int = 0,
+        index_key: str | None = None,
+        patch: int = 14,
+        tokens_hw: tuple[int, int] | None = None,
+        fit: str = "stretch",
+        on_error: str = "raise",
+        batched: bool = False,
+        prefix: str = "dhtorch.",
+        **views: Any,
+    ) -> None:
+        super().__init__()
+        if isinstance(method, str) and method not in METHODS:
+            raise ValueError(f"method is {method!r}, expected one of {sorted(METHODS)} or a function")
+        if on_error not in ON_ERROR or (batched and on_error == "skip"):
+            expected = ("raise", "flag") if batched else ON_ERROR
+            raise ValueError(f"on_error is {on_error!r}, expected one of {', '.join(expected)}")
+        self.views = Views(**views)
+        self.method = METHODS[method] if isinstance(method, str) else method
+        self.learned = torch.nn.ModuleList(_modules(self.method))  # so that .to() and .parameters() find them
+        self.n = int(_option(self.method, "n") if n is None else n)
+        self.seed, self.index_key = seed, index_key
+        self.patch, self.tokens_hw, self.fit = patch, tokens_hw, fit
+        self.on_error, self.batched, self.prefix = on_error, batched, prefix
+        self.tally = Tally()
+        self._seen_hw: tuple[int, int] | None = None
+
+    def forward(self, sample: Mapping[str, Any]) -> dict[str, Any] | None:
+        """The sample with our keys; None where it is skipped."""
+        with torch.set_grad_enabled(torch.is_grad_enabled() and get_worker_info() is None):
+            try:
+                read = self.views.read(sample, batched=self.batched)
+                seed = self._seeds(sample, len(read.bad))
+                if bool(read.bad.any()) and not (self.batched and self.on_error == "flag"):
+                    raise SampleError(read.complaint())
+            except SampleError as error:
+                if self.on_error == "raise" or self.batched:
+                    raise
+                return self.left_out(sample, error)
+            if bool(read.bad.any()):
+                warnings.warn(f"flagged: {read.complaint()}", stacklevel=2)
+            added = self._answer(read, seed)
+        self.tally.add(added["problem"])
+        self._seen_hw = read.anchor.hw
+        return self._joined(sample, added)
+
+    def report(self) -> dict[str, int]:
+        """Number of samples by problem since the transform was made, those of all workers together."""
+        return self.tally.report()
+
+    def left_out(self, sample: Mapping[str, Any], error: Exception) -> dict[str, Any] | None:
+        """A sample that cannot be read, as ``on_error`` wants it: None, or itself with zeros. Counted and warned of.
+
+        Raises:
+            SampleError: it is to be flagged, and nothing tells the size of its image.
+        """
+        hw = self.tokens_hw or self.views.image_hw(sample) or self._seen_hw
+        if self.on_error == "flag" and hw is None:
+            raise SampleError(f"{error} (and no image tells the size of its tokens: give tokens_hw)") from error
+        warnings.warn(f"{'skipped' if self.on_error == 'skip' else 'flagged'}: {error}", stacklevel=3)
+        self.tally.add(torch.tensor([Problem.UNREADABLE]))
+        return None if self.on_error == "skip" or hw is None else self._joined(sample, self._blank(hw))
+
+    def _answer(self, read: Read, seed: int | Tensor) -> dict[str, Tensor]:
+        frame, paired, bad = read.anchor, read.paired, read.bad
+        if read.other is not None and bool(paired.any()):
+            trace: dict[str, Any] = {}
+            estimate = self.method(frame, read.other, n=self.n, seed=seed, trace=trace)
+            samples, fit = trace["samples"], trace["fit"]
+            estimate = estimate.replace(gate=torch.where(paired[:, None], estimate.gate, Gate.NO_TRACK))
+        else:
+            samples = self._front_end(frame)
+            estimate, fit = _silent(samples), None
+        found = merge(samples, estimate)
+        tokens, known = patch_tokens(
+            found, samples.hole, frame.hw, patch=self.patch, tokens_hw=self.tokens_hw, fit=self.fit
+        )
+        valid = found.source != Source.NONE
+        xyz = cam.unproject(frame.camera, found.uv, torch.where(valid, found.depth, 1.0))
+        zero = torch.zeros_like(paired, dtype=torch.int32)
+        problem = torch.where(paired, zero, Problem.NO_SECOND_VIEW)
+        problem = torch.where((frame.depth > 0).flatten(1).any(1), problem, Problem.NO_DEPTH)
+        added = {
+            "uv": found.uv,
+            "xyz": torch.where(valid[..., None], xyz, 0.0),
+            "depth": found.depth,
+            "sigma": torch.where(valid, found.sigma, 0.0),
+            "score": torch.where(valid, found.score, 0.0),
+            "valid": valid,
+            "source": found.source,
+            "flag": samples.flag,
+            "hole": samples.hole,
+            "gate": estimate.gate,
+            **_pose(fit, paired, found.depth),
+            "tokens": tokens,
+            "tokens_valid": known,
+        }
+        out = {key: torch.where(bad.view(-1, *[1] * (x.ndim - 1)), torch.zeros_like(x), x) for key, x in added.items()}
+        return {**out, "problem": torch.where(bad, zero + Problem.UNREADABLE, problem)}
+
+    def _front_end(self, frame: Frame) -> Samples:
+        seat = {name: _option(self.method, name, default) for name, default in FRONT_END.items()}
+        uv = seat["sample"](frame.hw, self.n, device=frame.camera.f.device, dtype=frame.camera.f.dtype)
+        samples: Samples = seat["classify"](frame, seat["backproject"](frame, uv))
+        return samples
+
+    def _seeds(self, sample: Mapping[str, Any], batch: int) -> int | Tensor:
+        if self.index_key is None:
+            return self.seed
+        index = to_tensor(find(sample, self.index_key), self.index_key).flatten()
+        if index.shape[0] != batch or index.is_floating_point():
+            expected = f"{batch} whole numbers"
+            raise SampleError(
+                f"{self.index_key}: found {index.dtype} of shape {tuple(index.shape)}, expected {expected}"
+            )
+        return index.long().cpu() + self.seed
+
+    def _blank(self, hw: tuple[int, int]) -> dict[str, Tensor]:
+        """What is added to a sample that cannot be read: zeros of the usual shapes."""
+        rows, columns = grid(hw, patch=self.patch, tokens_hw=self.tokens_hw)
+        n, p = self.n, rows * columns
+        sizes = {"uv": (n, 2), "xyz": (n, 3), "depth": (n,), "sigma": (n,), "score": (n,), "T_1_from_0": (4, 4)}
+        sizes |= {"pose_cov": (6, 6), "tokens": (p, len(CHANNELS))}
+        out = {key: torch.zeros(1, *size) for key, size in sizes.items()}
+        for key, size in {"valid": (n,), "pose_ok": (), "tokens_valid": (p,)}.items():
+            out[key] = torch.zeros(1, *size, dtype=torch.bool)
+        for key, size in {"source": (n,), "flag": (n,), "hole": (n,), "gate": (n,), "pose_code": ()}.items():
+            out[key] = torch.zeros(1, *size, dtype=torch.int32)
+        return {**out, "problem": torch.full((1,), Problem.UNREADABLE, dtype=torch.int32)}
+
+    def _joined(self, sample: Mapping[str, Any], added: Mapping[str, Tensor]) -> dict[str, Any]:
+        # Copies of their own: a row of a shared table would be sent to the main process with the whole table.
+        mine = {self.prefix + key: x if self.batched else x[0].contiguous() for key, x in added.items()}
+        return {**sample, **mine}
+
+
+def _pose(fit: PoseFit | None, paired: Tensor, like: Tensor) -> dict[str, Tensor]:
+    B = paired.shape[0]
+    if fit is None:
+        code = torch.zeros(B, dtype=torch.int32, device=like.device)
+        blank = {"T_1_from_0": like.new_zeros(B, 4, 4), "pose_cov": like.new_zeros(B, 6, 6)}
+        return {**blank, "pose_ok": torch.zeros_like(paired), "pose_code": code}
+    ok = fit.ok & paired
+    last = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=like.dtype, device=like.device).expand(B, 1, 4)
+    top = torch.cat((fit.T_1_from_0.R, fit.T_1_from_0.t[..., None]), -1)
+    T = torch.where(ok[:, None, None], torch.cat((top, last), 1), 0.0)
+    cov = torch.where(ok[:, None, None], fit.cov, 0.0)
+    code = torch.where(paired, fit.code, torch.zeros_like(fit.code))
+    return {"T_1_from_0": T, "pose_cov": cov, "pose_ok": ok, "pose_code": code}
+
+
+def _silent(samples: Samples) -> Estimate:
+    """No answer anywhere: there is no view to track into."""
+    nan = torch.full_like(samples.depth, torch.nan)
+    zero, code = torch.zeros_like(samples.depth), torch.zeros_like(samples.flag)
+    return Estimate(samples.uv, nan, nan, nan, zero, zero, code, zero, code + Gate.NO_TRACK)
+
+
+def _option(method: Callable[..., Any], name: str, default: Any = None) -> Any:
+    """The value a method has for an option, that of a partial included."""
+    known = inspect.signature(method).parameters.get(name)
+    found = default if known is None or known.default is inspect.Parameter.empty else known.default
+    if found is None:
+        raise ValueError(f"the method has no default for {name}: give {name}")
+    return found
+
+
+def _modules(method: Any) -> Iterator[torch.nn.Module]:
+    """The networks in the seats of a method."""
+    if isinstance(method, torch.nn.Module):
+        yield method
+    elif isinstance(method, partial):
+        for part in (method.func, *method.args, *method.keywords.values()):
+            yield from _modules(part)

@@ -1,0 +1,52 @@
+"""What was wrong with samples, and how often: a code per sample, and counts that data-loader workers share."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any, Final
+
+import torch
+from torch import Tensor
+from torch.utils.data import get_worker_info
+
+from dhtorch.codes import names
+
+
+class Problem:
+    """Codes of ``problem``, the worst one of a sample."""
+
+    NONE: Final = 0
+    NO_SECOND_VIEW: Final = 1  #: front end only: one frame, or the other one only pads the episode
+    NO_DEPTH: Final = 2  #: the sensor gave no return at all
+    UNREADABLE: Final = 3  #: left out; every number of ours is 0
+
+
+#: Workers that are counted apart; more share a row, and may then lose counts.
+_ROWS = 128
+
+
+class Tally:
+    """Counts by problem, in memory that forked and spawned workers share, each writing to a row of its own."""
+
+    def __init__(self) -> None:
+        self.counts = _shared(torch.zeros(_ROWS, len(names(Problem)), dtype=torch.int64))
+
+    def add(self, problem: Tensor) -> None:
+        """Count the codes of some samples."""
+        worker = get_worker_info()
+        row = 0 if worker is None else 1 + worker.id % (_ROWS - 1)
+        self.counts[row] += torch.bincount(problem.cpu().long(), minlength=self.counts.shape[1])
+
+    def report(self) -> dict[str, int]:
+        """Number of samples by problem, all workers together."""
+        total = self.counts.sum(0).tolist()
+        return {name.lower(): total[code] for code, name in names(Problem).items()}
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Tally:
+        twin = copy.copy(self)
+        twin.counts = _shared(self.counts.clone())
+        return twin
+
+
+def _shared(counts: Tensor) -> Tensor:
+    return counts.share_memory_()

@@ -1,0 +1,103 @@
+"""Sparse depth pooled to the patch grid of a vision transformer: one depth token beside each of its patch tokens.
+
+Alphabet: B pictures, N samples, P = rows × columns of patches, row by row, as ViT and DINOv2 order theirs.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dhtorch.codes import Hole, Source, names
+from dhtorch.geometry.shapes import check
+from dhtorch.records import Map
+
+#: What the numbers of a token are: 1/m, 1/m, then shares of the patch's samples in [0, 1].
+CHANNELS = ("inverse_depth", "sigma", "answered", *(f"hole_{name.lower()}" for name in names(Hole).values()))
+
+#: How a picture is brought to the network's size: stretched, shrunk whole with bars, or cut to fill.
+FITS = ("stretch", "pad", "crop")
+
+
+def grid(hw: tuple[int, int], *, patch: int = 14, tokens_hw: tuple[int, int] | None = None) -> tuple[int, int]:
+    """Rows and columns of the patches of a picture of size ``hw``, seen by the network at ``tokens_hw``.
+
+    Raises:
+        ValueError: the picture is smaller than a patch.
+    """
+    height, width = hw if tokens_hw is None else tokens_hw
+    if patch < 1 or min(height, width) < patch:
+        raise ValueError(f"tokens: found a picture of {height}x{width}, expected at least one patch of {patch} px")
+    return height // patch, width // patch
+
+
+def patch_tokens(
+    found: Map,
+    hole: Tensor,  # (B, N) codes.Hole
+    hw: tuple[int, int],
+    *,
+    patch: int = 14,
+    tokens_hw: tuple[int, int] | None = None,
+    fit: str = "stretch",
+) -> tuple[Tensor, Tensor]:
+    """What is known of the depth inside each patch: tokens (B, P, 10) and whether any sample there has one (B, P).
+
+    Inverse depth, because it is bounded and errors of triangulation are even in it. ``inverse_depth`` and ``sigma``
+    are the mean and standard deviation of the inverse depth of a point of the patch drawn at random: the noise of the
+    samples and their spread. ``answered`` is the share of samples with a depth; a share for each class of hole says why
+    the others have none, ``hole_none`` being the share with a usable return. They sum to 1, or to 0 where the patch
+    has no sample.
+
+    Args:
+        found: sensor and recovered depths, from :func:`dhtorch.pair.merge`.
+        hole: class of each sample.
+        hw: size of the picture that ``found.uv`` are pixels of.
+        patch: side of a patch, px of the network's picture.
+        tokens_hw: size of the network's picture; None = ``hw``. What is left of a size that is no multiple of the
+            patch, on the right and below, is dropped, as the network's convolution drops it.
+        fit: how the picture is brought to that size, one of :data:`FITS`.
+
+    Raises:
+        ValueError: wrong shapes, an unknown fit, or no patch.
+
+    Gradient: to depth and sigma; where a sample lies and whether it has an answer carry none.
+    """
+    check("patch_tokens", uv=(found.uv, "B N 2"), depth=(found.depth, "B N"), hole=(hole, "B N"))
+    rows, columns = grid(hw, patch=patch, tokens_hw=tokens_hw)
+    cell = _cells(found.uv, hw, patch, tokens_hw or hw, fit, rows, columns)
+
+    def total(x: Tensor) -> Tensor:
+        zero = torch.zeros(x.shape[0], rows * columns + 1, dtype=torch.float64, device=x.device)
+        return zero.scatter_add(1, cell, x.double())[:, :-1]
+
+    answered = (found.source != Source.NONE) & (found.depth > 0)
+    inverse = torch.where(answered, 1 / torch.where(answered, found.depth, 1.0).double(), 0.0)
+    noise = torch.where(answered, found.sigma.double() * inverse * inverse, 0.0)
+    n, n_answered = total(torch.ones_like(inverse)), total(answered)
+    per, per_answered = 1 / n.clamp_min(1), 1 / n_answered.clamp_min(1)
+    mean = total(inverse) * per_answered
+    own = torch.cat((mean, torch.zeros_like(mean[:, :1])), 1).gather(1, cell)
+    off = torch.where(answered, inverse - own, 0.0)
+    variance = total(noise * noise + off * off) * per_answered
+    positive = variance > 0
+    sigma = torch.where(positive, torch.where(positive, variance, 1.0).sqrt(), 0.0)
+    shares = [total(hole == code) * per for code in names(Hole)]
+    tokens = torch.stack((mean, sigma, n_answered * per, *shares), -1)
+    return tokens.to(found.depth.dtype), n_answered > 0
+
+
+def _cells(
+    uv: Tensor, hw: tuple[int, int], patch: int, tokens_hw: tuple[int, int], fit: str, rows: int, columns: int
+) -> Tensor:
+    """(B, N) index of the patch each sample lies in; rows · columns where it lies in none."""
+    if fit not in FITS:
+        raise ValueError(f"tokens: fit is {fit!r}, expected one of {', '.join(FITS)}")
+    scale = torch.tensor([tokens_hw[1] / hw[1], tokens_hw[0] / hw[0]], dtype=torch.float64)
+    if fit != "stretch":
+        scale = (scale.amin() if fit == "pad" else scale.amax()).expand(2)
+    size, wanted = (torch.tensor([x[1], x[0]], dtype=torch.float64) for x in (hw, tokens_hw))
+    margin = (wanted - size * scale) / 2
+    place = (uv.detach().double() + 0.5) * scale.to(uv.device) + margin.to(uv.device)
+    column, row = (place / patch).floor().unbind(-1)
+    inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+    return torch.where(inside, row * columns + column, rows * columns).long()

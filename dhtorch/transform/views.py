@@ -1,0 +1,367 @@
+"""A sample of somebody's data set → our views: which keys, which layout, which unit.
+
+A sample is a dict, flat with dotted keys (LeRobot) or nested (RLDS, openpi), of numpy arrays or tensors, one frame or
+a few along time, one sample or a collated batch. What a number means is stated, never guessed: a depth without a unit
+is an error, and so are values that contradict what was stated.
+
+Alphabet: B samples, T frames of a sample along time, C × H × W image, h × w depth map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dhtorch.geometry import camera as cam
+from dhtorch.records import Camera, Frame
+from dhtorch.tree import stack
+
+#: Units per metre of the depths that have a name.
+UNITS = {"m": 1.0, "mm": 1000.0}
+
+#: Pixels at most by which the median depth of a frame is judged.
+PROBES = 16384
+
+#: The shapes of the image and the depth map may differ by this share; a transposed map differs by far more.
+MAX_ASPECT = 0.1
+
+#: Where the numbers are: a key of the sample, or the numbers themselves, the same for every sample.
+Numbers = str | Sequence[float]
+
+
+class SampleError(ValueError):
+    """A sample cannot be read as stated; the message names the key, what was found and what was expected."""
+
+
+class Read(NamedTuple):
+    """The views of B samples."""
+
+    anchor: Frame
+    other: Frame | None  # with a leading dimension where several were asked for; None = there is none
+    paired: Tensor  # (B,) bool: the other view is a view of its own, no copy that pads the start of an episode
+    bad: Tensor  # (B,) bool: values contradict what was stated
+    complaints: tuple[tuple[Tensor, Tensor, str], ...]  # mask (B,), value (B,) and what to say about it
+
+    def complaint(self) -> str:
+        """What to say about the first bad sample."""
+        row = int(self.bad.int().argmax())
+        said = next(text.format(float(value[row])) for bad, value, text in self.complaints if bad[row])
+        return said if len(self.bad) == 1 else f"sample {row} of the batch: {said}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Views:
+    """Where in a sample the views are, and what their numbers mean.
+
+    A key is looked up as it stands, else piece by piece (``observation.depth`` or ``observation/depth`` in nested
+    dicts). Images are uint8 or float in [0, 1], (C, H, W) or (H, W, C), with T in front where the sample holds frames
+    along time. Depth maps are (h, w), (1, h, w) or (h, w, 1), with or without that T.
+
+    Raises:
+        ValueError: an option that cannot be.
+    """
+
+    depth_unit: str | float  # "m", "mm", or metres per unit; there is no default
+    image: str = "image"  # key of the anchor's image
+    depth: str = "depth"  # key of the anchor's depth map
+    intrinsics: Numbers = "intrinsics"  # 3×3, or fx fy cx cy, px of the image
+    distortion: Numbers | None = None  # of the image, OpenCV's order
+    depth_intrinsics: Numbers | None = None  # px of the depth map; None = it covers the same field as the image
+    confidence: str | None = None  # key of the sensor's confidence: 0 low, 1 medium, 2 high
+    other_image: str | None = None  # key of the other view's image; None = another frame along time
+    other_intrinsics: Numbers | None = None  # None = those of the anchor
+    at: int = -1  # the anchor's place along time
+    other_at: int | Sequence[int] = 0  # the other view's; several are for a method of many views
+    layout: str | None = None  # "hwc" or "chw"; None = the axis of 1 or 3 is C, an error where that fits both
+    intrinsics_hw: tuple[int, int] | None = None  # image size that the intrinsics belong to; None = the image as it is
+    depth_range: tuple[float, float] = (0.0, float("inf"))  # m, returns outside are none (a codec's "no return")
+    max_depth: float = 100.0  # m, a median depth beyond is taken for a wrong unit
+    min_depth: float = 0.01  # m, one below likewise
+    max_offset: float = 0.2  # share of the image size by which the principal point may lie off the centre
+
+    def __post_init__(self) -> None:
+        unit, numeric = self.depth_unit, isinstance(self.depth_unit, float | int)
+        if not (unit in UNITS or (numeric and float(unit) > 0)):
+            raise ValueError(f"depth_unit is {unit!r}, expected one of {sorted(UNITS)} or metres per unit")
+        if self.layout not in (None, "hwc", "chw"):
+            raise ValueError(f"layout is {self.layout!r}, expected hwc, chw or None")
+        if self.other_image is not None and not isinstance(self.other_at, int):
+            raise ValueError("other_at is a list, expected one number where other_image names the other view")
+
+    def read(self, sample: Mapping[str, Any], *, batched: bool = False, dtype: torch.dtype = torch.float32) -> Read:
+        """The views of a sample (B = 1) or of a collated batch.
+
+        Raises:
+            SampleError: a key is missing, or a shape or dtype is not what was stated. Values that contradict what was
+                stated are in ``bad``.
+        """
+        source = _Source(sample, batched, dtype)
+        images = source.images(self.image, self.layout)
+        T, hw = images.shape[1], (images.shape[-2], images.shape[-1])
+        at = _place(self.at, T, self.image)
+        checks = [_in_unit_range(images[:, at], self.image)]
+        depths = self._metres(source.planes(self.depth, T))
+        depth = depths[:, at if depths.shape[1] > 1 else 0].contiguous()
+        checks += self._depth_checks(depth)
+        conf = None if self.confidence is None else source.planes(self.confidence, T)
+        if conf is not None:
+            conf = conf[:, at if conf.shape[1] > 1 else 0]
+            checks.append(_is_level(conf, self.confidence))
+            conf = conf.clamp(0, 2).to(torch.uint8).contiguous()
+            if conf.shape != depth.shape:
+                raise SampleError(f"{self.confidence}: found {_size(conf)}, expected {_size(depth)} as {self.depth}")
+        camera = self._camera(source, self.intrinsics, hw, T, at, checks)
+        anchor = Frame(images[:, at].contiguous(), depth, camera, self._depth_camera(source, depth, hw, T, at), conf)
+        other, paired = self._other(source, images, depths, anchor, checks)
+        bad = torch.stack([c[0] for c in checks]).any(0)
+        return Read(anchor, other, paired, bad, tuple(checks))
+
+    def image_hw(self, sample: Mapping[str, Any]) -> tuple[int, int] | None:
+        """Size of the anchor's image, None where it cannot be read."""
+        try:
+            images = _Source(sample, False, torch.float32).images(self.image, self.layout)
+        except SampleError:
+            return None
+        return images.shape[-2], images.shape[-1]
+
+    def _other(
+        self, source: _Source, images: Tensor, depths: Tensor, anchor: Frame, checks: list[Any]
+    ) -> tuple[Frame | None, Tensor]:
+        T = images.shape[1]
+        at = _place(self.at, T, self.image)
+        key = self.image if self.other_image is None else self.other_image
+        if self.other_image is not None:
+            images = source.images(key, self.layout)
+        wanted = [self.other_at] if isinstance(self.other_at, int) else self.other_at
+        places = [_place(p, images.shape[1], key) for p in wanted]
+        pad = source.pad(key, images.shape[1])
+        frames, own = [], []
+        for p in places:
+            own.append(~pad[:, p] if self.other_image is not None or p != at else torch.zeros_like(pad[:, p]))
+            image = images[:, p].contiguous()
+            checks.append(_in_unit_range(image, key))
+            depth = torch.zeros_like(anchor.depth)
+            if self.other_image is None and depths.shape[1] > 1:
+                depth = depths[:, p].contiguous()
+            hw, numbers = (image.shape[-2], image.shape[-1]), self.other_intrinsics or self.intrinsics
+            # The anchor's numbers along time belong to its own frames, not to those of another image.
+            shared = self.other_image is not None and self.other_intrinsics is None
+            count, when = (T, at) if shared else (images.shape[1], p)
+            camera = self._camera(source, numbers, hw, count, when, checks)
+            frames.append(Frame(image, depth, camera, anchor.depth_camera))
+        paired = torch.stack(own).any(0)
+        if self.other_image is None and set(places) == {at}:
+            return None, paired
+        return (frames[0] if isinstance(self.other_at, int) else stack(frames)), paired
+
+    def _metres(self, x: Tensor) -> Tensor:
+        """Depth in metres, 0 = no return."""
+        if self.depth_unit == "m" and not x.is_floating_point():
+            raise SampleError(f"{self.depth}: found whole numbers ({x.dtype}), expected metres; is the unit mm?")
+        per_metre = UNITS.get(self.depth_unit) if isinstance(self.depth_unit, str) else None
+        z = x / per_metre if per_metre is not None else x * float(self.depth_unit)
+        low, high = self.depth_range
+        return torch.where(z.isfinite() & (z > max(low, 0.0)) & (z <= high), z, torch.zeros_like(z))
+
+    def _depth_checks(self, depth: Tensor) -> list[tuple[Tensor, Tensor, str]]:
+        flat = depth.detach().flatten(1)
+        flat = flat[:, :: max(1, flat.shape[1] // PROBES)]
+        median = torch.where(flat > 0, flat, torch.nan).nanmedian(1).values
+        said = f"{self.depth}: the median return is {{:.4g}} m with the unit {self.depth_unit!r}, expected"
+        return [
+            (median > self.max_depth, median, f"{said} at most {self.max_depth:g} m; are the numbers millimetres?"),
+            (median < self.min_depth, median, f"{said} at least {self.min_depth:g} m; are the numbers metres?"),
+        ]
+
+    def _camera(
+        self, source: _Source, numbers: Numbers, hw: tuple[int, int], T: int, at: int, checks: list[Any]
+    ) -> Camera:
+        camera = source.camera(numbers, T, at, source.numbers(self.distortion, T, at))
+        if self.intrinsics_hw is not None:
+            camera = cam.resize(camera, self.intrinsics_hw, hw)
+        name = numbers if isinstance(numbers, str) else "intrinsics"
+        size = torch.tensor([hw[1], hw[0]], dtype=camera.c.dtype, device=camera.c.device)
+        off = ((camera.c.detach() + 0.5) / size - 0.5).abs().amax(-1)
+        small = camera.f.detach().amin(-1)
+        limit = f"at most {self.max_offset:g} in an image of {hw[0]}x{hw[1]}; do they belong to another size?"
+        checks.append(
+            (~(off <= self.max_offset), off, f"{name}: principal point {{:.2f}} sizes off the centre, {limit}")
+        )
+        checks.append((~(small > 0), small, f"{name}: found focal length {{:.4g}}, expected a positive number of px"))
+        return camera
+
+    def _depth_camera(self, source: _Source, depth: Tensor, hw: tuple[int, int], T: int, at: int) -> Camera | None:
+        if self.depth_intrinsics is not None:
+            return source.camera(self.depth_intrinsics, T, at, None)
+        h, w = depth.shape[-2:]
+        if abs((h * hw[1]) / (w * hw[0]) - 1) > MAX_ASPECT:
+            raise SampleError(
+                f"{self.depth}: found {h}x{w} (height x width), which is no scaled image of {hw[0]}x{hw[1]}; is it "
+                "transposed? A map with a field of its own needs depth_intrinsics"
+            )
+        return None
+
+
+def find(sample: Mapping[str, Any], key: str) -> Any:
+    """The value under a key, or piece by piece in nested dicts.
+
+    Raises:
+        SampleError: there is none.
+    """
+    if key in sample:
+        return sample[key]
+    value: Any = sample
+    for piece in key.replace("/", ".").split("."):
+        if not (isinstance(value, Mapping) and piece in value):
+            raise SampleError(f"{key}: found no such key, expected one of {', '.join(_keys(sample))}")
+        value = value[piece]
+    return value
+
+
+def to_tensor(value: Any, key: str) -> Tensor:
+    """A plain tensor of an array, a picture, numbers or a tensor of any class.
+
+    Raises:
+        SampleError: it holds no numbers.
+    """
+    if isinstance(value, Tensor):
+        return value.as_subclass(Tensor)
+    array = np.asarray(value)
+    if array.dtype.kind not in "buif":
+        raise SampleError(f"{key}: found {type(value).__name__} of {array.dtype}, expected an array of numbers")
+    if array.dtype.kind == "u" and array.dtype.itemsize in (2, 4):
+        array = array.astype(np.int64)  # torch knows little of unsigned words
+    array = array.astype(array.dtype.newbyteorder("="), copy=not array.flags.writeable)
+    return torch.from_numpy(np.ascontiguousarray(array))
+
+
+class _Source:
+    """The tensors of a sample, all with B in front."""
+
+    def __init__(self, sample: Mapping[str, Any], batched: bool, dtype: torch.dtype) -> None:
+        self.sample, self.batched, self.dtype = sample, batched, dtype
+        self.like: Tensor | None = None  # the anchor's images: everything follows their device and number
+
+    def get(self, key: str) -> Tensor:
+        x = to_tensor(find(self.sample, key), key)
+        x = x if self.batched else x[None]
+        if self.like is None:
+            self.like = x
+        if x.ndim == 0 or x.shape[0] != self.like.shape[0]:
+            raise SampleError(f"{key}: found shape {tuple(x.shape)}, expected {self.like.shape[0]} samples in front")
+        return x.to(self.like.device)
+
+    def images(self, key: str, layout: str | None) -> Tensor:
+        """(B, T, C, H, W), uint8 or floating."""
+        x = self.get(key)
+        if x.ndim not in (4, 5):
+            shape = tuple(x.shape[1:])
+            raise SampleError(f"{key}: found shape {shape}, expected (C, H, W) or (H, W, C), or with T in front")
+        if x.dtype != torch.uint8 and not x.is_floating_point():
+            raise SampleError(f"{key}: found {x.dtype}, expected uint8, or float in [0, 1]")
+        x = x if x.ndim == 5 else x[:, None]
+        first, last = x.shape[2] in (1, 3), x.shape[4] in (1, 3)
+        if layout is None and first == last:
+            shape = tuple(x.shape[2:])
+            raise SampleError(f"{key}: found shape {shape}, expected one axis of 1 or 3 channels; or state layout")
+        hwc = last if layout is None else layout == "hwc"
+        if not (last if hwc else first):
+            raise SampleError(f"{key}: found shape {tuple(x.shape[2:])}, expected layout {layout} with 1 or 3 channels")
+        x = x.movedim(-1, 2) if hwc else x
+        return x if x.dtype == torch.uint8 else x.to(self.dtype)
+
+    def planes(self, key: str, T: int) -> Tensor:
+        """(B, T or 1, h, w), floating if it was, else whole."""
+        x = self.get(key)
+        shape = tuple(x.shape[1:])
+        if x.ndim == 3:
+            x = x[:, None]
+        elif x.ndim == 4 and x.shape[1] not in (1, T) and x.shape[3] == 1:
+            x = x[:, None, ..., 0]
+        elif x.ndim == 5:
+            x = x[:, :, 0] if x.shape[2] == 1 else x[..., 0] if x.shape[4] == 1 else x
+        if x.ndim != 4 or x.shape[1] not in (1, T) or 0 in x.shape:
+            expected = f"(h, w), (1, h, w) or (h, w, 1), with or without {T} in front"
+            raise SampleError(f"{key}: found shape {shape}, expected {expected}")
+        return x.to(self.dtype) if x.is_floating_point() else x
+
+    def numbers(self, numbers: Numbers | None, T: int, at: int) -> Tensor | None:
+        """(B, k) of numbers given once, per sample, or per sample and frame."""
+        if numbers is None or self.like is None:
+            return None
+        name = numbers if isinstance(numbers, str) else "numbers"
+        if isinstance(numbers, str):
+            x = self.get(numbers)
+        else:
+            x = torch.as_tensor(numbers, device=self.like.device)[None].expand(self.like.shape[0], *np.shape(numbers))
+        if x.ndim >= 3 and x.shape[-1] == x.shape[-2] == 3:
+            x = x.flatten(-2)
+        if x.ndim == 3 and x.shape[1] in (1, T):
+            x = x[:, at if x.shape[1] > 1 else 0]
+        if x.ndim != 2:
+            raise SampleError(
+                f"{name}: found shape {tuple(x.shape[1:])}, expected one row of numbers, or one per frame"
+            )
+        return x.to(self.dtype)
+
+    def camera(self, numbers: Numbers, T: int, at: int, distortion: Tensor | None) -> Camera:
+        x = self.numbers(numbers, T, at)
+        assert x is not None
+        if x.shape[1] == 4:
+            return Camera(x[:, :2], x[:, 2:], distortion)
+        if x.shape[1] != 9:
+            name = numbers if isinstance(numbers, str) else "intrinsics"
+            raise SampleError(f"{name}: found {x.shape[1]} numbers, expected 3x3, or fx fy cx cy")
+        return cam.from_matrix(x.unflatten(1, (3, 3)), distortion)
+
+    def pad(self, key: str, T: int) -> Tensor:
+        """(B, T) whether a frame only pads the start or end of an episode: LeRobot's ``<key>_is_pad``."""
+        assert self.like is not None
+        name = f"{key}_is_pad"
+        if name not in self.sample:
+            return torch.zeros(self.like.shape[0], T, dtype=torch.bool, device=self.like.device)
+        x = self.get(name).bool().flatten(1)
+        if x.shape[1] != T:
+            raise SampleError(f"{name}: found {x.shape[1]} values, expected {T}")
+        return x
+
+
+def _place(at: int, T: int, key: str) -> int:
+    """A place along time, counted from the end if negative; the only frame where there is no other."""
+    if T == 1:
+        return 0
+    if not -T <= at < T:
+        raise SampleError(f"{key}: found {T} frames along time, expected one at {at}")
+    return at % T
+
+
+def _in_unit_range(image: Tensor, key: str) -> tuple[Tensor, Tensor, str]:
+    text = f"{key}: found the value {{:.4g}}, expected floats in [0, 1] (pixels before any normalisation)"
+    if image.dtype == torch.uint8:
+        return torch.zeros_like(image[:, 0, 0, 0], dtype=torch.bool), image[:, 0, 0, 0], text
+    low, high = (f(image.detach().flatten(1), 1) for f in (torch.amin, torch.amax))
+    bad_low, bad_high = ~(low >= -1e-3), ~(high <= 1 + 1e-3)
+    return bad_low | bad_high, torch.where(bad_high, high, low), text
+
+
+def _is_level(conf: Tensor, key: str | None) -> tuple[Tensor, Tensor, str]:
+    high = conf.flatten(1).amax(1)
+    text = f"{key}: found the value {{:.4g}}, expected 0 low, 1 medium, 2 high"
+    return ~(high <= 2) | (conf != conf.floor()).flatten(1).any(1), high, text
+
+
+def _size(x: Tensor) -> str:
+    return f"{x.shape[-2]}x{x.shape[-1]}"
+
+
+def _keys(sample: Mapping[str, Any], prefix: str = "") -> list[str]:
+    found: list[str] = []
+    for key, value in sample.items():
+        nested = isinstance(value, Mapping)
+        found += _keys(value, f"{prefix}{key}.") if nested else [f"{prefix}{key}"]
+    return sorted(found)
