@@ -143,12 +143,11 @@ def write(path: str | Path, result: Mapping[str, Any]) -> Path:
     """
     path = Path(path)
     validate(result, str(path))
-    text = json.dumps(result, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=_UNFINISHED, dir=path.parent)
     try:
         with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
+            file.write(_text(result))
             file.flush()
             os.fsync(file.fileno())
         Path(name).chmod(0o644)
@@ -158,6 +157,24 @@ def write(path: str | Path, result: Mapping[str, Any]) -> Path:
         raise
     _sync_folder(path.parent)
     return path
+
+
+def _text(result: Mapping[str, Any]) -> str:
+    """JSON in which every summary entry and every row is a line: small, and two versions can be compared."""
+
+    def dump(value: Any) -> str:
+        return json.dumps(value, ensure_ascii=False, allow_nan=False)
+
+    lines = []
+    for name, value in result.items():
+        if name == "rows":
+            body = "[\n" + ",\n".join(f"  {dump(row)}" for row in value) + "\n ]" if value else "[]"
+        elif isinstance(value, Mapping) and name != "config":
+            body = "{\n" + ",\n".join(f"  {dump(k)}: {dump(v)}" for k, v in value.items()) + "\n }" if value else "{}"
+        else:
+            body = dump(value)
+        lines.append(f" {dump(name)}: {body}")
+    return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
 def clear(path: str | Path) -> None:

@@ -17,7 +17,7 @@ from dhtorch.records import Estimate, Samples
 Row = dict[str, Any]
 
 #: Points of an overlay.
-SHOWN = 400
+SHOWN = 200
 
 #: Columns of a pair that a scene row measures anew on its pooled points, or that name the pair.
 _OWN = {"scene", "pair", "method", "truth", "gate_share", "ms", "pnp_ok", "n_inlier", "n_holes", "n_recovered"}
