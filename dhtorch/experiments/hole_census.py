@@ -53,7 +53,7 @@ def run(
         rows = []
         for i in progress(frames, recording.name, len(frames)):
             rows.append({"scene": recording.name, "pair": [i, i], "method": name, "truth": None})
-            rows[-1] |= _census(adapt(method, recording), recording[i].to(settings.dtype).to(settings.device))
+            rows[-1] |= census(look(adapt(method, recording), recording[i].to(settings.dtype).to(settings.device)))
         outcome.rows += [*rows, _scene(rows, recording)]
         outcome.n_pairs += len(rows)
     scenes = [r for r in outcome.rows if r["pair"] is None and r["role"] is None]
@@ -71,11 +71,17 @@ def verdict(summary: Mapping[str, Any]) -> tuple[bool | None, str]:
     return share >= 0.5 and hole >= 0.1 * valid, why
 
 
-def _census(method: Method, frame: Any) -> Row:
+def look(method: Method, frame: Any) -> Samples:
+    """Seats 1 to 3 of a method: what its samples find in a frame."""
     seats, like = method.keywords, frame.camera.f
     with torch.no_grad():
         uv = seats["sample"](frame.hw, seats["n"], device=like.device, dtype=like.dtype)
         samples: Samples = seats["classify"](frame, seats["backproject"](frame, uv))
+    return samples
+
+
+def census(samples: Samples) -> Row:
+    """Holes of one frame (B = 1): how many, of which class, and what could fill them."""
     hole, quality = samples.hole[0], samples.trackability[0]
     n_holes = int((hole != Hole.NONE).sum())
     share = {k: float((hole == k).sum()) / n_holes if n_holes else None for k in names(Hole) if k != Hole.NONE}
