@@ -168,6 +168,7 @@ def test_links_without_confidence_leave_the_map_and_keep_the_pose():
     alone, refined = found["good"], found["good + icp points"]
     assert refined["confident_share"] == 0 and refined["drift_rel"] < 1e-9
     assert refined["n_voxels"] < alone["n_voxels"] == refined["n_voxels_all"]
+    assert refined["voxels_vs_pose"] == refined["n_voxels"] / alone["n_voxels"] and alone["voxels_vs_pose"] == 1
     assert outcome.verdict == "refuted", "without confidence nothing is gained where there is no pose"
 
 
@@ -175,8 +176,8 @@ def test_a_scene_without_trajectory_or_depth_has_no_answer():
     blind, empty = room(), room(lidar=None)
     blind.poses = None
     assert experiment.verdict(asked(blind))[0] is None
-    found = asked(empty).scenes("good + icp planes", "trajectory")["synthetic_room"]
-    assert found["n_voxels"] == 0 and found["confident_share"] == 0 and found["right_share"] is None
+    silent = asked(empty)
+    assert silent.verdict == "undecided" and silent.rows[0]["note"] == "nothing to ask" and len(silent.rows) == 9
     with pytest.raises(ValueError, match="found 1 frames of synthetic_room and links=10, expected at least two"):
         asked(SyntheticRoom(hw=(96, 128), n_frames=1), links=10)
 

@@ -37,7 +37,7 @@ SOLVERS = ("", " + icp points", " + icp planes")
 VARIANTS = tuple(source + solver for source in SOURCES for solver in SOLVERS)
 TRUTH = "trajectory"
 
-#: Points from which plane normals can be estimated.
+#: A set of fewer points is no set: links that meet one are not asked.
 MIN_POINTS = 16
 
 
@@ -63,9 +63,10 @@ def run(
     Rows of links: error of the relative pose against the trajectory (``rotation_deg``, ``translation_m``,
     ``translation_rel`` in median depths), ``confident`` (0 or 1), ``inlier_share``, ``rms_m``, ``condition``. Rows of
     scenes: their medians, ``confident_share``, and of the whole chain ``n_voxels`` covered by the frames whose link is
-    confident, ``n_voxels_all`` by all frames, ``right_share`` (of the former, within one voxel of the map under the
-    true path: a smeared map covers more), ``drift_deg`` and ``drift_rel`` at its end. A built-in room knows its true
-    path; elsewhere the good pose is the reference, and its drift zero by definition.
+    confident, ``voxels_vs_pose``, their number over that of the same poses alone, ``n_voxels_all`` by all frames,
+    ``right_share`` (of the former, within one voxel of the map under the true path: a smeared map covers more),
+    ``drift_deg`` and ``drift_rel`` at its end. A built-in room knows its true path; elsewhere the good pose is the
+    reference, its drift zero by definition, and where it is loose some of ICP's drift is the reference's own.
 
     Args:
         recordings, settings, progress: as :func:`dhtorch.experiments.protocol.run`. Scenes without a trajectory or with
@@ -85,6 +86,8 @@ def run(
 
     def ask(recording: Any, item: Item) -> dict[str, Row]:
         chain = worlds.setdefault(recording.name, _Chain(recording, adapt(method, recording), settings, voxel))
+        if not all(chain.cloud(k)[0].isfinite().all(-1).sum() >= MIN_POINTS for k in item):
+            return {}
         starts = {"good": chain.relative(item), "none": se3.identity(1, chain.cloud(item[0]).double())}
         starts["poor"] = se3.compose(chain.error(item, poor_deg, poor_shift), starts["good"])
         found: dict[str, Row] = {}
@@ -101,7 +104,7 @@ def run(
 
     def whole(recording: Any, found: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
         chain = worlds.pop(recording.name, None)
-        return {} if chain is None else {v: chain.summary(v) for v in VARIANTS}
+        return {v: chain.summary(v) for v in VARIANTS} if chain and any(found) else {}
 
     def items(recording: Any) -> list[Item]:
         return chain_of(recording, links)
@@ -183,7 +186,7 @@ class _Chain:
         if not solver:
             return None
         first, second = self.cloud(item[0]), self.cloud(item[1])
-        planes = normals(second) if solver.endswith("planes") and second.shape[1] >= MIN_POINTS else None
+        planes = normals(second) if solver.endswith("planes") else None
         return register(
             first, second, start, normals_1=planes, reach_m=reach * self.scale, least_reach_m=least * self.scale
         )
@@ -206,11 +209,13 @@ class _Chain:
         placed = self.placed[variant]
         true = {i: (self.true_poses[i : i + 1].to(torch.float64), True) for i in placed}
         covered, real = self.voxels(placed, sure_only=True), self.voxels(true, sure_only=False)
+        alone = self.voxels(self.placed[variant.split(" + ", maxsplit=1)[0]], sure_only=False)
         last = max(placed)
         drift = _off(placed[last][0], true[last][0])
         links = [sure for i, (_, sure) in placed.items() if i != min(placed)]
         return {
             "n_voxels": len(covered),
+            "voxels_vs_pose": len(covered) / max(len(alone), 1),
             "n_voxels_all": len(self.voxels(placed, sure_only=False)),
             "right_share": _near(covered, real),
             "confident_share": sum(links) / len(links),
