@@ -1,5 +1,6 @@
 """One contract, one table: every public function of geometry, stages and evaluate has a row, or the last test fails."""
 
+import functools
 import importlib
 import inspect
 import pkgutil
@@ -27,6 +28,7 @@ from dhtorch.geometry import (
     se3,
     steady,
 )
+from dhtorch.negative import helix_correlation, hole_attention, icp
 from dhtorch.records import Camera, Frame, Samples, Tracks
 from dhtorch.stages import backproject, holes, pose, score, track, triangulate
 
@@ -183,6 +185,29 @@ def triples(batch, n, dtype):
     return Y / Y[..., 2:], Y
 
 
+def registered(batch, n, dtype):
+    """Two sets of points of which one is the other moved a little, and where to start."""
+    xyz = uniform(batch, n, 3, dtype=dtype, low=1, high=2)
+    T = se3.exp(uniform(batch, 6, dtype=dtype, low=-0.02, high=0.02))
+    return xyz, se3.apply(T, xyz), se3.identity(batch, xyz)
+
+
+def waves(batch, n, dtype):
+    """Two signals, the second shifted by three steps, and sites away from their ends."""
+    signal = torch.nn.functional.avg_pool1d(uniform(batch, 330, dtype=torch.float64), 9, 1).to(dtype)
+    site = 80 + torch.randint(0, 160, (batch, n), generator=generator(3))
+    return signal[:, :-3], signal[:, 3:], site, site
+
+
+def clustered(batch, n, dtype):
+    return pixels(batch, n, dtype), torch.rand(batch, n, generator=generator(3)) < 0.6
+
+
+def with_options(fn, **options):
+    """A function of the table with other options, under its own name."""
+    return functools.update_wrapper(functools.partial(fn, **options), fn)
+
+
 def wrong_last_axis(position):
     """A call whose argument at ``position`` lacks its last column."""
     return lambda args: tuple(tensor_map(lambda v: v[..., :-1], a) if k == position else a for k, a in enumerate(args))
@@ -274,6 +299,11 @@ ROWS = [
     Row(holdout.half, lambda b, n, d: (sampled(b, n, d)[1], 3), "dtype batch empty raises", (0,), bad=lambda a: (a[0].replace(trackability=a[0].trackability[:, 1:]), a[1])),
     Row(holdout.without_returns, lambda b, n, d: (sampled(b, n, d)[1], torch.rand(b, n, generator=generator(3)) < 0.5), ALL, (0, 1), (0,), bad=lambda a: (a[0], a[1][:, 1:])),
     Row(holdout.drop_outs, lambda b, n, d: (*sampled(b, n, d), holdout.truth_at(*frames(b, n, d))), "dtype batch vmap capture empty raises", (1, 2), bad=lambda a: (a[0], a[1], a[2].replace(depth=a[2].depth[:, 1:]))),
+    Row(helix_correlation.read_arm, lambda b, n, d: (frames(b, n, d)[0].image, pixels(1, n, d)[0]), "dtype batch capture gradcheck raises", grad=(0, 1), shared=(1,), bad=wrong_last_axis(1)),
+    Row(helix_correlation.correlate, waves, "dtype batch vmap capture gradcheck empty shuffle padding raises", (2, 3), (0, 1), bad=wrong_last_axis(3)),
+    Row(with_options(icp.register, iterations=5), registered, "dtype batch vmap capture shuffle raises", (0,), bad=wrong_last_axis(0)),
+    Row(with_options(icp.normals, neighbours=4), lambda b, n, d: registered(b, n, d)[:1], "dtype batch vmap capture shuffle raises", (0,), bad=wrong_last_axis(0)),
+    Row(hole_attention.largest_cluster, clustered, "dtype batch vmap capture shuffle raises", (0, 1), bad=wrong_last_axis(0)),
     Row(holdout.candidates, judged, "dtype batch vmap capture empty shuffle raises", (0, 1), bad=lambda a: (a[0], a[1].replace(depth=a[1].depth[:, 1:]), a[2])),
 ]  # fmt: skip
 
@@ -300,7 +330,6 @@ ELSEWHERE = {
     *(f"dhtorch.evaluate.control.{name}" for name in ("plug_in", "conformal", "scenes_needed", "p_value")),
     *(f"dhtorch.evaluate.compare.{name}" for name in ("method_ratios", "ratio_over_seeds", "equal_coverage")),
     "dhtorch.evaluate.curves.sampled",
-    *(f"dhtorch.evaluate.correlation.{name}" for name in ("pearson", "spearman", "ranks")),
     *(f"dhtorch.evaluate.correlation.{name}" for name in ("pearson", "spearman", "ranks")),
     *(f"dhtorch.evaluate.bootstrap.{name}" for name in ("interval", "interval_of", "resample")),
 }
@@ -433,7 +462,7 @@ def test_wrong_shapes_raise(row):
 
 
 def public_functions():
-    for package in ("geometry", "stages", "evaluate"):
+    for package in ("geometry", "stages", "evaluate", "negative"):
         module = importlib.import_module(f"dhtorch.{package}")
         for info in pkgutil.iter_modules(module.__path__, f"dhtorch.{package}."):
             part = importlib.import_module(info.name)
