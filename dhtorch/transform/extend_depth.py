@@ -20,7 +20,7 @@ from dhtorch.stages.backproject import backproject
 from dhtorch.stages.holes import classify
 from dhtorch.stages.sample import spiral
 from dhtorch.transform.problems import Problem, Tally
-from dhtorch.transform.tokens import CHANNELS, grid, patch_tokens
+from dhtorch.transform.tokens import CHANNELS, FITS, grid, patch_tokens
 from dhtorch.transform.views import Read, SampleError, Views, find, to_tensor
 
 #: Methods that have a name; any function called and answering like :func:`dhtorch.extend` will do as well.
@@ -91,6 +91,9 @@ class ExtendDepth(torch.nn.Module):
         if on_error not in ON_ERROR or (batched and on_error == "skip"):
             expected = ("raise", "flag") if batched else ON_ERROR
             raise ValueError(f"on_error is {on_error!r}, expected one of {', '.join(expected)}")
+        if fit not in FITS:
+            raise ValueError(f"fit is {fit!r}, expected one of {', '.join(FITS)}")
+        grid((max(patch, 1),) * 2, patch=patch, tokens_hw=tokens_hw)  # raises where no patch fits
         self.views = Views(**views)
         self.method = METHODS[method] if isinstance(method, str) else method
         self.learned = torch.nn.ModuleList(_modules(self.method))  # so that .to() and .parameters() find them
