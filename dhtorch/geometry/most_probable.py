@@ -33,10 +33,13 @@ MEDIAN_2D, MEDIAN_1D = 1.17741, 0.67449
 #: Precision (1/rad²) of a turn that is held at zero.
 RIGID = 1e18
 
+#: Parameters that a pose takes from its residuals.
+PARAMETERS = 6
+
 #: Least believed ratio of mean psi′ to mean w: residuals all beyond the bend would make it negative.
 MIN_RISE = 0.1
 
-#: Near cost (in units of its variance) that may be gained or lost without being asked why.
+#: Cost (in units of its variance) that may be gained or lost without being asked why.
 SLACK = 1.0
 
 
@@ -46,11 +49,12 @@ class Options(NamedTuple):
     far_weight: float = 0.1
     max_rise: float = 0.1
     turn_sigma: float = 0.01
-    min_drop: float = 0.02
+    turn_gain: float = 0.02
+    translation_gain: float = 0.5
     kernel: str | None = "geman_mcclure"
     bend: float = 2.0
-    near_steps: int = 8
-    steps: int = 10
+    near_steps: int = 4
+    steps: int = 6
 
 
 class Solution(NamedTuple):
@@ -60,6 +64,7 @@ class Solution(NamedTuple):
     noise: Tensor  # (B, N) px²
     far_weight: Tensor  # (B,) 0 where far tracks were not believed
     turn_precision: Tensor  # (B,) 1/rad²
+    translates: Tensor  # (B,) bool, a pure rotation does not explain the tracks
 
 
 @torch.no_grad()
@@ -67,13 +72,14 @@ def most_probable(problem: Problem, start: Pose, o: Options) -> Solution:
     """Solve for the near tracks, then for all, then for all with a turn; go on only where that is borne out.
 
     *Far tracks* are believed unless the near tracks' robust cost rises by more than ``max_rise`` with them. A *turn* is
-    believed where it lowers the whole cost by more than ``min_drop`` of it: three more parameters always fit better,
-    and by how much they do without a turn is a matter of systematic errors, not of the number of tracks.
+    believed where it takes away more than ``turn_gain`` of the whole cost, a *translation* where it takes away more
+    than ``translation_gain`` of the cost of the best pure rotation. More parameters always fit better; by how much they
+    do without need is a matter of systematic errors, which no number of tracks averages out: hence shares.
 
     Raises:
         ValueError: wrong shapes, an unknown kernel.
 
-    Cost: ``near_steps`` + 2.5 ``steps`` evaluations of the problem. Fixed: nothing depends on values.
+    Cost: ``near_steps`` + 3.5 ``steps`` evaluations of the problem. Fixed: nothing depends on values.
     """
     at = Unknowns(start, torch.zeros_like(start.t))
     none, far, rigid = (torch.full_like(start.t[:, 0], x) for x in (0.0, o.far_weight, RIGID))
@@ -93,17 +99,25 @@ def most_probable(problem: Problem, start: Pose, o: Options) -> Solution:
         both, cost = solve(both, noise, far, rigid, o.steps // 2)
         loose = torch.full_like(rigid, o.turn_sigma**-2)
         turned, lower = solve(both, noise, far, loose, o.steps)
-        worth = lower < cost * (1 - o.min_drop)
+        worth = cost - lower > o.turn_gain * cost + SLACK
         both, precision = choose(worth, turned, both), torch.where(worth, loose, rigid)
     cost_near, cost_both = (_near_cost(problem, x, noise, o) for x in (near, both))
     believed = cost_both <= cost_near * (1 + o.max_rise) + SLACK
-    at = choose(believed, both, near)
-    return Solution(
-        at,
-        noise_scale(problem, at),
-        torch.where(believed, far, none),
-        torch.where(believed, precision, rigid),
-    )
+    at, precision = choose(believed, both, near), torch.where(believed, precision, rigid)
+    far, noise = torch.where(believed, far, none), noise_scale(problem, at)
+    return Solution(at, noise, far, precision, _translates(problem, at, noise, far, precision, o))
+
+
+def _translates(problem: Problem, at: Unknowns, noise: Tensor, far: Tensor, precision: Tensor, o: Options) -> Tensor:
+    """Whether (B,) the cost is far below that of the best rotation without translation, under the same noise."""
+
+    def evaluate(at: Unknowns, held: float = RIGID) -> Normal:
+        cost, H, g = normal(problem, at, noise, far, precision, o.kernel, o.bend)
+        return Normal(cost, H + torch.diag(H.new_tensor([0.0] * 3 + [held] * 3 + [0.0] * 3)), g)
+
+    still = Unknowns(Pose(at.T.R, torch.zeros_like(at.T.t)), at.turn)
+    _, rotation = minimise(evaluate, still, o.steps, step=step)
+    return rotation - evaluate(at).cost > o.translation_gain * rotation + SLACK
 
 
 @torch.no_grad()
@@ -163,12 +177,22 @@ def _near_cost(problem: Problem, at: Unknowns, noise: Tensor, o: Options) -> Ten
 
 
 def _rise_and_scatter(square: Tensor, weight: Tensor, used: Tensor, size: int, o: Options) -> tuple[Tensor, Tensor]:
-    """mean psi′ / mean w and mean psi² / mean w² (B,) of the used tracks, whose residuals have ``size`` coordinates."""
+    """mean psi′ / mean w and mean psi² / mean w² (B,) of the used tracks, whose residuals have ``size`` coordinates.
+
+    Both are corrected for the freedom that the pose takes from few residuals, the scatter once for itself and once for
+    the scale of the noise, which comes from the same residuals.
+    """
     steeper = weight_slope(square, o.kernel, o.bend) * square * (2 / size) + weight
 
     def total(x: Tensor) -> Tensor:
         return (x * used).sum(-1)
 
-    rise = total(steeper) / total(weight).clamp_min(1e-9)
+    count = total(torch.ones_like(weight)).clamp_min(1.0)
+    mean = total(steeper) / count
+    uneven = (total(steeper * steeper) / count - mean * mean) / (mean * mean).clamp_min(MIN_RISE**2)
+    free = size * count
+    few = 1 + PARAMETERS / free * uneven
+    spent = free / (free - PARAMETERS).clamp_min(1.0)
+    rise = mean / (total(weight) / count).clamp_min(1e-9)
     scatter = total(weight * weight * square) / size / total(weight * weight).clamp_min(1e-9)
-    return rise.clamp_min(MIN_RISE), scatter
+    return rise.clamp_min(MIN_RISE) / few, scatter * spent * spent

@@ -28,6 +28,9 @@ from dhtorch.geometry.se3 import Pose
 from dhtorch.geometry.shapes import check
 from dhtorch.tree import Record, record
 
+#: A far track is not closer to the anchor than the nearest point of the sensor by more than this factor.
+MAX_NEARER = 2.0
+
 #: Squared residual (in units of its variance) of a point behind a camera: far beyond every kernel.
 BEHIND = 1e4
 
@@ -91,7 +94,7 @@ class Linear(NamedTuple):
     v: Tensor  # (B, 7, N) px, along v
     slope: Tensor  # (B, 2, N) px m, d r / d q
     precision: Tensor  # (B, N) m², of q before this track is read: 0 for far tracks, infinite for one at infinity
-    front: Tensor  # (B, N) bool, in front of camera 1; others are finite and have no meaning
+    front: Tensor  # (B, N) bool, in front of camera 1 and not at the epipole; others are finite and have no meaning
 
 
 def linearise_tracks(problem: Problem, at: Unknowns) -> Linear:
@@ -110,7 +113,9 @@ def linearise_tracks(problem: Problem, at: Unknowns) -> Linear:
     q = torch.where(problem.near, problem.inverse, free.clamp_min(0))
     precision = torch.where(problem.near, 1 / problem.variance, torch.where(infinite, torch.inf, 0.0))
     Y = a + q[:, None] * t
-    front = Y[:, 2] > MIN_DEPTH
+    # At the epipole a track fits any pose if only its point is near enough, and then holds it as if it were a vice.
+    nearest = torch.where(problem.near, problem.inverse, torch.zeros_like(q)).amax(-1, keepdim=True).detach()
+    front = (Y[:, 2] > MIN_DEPTH) & (problem.near | (q < MAX_NEARER * nearest))
     w = 1 / torch.where(front, Y[:, 2], torch.ones_like(q))
     x, y, k = Y[:, 0] * w, Y[:, 1] * w, q * w
     seen = (uv - c[..., None]) / f[..., None]

@@ -241,11 +241,12 @@ def map_pose(
     max_rise: float = 0.1,
     isotropic: float = 0.1,
     turn_sigma: float = 0.01,
-    min_drop: float = 0.02,
+    turn_gain: float = 0.02,
+    translation_gain: float = 0.5,
     kernel: str | None = "geman_mcclure",
     bend: float = 2.0,
-    near_steps: int = 8,
-    steps: int = 10,
+    near_steps: int = 4,
+    steps: int = 6,
     threshold_px: float = 3.0,
 ) -> PoseFit:
     """The most probable pose under all tracks: near ones hold the scale, far ones, without depth, the rotation.
@@ -268,7 +269,8 @@ def map_pose(
         isotropic: share of a track's noise that does not depend on its patch, see ``covariance.noise_shape``.
         turn_sigma: one standard deviation of how far rows may turn against each other, rad per unit of height (of a
             ray with z = 1); 0 for a global shutter.
-        min_drop: share of the cost that such a turn must take away to be believed.
+        turn_gain: share of the cost that such a turn must take away to be believed.
+        translation_gain: share of the cost of the best pure rotation that the translation must take away.
         kernel, bend: robust kernel and the residual, in standard deviations, at which it bends.
         near_steps, steps: Levenberg–Marquardt steps of the two solutions.
         threshold_px: largest reprojection error of a near track that is reported as an inlier.
@@ -277,7 +279,8 @@ def map_pose(
         PoseFit with ``shutter``. ``cov`` is the sandwich of an M-estimator with inverse depths and turn eliminated, in
         which residuals with heavy tails widen the answer; ``sigma_px`` is the scale of the noise of the far tracks, to
         be multiplied with their shape. Codes: those of ``start`` where it found no pose; DEGENERATE: the near tracks
-        leave the pose undetermined; KEPT_PNP: far tracks contradict the near ones, which alone are answered.
+        leave the pose undetermined; NO_BASELINE: a pure rotation explains the tracks nearly as well; KEPT_PNP: far
+        tracks contradict the near ones, which alone are answered.
 
     Raises:
         ValueError: wrong shapes, an unknown kernel; else as ``start``.
@@ -289,7 +292,7 @@ def map_pose(
     """
     B = check("map_pose", xyz=(samples.xyz, "B N 3"), uv_1=(tracks.uv_1, "B N 2"), cov=(tracks.cov, "B N 2 2"))["B"]
     first = start(samples, tracks, camera_0, camera_1, draws)
-    options = Options(far_weight, max_rise, turn_sigma, min_drop, kernel, bend, near_steps, steps)
+    options = Options(far_weight, max_rise, turn_sigma, turn_gain, translation_gain, kernel, bend, near_steps, steps)
     parts = [slice(b, b + MAP_PAIRS) for b in range(0, B, MAP_PAIRS)]
     problem = _near_far(samples, tracks, camera_0, camera_1, isotropic)
     fits = [_fit_all(options, threshold_px, first[p], problem[p], tracks[p]) for p in parts]
@@ -302,7 +305,7 @@ def _fit_all(o: Options, threshold_px: float, first: PoseFit, problem: Problem, 
     found = most_probable(problem.detach(), choose(first.ok, first.T_1_from_0.detach(), eye), o)
     # The last step, in float64 and with the graph on.
     problem = problem.to(torch.float64)
-    found = pytree.tree_map(torch.Tensor.double, found)
+    found = pytree.tree_map(lambda x: x.double() if x.is_floating_point() else x, found)
     found = found._replace(at=found.at._replace(T=Pose(_orthonormal(found.at.T.R), found.at.T.t)))
     weights = (found.noise, found.far_weight, found.turn_precision)
     _, H, g = near_far.normal(problem, found.at, *weights, o.kernel, o.bend)
@@ -311,6 +314,7 @@ def _fit_all(o: Options, threshold_px: float, first: PoseFit, problem: Problem, 
         cov, known = m_covariance(problem, found, o)
         finite = at.T.R.isfinite().flatten(1).all(1) & at.T.t.isfinite().all(1)
         code = torch.where(found.far_weight < o.far_weight, PoseCode.KEPT_PNP, PoseCode.OK)
+        code = torch.where(found.translates, code, PoseCode.NO_BASELINE)
         code = torch.where(solved & known & finite, code, PoseCode.DEGENERATE)
         code = torch.where(first.ok, code, first.code).to(torch.int32)
         ok = (code == PoseCode.OK) | (code == PoseCode.KEPT_PNP)

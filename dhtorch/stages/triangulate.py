@@ -8,13 +8,16 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from dhtorch.codes import Gate, first_reason
+from dhtorch.codes import Gate, PoseCode, first_reason
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import epipolar
-from dhtorch.geometry.covariance import noise_shape
+from dhtorch.geometry.covariance import median, noise_shape
 from dhtorch.geometry.near_far import straighten
 from dhtorch.geometry.shapes import check
 from dhtorch.records import Camera, Estimate, PoseFit, Samples, Tracks
+
+#: Least trackability that a grey difference is divided by.
+MIN_TRACKABILITY = 1e-8
 
 
 def two_view(
@@ -28,10 +31,12 @@ def two_view(
     max_residual_px: float | None = 3.0,
     max_sigma_rel: float | None = None,
     min_t_snr: float | None = None,
-    max_photometric: float | None = None,
+    max_mismatch_px: float | None = None,
     fitted_noise: bool = False,
     isotropic: float = 0.1,
+    mismatch_px: float | None = None,
     sigma_scale: float = 1.0,
+    sensor_share: float = 0.0,
     solver: Callable[..., epipolar.TwoView] = epipolar.triangulate,
 ) -> Estimate:
     """Triangulate every track under the anchored pose and abstain where the geometry is weak.
@@ -47,12 +52,16 @@ def two_view(
         max_sigma_rel: sigma / depth above which a point is not answered; None asks nothing.
         min_t_snr: length of the translation, in its own standard deviations, below which no point of the pair is
             answered; None asks nothing.
-        max_photometric: grey difference (rms, image in [0, 1]) of a track's patches above which it may have slid to
-            another place of its epipolar line, and is not answered; None asks nothing.
+        max_mismatch_px: grey difference of a track's patches above which it may have slid to another place of its
+            epipolar line, and is not answered; as the shift that would make it, the rms over the root of the
+            sample's trackability. None asks nothing.
         fitted_noise: take the scale of the tracks' noise from the pose's residuals (``fit.sigma_px``), and from the
             tracks' covariances only its shape; else the covariances as they are.
         isotropic: share of that shape which does not depend on the patch, see ``covariance.noise_shape``.
-        sigma_scale: factor on sigma and sigma_shared, as a calibration found it.
+        mismatch_px: such a shift that widens a track's noise as much as what is fitted; None: none does.
+        sigma_scale: factor on what the tracks and the pose give to sigma, as a calibration found it.
+        sensor_share: share of the sensor's relative noise that all its returns have in common (a wrong scale): it
+            passes whole to every recovered depth, however many near points there are.
         solver: ``(uv_0, uv_1, camera_0, camera_1, T_1_from_0) -> TwoView``, how two rays become a depth.
 
     Returns:
@@ -71,7 +80,7 @@ def two_view(
     Source: paper, "Gated two-view triangulation and abstention".
     """
     check("two_view", uv_0=(tracks.uv_0, "B N 2"), uv=(samples.uv, "B N 2"), R=(fit.T_1_from_0.R, "B 3 3"))
-    posed = fit.ok[:, None]
+    posed, still = fit.ok[:, None], fit.code == PoseCode.NO_BASELINE
     tracked = tracks.valid & tracks.uv_0.isfinite().all(-1) & tracks.uv_1.isfinite().all(-1)
     uv_0, uv_1 = _silence(tracks.uv_0, tracked), _silence(tracks.uv_1, tracked)
     y = None
@@ -86,17 +95,22 @@ def two_view(
         scale = torch.where(posed, fit.sigma_px[:, None], 1.0).to(cov.dtype)
         cov = noise_shape(cov, tracked, isotropic) * (scale * scale)[..., None, None]
     own, shared = _variance(geometry, cov, fit, y)
-    own, shared = own * sigma_scale**2, shared * sigma_scale**2
+    mismatch = tracks.photometric / samples.trackability.clamp_min(MIN_TRACKABILITY).sqrt()
+    if mismatch_px is not None:
+        own = own * (1 + (mismatch / mismatch_px) ** 2)
+    common = sensor_share * _relative_noise(samples, fit) * geometry.depth
+    own, shared = own * sigma_scale**2, shared * sigma_scale**2 + common * common
     behind = ~((geometry.depth > 0) & (geometry.depth_1 > 0))
     limit = None if max_sigma_rel is None else (max_sigma_rel * geometry.depth) ** 2
     gate = first_reason(
         (~tracked, Gate.NO_TRACK),
+        (still[:, None].expand_as(tracked), Gate.NO_BASELINE),
         (~posed, Gate.NO_POSE),
         (_below(fit.t_snr[:, None].expand_as(tracked), min_t_snr), Gate.NO_BASELINE),
         (behind, Gate.BEHIND),
         (parallax_deg <= (min_parallax_deg if min_parallax_deg is not None else -1.0), Gate.PARALLAX),
         (geometry.residual_px >= (max_residual_px if max_residual_px is not None else torch.inf), Gate.RESIDUAL),
-        (_above(tracks.photometric, max_photometric), Gate.INCONSISTENT),
+        (_above(mismatch, max_mismatch_px), Gate.INCONSISTENT),
         (_above(own + shared, limit), Gate.UNCERTAIN),
     )
     keep, measured = gate == Gate.ANSWER, tracked & posed
@@ -119,6 +133,13 @@ def _variance(geometry: epipolar.TwoView, cov: Tensor, fit: PoseFit, y: Tensor |
         return epipolar.depth_variance(geometry, cov, fit.cov.nan_to_num())
     J = torch.cat((geometry.J_pose, geometry.J_pose[..., :3] * y[..., None, None]), -1)
     return epipolar.depth_variance(geometry._replace(J_pose=J), cov, fit.shutter.cov.nan_to_num())
+
+
+def _relative_noise(samples: Samples, fit: PoseFit) -> Tensor:
+    """Median sigma / depth (B, 1) of the near points that hold the pose; 0 where there are none."""
+    used = fit.inlier & (samples.depth > 0)
+    relative = samples.sigma / torch.where(used, samples.depth, torch.ones_like(samples.depth))
+    return torch.where(used.any(-1, keepdim=True), median(relative, used), 0.0)
 
 
 def _above(x: Tensor, limit: Tensor | float | None) -> Tensor:

@@ -1,0 +1,280 @@
+"""Seat 5 with far tracks: accuracy, an honest covariance, what is believed and what is not, gradients."""
+
+import math
+
+import pytest
+import torch
+
+from dhtorch.codes import Gate, PoseCode
+from dhtorch.geometry import camera as cam
+from dhtorch.geometry import covariance, most_probable, near_far, se3
+from dhtorch.geometry.least_squares import robust, weight_slope
+from dhtorch.records import Camera, Pose, Samples, Tracks
+from dhtorch.stages.pose import _near_far, map_pose, pnp_ransac
+from dhtorch.stages.triangulate import two_view
+
+D = torch.float64
+#: Every pair of the trials gets the same draws: they only choose a start.
+DRAWS = torch.rand(1, 64, 3, generator=torch.Generator().manual_seed(7), dtype=D)
+
+
+def pairs(
+    batch, near=60, far=140, *, noise=0.3, depth=0.01, turn=0.0, baseline=0.1, planar=False, rotation=0.05, seed=0
+):
+    """Arguments of the seat, true pose, true turn and true far depth. ``noise`` px is anisotropic, as tracks' is."""
+    g = torch.Generator().manual_seed(seed)
+    rand = lambda *s: torch.rand(*s, generator=g, dtype=D)  # noqa: E731
+    randn = lambda *s: torch.randn(*s, generator=g, dtype=D)  # noqa: E731
+    n = near + far
+    camera_0 = Camera(500 + 50 * rand(batch, 2), 10 * rand(batch, 2) + torch.tensor([315.0, 235.0], dtype=D))
+    camera_1 = Camera(450 + 50 * rand(batch, 2), 10 * rand(batch, 2) + torch.tensor([315.0, 235.0], dtype=D))
+    uv_0 = rand(batch, n, 2) * torch.tensor([600.0, 440.0], dtype=D) + 20
+    z = torch.cat((0.6 + 1.0 * rand(batch, near), 2.5 + 3 * rand(batch, far)), 1)
+    ray = cam.rays(camera_0, uv_0)
+    if planar:
+        z[:, :near] = 1 / (1 + 0.3 * ray[:, :near, 0] + 0.8 * ray[:, :near, 1])
+    direction = torch.nn.functional.normalize(randn(batch, 3), dim=-1)
+    T = se3.exp(torch.cat((rotation * randn(batch, 3), baseline * direction), -1))
+    b = turn * randn(batch, 3)
+    Y = se3.apply(T, ray * z[..., None])
+    Y = Y + torch.linalg.cross(ray[..., 1:2] * b[:, None], Y)
+    uv_1 = cam.project(camera_1, Y)
+    angle, spread = math.pi * rand(batch, n), 1 + 2 * rand(batch, n)
+    axis = torch.stack((angle.cos(), angle.sin()), -1)
+    cov = torch.eye(2, dtype=D) + (spread**2 - 1)[..., None, None] * axis[..., None] * axis[..., None, :]
+    uv_1 = uv_1 + noise * (torch.linalg.cholesky(cov) @ randn(batch, n, 2, 1))[..., 0]
+    sensed = z * (1 + depth * randn(batch, n))
+    xyz = torch.where((torch.arange(n) < near)[:, None], ray * sensed[..., None], torch.nan)
+    zero = torch.zeros(batch, n, dtype=D)
+    code = zero.to(torch.int32)
+    sigma = max(depth, 1e-3) * sensed
+    samples = Samples(uv_0, sensed * (torch.arange(n) < near), sigma, xyz, zero + 1, code, zero + 1, code)
+    tracks = Tracks(uv_0, uv_1, zero, zero, cov * 0.01, zero == 0)
+    return (samples, tracks, camera_0, camera_1, DRAWS.expand(batch, -1, -1)), T, b, z
+
+
+def errors(fit, T):
+    """Rotation (rad) and translation (m) errors as one tangent vector (B, 6)."""
+    delta = se3.compose(Pose(fit.T_1_from_0.R.to(D), fit.T_1_from_0.t.to(D)), se3.invert(T))
+    R = delta.R
+    omega = 0.5 * torch.stack((R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]), -1)
+    return torch.cat((omega, delta.t), -1)
+
+
+def nees(fit, T):
+    return covariance.mahalanobis(errors(fit, T), fit.cov.to(D)) ** 2 / 6
+
+
+def put(args, **changes):
+    """The seat's arguments with fields of the tracks (or ``xyz``) replaced."""
+    samples, tracks, *rest = args
+    if "xyz" in changes:
+        samples = samples.replace(xyz=changes.pop("xyz"))
+    return samples, tracks.replace(**changes), *rest
+
+
+# -------------------------------------------------------------------------------------------------- accuracy
+
+
+@pytest.mark.parametrize("planar", [False, True])
+def test_exact_tracks_give_the_exact_pose(planar):
+    args, T, _, _ = pairs(4, 12, 30, noise=0.0, depth=0.0, planar=planar)
+    fit = map_pose(*args)
+    assert (fit.code == PoseCode.OK).all() and fit.inlier[:, :12].all() and not fit.inlier[:, 12:].any()
+    assert errors(fit, T).abs().max() < 1e-8 and fit.shutter.turn.abs().max() < 1e-8
+
+
+def test_far_tracks_and_weights_beat_near_points_alone():
+    args, T, _, _ = pairs(60, 30, 200, depth=0.02, planar=True)
+    plain, joint = errors(pnp_ransac(*args), T), errors(map_pose(*args), T)
+    near = errors(map_pose(*args, far_weight=1e-9), T)
+    for part in (slice(0, 3), slice(3, 6)):
+        size = [e[:, part].norm(dim=-1).median() for e in (plain, near, joint)]
+        assert size[2] < 0.8 * size[1] and size[2] < 0.6 * size[0]
+
+
+def test_covariance_is_that_of_the_errors():
+    """500 trials with the assumed noise: the mean of the normalised squared error lies in the band of chi² / 6."""
+    args, T, _, _ = pairs(500, 60, 140)
+    fit = map_pose(*args, turn_sigma=0.0, isotropic=0.0)
+    assert (fit.code == PoseCode.OK).all()
+    assert abs(nees(fit, T).mean() - 1) < 1.96 * (2 / (6 * 500)) ** 0.5
+    assert abs(fit.sigma_px.mean() / (0.3 * 2.5**0.5) - 1) < 0.05  # the shapes' median mean variance is 2.5
+
+
+def test_sigma_is_the_spread_of_far_depths():
+    args, _, _, z = pairs(80, 60, 140)
+    fit = map_pose(*args, isotropic=0.0)
+    estimate = two_view(*args[:2], fit, *args[2:4], max_residual_px=None, fitted_noise=True, isotropic=0.0)
+    far = estimate.keep & (torch.arange(200) >= 60) & (estimate.sigma < 0.1 * z)
+    standard = ((estimate.depth - z) / estimate.sigma)[far]
+    assert len(standard) > 2000 and abs((standard.abs() < 1).double().mean() - 0.68) < 0.05
+    assert (estimate.sigma_shared[far] > 0).all() and (estimate.sigma_shared <= estimate.sigma)[far].all()
+
+
+# ---------------------------------------------------------------------------------------------- the elimination
+
+
+def test_elimination_is_the_schur_complement_of_the_whole_problem():
+    """Normal equations with every inverse depth as an unknown of its own, reduced by hand."""
+    args, T, _, _ = pairs(1, 16, 16, noise=0.02, depth=0.0)
+    samples, tracks, camera_0, camera_1, _ = args
+    problem = _near_far(samples, tracks, camera_0, camera_1, 0.2)
+    at = near_far.Unknowns(T, torch.zeros(1, 3, dtype=D))
+    noise = torch.full((1, 32), 0.09, dtype=D)
+    one = torch.ones(1, dtype=D)
+    cost, H, g = near_far.normal(problem, at, noise, one, 0 * one, None, 1.0)
+    ray = problem.ray[0].T
+    a, t = ray @ T.R[0].T, T.t[0]
+    cov = near_far_shape(problem)[0] * 0.09
+    whiten = torch.linalg.inv(torch.linalg.cholesky(cov))
+
+    def every_residual(x):
+        pose, turn, q = se3.retract(T, x[None, :6]), at.turn + x[6:9], x[9:]
+        Y = ray @ pose.R[0].T + q[:, None] * pose.t[0]
+        uv = near_far.straighten(problem.uv, problem.f, problem.c, problem.ray[:, 1], turn)[0].T
+        miss = Y[:, :2] / Y[:, 2:] * problem.f[0] + problem.c[0] - uv
+        prior = (q - problem.inverse[0]) / problem.variance[0].sqrt()
+        return torch.cat(((whiten @ miss[..., None]).flatten(), prior[problem.near[0]]))
+
+    start = torch.cat((torch.zeros(9, dtype=D), problem.inverse[0].clone()))
+    for _ in range(12):  # inverse depths at their optimum, the pose held
+        J, r = torch.func.jacrev(every_residual)(start), every_residual(start)
+        start[9:] -= torch.linalg.solve(J[:, 9:].T @ J[:, 9:], J[:, 9:].T @ r)
+    assert (start[9:] > 0).all()
+    linear = near_far.linearise_tracks(problem, at)
+    near = problem.near[0]
+    start[9:] = torch.where(near, problem.inverse[0], start[9:])
+    J, r = torch.func.jacrev(every_residual)(start), every_residual(start)
+    A = J.T @ J
+    b = J.T @ r
+    reduced = A[:9, :9] - A[:9, 9:] @ torch.linalg.solve(A[9:, 9:], A[9:, :9])
+    right = b[:9] - A[:9, 9:] @ torch.linalg.solve(A[9:, 9:], b[9:])
+    torch.testing.assert_close(H[0], reduced, rtol=2e-3, atol=1e-6 * float(reduced.abs().max()))
+    torch.testing.assert_close(g[0], right, rtol=2e-2, atol=1e-3 * float(right.abs().max()))
+    assert linear.front.all() and cost > 0 and a.shape[0] == 32 and t.isfinite().all()
+
+
+def near_far_shape(problem):
+    xx, xy, yy = problem.shape.unbind(1)
+    return torch.stack((torch.stack((xx, xy), -1), torch.stack((xy, yy), -1)), -2)
+
+
+@pytest.mark.parametrize("kernel", [None, "huber", "cauchy", "geman_mcclure"])
+def test_weight_slope_is_the_derivative_of_the_weight(kernel):
+    square = torch.tensor([0.01, 0.5, 3.0, 5.0, 40.0], dtype=D, requires_grad=True)
+    weight = robust(square, kernel, 2.0)[1]
+    expected = torch.autograd.grad(weight.sum(), square)[0] if weight.requires_grad else torch.zeros_like(square)
+    torch.testing.assert_close(weight_slope(square, kernel, 2.0), expected)
+
+
+# ------------------------------------------------------------------------------------------------ what is believed
+
+
+def test_rows_that_turn_are_found_and_undone():
+    args, T, b, z = pairs(30, 80, 160, turn=0.01)
+    loose, rigid = map_pose(*args), map_pose(*args, turn_sigma=0.0)
+    assert loose.ok.all()
+    assert (loose.shutter.turn - b).norm(dim=-1).median() < 0.1 * b.norm(dim=-1).median()
+    assert errors(loose, T)[:, :3].norm(dim=-1).median() < 0.5 * errors(rigid, T)[:, :3].norm(dim=-1).median()
+    far = torch.arange(240) >= 80
+    error = []
+    for fit in (loose, rigid):
+        estimate = two_view(*args[:2], fit, *args[2:4])
+        error.append((estimate.depth / z - 1).abs()[estimate.keep & far].median())
+    assert error[0] < 0.7 * error[1]
+    still = map_pose(*pairs(30, 80, 160)[0])
+    assert (still.shutter.turn.abs() < 1e-9).double().mean() > 0.9  # 2 % of the cost is not taken away by chance
+
+
+def test_far_tracks_that_contradict_are_left_out():
+    """The far scene turns on its own: the near tracks alone are answered, and it is said."""
+    args, T, _, _ = pairs(10, 80, 400, baseline=0.3, noise=0.1, depth=0.002)
+    camera_1, uv_1 = args[3], args[1].uv_1
+    ray = cam.rays(camera_1, uv_1)
+    turned = ray + torch.linalg.cross(torch.tensor([0.002, 0.004, 0.003], dtype=D).expand_as(ray), ray)
+    far = (torch.arange(480) >= 80)[:, None]
+    moved = put(args, uv_1=torch.where(far, cam.project(camera_1, turned), uv_1))
+    fit, believed, near = (
+        map_pose(*moved, turn_sigma=0.0, far_weight=weight, max_rise=rise)
+        for weight, rise in ((1.0, 0.1), (1.0, 1e9), (1e-9, 0.1))
+    )
+    assert (fit.code == PoseCode.KEPT_PNP).all() and (believed.code == PoseCode.OK).all()
+    torch.testing.assert_close(fit.T_1_from_0.t, near.T_1_from_0.t, rtol=0, atol=1e-4)
+    assert errors(fit, T)[:, 3:].norm(dim=-1).median() < 0.2 * errors(believed, T)[:, 3:].norm(dim=-1).median()
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_pure_rotation_is_silent(noise):
+    args, _, _, _ = pairs(20, 80, 160, baseline=0.0, noise=noise)
+    fit = map_pose(*args)
+    assert (fit.code == PoseCode.NO_BASELINE).all() and not fit.ok.any() and fit.T_1_from_0.t.isnan().all()
+    estimate = two_view(*args[:2], fit, *args[2:4])
+    assert (estimate.gate == Gate.NO_BASELINE).all()
+    if noise:
+        assert (map_pose(*args, translation_gain=-1e9).code != PoseCode.NO_BASELINE).all()
+
+
+def test_without_a_start_there_is_no_pose():
+    args, _, _, _ = pairs(3, 30, 60)
+    valid = args[1].valid.clone()
+    valid[0, 3:30], valid[1, :] = False, False
+    fit = map_pose(*put(args, valid=valid))
+    assert fit.code.tolist() == [PoseCode.TOO_FEW, PoseCode.TOO_FEW, PoseCode.OK]
+    for x in (fit.T_1_from_0.R, fit.T_1_from_0.t, fit.cov, fit.sigma_px, fit.t_snr, fit.shutter.turn, fit.shutter.cov):
+        assert x[:2].isnan().all() and x[2].isfinite().all()
+    assert not fit.inlier[:2].any()
+
+
+def test_mistracks_and_values_that_cannot_be_used_do_not_matter():
+    args, T, _, _ = pairs(20, 60, 140, noise=0.2)
+    clean = errors(map_pose(*args), T)[:, :3].norm(dim=-1).median()
+    wrong = torch.arange(200) % 10 < 3
+    g = torch.Generator().manual_seed(3)
+    anywhere = torch.rand(20, 200, 2, generator=g, dtype=D) * 450
+    dirty = put(args, uv_1=torch.where(wrong[:, None], anywhere, args[1].uv_1))
+    assert errors(map_pose(*dirty), T)[:, :3].norm(dim=-1).median() < 2 * clean
+    uv_1, cov = args[1].uv_1.clone(), args[1].cov.clone()
+    uv_1[:, wrong], cov[:, 5] = torch.nan, torch.nan
+    hidden = map_pose(*put(args, valid=args[1].valid & ~wrong, cov=cov))
+    spoilt = map_pose(*put(args, uv_1=uv_1, cov=cov))
+    torch.testing.assert_close(hidden.T_1_from_0.t, spoilt.T_1_from_0.t, rtol=0, atol=0)
+
+
+# ------------------------------------------------------------------------------------------------------ gradients
+
+
+def test_gradient_of_the_whole_stage_at_exact_data():
+    args, _, _, _ = pairs(1, 9, 7, noise=0.0, depth=0.0)
+    samples, tracks, camera_0, camera_1, draws = args
+    leaves = [
+        x.clone().requires_grad_() for x in (samples.xyz[:, :9], tracks.uv_0, tracks.uv_1, camera_0.f, camera_1.f)
+    ]
+
+    def pose(xyz, uv_0, uv_1, f_0, f_1):
+        full = torch.cat((xyz, samples.xyz[:, 9:]), 1)
+        moved = samples.replace(xyz=full), tracks.replace(uv_0=uv_0, uv_1=uv_1)
+        fit = map_pose(*moved, camera_0.replace(f=f_0), camera_1.replace(f=f_1), draws, steps=12, near_steps=8)
+        return fit.T_1_from_0.R, fit.T_1_from_0.t
+
+    assert torch.autograd.gradcheck(pose, leaves, eps=1e-6, atol=1e-5, rtol=1e-3, fast_mode=True)
+
+
+def test_gradients_stay_finite_whatever_the_input():
+    args, _, _, _ = pairs(4, 24, 40, noise=0.3)
+    xyz, uv_1, valid = args[0].xyz.clone(), args[1].uv_1.clone(), args[1].valid.clone()
+    xyz[0, :24:2], uv_1[1, ::3], valid[2] = torch.nan, torch.nan, False
+    xyz[3, :24] = xyz[3, :1]
+    leaves = [x.requires_grad_() for x in (xyz, uv_1, args[3].f.clone(), args[2].c.clone())]
+    moved = put(args, xyz=leaves[0], uv_1=leaves[1], valid=valid)
+    fit = map_pose(*moved[:2], moved[2].replace(c=leaves[3]), moved[3].replace(f=leaves[2]), moved[4])
+    (fit.T_1_from_0.R.nan_to_num().sum() + fit.T_1_from_0.t.nan_to_num().sum()).backward()
+    for x in leaves:
+        assert x.grad.isfinite().all()
+    assert not fit.cov.requires_grad and (leaves[1].grad[0] != 0).any()
+
+
+def test_options_have_one_default():
+    options = most_probable.Options()
+    defaults = map_pose.__kwdefaults__
+    assert {k: defaults[k] for k in options._asdict()} == options._asdict()
