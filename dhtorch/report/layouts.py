@@ -39,6 +39,20 @@ LEARNED: Known = (
     (r"dust3r(?:_oracle)?", None, "DUSt3R"),
     (r"vggt(?:_oracle)?", None, "VGGT-1B"),
 )
+HELIX: Known = (
+    ("own_arm", "own arm in time", "dual-helix correlation"),
+    ("between_arms", "between the arms", None),
+    ("best_arm", "the better of both", None),
+    ("flow", "plain flow", "plain 2-D optical flow"),
+    ("flow_along_arm", "plain flow along the arm", None),
+)
+ICP: Known = (("good", None, "device pose (VIO) alone"), (r"good \+ icp points", None, "ICP over it"))
+ATTENTION: Known = (
+    ("centre", "gaze at the centre", "before"),
+    ("attention", "gaze on the largest hole cluster", "gaze on the largest hole cluster"),
+    ("random", "gaze anywhere", None),
+    ("even", "even samples", None),
+)
 
 
 def in_layout(result: Result) -> list[Table]:
@@ -199,6 +213,27 @@ def _comparison(result: Result) -> list[Table]:
     return [by_variant(result, "Methods, over scenes", ["n_scenes", *measured])]
 
 
+def _helix(result: Result) -> list[Table]:
+    columns = ("n_scenes", "corr", "rank_corr", "corr_answered", "coverage", "flow_share")
+    title = "Shift as a depth cue: correlation with the sensor's inverse depth, medians over scenes"
+    return [by_variant(result, title, columns, lines(result, HELIX), published.HELIX)]
+
+
+def _icp(result: Result) -> list[Table]:
+    columns: tuple[str, ...] = ("n_scenes", "n_voxels", "voxels_vs_pose", "right_share", "confident_share")
+    columns += ("rotation_deg", "drift_deg", "drift_rel")
+    title = "ICP over poses from elsewhere, medians over scenes; voxels added up"
+    return [by_variant(result, title, columns, lines(result, ICP), published.ICP)]
+
+
+def _attention(result: Result) -> list[Table]:
+    columns = ("n_scenes", "hole_rate", "rise", "cluster_share", "cluster_returns")
+    routes = ("n_scenes", *(f"route_share.{r}" for r in ("triangulate", "change_exposure", "get_closer", "turn_head")))
+    title = "Looking at the holes, medians over scenes"
+    found = by_variant(result, title, columns, lines(result, ATTENTION), published.ATTENTION)
+    return [found, by_variant(result, "What the holes ask for", routes)]
+
+
 LAYOUTS: dict[str, Callable[[Result], list[Table]]] = {
     "range_split": _range_split,
     "real_holes": _real_holes,
@@ -212,6 +247,9 @@ LAYOUTS: dict[str, Callable[[Result], list[Table]]] = {
     "ablation": _ablation,
     "latency": timings.latency,
     "method_comparison": _comparison,
+    "helix_correlation": _helix,
+    "icp": _icp,
+    "hole_attention": _attention,
 }
 #: Columns that stand in these tables and need not be repeated.
 SHOWN = ("trackability_hole", "trackability_valid", "passes", "parameters", "weight_bytes", *DERIVED)

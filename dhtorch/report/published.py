@@ -186,10 +186,31 @@ MOTION = Published(
     ),
 )
 
+HELIX = Published(
+    "section 4",
+    "captures of its own, mostly; inverse depth of the LiDAR",
+    _table("corr", {"dual-helix correlation": "−0.04", "plain 2-D optical flow": "+0.34"}),
+    ("Under forward motion the flow is radial, and a tangential correlation does not see it.",),
+)
+
+ICP = Published(
+    "section 4",
+    "captures of its own, mostly",
+    _table("n_voxels", {"device pose (VIO) alone": "6,200", "ICP over it": "5,417"}),
+    ("Rarely confident over a good pose; of use where there is none.",),
+)
+
+ATTENTION = Published(
+    "section 4",
+    "captures of its own, mostly",
+    _table("hole_rate", {"before": "0.67", "gaze on the largest hole cluster": "0.78"}),
+    ("Use of the holes: routing, what may need a head turn.",),
+)
+
 
 def number(text: str | None) -> float | None:
     """A printed figure as a number, per cent as a share; None where it is a range, a word or nothing."""
-    found = re.fullmatch(r"([−-]?[\d,]+(?:\.\d+)?) ?(%|M|B)?", text or "")
+    found = re.fullmatch(r"([+−-]?[\d,]+(?:\.\d+)?) ?(%|M|B)?", text or "")
     if not found:
         return None
     scale = {"%": 0.01, "M": 1e6, "B": 1e9, None: 1.0}[found[2]]
