@@ -163,6 +163,7 @@ def test_forward_motion_is_not_seen_where_plain_flow_sees_it():
     found = {v: outcome.scenes(v)["synthetic_room"] for v in experiment.VARIANTS}
     assert found["flow"]["corr"] > 0.6 and found["own_arm"]["corr"] < 0.5 * found["flow"]["corr"]
     assert found["flow_along_arm"]["flow_share"] < 0.15 and found["own_arm"]["flow_share"] < 0.3
+    assert found["flow_along_arm"]["along_share"] == 1 and found["own_arm"]["along_share"] > 0.5
     assert found["flow"]["coverage"] > 0.8 and outcome.verdict == "supported"
     pairs = [r for r in outcome.rows if r["pair"] is not None]
     assert len(pairs) == 5 * outcome.n_pairs and "own_arm.corr" in outcome.summary

@@ -42,6 +42,9 @@ MIN_SITES = 20
 #: Flow below it (px) has no share that could be seen.
 MOVED_PX = 1.0
 
+#: Shifts this near to each other (px) are the same.
+ALIKE_PX = 2.0
+
 #: Points of the sampler per step (1 px) of an arm, from which its even steps are read: plenty.
 DENSE = 4
 
@@ -72,8 +75,9 @@ def run(
     Rows, per pair and per scene: ``corr`` (Pearson) and ``rank_corr`` (Spearman) of the size of the shift with inverse
     depth, over the sites that the own arm and the tracker answer, so that all are judged alike; ``corr_answered``, over
     those that the variant itself answers; ``coverage``, their share of the candidates; ``median_shift_px``;
-    ``flow_share``, the median of its shift over plain flow's. A candidate is a site with texture whose return passes
-    the truth test. Nothing is hidden from anyone.
+    ``flow_share``, the median of its shift over plain flow's; ``along_share``, of the common sites those whose shift is
+    within 2 px of what plain flow has along the arm: the rest recognised something else. A candidate is a site with
+    texture whose return passes the truth test. Nothing is hidden from anyone.
 
     Args:
         recordings, pairs, settings, progress: as :func:`dhtorch.experiments.protocol.run`.
@@ -182,8 +186,8 @@ def _pair(
         "flow_along_arm": ((flow * tangent).sum(-1).abs(), tracks.valid[0]),
     }
     common = candidate & (peaks > 0) & tracks.valid[0]
-    sites_of = (samples.depth[0], candidate, common, flow.norm(dim=-1))
-    return {name: _numbers(*shift, *sites_of) for name, shift in found.items()}
+    plain = (flow.norm(dim=-1), found["flow_along_arm"][0])
+    return {name: _numbers(*shift, samples.depth[0], candidate, common, *plain) for name, shift in found.items()}
 
 
 def _against(
@@ -205,7 +209,9 @@ def _against(
     return (at - arms[a].uv[site]).norm(dim=-1), shift.lag[0], shift.peak[0]
 
 
-def _numbers(shift: Tensor, answered: Tensor, depth: Tensor, candidate: Tensor, common: Tensor, flow: Tensor) -> Row:
+def _numbers(
+    shift: Tensor, answered: Tensor, depth: Tensor, candidate: Tensor, common: Tensor, flow: Tensor, along: Tensor
+) -> Row:
     """How the size of the shift (K,) goes with inverse depth."""
     mine = candidate & answered
     same = mine & common
@@ -224,5 +230,6 @@ def _numbers(shift: Tensor, answered: Tensor, depth: Tensor, candidate: Tensor, 
         "rank_corr": over(same, spearman),
         "corr_answered": over(mine, pearson),
         "median_shift_px": median(shift[mine].tolist()),
+        "along_share": float(((shift - along).abs() < ALIKE_PX)[same].float().mean()) if bool(same.any()) else None,
         "flow_share": median((shift / flow.clamp_min(MOVED_PX))[moved].tolist()),
     }

@@ -22,6 +22,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dhtorch.evaluate import bootstrap
 from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, adapt, quiet, refill
 from dhtorch.experiments.rows import Row
 from dhtorch.experiments.screening import Item, paired, screen
@@ -121,10 +122,12 @@ def verdict(outcome: Outcome) -> tuple[bool | None, str]:
         return None, "no scene with a trajectory and depth in two frames"
     fewer, nearer = (sum(a < b for a, b in both) for both in (covered, lost))
     total = [sum(pair[k] for pair in covered) for k in (0, 1)]
+    ratio = bootstrap.interval([a / max(b, 1) for a, b in covered])
+    low, high = (ratio.value if bound is None else bound for bound in (ratio.low, ratio.high))
     sure = [r["confident_share"] for r in outcome.scenes("good + icp points", TRUTH).values() if r["n_pairs"]]
     why = (
         f"over a good pose ICP covers {total[0]:.0f} voxels, the pose alone {total[1]:.0f} (paper: 5417, 6200), fewer"
-        f" on {fewer} of {len(covered)} scenes, {sum(sure) / len(sure):.0%} of the links confident; without a pose it"
+        f" on {fewer} of {len(covered)} scenes, median ratio {ratio.value:.2f} ({low:.2f} to {high:.2f}), {sum(sure) / len(sure):.0%} of the links confident; without a pose it"
         f" ends nearer than the identity on {nearer} of {len(lost)}"
     )
     return fewer > len(covered) / 2 and nearer > len(lost) / 2, why

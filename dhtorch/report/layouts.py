@@ -214,7 +214,7 @@ def _comparison(result: Result) -> list[Table]:
 
 
 def _helix(result: Result) -> list[Table]:
-    columns = ("n_scenes", "corr", "rank_corr", "corr_answered", "coverage", "flow_share")
+    columns = ("n_scenes", "corr", "rank_corr", "corr_answered", "coverage", "flow_share", "along_share")
     title = "Shift as a depth cue: correlation with the sensor's inverse depth, medians over scenes"
     return [by_variant(result, title, columns, lines(result, HELIX), published.HELIX)]
 
