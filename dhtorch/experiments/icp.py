@@ -127,8 +127,9 @@ def verdict(outcome: Outcome) -> tuple[bool | None, str]:
     sure = [r["confident_share"] for r in outcome.scenes("good + icp points", TRUTH).values() if r["n_pairs"]]
     why = (
         f"over a good pose ICP covers {total[0]:.0f} voxels, the pose alone {total[1]:.0f} (paper: 5417, 6200), fewer"
-        f" on {fewer} of {len(covered)} scenes, median ratio {ratio.value:.2f} ({low:.2f} to {high:.2f}), {sum(sure) / len(sure):.0%} of the links confident; without a pose it"
-        f" ends nearer than the identity on {nearer} of {len(lost)}"
+        f" on {fewer} of {len(covered)} scenes, median ratio {ratio.value:.2f} ({low:.2f} to {high:.2f}),"
+        f" {sum(sure) / len(sure):.0%} of the links confident; without a pose it ends nearer than the identity on"
+        f" {nearer} of {len(lost)}"
     )
     return fewer > len(covered) / 2 and nearer > len(lost) / 2, why
 
