@@ -18,6 +18,7 @@ from dhtorch.geometry import (
     camera,
     covariance,
     epipolar,
+    filters,
     least_squares,
     lookup,
     most_probable,
@@ -27,8 +28,9 @@ from dhtorch.geometry import (
     ransac,
     se3,
     steady,
+    thin_lens,
 )
-from dhtorch.negative import helix_correlation, hole_attention, icp
+from dhtorch.negative import defocus, defocus_fusion, focus_stack, helix_correlation, hole_attention, icp
 from dhtorch.records import Camera, Frame, Samples, Tracks
 from dhtorch.stages import backproject, holes, pose, score, track, triangulate
 
@@ -208,6 +210,34 @@ def with_options(fn, **options):
     return functools.update_wrapper(functools.partial(fn, **options), fn)
 
 
+def lenses(batch, dtype):
+    """A fast lens behind which a metre is a few pixels of blur."""
+    values = ((0.03, 0.04), (1.0, 2.0), (1e-4, 2e-4))
+    return thin_lens.Lens(*(uniform(batch, dtype=dtype, low=a, high=b, seed=k) for k, (a, b) in enumerate(values)))
+
+
+def stacks(batch, n, dtype):
+    """A picture and ever softer copies of it."""
+    image = shifted(batch, n, dtype)[0]
+    return torch.stack([filters.gaussian(image, s) for s in (1.0, 0.0, 1.5, 2.5)], 1)
+
+
+def blurs(batch, n, dtype):
+    image = uniform(batch, 1, *HW, dtype=torch.float64, seed=7).round().to(dtype)
+    return defocus.local_blur(filters.gaussian(torch.nn.functional.avg_pool2d(image, 5, 1, 2), 1.0))
+
+
+def sensed(batch, n, dtype):
+    coarse = uniform(batch, 8, 12, dtype=dtype, low=1, high=3)
+    coarse[:, 2, 3] = 0
+    return coarse, uniform(batch, 3, *HW, dtype=dtype)
+
+
+def filled(batch, n, dtype):
+    coarse, _ = sensed(batch, n, dtype)
+    return defocus_fusion.bilinear(coarse, HW), coarse, blurs(batch, n, dtype)
+
+
 def wrong_last_axis(position):
     """A call whose argument at ``position`` lacks its last column."""
     return lambda args: tuple(tensor_map(lambda v: v[..., :-1], a) if k == position else a for k, a in enumerate(args))
@@ -285,7 +315,7 @@ ROWS = [
     Row(near_far.prior, lambda b, n, d: (uniform(b, dtype=d),), POINTLESS, grad=(0,)),
     Row(most_probable.noise_scale, lambda b, n, d: problems(b, n, d)[:2], "dtype batch vmap capture"),
     Row(most_probable.most_probable, lambda b, n, d: (problems(b, n, d)[0], problems(b, n, d)[1].T, most_probable.Options()), "batch vmap capture"),
-    Row(most_probable.covariance, lambda b, n, d: (problems(b, n, d)[0], most_probable.Solution(*weighed(b, n, d)[1:5]), most_probable.Options()), "batch vmap capture"),
+    Row(most_probable.covariance, lambda b, n, d: (problems(b, n, d)[0], most_probable.Solution(*weighed(b, n, d)[1:5], torch.ones(b, dtype=torch.bool)), most_probable.Options()), "batch vmap capture"),
     Row(covariance.noise_shape, lambda b, n, d: (tracked(b, n, d)[1].cov * uniform(b, n, 1, 1, dtype=d, low=0.5), torch.ones(b, n, dtype=torch.bool), 0.1), "dtype batch vmap capture gradcheck empty shuffle raises", (0, 1), (0,), bad=wrong_last_axis(0)),
     Row(covariance.median, lambda b, n, d: (uniform(b, n, dtype=d), uniform(b, n, dtype=d, seed=1) > 0.3), "dtype batch vmap capture gradcheck empty shuffle raises", (0, 1), (0,), bad=wrong_last_axis(1)),
     Row(covariance.from_normal, lambda b, n, d: (positive(b, n, d), uniform(b, dtype=d, low=0.1)), "dtype batch vmap capture"),
@@ -305,6 +335,24 @@ ROWS = [
     Row(with_options(icp.normals, neighbours=4), lambda b, n, d: registered(b, n, d)[:1], "dtype batch vmap capture shuffle raises", (0,), bad=wrong_last_axis(0)),
     Row(hole_attention.largest_cluster, clustered, "dtype batch vmap capture shuffle raises", (0, 1), bad=wrong_last_axis(0)),
     Row(holdout.candidates, judged, "dtype batch vmap capture empty shuffle raises", (0, 1), bad=lambda a: (a[0], a[1].replace(depth=a[1].depth[:, 1:]), a[2])),
+    Row(filters.separable, lambda b, n, d: (frames(b, n, d)[0].image, [0.25, 0.5, 0.25], [-0.5, 0.0, 0.5]), POINTLESS + " raises", grad=(0,), bad=lambda a: (a[0][0], *a[1:])),
+    Row(filters.gaussian, lambda b, n, d: (frames(b, n, d)[0].image, 1.2), POINTLESS + " raises", grad=(0,), bad=lambda a: (a[0][0], a[1])),
+    Row(filters.box, lambda b, n, d: (frames(b, n, d)[0].image, 2), POINTLESS + " raises", grad=(0,), bad=lambda a: (a[0][0], a[1])),
+    Row(thin_lens.spot_gain, lambda b, n, d: (lenses(b, d), uniform(b, 3, dtype=d, low=1, high=4)), POINTLESS + " raises", grad=(0, 1), bad=lambda a: (a[0], a[1][:, 0])),
+    Row(thin_lens.spot_diameter, lambda b, n, d: (lenses(b, d), uniform(b, n, dtype=d, low=1, high=4), uniform(b, dtype=d, low=1, high=4, seed=1)), ALL, (1,), (0, 1, 2), bad=lambda a: (a[0], a[1], a[2][None])),
+    Row(thin_lens.depth_of_spot, lambda b, n, d: (lenses(b, d), uniform(b, n, dtype=d, low=-2, high=0.5), uniform(b, dtype=d, low=1, high=2, seed=1)), ALL, (1,), (0, 1, 2), bad=lambda a: (a[0], a[1], a[2][None])),
+    Row(defocus.local_blur, lambda b, n, d: (shifted(b, n, d)[0],), "dtype batch vmap capture raises", bad=lambda a: (a[0][0],)),
+    Row(defocus.inverse_depth, lambda b, n, d: (blurs(b, n, d), torch.ones(b, *HW, dtype=d), lenses(b, d), uniform(b, dtype=d, low=1, high=2)), "dtype batch vmap capture raises", bad=wrong_last_axis(1)),
+    Row(defocus.side_by_height, lambda b, n, d: (blurs(b, n, d),), "dtype vmap capture"),
+    Row(defocus.side_by_colour, lambda b, n, d: (frames(b, n, d)[0].image,), "dtype batch vmap capture raises", bad=lambda a: (a[0][:, :2],)),
+    Row(focus_stack.sharpness, lambda b, n, d: (stacks(b, n, d),), POINTLESS + " raises", grad=(0,), bad=lambda a: (a[0][0],)),
+    Row(focus_stack.sharpest, lambda b, n, d: (focus_stack.sharpness(stacks(b, n, d)),), "dtype batch vmap capture raises", bad=lambda a: (a[0][0],)),
+    Row(focus_stack.depth_at, lambda b, n, d: (uniform(b, *HW, dtype=d, high=3), torch.tensor([0.5, 1.0, 2.0, 4.0], dtype=d).expand(b, 4)), "dtype batch gradcheck raises", grad=(0, 1), bad=lambda a: (a[0][0], a[1])),
+    Row(focus_stack.align, lambda b, n, d: (stacks(b, n, d),), "dtype raises", bad=lambda a: (a[0][0],)),
+    Row(defocus_fusion.bilinear, lambda b, n, d: (sensed(b, n, d)[0], HW), "dtype batch vmap capture raises", bad=lambda a: (a[0][0], a[1])),
+    Row(defocus_fusion.joint_bilateral, sensed, "dtype vmap capture gradcheck raises", grad=(1,), bad=lambda a: (a[0][0], a[1])),
+    Row(defocus_fusion.guided_filter, lambda b, n, d: (filled(b, n, d)[0], sensed(b, n, d)[1]), "dtype batch vmap capture gradcheck raises", grad=(1,), bad=wrong_last_axis(0)),
+    Row(defocus_fusion.defocus_guided, filled, "dtype vmap capture raises", bad=wrong_last_axis(0)),
 ]  # fmt: skip
 
 #: Functions without a batch of points: samplers, loops over a callable, flat lists of pooled points. Their promises are
@@ -312,6 +360,7 @@ ROWS = [
 ELSEWHERE = {
     *(f"dhtorch.stages.sample.{name}" for name in ("spiral", "vogel", "grid")),
     "dhtorch.geometry.shapes.check",
+    "dhtorch.geometry.filters.gaussian_taps",
     *(f"dhtorch.window.{name}" for name in ("inverse_variance", "key_views", "extend_window")),
     "dhtorch.geometry.least_squares.minimise",
     *(f"dhtorch.geometry.lucas_kanade.{n}" for n in ("search", "step", "squares", "covariance", "for_some", "within")),

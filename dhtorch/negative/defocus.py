@@ -10,8 +10,6 @@ Alphabet: ``sigma`` px, standard deviation of the blur; ``side`` −1 in front o
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -38,7 +36,7 @@ def local_blur(
     coarse_px: float = 2.0,
     window_px: float = 6.0,
     noise: float = 1 / 255,
-    min_snr: float = 8.0,
+    min_snr: float = 60.0,
     max_sigma_px: float = 8.0,
 ) -> Blur:
     """Standard deviation of the blur around every pixel, from gradients at two scales.
@@ -157,5 +155,5 @@ def _gradient_energy(grey: Tensor, width_px: float, window_px: float, noise: flo
     """Mean squared gradient (B, H, W) in a window, and what of it is expected of noise (already taken off)."""
     smooth, slope = gaussian_taps(width_px), gaussian_taps(width_px, derivative=True)
     across, down = separable(grey, smooth, slope), separable(grey, slope, smooth)
-    expected = 2 * noise * noise * math.fsum(w * w for w in smooth) * math.fsum(w * w for w in slope)
+    expected = 2 * noise * noise * sum([w * w for w in smooth]) * sum([w * w for w in slope])
     return (gaussian(across * across + down * down, window_px) - expected)[:, 0], expected
