@@ -90,16 +90,14 @@ def two_view(
         uv_1 = straighten(uv_1.transpose(1, 2), camera_1.f, camera_1.c, y, turn).transpose(1, 2)
     geometry = solver(uv_0, uv_1, camera_0, camera_1, _stand_in(fit))
     parallax_deg = geometry.parallax * (180 / math.pi)
-    cov = tracks.cov
-    if fitted_noise:
-        scale = torch.where(posed, fit.sigma_px[:, None], 1.0).to(cov.dtype)
-        cov = noise_shape(cov, tracked, isotropic) * (scale * scale)[..., None, None]
-    own, shared = _variance(geometry, cov, fit, y)
     mismatch = tracks.photometric / samples.trackability.clamp_min(MIN_TRACKABILITY).sqrt()
+    cov = _fitted(tracks.cov, tracked, fit, isotropic) if fitted_noise else tracks.cov
+    own, shared = _variance(geometry, cov, fit, y)
+    own, shared = own * sigma_scale**2, shared * sigma_scale**2
     if mismatch_px is not None:
         own = own * (1 + (mismatch / mismatch_px) ** 2)
-    common = sensor_share * _relative_noise(samples, fit) * geometry.depth
-    own, shared = own * sigma_scale**2, shared * sigma_scale**2 + common * common
+    if sensor_share > 0:
+        shared = shared + (sensor_share * _relative_noise(samples, fit) * geometry.depth) ** 2
     behind = ~((geometry.depth > 0) & (geometry.depth_1 > 0))
     limit = None if max_sigma_rel is None else (max_sigma_rel * geometry.depth) ** 2
     gate = first_reason(
@@ -140,6 +138,12 @@ def _relative_noise(samples: Samples, fit: PoseFit) -> Tensor:
     used = fit.inlier & (samples.depth > 0)
     relative = samples.sigma / torch.where(used, samples.depth, torch.ones_like(samples.depth))
     return torch.where(used.any(-1, keepdim=True), median(relative, used), 0.0)
+
+
+def _fitted(cov: Tensor, tracked: Tensor, fit: PoseFit, isotropic: float) -> Tensor:
+    """Covariances of the tracks with the shape they state and the scale that the pose's residuals have."""
+    scale = torch.where(fit.ok[:, None], fit.sigma_px[:, None], 1.0).to(cov.dtype)
+    return noise_shape(cov, tracked, isotropic) * (scale * scale)[..., None, None]
 
 
 def _above(x: Tensor, limit: Tensor | float | None) -> Tensor:
