@@ -100,6 +100,21 @@ def test_variants_share_tracks_and_pay_for_them():
     assert set(outcome.points) == {("synthetic_room", name, "full") for name in variants}
 
 
+def test_views_of_a_window_are_shared_too():
+    asked = []
+
+    def track(image_0, image_1, uv_0, *, uv_1_init=None, pyramid_0=None):
+        asked.append(uv_1_init)
+        return lucas_kanade(image_0, image_1, uv_0, uv_1_init=uv_1_init)
+
+    base = protocol.refill(method("window"), track=track, views=3)
+    variants = {name: protocol.Variant(base, seed=k) for k, name in enumerate(("first", "second"))}
+    outcome = protocol.run([small()], protocol.Protocol(variants), partial(by_gap, gap=3), protocol.Settings())
+    assert len(asked) == 3 and asked[0] is None and asked[2] is not None, "one search for each view, not for each seed"
+    first, second = (scene_row(outcome, method=name) for name in variants)
+    assert first["ms"]["track"] == pytest.approx(second["ms"]["track"], rel=0.5)
+
+
 def test_refill_changes_a_seat_or_its_options_and_nothing_else():
     base = method("paper")
     changed = protocol.refill(base, n=64, track={"levels": 6}, score=len)
@@ -132,9 +147,7 @@ def test_curves_of_a_scene_are_what_its_points_say():
 
 def test_candidates_do_not_depend_on_the_method():
     methods = {name: method(name) for name in ("paper", "opencv")}
-    outcome = opencv_twin.run(
-        [small(lidar="exact")], {}, partial(by_gap, gap=2), pair.Settings(), methods=methods
-    )
+    outcome = opencv_twin.run([small(lidar="exact")], {}, partial(by_gap, gap=2), pair.Settings(), methods=methods)
     for truth in ("raw", "5x5", "full"):
         a, b = (scene_row(outcome, method=m, truth=truth) for m in methods)
         assert a["n_candidates"] == b["n_candidates"] and a["n_dropped"] == b["n_dropped"]

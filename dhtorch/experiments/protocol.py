@@ -338,10 +338,11 @@ class _Scene:
     def add(self, batch: Batch) -> None:
         """Run all variants on one batch of pairs."""
         near = self.protocol.hide(batch.anchor, self.cutoff)
-        seen = tuple(self.protocol.hide(view, self.cutoff) for view in batch.others)
+        views = tuple(self.protocol.hide(view, self.cutoff) for view in batch.others)
+        seen = {n: tree.stack(views[-n:]) if n > 1 else views[-1] for n in map(n_views, self._methods())}
         shared, enough = SharedTracks(), [True] * len(batch.pairs)
         for k, (name, variant) in enumerate(self.variants.items()):
-            estimate, trace = self._ask(variant, batch, near, seen, shared)
+            estimate, trace = self._ask(variant, batch, near, seen[n_views(variant.method)], shared)
             truths = {cohort: of(batch, trace) for cohort, of in self.protocol.cohorts.items()}
             answer = Answer(batch, name, estimate, trace, truths)
             if k == 0:
@@ -379,8 +380,11 @@ class _Scene:
                 rows.append(row)
         return rows
 
+    def _methods(self) -> list[Method]:
+        return [variant.method for variant in self.variants.values()]
+
     def _ask(
-        self, variant: Variant, batch: Batch, near: Frame, seen: tuple[Frame, ...], shared: SharedTracks
+        self, variant: Variant, batch: Batch, near: Frame, seen: Frame, shared: SharedTracks
     ) -> tuple[Estimate, Trace]:
         method = variant.method
         trace: Trace = {}
@@ -390,10 +394,8 @@ class _Scene:
         if variant.fit is not None:
             options["fit"] = variant.fit(batch, method.keywords["n"])
         options |= variant.given(batch)
-        views = n_views(method)
         with torch.no_grad():
-            other = seen[-1] if views == 1 else tree.stack(seen[-views:])
-            estimate = method(near, other, trace=trace, **options)
+            estimate = method(near, seen, trace=trace, **options)
         shared.charge(trace["ms"])
         return estimate, trace
 

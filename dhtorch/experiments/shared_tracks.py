@@ -19,12 +19,12 @@ Track = Callable[..., Tracks]
 class SharedTracks:
     """Remembers the tracks of one batch of pairs.
 
-    A seat filled by the same function with the same options, asked about the same images and pixels, gets the same
-    record. Its time is charged to every variant as if each had tracked.
+    A seat filled by the same function with the same options, asked about the same images, pixels and initial values,
+    gets the same record. Its time is charged to every variant as if each had tracked.
     """
 
     def __init__(self) -> None:
-        self._known: list[tuple[Any, Tensor, Tensor, Tensor, Tracks, float]] = []
+        self._known: list[tuple[Any, tuple[Tensor, ...], Tracks, float]] = []
         self._owed = 0.0
 
     def seat(self, track: Track) -> Track:
@@ -40,18 +40,33 @@ class SharedTracks:
             ms["track"] = ms.get("track", 0.0) + self._owed
             self._owed = 0.0
 
-    def _track(self, track: Track, image_0: Tensor, image_1: Tensor, uv_0: Tensor, **options: Any) -> Tracks:
-        if options:  # initial values or a pyramid of the caller's own: not the same question
-            return track(image_0, image_1, uv_0, **options)
-        key = _key(track)
-        for known, a, b, uv, tracks, ms in self._known:
-            if known == key and a is image_0 and b is image_1 and torch.equal(uv, uv_0):
+    def _track(
+        self,
+        track: Track,
+        image_0: Tensor,
+        image_1: Tensor,
+        uv_0: Tensor,
+        *,
+        uv_1_init: Tensor | None = None,
+        **options: Any,  # a pyramid of image_0: says nothing that the image does not
+    ) -> Tracks:
+        start = time.perf_counter()
+        key, question = _key(track), (image_0, image_1, uv_0, uv_0 if uv_1_init is None else uv_1_init)
+        for known, asked, tracks, ms in self._known:
+            if known == key and all(map(_same, asked, question)):
                 self._owed += ms
                 return tracks
-        start = time.perf_counter()
-        tracks = track(image_0, image_1, uv_0)
-        self._known.append((key, image_0, image_1, uv_0, tracks, 1e3 * (time.perf_counter() - start)))
+        given = options if uv_1_init is None else {**options, "uv_1_init": uv_1_init}
+        tracks = track(image_0, image_1, uv_0, **given)
+        self._known.append((key, question, tracks, 1e3 * (time.perf_counter() - start)))
         return tracks
+
+
+def _same(a: Tensor, b: Tensor) -> bool:
+    """The same memory, or equal values; images are not read where their place already tells."""
+    if a.shape != b.shape or a.dtype != b.dtype:
+        return False
+    return (a.data_ptr() == b.data_ptr() and a.stride() == b.stride()) or (a.ndim < 4 and torch.equal(a, b))
 
 
 def _key(fn: Any) -> Any:
