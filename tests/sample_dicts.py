@@ -15,7 +15,7 @@ NEAR = 2.0
 
 @cache
 def room():
-    return SyntheticRoom(hw=(SIDE, SIDE), n_frames=12, lidar="exact", image_noise=0.0)
+    return SyntheticRoom(hw=(SIDE, SIDE), n_frames=12, lidar="exact", image_noise=0.0, supersample=1)
 
 
 @cache

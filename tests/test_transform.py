@@ -6,6 +6,7 @@ import pickle
 import warnings
 from functools import partial
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -196,6 +197,16 @@ def as_dotted(s):
 )
 def test_layouts_of_one_sample_give_one_answer(sample, change, options):
     assert same(transform()(sample), transform(**options)(change(sample)))
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+def test_other_floating_types_are_lifted(sample, dtype):
+    sample = as_float_chw(sample)
+    changed = {k: sample[k].to(dtype) for k in ("image", "before", "depth")}
+    out = added(transform()({**sample, **changed}))
+    assert out["depth"].dtype == torch.float32 and all(v.isfinite().all() for v in out.values())
+    both = out["valid"] & added(transform()(sample))["valid"]
+    assert both.sum() > 100 and out["pose_ok"]
 
 
 def test_intrinsics_may_be_given_once_or_belong_to_another_size(sample):
@@ -494,6 +505,19 @@ def test_a_whole_batch_skipped(items):
     assert batches[0] == {"dhtorch.skipped": 2} and batches[1]["dhtorch.depth"].shape == (2, N)
     with pytest.raises(SampleError, match="neither item 0 nor its neighbours"):
         ExtendedDataset(Frames(items[:2], {0, 1}), transform(on_error="flag"))[0]
+
+
+class Threads(Frames):
+    def __getitem__(self, i):
+        return {"torch": torch.get_num_threads(), "cv2": cv2.getNumThreads()}
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_one_thread_in_a_worker(items):
+    cv2.setNumThreads(2)
+    batches, _ = loaded(Threads(items[:2]), 1, "fork")
+    assert batches[0]["torch"].tolist() == batches[0]["cv2"].tolist() == [1, 1] and cv2.getNumThreads() == 2
+    cv2.setNumThreads(1)
 
 
 def test_it_pickles_and_copies(sample):
