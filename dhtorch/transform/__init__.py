@@ -14,9 +14,10 @@ from dhtorch.transform.adapters import (
     one_thread,
 )
 from dhtorch.transform.extend_depth import ExtendDepth
+from dhtorch.transform.leaves import SampleError
 from dhtorch.transform.problems import Problem
 from dhtorch.transform.tokens import CHANNELS, grid, patch_tokens
-from dhtorch.transform.views import SampleError, Views
+from dhtorch.transform.views import Views
 
 __all__ = [
     "CHANNELS",

@@ -18,7 +18,7 @@ import torch
 from torch.utils.data import Dataset, IterableDataset, default_collate
 
 from dhtorch.transform.extend_depth import ExtendDepth
-from dhtorch.transform.views import SampleError, find
+from dhtorch.transform.leaves import SampleError, find
 
 #: Neighbours asked for the shapes of a sample that could not be loaded.
 _NEIGHBOURS = 16

@@ -19,9 +19,10 @@ from dhtorch.records import Estimate, Frame, PoseFit, Samples
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.holes import classify
 from dhtorch.stages.sample import spiral
+from dhtorch.transform.leaves import SampleError, find, to_tensor
 from dhtorch.transform.problems import Problem, Tally
 from dhtorch.transform.tokens import CHANNELS, FITS, grid, patch_tokens
-from dhtorch.transform.views import Read, SampleError, Views, find, to_tensor
+from dhtorch.transform.views import Read, Views
 
 #: Methods that have a name; any function called and answering like :func:`dhtorch.extend` will do as well.
 METHODS: dict[str, Callable[..., Estimate]] = {"paper": extend}

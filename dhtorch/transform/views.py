@@ -13,12 +13,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from dhtorch.geometry import camera as cam
 from dhtorch.records import Camera, Frame
+from dhtorch.transform.leaves import Leaves, Numbers, SampleError
 from dhtorch.tree import stack
 
 #: Units per metre of the depths that have a name.
@@ -29,13 +29,6 @@ PROBES = 16384
 
 #: The shapes of the image and the depth map may differ by this share; a transposed map differs by far more.
 MAX_ASPECT = 0.1
-
-#: Where the numbers are: a key of the sample, or the numbers themselves, the same for every sample.
-Numbers = str | Sequence[float]
-
-
-class SampleError(ValueError):
-    """A sample cannot be read as stated; the message names the key, what was found and what was expected."""
 
 
 class Read(NamedTuple):
@@ -100,46 +93,46 @@ class Views:
             SampleError: a key is missing, or a shape or dtype is not what was stated. Values that contradict what was
                 stated are in ``bad``.
         """
-        source = _Source(sample, batched, dtype)
-        images = source.images(self.image, self.layout)
+        leaves = Leaves(sample, batched, dtype)
+        images = leaves.images(self.image, self.layout)
         T, hw = images.shape[1], (images.shape[-2], images.shape[-1])
         at = _place(self.at, T, self.image)
         checks = [_in_unit_range(images[:, at], self.image)]
-        depths = self._metres(source.planes(self.depth, T))
+        depths = self._metres(leaves.planes(self.depth, T))
         depth = depths[:, at if depths.shape[1] > 1 else 0].contiguous()
         checks += self._depth_checks(depth)
-        conf = None if self.confidence is None else source.planes(self.confidence, T)
+        conf = None if self.confidence is None else leaves.planes(self.confidence, T)
         if conf is not None:
             conf = conf[:, at if conf.shape[1] > 1 else 0]
             checks.append(_is_level(conf, self.confidence))
             conf = conf.clamp(0, 2).to(torch.uint8).contiguous()
             if conf.shape != depth.shape:
                 raise SampleError(f"{self.confidence}: found {_size(conf)}, expected {_size(depth)} as {self.depth}")
-        camera = self._camera(source, self.intrinsics, hw, T, at, checks)
-        anchor = Frame(images[:, at].contiguous(), depth, camera, self._depth_camera(source, depth, hw, T, at), conf)
-        other, paired = self._other(source, images, depths, anchor, checks)
+        camera = self._camera(leaves, self.intrinsics, hw, T, at, checks)
+        anchor = Frame(images[:, at].contiguous(), depth, camera, self._depth_camera(leaves, depth, hw, T, at), conf)
+        other, paired = self._other(leaves, images, depths, anchor, checks)
         bad = torch.stack([c[0] for c in checks]).any(0)
         return Read(anchor, other, paired, bad, tuple(checks))
 
     def image_hw(self, sample: Mapping[str, Any]) -> tuple[int, int] | None:
         """Size of the anchor's image, None where it cannot be read."""
         try:
-            images = _Source(sample, False, torch.float32).images(self.image, self.layout)
+            images = Leaves(sample, False, torch.float32).images(self.image, self.layout)
         except SampleError:
             return None
         return images.shape[-2], images.shape[-1]
 
     def _other(
-        self, source: _Source, images: Tensor, depths: Tensor, anchor: Frame, checks: list[Any]
+        self, leaves: Leaves, images: Tensor, depths: Tensor, anchor: Frame, checks: list[Any]
     ) -> tuple[Frame | None, Tensor]:
         T = images.shape[1]
         at = _place(self.at, T, self.image)
         key = self.image if self.other_image is None else self.other_image
         if self.other_image is not None:
-            images = source.images(key, self.layout)
+            images = leaves.images(key, self.layout)
         wanted = [self.other_at] if isinstance(self.other_at, int) else self.other_at
         places = [_place(p, images.shape[1], key) for p in wanted]
-        pad = source.pad(key, images.shape[1])
+        pad = leaves.pad(key, images.shape[1])
         frames, own = [], []
         for p in places:
             own.append(~pad[:, p] if self.other_image is not None or p != at else torch.zeros_like(pad[:, p]))
@@ -152,7 +145,7 @@ class Views:
             # The anchor's numbers along time belong to its own frames, not to those of another image.
             shared = self.other_image is not None and self.other_intrinsics is None
             count, when = (T, at) if shared else (images.shape[1], p)
-            camera = self._camera(source, numbers, hw, count, when, checks)
+            camera = self._camera(leaves, numbers, hw, count, when, checks)
             frames.append(Frame(image, depth, camera, anchor.depth_camera))
         paired = torch.stack(own).any(0)
         if self.other_image is None and set(places) == {at}:
@@ -179,9 +172,9 @@ class Views:
         ]
 
     def _camera(
-        self, source: _Source, numbers: Numbers, hw: tuple[int, int], T: int, at: int, checks: list[Any]
+        self, leaves: Leaves, numbers: Numbers, hw: tuple[int, int], T: int, at: int, checks: list[Any]
     ) -> Camera:
-        camera = source.camera(numbers, T, at, source.numbers(self.distortion, T, at))
+        camera = leaves.camera(numbers, T, at, leaves.numbers(self.distortion, T, at))
         if self.intrinsics_hw is not None:
             camera = cam.resize(camera, self.intrinsics_hw, hw)
         name = numbers if isinstance(numbers, str) else "intrinsics"
@@ -195,9 +188,9 @@ class Views:
         checks.append((~(small > 0), small, f"{name}: found focal length {{:.4g}}, expected a positive number of px"))
         return camera
 
-    def _depth_camera(self, source: _Source, depth: Tensor, hw: tuple[int, int], T: int, at: int) -> Camera | None:
+    def _depth_camera(self, leaves: Leaves, depth: Tensor, hw: tuple[int, int], T: int, at: int) -> Camera | None:
         if self.depth_intrinsics is not None:
-            return source.camera(self.depth_intrinsics, T, at, None)
+            return leaves.camera(self.depth_intrinsics, T, at, None)
         h, w = depth.shape[-2:]
         if abs((h * hw[1]) / (w * hw[0]) - 1) > MAX_ASPECT:
             raise SampleError(
@@ -205,130 +198,6 @@ class Views:
                 "transposed? A map with a field of its own needs depth_intrinsics"
             )
         return None
-
-
-def find(sample: Mapping[str, Any], key: str) -> Any:
-    """The value under a key, or piece by piece in nested dicts.
-
-    Raises:
-        SampleError: there is none.
-    """
-    if key in sample:
-        return sample[key]
-    value: Any = sample
-    for piece in key.replace("/", ".").split("."):
-        if not (isinstance(value, Mapping) and piece in value):
-            raise SampleError(f"{key}: found no such key, expected one of {', '.join(_keys(sample))}")
-        value = value[piece]
-    return value
-
-
-def to_tensor(value: Any, key: str) -> Tensor:
-    """A plain tensor of an array, a picture, numbers or a tensor of any class.
-
-    Raises:
-        SampleError: it holds no numbers.
-    """
-    if isinstance(value, Tensor):
-        return value.as_subclass(Tensor)
-    array = np.asarray(value)
-    if array.dtype.kind not in "buif":
-        raise SampleError(f"{key}: found {type(value).__name__} of {array.dtype}, expected an array of numbers")
-    if array.dtype.kind == "u" and array.dtype.itemsize in (2, 4):
-        array = array.astype(np.int64)  # torch knows little of unsigned words
-    array = array.astype(array.dtype.newbyteorder("="), copy=not array.flags.writeable)
-    return torch.from_numpy(np.ascontiguousarray(array))
-
-
-class _Source:
-    """The tensors of a sample, all with B in front."""
-
-    def __init__(self, sample: Mapping[str, Any], batched: bool, dtype: torch.dtype) -> None:
-        self.sample, self.batched, self.dtype = sample, batched, dtype
-        self.like: Tensor | None = None  # the anchor's images: everything follows their device and number
-
-    def get(self, key: str) -> Tensor:
-        x = to_tensor(find(self.sample, key), key)
-        x = x if self.batched else x[None]
-        if self.like is None:
-            self.like = x
-        if x.ndim == 0 or x.shape[0] != self.like.shape[0]:
-            raise SampleError(f"{key}: found shape {tuple(x.shape)}, expected {self.like.shape[0]} samples in front")
-        return x.to(self.like.device)
-
-    def images(self, key: str, layout: str | None) -> Tensor:
-        """(B, T, C, H, W), uint8 or floating."""
-        x = self.get(key)
-        if x.ndim not in (4, 5):
-            shape = tuple(x.shape[1:])
-            raise SampleError(f"{key}: found shape {shape}, expected (C, H, W) or (H, W, C), or with T in front")
-        if x.dtype != torch.uint8 and not x.is_floating_point():
-            raise SampleError(f"{key}: found {x.dtype}, expected uint8, or float in [0, 1]")
-        x = x if x.ndim == 5 else x[:, None]
-        first, last = x.shape[2] in (1, 3), x.shape[4] in (1, 3)
-        if layout is None and first == last:
-            shape = tuple(x.shape[2:])
-            raise SampleError(f"{key}: found shape {shape}, expected one axis of 1 or 3 channels; or state layout")
-        hwc = last if layout is None else layout == "hwc"
-        if not (last if hwc else first):
-            raise SampleError(f"{key}: found shape {tuple(x.shape[2:])}, expected layout {layout} with 1 or 3 channels")
-        x = x.movedim(-1, 2) if hwc else x
-        return x if x.dtype == torch.uint8 else x.to(self.dtype)
-
-    def planes(self, key: str, T: int) -> Tensor:
-        """(B, T or 1, h, w), floating if it was, else whole."""
-        x = self.get(key)
-        shape = tuple(x.shape[1:])
-        if x.ndim == 3:
-            x = x[:, None]
-        elif x.ndim == 4 and x.shape[1] not in (1, T) and x.shape[3] == 1:
-            x = x[:, None, ..., 0]
-        elif x.ndim == 5:
-            x = x[:, :, 0] if x.shape[2] == 1 else x[..., 0] if x.shape[4] == 1 else x
-        if x.ndim != 4 or x.shape[1] not in (1, T) or 0 in x.shape:
-            expected = f"(h, w), (1, h, w) or (h, w, 1), with or without {T} in front"
-            raise SampleError(f"{key}: found shape {shape}, expected {expected}")
-        return x.to(self.dtype) if x.is_floating_point() else x
-
-    def numbers(self, numbers: Numbers | None, T: int, at: int) -> Tensor | None:
-        """(B, k) of numbers given once, per sample, or per sample and frame."""
-        if numbers is None or self.like is None:
-            return None
-        name = numbers if isinstance(numbers, str) else "numbers"
-        if isinstance(numbers, str):
-            x = self.get(numbers)
-        else:
-            x = torch.as_tensor(numbers, device=self.like.device)[None].expand(self.like.shape[0], *np.shape(numbers))
-        if x.ndim >= 3 and x.shape[-1] == x.shape[-2] == 3:
-            x = x.flatten(-2)
-        if x.ndim == 3 and x.shape[1] in (1, T):
-            x = x[:, at if x.shape[1] > 1 else 0]
-        if x.ndim != 2:
-            raise SampleError(
-                f"{name}: found shape {tuple(x.shape[1:])}, expected one row of numbers, or one per frame"
-            )
-        return x.to(self.dtype)
-
-    def camera(self, numbers: Numbers, T: int, at: int, distortion: Tensor | None) -> Camera:
-        x = self.numbers(numbers, T, at)
-        assert x is not None
-        if x.shape[1] == 4:
-            return Camera(x[:, :2], x[:, 2:], distortion)
-        if x.shape[1] != 9:
-            name = numbers if isinstance(numbers, str) else "intrinsics"
-            raise SampleError(f"{name}: found {x.shape[1]} numbers, expected 3x3, or fx fy cx cy")
-        return cam.from_matrix(x.unflatten(1, (3, 3)), distortion)
-
-    def pad(self, key: str, T: int) -> Tensor:
-        """(B, T) whether a frame only pads the start or end of an episode: LeRobot's ``<key>_is_pad``."""
-        assert self.like is not None
-        name = f"{key}_is_pad"
-        if name not in self.sample:
-            return torch.zeros(self.like.shape[0], T, dtype=torch.bool, device=self.like.device)
-        x = self.get(name).bool().flatten(1)
-        if x.shape[1] != T:
-            raise SampleError(f"{name}: found {x.shape[1]} values, expected {T}")
-        return x
 
 
 def _place(at: int, T: int, key: str) -> int:
@@ -357,11 +226,3 @@ def _is_level(conf: Tensor, key: str | None) -> tuple[Tensor, Tensor, str]:
 
 def _size(x: Tensor) -> str:
     return f"{x.shape[-2]}x{x.shape[-1]}"
-
-
-def _keys(sample: Mapping[str, Any], prefix: str = "") -> list[str]:
-    found: list[str] = []
-    for key, value in sample.items():
-        nested = isinstance(value, Mapping)
-        found += _keys(value, f"{prefix}{key}.") if nested else [f"{prefix}{key}"]
-    return sorted(found)

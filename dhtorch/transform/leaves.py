@@ -1,0 +1,157 @@
+"""The tensors behind the keys of a sample, all with the same number of dimensions whatever their layout was.
+
+Alphabet: B samples, T frames of a sample along time, C × H × W image, h × w depth map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dhtorch.geometry import camera as cam
+from dhtorch.records import Camera
+
+#: Where the numbers are: a key of the sample, or the numbers themselves, the same for every sample.
+Numbers = str | Sequence[float]
+
+
+class SampleError(ValueError):
+    """A sample cannot be read as stated; the message names the key, what was found and what was expected."""
+
+
+def find(sample: Mapping[str, Any], key: str) -> Any:
+    """The value under a key, or piece by piece in nested dicts.
+
+    Raises:
+        SampleError: there is none.
+    """
+    if key in sample:
+        return sample[key]
+    value: Any = sample
+    for piece in key.replace("/", ".").split("."):
+        if not (isinstance(value, Mapping) and piece in value):
+            raise SampleError(f"{key}: found no such key, expected one of {', '.join(_keys(sample))}")
+        value = value[piece]
+    return value
+
+
+def to_tensor(value: Any, key: str) -> Tensor:
+    """A plain tensor of an array, a picture, numbers or a tensor of any class.
+
+    Raises:
+        SampleError: it holds no numbers.
+    """
+    if isinstance(value, Tensor):
+        return value.as_subclass(Tensor)
+    array = np.asarray(value)
+    if array.dtype.kind not in "buif":
+        raise SampleError(f"{key}: found {type(value).__name__} of {array.dtype}, expected an array of numbers")
+    if array.dtype.kind == "u" and array.dtype.itemsize in (2, 4):
+        array = array.astype(np.int64)  # torch knows little of unsigned words
+    array = array.astype(array.dtype.newbyteorder("="), copy=not array.flags.writeable)
+    return torch.from_numpy(np.ascontiguousarray(array))
+
+
+class Leaves:
+    """The tensors of a sample, all with B in front."""
+
+    def __init__(self, sample: Mapping[str, Any], batched: bool, dtype: torch.dtype) -> None:
+        self.sample, self.batched, self.dtype = sample, batched, dtype
+        self.like: Tensor | None = None  # the anchor's images: everything follows their device and number
+
+    def get(self, key: str) -> Tensor:
+        """(B, …) on the device of the first one asked for."""
+        x = to_tensor(find(self.sample, key), key)
+        x = x if self.batched else x[None]
+        if self.like is None:
+            self.like = x
+        if x.ndim == 0 or x.shape[0] != self.like.shape[0]:
+            raise SampleError(f"{key}: found shape {tuple(x.shape)}, expected {self.like.shape[0]} samples in front")
+        return x.to(self.like.device)
+
+    def images(self, key: str, layout: str | None) -> Tensor:
+        """(B, T, C, H, W), uint8 or floating."""
+        x = self.get(key)
+        if x.ndim not in (4, 5):
+            shape = tuple(x.shape[1:])
+            raise SampleError(f"{key}: found shape {shape}, expected (C, H, W) or (H, W, C), or with T in front")
+        if x.dtype != torch.uint8 and not x.is_floating_point():
+            raise SampleError(f"{key}: found {x.dtype}, expected uint8, or float in [0, 1]")
+        x = x if x.ndim == 5 else x[:, None]
+        first, last = x.shape[2] in (1, 3), x.shape[4] in (1, 3)
+        if layout is None and first == last:
+            shape = tuple(x.shape[2:])
+            raise SampleError(f"{key}: found shape {shape}, expected one axis of 1 or 3 channels; or state layout")
+        hwc = last if layout is None else layout == "hwc"
+        if not (last if hwc else first):
+            raise SampleError(f"{key}: found shape {tuple(x.shape[2:])}, expected layout {layout} with 1 or 3 channels")
+        x = x.movedim(-1, 2) if hwc else x
+        return x if x.dtype == torch.uint8 else x.to(self.dtype)
+
+    def planes(self, key: str, T: int) -> Tensor:
+        """(B, T or 1, h, w), floating if it was, else whole."""
+        x = self.get(key)
+        shape = tuple(x.shape[1:])
+        if x.ndim == 3:
+            x = x[:, None]
+        elif x.ndim == 4 and x.shape[1] not in (1, T) and x.shape[3] == 1:
+            x = x[:, None, ..., 0]
+        elif x.ndim == 5:
+            x = x[:, :, 0] if x.shape[2] == 1 else x[..., 0] if x.shape[4] == 1 else x
+        if x.ndim != 4 or x.shape[1] not in (1, T) or 0 in x.shape:
+            expected = f"(h, w), (1, h, w) or (h, w, 1), with or without {T} in front"
+            raise SampleError(f"{key}: found shape {shape}, expected {expected}")
+        return x.to(self.dtype) if x.is_floating_point() else x
+
+    def numbers(self, numbers: Numbers | None, T: int, at: int) -> Tensor | None:
+        """(B, k) of numbers given once, per sample, or per sample and frame."""
+        if numbers is None or self.like is None:
+            return None
+        name = numbers if isinstance(numbers, str) else "numbers"
+        if isinstance(numbers, str):
+            x = self.get(numbers)
+        else:
+            x = torch.as_tensor(numbers, device=self.like.device)[None].expand(self.like.shape[0], *np.shape(numbers))
+        if x.ndim >= 3 and x.shape[-1] == x.shape[-2] == 3:
+            x = x.flatten(-2)
+        if x.ndim == 3 and x.shape[1] in (1, T):
+            x = x[:, at if x.shape[1] > 1 else 0]
+        if x.ndim != 2:
+            raise SampleError(
+                f"{name}: found shape {tuple(x.shape[1:])}, expected one row of numbers, or one per frame"
+            )
+        return x.to(self.dtype)
+
+    def camera(self, numbers: Numbers, T: int, at: int, distortion: Tensor | None) -> Camera:
+        """Camera of the frame at a place along time."""
+        x = self.numbers(numbers, T, at)
+        assert x is not None
+        if x.shape[1] == 4:
+            return Camera(x[:, :2], x[:, 2:], distortion)
+        if x.shape[1] != 9:
+            name = numbers if isinstance(numbers, str) else "intrinsics"
+            raise SampleError(f"{name}: found {x.shape[1]} numbers, expected 3x3, or fx fy cx cy")
+        return cam.from_matrix(x.unflatten(1, (3, 3)), distortion)
+
+    def pad(self, key: str, T: int) -> Tensor:
+        """(B, T) whether a frame only pads the start or end of an episode: LeRobot's ``<key>_is_pad``."""
+        assert self.like is not None
+        name = f"{key}_is_pad"
+        if name not in self.sample:
+            return torch.zeros(self.like.shape[0], T, dtype=torch.bool, device=self.like.device)
+        x = self.get(name).bool().flatten(1)
+        if x.shape[1] != T:
+            raise SampleError(f"{name}: found {x.shape[1]} values, expected {T}")
+        return x
+
+
+def _keys(sample: Mapping[str, Any], prefix: str = "") -> list[str]:
+    found: list[str] = []
+    for key, value in sample.items():
+        nested = isinstance(value, Mapping)
+        found += _keys(value, f"{prefix}{key}.") if nested else [f"{prefix}{key}"]
+    return sorted(found)
