@@ -351,7 +351,7 @@ ROWS = [
     Row(focus_stack.align, lambda b, n, d: (stacks(b, n, d),), "dtype raises", bad=lambda a: (a[0][0],)),
     Row(defocus_fusion.bilinear, lambda b, n, d: (sensed(b, n, d)[0], HW), "dtype batch vmap capture raises", bad=lambda a: (a[0][0], a[1])),
     Row(defocus_fusion.joint_bilateral, sensed, "dtype vmap capture gradcheck raises", grad=(1,), bad=lambda a: (a[0][0], a[1])),
-    Row(defocus_fusion.guided_filter, lambda b, n, d: (filled(b, n, d)[0], sensed(b, n, d)[1]), "dtype batch vmap capture gradcheck raises", grad=(1,), bad=wrong_last_axis(0)),
+    Row(defocus_fusion.guided_filter, sensed, "dtype batch vmap capture gradcheck raises", grad=(1,), bad=lambda a: (a[0][0], a[1])),
     Row(defocus_fusion.defocus_guided, filled, "dtype vmap capture raises", bad=wrong_last_axis(0)),
 ]  # fmt: skip
 

@@ -146,7 +146,7 @@ def _frame(
     filled = {
         "bilinear": plain,
         "joint_bilateral": joint_bilateral(coarse, guide),
-        "guided_filter": guided_filter(plain, guide),
+        "guided_filter": guided_filter(coarse, guide),
         "defocus_guided": defocus_guided(plain, coarse, blur),
         "defocus_bold": defocus_guided(plain, coarse, blur, distrust=BOLD),
         "defocus_bilateral": joint_bilateral(coarse, blur.sigma[:, None] / GUIDE_PX),

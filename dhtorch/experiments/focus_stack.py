@@ -141,7 +141,9 @@ def verdict(outcome: Outcome) -> tuple[bool | None, str]:
     clean, field = at("clean.rank_corr"), at("light_field.rank_corr")
     plain, gated, flips = (at(f"light_field.{m}") for m in ("abs_corr", "gated_abs_corr", "flip_share"))
     if clean is None or field is None or plain is None or gated is None or flips is None:
-        return None, "no rendered stacks: clean and light-field ones are not compared"
+        known = {"Spearman": at("given.rank_corr"), "order of the pictures recovered": at("given_aligned.order_corr")}
+        said = "; ".join(f"{k} {v:.2f}" for k, v in known.items() if v is not None)
+        return None, f"no rendered stacks: clean and light-field ones are not compared{said and f' ({said})'}"
     why = (
         f"clean Spearman {clean:.2f} (paper 0.69), gated r {at('clean.gated_corr') or 0:.2f} (0.76); light"
         f" field Spearman {field:.2f}, flipped on {flips:.0%} of scenes (1/5),"
@@ -194,20 +196,29 @@ def without_truth(stack: FocalStack, measure: str, window_px: float) -> dict[str
 
 
 def order(measured: Tensor) -> float | None:
-    """|Spearman| of the true order of the pictures of (1, S, H, W) with the one read off their similarity.
+    """|Spearman| of the true order of the pictures of (1, S, H, W) with the one read off their sharpness.
 
-    The pictures are laid on a line such that those sharp in the same places are close (the second eigenvector of the
-    graph Laplacian of their correlations): the true order takes no part.
+    Every picture is linked to the one that is sharp in most nearly the same places (the shortest tree of links); the
+    order is the way along the tree from the one end of its longest path. The true order takes no part.
     """
     size = max(4, min(measured.shape[-2:]) // 30)
-    pooled = torch.nn.functional.avg_pool2d(measured[0][:, None], size).flatten(1).double()
-    weight = torch.log(pooled + 1e-9)
-    weight = weight - weight.mean(0)  # what a place has in all pictures is its texture, not its focus
-    likeness = torch.corrcoef(weight).clamp_min(0).fill_diagonal_(0)
-    laplacian = torch.diag(likeness.sum(1)) - likeness
-    line = torch.linalg.eigh(laplacian).eigenvectors[:, 1]
-    found = spearman(line, torch.arange(len(line), dtype=line.dtype))
+    level = torch.log(torch.nn.functional.avg_pool2d(measured[0][:, None], size).flatten(1).double() + 1e-9)
+    level = level - level.mean(0)  # what a place has in all pictures is its texture, not its focus
+    unlike = (1 - torch.corrcoef(level)).clamp_min(0).sqrt()
+    end = int(_along_tree(unlike, 0).argmax())
+    found = spearman(_along_tree(unlike, end), torch.arange(len(unlike), dtype=unlike.dtype))
     return None if found is None else abs(found)
+
+
+def _along_tree(distance: Tensor, start: int) -> Tensor:
+    """Way (S,) from one node to every other along the shortest tree that joins all (Prim)."""
+    way = torch.full_like(distance[0], torch.nan)
+    way[start] = 0
+    for _ in range(len(distance) - 1):
+        links = torch.where(way.isfinite()[:, None] & way.isnan(), distance, torch.inf)
+        i, j = divmod(int(links.argmin()), len(distance))
+        way[j] = way[i] + distance[i, j]
+    return way
 
 
 def halves(measured: Tensor) -> float | None:

@@ -86,29 +86,31 @@ def joint_bilateral(
 
 
 def guided_filter(
-    dense: Tensor,  # (B, H, W) m, 0 = none
+    coarse: Tensor,  # (B, h, w) m, 0 = no return
     guide: Tensor,  # (B, C, H, W) float in [0, 1] or uint8
     *,
-    radius: int = 6,
+    radius: int = 1,
     smooth: float = 1e-3,
 ) -> Tensor:
     """Dense depth (B, H, W) m that is, around every pixel, a linear function of the grey guide.
 
+    The functions are fitted to the returns alone and interpolated in between, so that the guide's own edges decide
+    where depth changes. 0 where no return is near.
+
     Args:
-        dense: interpolated depth.
-        guide: of the same size.
-        radius: of the windows, px.
+        coarse, guide: of one field.
+        radius: of the windows, in steps of the coarse map.
         smooth: grey variance below which a window counts as flat.
 
     Raises:
         ValueError: wrong shapes.
 
-    Gradient: to depth and guide.
-    Source: K. He, J. Sun, X. Tang, "Guided image filtering", 2010.
+    Gradient: to the returns and the guide.
+    Source: K. He, J. Sun, "Fast guided filter", 2015.
     """
-    check("guided_filter", dense=(dense, "B H W"), guide=(guide, "B C H W"))
-    grey = luma(guide, 1).to(dense.dtype)
-    there = (dense > 0).to(dense.dtype)[:, None]
+    sizes = check("guided_filter", coarse=(coarse, "B h w"), guide=(guide, "B C H W"))
+    grey = luma(guide, 1).to(coarse.dtype)
+    there = (coarse > 0).to(coarse.dtype)[:, None]
     count = box(there, radius)
     some = count > LEAST
     safe = torch.where(some, count, torch.ones_like(count))
@@ -116,11 +118,14 @@ def guided_filter(
     def mean(x: Tensor) -> Tensor:
         return box(x * there, radius) / safe
 
-    z = dense[:, None]
-    middle, level = mean(grey), mean(z)
-    slope = (mean(grey * z) - middle * level) / (mean(grey * grey) - middle * middle + smooth).clamp_min(smooth)
-    found = mean(slope) * grey + mean(level - slope * middle)
-    return torch.where(some & (found > 0) & (there > 0), found, z * there)[:, 0]
+    z, small = coarse[:, None], F.interpolate(grey, coarse.shape[-2:], mode="area")
+    middle, level = mean(small), mean(z)
+    slope = (mean(small * z) - middle * level) / (mean(small * small) - middle * middle).clamp_min(0).add(smooth)
+    hw = (sizes["H"], sizes["W"])
+    slope, offset = (_resized(mean(x)[:, 0], hw) for x in (slope, level - slope * middle))
+    found = slope * grey[:, 0] + offset
+    seen = (_resized(some.to(coarse.dtype)[:, 0], hw) > 1 - LEAST) & (found > 0)
+    return torch.where(seen, found, torch.zeros_like(found))
 
 
 def defocus_guided(

@@ -207,6 +207,32 @@ ATTENTION = Published(
     ("Use of the holes: routing, what may need a head turn.",),
 )
 
+DEFOCUS = Published(
+    "section 4",
+    "captures of its own, mostly",
+    _table(
+        "rho_abs corr",
+        {"unsigned": "0.22 | –", "side from an oracle": "– | 0.66", "side has to be produced": "– | 0.06"},
+    ),
+    ("Two ambiguities: texture (a blank wall looks defocused), and near against far of the focus.",),
+)
+
+FOCUS_STACK = Published(
+    "section 4",
+    "FoD500 (clean synthetic), DDFF-12 (real light fields)",
+    _table(
+        "rank_corr gated_corr flip_share abs_corr gated_abs_corr",
+        {"clean synthetic": "0.69 | 0.76 | – | – | –", "real light fields": "– | – | ∼1/5 | 0.15 | 0.21"},
+    ),
+)
+
+FUSION = Published(
+    "section 4",
+    "captures of its own, mostly",
+    _table("corr", {"bilinear": "0.82–0.99"}),
+    ("Defocus never beats plain interpolation and slightly raises the error.",),
+)
+
 
 def number(text: str | None) -> float | None:
     """A printed figure as a number, per cent as a share; None where it is a range, a word or nothing."""
