@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
@@ -99,6 +100,29 @@ def extend(
     if trace is not None:
         trace.update(samples=samples, tracks=tracks, tracks_ideal=usable, fit=fit, estimate=estimate)
     return estimate
+
+
+#: Methods by name, each called as :func:`extend`: the paper's, and pose and abstention by what the errors must be.
+METHODS: dict[str, Callable[..., Estimate]] = {
+    "paper": extend,
+    "map": partial(
+        extend,
+        track=partial(_track.lucas_kanade_affine, levels=5),
+        pose=_pose.map_pose,
+        triangulate=partial(
+            _triangulate.two_view,
+            min_parallax_deg=None,
+            max_sigma_rel=0.3,
+            min_t_snr=3.0,
+            max_mismatch_px=10.0,
+            fitted_noise=True,
+            mismatch_px=2.0,
+            sigma_scale=2.0,
+            sensor_share=1.0,
+        ),
+        score=_score.rank_by_error,
+    ),
+}
 
 
 def merge(samples: Samples, estimate: Estimate) -> Map:

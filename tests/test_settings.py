@@ -12,6 +12,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from dhtorch.data import FORMATS
+from dhtorch.pair import METHODS
 from dhtorch.run import config_dir
 
 CONF = config_dir()
@@ -122,3 +123,28 @@ def test_misspelt_options_fail():
 
 def test_the_settings_folder_travels_with_the_package():
     assert (CONF / "run.yaml").is_file() and Path(CONF).is_absolute()
+
+
+def effective(seat):
+    """(function, every option with its value) of a seat, partials inside it included."""
+    fn, given = (seat.func, seat.keywords) if isinstance(seat, functools.partial) else (seat, {})
+    known = {k: p.default for k, p in options(fn).items() if p.default is not p.empty and k not in AT_RUN_TIME}
+    known |= {k: v for k, v in given.items() if k not in AT_RUN_TIME}
+    return fn, {k: effective(v) if callable(v) else v for k, v in known.items()}
+
+
+@pytest.mark.parametrize("name", sorted(METHODS))
+def test_methods_by_name_are_those_of_the_settings(name):
+    ours, theirs = effective(METHODS[name]), effective(instantiate(compose(f"method={name}").method, _convert_="all"))
+    assert ours[0] is theirs[0]
+    agree(ours, theirs, name)
+
+
+def agree(a, b, where):
+    """Two seats are the same function with the same options."""
+    assert a[0] is b[0] and a[1].keys() == b[1].keys(), where
+    for key, value in a[1].items():
+        if isinstance(value, tuple) and callable(value[0]):
+            agree(value, b[1][key], f"{where}.{key}")
+        else:
+            assert same(value, b[1][key]), f"{where}.{key}: {value} against {b[1][key]}"

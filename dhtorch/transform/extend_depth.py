@@ -14,7 +14,7 @@ from torch.utils.data import get_worker_info
 
 from dhtorch.codes import Gate, Source
 from dhtorch.geometry import camera as cam
-from dhtorch.pair import extend, merge
+from dhtorch.pair import METHODS, merge
 from dhtorch.records import Estimate, Frame, PoseFit, Samples
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.holes import classify
@@ -23,9 +23,6 @@ from dhtorch.transform.leaves import SampleError, find, to_tensor
 from dhtorch.transform.problems import Problem, Tally
 from dhtorch.transform.tokens import CHANNELS, FITS, grid, patch_tokens
 from dhtorch.transform.views import Read, Views
-
-#: Methods that have a name; any function called and answering like :func:`dhtorch.extend` will do as well.
-METHODS: dict[str, Callable[..., Estimate]] = {"paper": extend}
 
 #: Seats of the front end: what a method that does not name its own is given.
 FRONT_END: dict[str, Callable[..., Any]] = {"sample": spiral, "backproject": backproject, "classify": classify}
@@ -41,7 +38,8 @@ class ExtendDepth(torch.nn.Module):
     on the batch. Without a second view only the front end runs: the sensor's own returns, flags and hole classes.
 
     Args:
-        method: a name (:data:`METHODS`), or a function called as :func:`dhtorch.extend`, such as a partial of it.
+        method: a name (:data:`dhtorch.pair.METHODS`), or a function called as :func:`dhtorch.extend`, such as a
+            partial of it.
         n: samples per image; None = the method's own default.
         seed: of the pose search. With ``index_key`` each sample has the seed ``seed + sample[index_key]``.
         index_key: key of a whole number that tells samples apart; None = the same draws for all.
