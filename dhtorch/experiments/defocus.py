@@ -44,6 +44,9 @@ VARIANTS = ("oracle_side", *DEPLOYABLE, "height_alone", "texture_alone", "natura
 #: Fewest pixels on which a correlation is said.
 MIN_SITES = 50
 
+#: Inverse distance beyond which nothing is focused, 1/m.
+FARTHEST_DPT = 0.01
+
 #: What counts as weak, as a working oracle, and how much of it a deployable estimator may keep.
 WEAK, USEFUL, KEPT = 0.5, 0.4, 0.5
 
@@ -169,7 +172,9 @@ def _through_lens(
     focus = depth[:, h // 2, w // 2]
     shifts = (-colour / 2, 0.0, colour / 2) if sharp.shape[1] == 3 else (0.0,)
     parts = [(sharp, 0.0)] if not colour else [(sharp[:, k : k + 1], shift) for k, shift in enumerate(shifts)]
-    seen = torch.cat([photograph(x, depth, lens, (1 / (1 / focus + d))[:, None])[:, 0] for x, d in parts], 1)
+    # Red of a lens focused far may be in focus nowhere: as far as can be stands for that.
+    focused = [(x, (1 / (1 / focus + d).clamp_min(FARTHEST_DPT))[:, None]) for x, d in parts]
+    seen = torch.cat([photograph(x, depth, lens, s)[:, 0] for x, s in focused], 1)
     grain = noise * torch.randn(seen.shape, generator=torch.Generator().manual_seed(seed)).to(seen)
     seen = seen + grain
     blur = local_blur(seen, noise=noise, window_px=window_px)
