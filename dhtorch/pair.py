@@ -113,7 +113,7 @@ METHODS: dict[str, Callable[..., Estimate]] = {
             _triangulate.two_view,
             min_parallax_deg=None,
             max_sigma_rel=0.3,
-            min_t_snr=3.0,
+            min_t_snr=30.0,
             max_mismatch_px=10.0,
             fitted_noise=True,
             mismatch_px=2.0,
