@@ -29,9 +29,12 @@ SCHEMA = 1
 #: Share of the fitting scenes' weight on which a step of a table must rest.
 MIN_SHARE = 0.02
 
-#: Shares that lie within one and within two sigmas: a normal variable's, and less than its 95 %, because errors have
-#: heavier tails and a few gross ones would widen every sigma.
-WITHIN = (0.6826894921370859, 0.9)
+#: Probability that a normal variable lies within one standard deviation.
+ONE_SIGMA = 0.6826894921370859
+
+#: Share asked within two: less than a normal variable's 95 %, because errors have heavier tails and a few gross ones
+#: would widen every sigma.
+TWO_SIGMA = 0.9
 
 #: Targets, in per cent, for which thresholds are kept.
 TARGETS = (5, 10, 20)
@@ -131,8 +134,9 @@ def fit(
 def fit_sigma(scenes: Sequence[Points]) -> SigmaModel | None:
     """The correction after which 68 % of the answers lie within one sigma and no fewer than 90 % within two.
 
-    Scenes have the same weight. For every floor the scale follows from those shares; of all these pairs the one is taken
-    under which the errors are most probable (Student's t with three degrees of freedom, which gross errors do not rule).
+    Scenes have the same weight. For every floor the scale follows from the first share; of all these pairs the one is
+    taken under which the errors are most probable (Student's t with three degrees of freedom, which gross errors do not
+    rule). Where fewer than 90 % then lie within two sigmas, scale and floor are widened until they do.
 
     Returns:
         SigmaModel; None where no sigma is stated.
@@ -150,17 +154,14 @@ def fit_sigma(scenes: Sequence[Points]) -> SigmaModel | None:
     error, sigma, weight = torch.cat(errors), torch.cat(sigmas), torch.cat(weights)
     best, least = SigmaModel(1.0, 0.0), math.inf
     for floor in FLOORS:
-        model = SigmaModel(_scale((error.square() - floor * floor) / sigma.square(), weight), floor)
+        scale = _quantile((error.square() - floor * floor) / sigma.square(), weight, ONE_SIGMA).clamp_min(0).sqrt()
+        model = SigmaModel(float(scale), floor)
         spread = model(sigma, torch.ones_like(sigma)).clamp_min(torch.finfo(sigma.dtype).tiny)
         cost = float((weight * (2 * torch.log1p((error / spread).square() / 3) + spread.log())).sum())
         best, least = (model, cost) if cost < least else (best, least)
-    return best
-
-
-def _scale(square: Tensor, weight: Tensor) -> float:
-    """Factor on sigma from squared errors over squared sigmas, what the floor explains taken off."""
-    needed = [_quantile(square, weight, share).clamp_min(0).sqrt() / k for k, share in enumerate(WITHIN, 1)]
-    return float(torch.stack(needed).max())
+    spread = best(sigma, torch.ones_like(sigma)).clamp_min(torch.finfo(sigma.dtype).tiny)
+    wider = max(1.0, float(_quantile(error / spread, weight, TWO_SIGMA)) / 2)
+    return SigmaModel(best.scale * wider, best.floor * wider)
 
 
 def _quantile(x: Tensor, weight: Tensor, share: float) -> Tensor:
