@@ -11,11 +11,13 @@ import argparse
 import json
 import re
 import sys
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from dhtorch import archive
+from dhtorch.experiments import method_comparison
 from dhtorch.report import Table, layouts, text
 
 HERE = Path(__file__).resolve().parent
@@ -109,6 +111,42 @@ def speed() -> str:
     return table(["", "`paper`, ms", "`opencv`, ms", "ratio"], shown)
 
 
+def comparison() -> str:
+    """The numbers that decide the method comparison, each beside its bar."""
+    summary = json.loads((RESULTS / "method_comparison.json").read_text())["summary"]
+    rows = []
+    for name, (one, many, _) in method_comparison.BARS.items():
+        bars = f"{BOUND[name]} {one:g}" if one == many else f"{BOUND[name]} {one:g} / {many:g}"
+        cells = [f"{summary[f'{m}.{name}']['value']:.3f}" for m in ("map", "window")]
+        rows.append([NUMBER[name], *cells, bars])
+    return table(["number", "`map`", "`window`", "bar"], rows)
+
+
+def by_scene() -> str:
+    """Coverage and median error of every method on every scene, and the ratio at equal coverage over five seeds."""
+    rows = []
+    for scene, methods in scenes("method_comparison", "full").items():
+        name = f"{scene} ({methods['paper']['role']})" if methods["paper"]["role"] else scene
+        cells = [name, str(methods["paper"]["n_candidates"])]
+        for key in ("coverage", "median_rel"):
+            cells.append(" / ".join(percent(methods[m].get(key)) for m in ("paper", "map", "window")))
+        ratios = [
+            methods[m].get("against_paper", {}).get("median_rel_ratio_at_equal_coverage") for m in ("map", "window")
+        ]
+        rows.append([*cells, " / ".join(map(number, ratios))])
+    head = ["scene", "candidates", "coverage", "median error", "ratio at equal coverage, `map` / `window`"]
+    return table(head, rows)
+
+
+def verdicts(names: Sequence[str]) -> str:
+    """Archived questions, their answers and why."""
+    rows = []
+    for name in names:
+        result = json.loads((RESULTS / f"{name}.json").read_text())
+        rows.append([f"`{result['experiment']}` on {result['data']['name']}", result["verdict"], result["why"]])
+    return text.grid(Table("", ["experiment", "verdict", "why"], rows, n_label=3))
+
+
 def picture(path: Path) -> None:
     """The idea at a glance: what the sensor may say within 2 m, and what two views add."""
     import matplotlib as mpl
@@ -151,7 +189,30 @@ def picture(path: Path) -> None:
     figure.savefig(path, dpi=80, bbox_inches="tight")
 
 
-TABLES = {"room": room, "shared": shared, "truths": truths, "speed": speed}
+TABLES = {"room": room, "shared": shared, "truths": truths, "speed": speed, "comparison": comparison}
+TABLES |= {"comparison scenes": by_scene}
+
+#: Numbers of the method comparison in words, and on which side of its bar each belongs.
+NUMBER = {
+    "median_rel_ratio": "median error, ratio to `paper`",
+    "worst_scene_ratio": "worst scene's ratio at equal coverage",
+    "aurc_ratio": "area under risk–coverage, ratio to `paper`",
+    "coverage_at_5": "coverage at 5 % mean risk",
+    "within_sigma": "errors within one stated sigma",
+    "within_2sigma": "errors within two",
+    "ece": "calibration error of P(error < 10 %)",
+    "realised_risk_10": "risk realised at the threshold for 10 %",
+    "realised_risk_5": "risk realised at the threshold for 5 %",
+}
+BOUND = dict.fromkeys(NUMBER, "≤") | {"coverage_at_5": "≥", "within_2sigma": "≥", "within_sigma": "±0.07 of"}
+
+#: Results whose verdicts are shown, beside those with a table.
+ASKED = (
+    *("hole_census", "device_pose", "motion", "ablation", "latency"),
+    *("room_range_split", "room_gate_ablation", "room_device_pose", "room_real_holes", "paths_motion"),
+)
+NEGATIVE = ("helix_correlation", "defocus", "focus_stack", "defocus_fusion", "icp", "hole_attention")
+TABLES |= {"verdicts": partial(verdicts, ASKED), "negative": partial(verdicts, NEGATIVE)}
 
 
 def in_layout(name: str) -> str:
