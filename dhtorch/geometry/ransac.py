@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dhtorch.geometry.covariance import median
 from dhtorch.geometry.least_squares import MIN_DEPTH
 from dhtorch.geometry.p3p import p3p
 from dhtorch.geometry.se3 import Pose
@@ -16,6 +17,10 @@ from dhtorch.geometry.shapes import check
 
 #: A point set counts as a line when its spread across is below this share of its spread along.
 MIN_SPREAD = 1e-3
+
+#: Points this many times as far as the median one are directions, not places: a renderer's sky at 1e10 m, with the
+#: points of a room, would look like a line.
+FAR_OFF = 100.0
 
 
 def usable_first(
@@ -149,12 +154,15 @@ def collinear(
 ) -> Tensor:
     """(B,) bool: the used points lie on one line (or in one point), and so leave a rotation undetermined.
 
-    The second largest eigenvalue of their scatter is compared with the largest through the matrix's invariants.
+    The second largest eigenvalue of their scatter is compared with the largest through the matrix's invariants. Points
+    more than ``FAR_OFF`` times as far from the origin as the median one are not looked at.
 
     Raises:
         ValueError: wrong shapes.
     """
     check("collinear", xyz=(xyz, "B 3 M"), used=(used, "B M"))
+    reach = xyz.detach().abs().amax(1)
+    used = used & (reach <= FAR_OFF * median(reach, used))
     weight = used.double()[:, None]
     x = torch.where(used[:, None], xyz.double(), torch.zeros_like(xyz, dtype=torch.float64))
     x = (x - x.sum(-1, keepdim=True) / weight.sum(-1, keepdim=True).clamp_min(1)) * weight
