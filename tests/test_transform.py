@@ -310,7 +310,7 @@ def test_options_that_cannot_be():
     for options, message in [
         ({"depth_unit": "cm"}, "depth_unit"),
         ({"depth_unit": -1.0}, "depth_unit"),
-        ({"method": "papier"}, "expected one of .'paper'"),
+        ({"method": "papier"}, "expected one of .'map', 'paper'"),
         ({"on_error": "ignore"}, "on_error"),
         ({"batched": True, "on_error": "skip"}, "on_error"),
         ({"layout": "whc"}, "layout"),
