@@ -134,12 +134,14 @@ class SyntheticRoom(Sequence[Frame]):
             ``depth`` (1, H, W) m float32 and ``surface`` (1, H, W) uint8, a key of :data:`SURFACES`.
         """
         i = self._position(index)
+        return self._true_view(self.camera, self.true_poses[i : i + 1], self.hw)
+
+    def _true_view(self, camera: Camera, pose: Pose, hw: tuple[int, int]) -> dict[str, Tensor]:
         scene = furnished_room(self.seed)
-        depth, solid = scene.solids.view(self.camera, self.true_poses[i : i + 1], self.hw)
-        o, d = world_rays(self.camera, self.true_poses[i : i + 1], self.hw)
+        depth, solid = scene.solids.view(camera, pose, hw)
+        o, d = world_rays(camera, pose, hw)
         face, _, _ = scene.solids.locate(solid, [o[k] + d[k] * depth for k in range(3)])
-        shape = (1, *self.hw)
-        return {"depth": depth.view(shape), "surface": scene.kind[face].to(torch.uint8).view(shape)}
+        return {"depth": depth.view(1, *hw), "surface": scene.kind[face].to(torch.uint8).view(1, *hw)}
 
     def _position(self, index: int) -> int:
         i, n = operator.index(index), len(self)
@@ -150,7 +152,7 @@ class SyntheticRoom(Sequence[Frame]):
     def _render(self, i: int) -> Frame:
         pose = self.true_poses[i : i + 1]
         scene = furnished_room(self.seed)
-        image = _photograph(scene, self.camera, pose, self.hw, self.supersample)
+        image = self._picture(i)
         image = image * 255 + self.image_noise * torch.randn(image.shape, generator=self._generator(i, "image"))
         conf = torch.zeros(1, *self.depth_hw, dtype=torch.uint8)
         depth, depth_camera = conf.float(), resize(self.camera, self.hw, self.depth_hw)
@@ -171,6 +173,12 @@ class SyntheticRoom(Sequence[Frame]):
             time=self.times[i : i + 1],
             T_world_from_cam=self.poses[i : i + 1].to(torch.float32),
         )
+
+    def _picture(self, i: int) -> Tensor:
+        return self._photograph(self.camera, self.true_poses[i : i + 1], self.hw)
+
+    def _photograph(self, camera: Camera, pose: Pose, hw: tuple[int, int]) -> Tensor:
+        return _photograph(furnished_room(self.seed), camera, pose, hw, self.supersample)
 
     def _generator(self, i: int, stream: str) -> Generator:
         return Generator().manual_seed(Random(f"{self.seed} {i} {stream}").getrandbits(62))

@@ -1,0 +1,123 @@
+"""Every stress of the built-in room does what it says, and nothing else."""
+
+import pickle
+from functools import partial
+
+import pytest
+import torch
+
+from dhtorch.data import stress
+from dhtorch.data.stress import STRESSES, StressRoom, open_stress
+from dhtorch.data.synthetic import SyntheticRoom
+from dhtorch.geometry import camera, se3
+from dhtorch.stages.backproject import backproject
+from dhtorch.stages.sample import spiral
+
+SMALL = {"hw": (96, 128), "n_frames": 8, "supersample": 1, "depth_hw": (96, 128)}
+NEAR = 2.0
+
+
+@pytest.fixture(scope="module")
+def walk():
+    return SyntheticRoom(**SMALL)
+
+
+def room(name, **options):
+    return StressRoom(name, **SMALL | options)
+
+
+def near(frame):
+    return (frame.depth > 0) & (frame.depth <= NEAR)
+
+
+def test_one_recording_for_each_stress():
+    rooms = open_stress(hw=(48, 64), n_frames=7)
+    assert [r.name for r in rooms] == [f"stress_{name}" for name in STRESSES]
+    assert {r.stress for r in rooms if r.role == "rotation"} == {"rotation", "rotation_exact"}
+    with pytest.raises(ValueError, match="earthquake"):
+        open_stress(["earthquake"])
+
+
+@pytest.mark.parametrize("name", ["rotation", "rotation_exact"])
+def test_rotation_has_no_baseline(name):
+    T = se3.relative(room(name).true_poses[:1], room(name).true_poses[6:7])
+    assert T.t.norm() < 1e-12 and se3.rotation_angle(T.R).rad2deg() > 2
+
+
+@pytest.mark.parametrize("name", ["lateral", "forward", "orbit"])
+def test_paths_go_where_they_say(name):
+    T = se3.relative(*(room(name).true_poses[i : i + 1] for i in (0, 6)))
+    assert T.t.norm() > 0.08
+    assert (T.t[0, 2].abs() > 0.9 * T.t.norm()) == (name == "forward")
+    assert (se3.rotation_angle(T.R).rad2deg() > 2) == (name == "orbit")
+
+
+def test_the_exact_rotation_is_exact():
+    frame, truth = room("rotation_exact")[2], room("rotation_exact").truth(2)["depth"]
+    assert torch.equal(frame.depth, truth)
+
+
+def test_planar_points_are_planar(walk):
+    flat = room("planar_near")
+    for i in (0, 3):
+        frame, kept = flat[i], near(flat[i])
+        assert 100 < kept.sum() < 0.7 * near(walk[i]).sum()
+        assert torch.equal(frame.depth[~near(walk[i])], walk[i].depth[~near(walk[i])])
+        v, u = kept[0].nonzero().unbind(-1)
+        uv, at = torch.stack((u, v), -1)[None].double(), frame.depth_camera.to(torch.float64)
+        true = (
+            SyntheticRoom(**SMALL | {"lidar": None}).truth(i)["depth"][0, v, u].double()[None]
+        )  # same size, same camera
+        xyz = camera.unproject(at, uv, true)[0]
+        spread = torch.linalg.svdvals(xyz - xyz.mean(0))
+        assert spread[2] < 1e-5 * spread[0] and spread[1] > 0.05 * spread[0]
+        assert ((frame.depth[0, v, u] / true[0] - 1).abs() < 0.05).all()
+
+
+@pytest.mark.parametrize("places", [None, partial(spiral, foveation=1.0)])
+def test_only_twenty_near_returns_remain(walk, places):
+    few = room("few_near", places=places, n_places=512)
+    frame = few[1]
+    assert near(frame).sum() == stress.FEW
+    assert torch.equal(frame.depth[near(frame)], walk[1].depth[near(frame)])
+    assert torch.equal(frame.depth[~near(walk[1])], walk[1].depth[~near(walk[1])])
+    if places is not None:  # each of them is read
+        samples = backproject(frame, spiral(few.hw, 512))
+        assert len(samples.depth[(samples.depth > 0) & (samples.depth <= NEAR)].unique()) == stress.FEW
+
+
+def test_depth_noise_is_two_to_three_percent(walk):
+    frame, said = room("depth_noise")[0], walk[0].depth > 0
+    assert torch.equal(frame.depth > 0, said)
+    assert 0.02 < (frame.depth[said] / walk[0].depth[said] - 1).std() < 0.03
+
+
+def test_rows_of_a_rolling_shutter_are_seen_one_after_the_other():
+    rolling = room("rolling_shutter", image_noise=0.0)
+    first, last = rolling.bands[3][:1], rolling.bands[3][-1:]
+    whole = se3.relative(*(rolling.true_poses[i : i + 1] for i in (3, 4))).t.norm()
+    assert 0.5 < se3.relative(first, last).t.norm() / whole < 0.7  # 20 ms of 33 ms
+    assert rolling[3].camera.readout.item() == pytest.approx(stress.READOUT_S)
+    middle = SyntheticRoom(**SMALL | {"image_noise": 0.0})
+    for pose, rows in ((first, slice(0, 3)), (last, slice(94, 96))):
+        middle.true_poses = pose
+        image, truth = middle._render(0).image, middle.truth(0)["depth"]
+        assert (rolling[3].image[..., rows, :].int() - image[..., rows, :].int()).abs().max() <= 1
+        assert torch.allclose(rolling.truth(3)["depth"][:, rows], truth[:, rows], rtol=1e-4)
+    middle.true_poses = rolling.true_poses[3:4]
+    assert (rolling[3].image.int() - middle._render(0).image.int()).abs().float().mean() > 0.5
+
+
+def test_mistracks_leave_anchors_alone(walk):
+    moved = room("mistracks")
+    assert torch.equal(moved[5].image, walk[5].image) and torch.equal(moved[7].depth, walk[7].depth)
+    share = (moved[7].image != walk[7].image).any(1).float().mean()
+    assert 0.2 < share < 0.35
+
+
+def test_frames_are_the_same_in_another_process():
+    for name in ("few_near", "mistracks"):
+        one = room(name, n_frames=7, places=partial(spiral, foveation=1.0))
+        two = pickle.loads(pickle.dumps(one))
+        a, b = one[6], two[6]
+        assert torch.equal(a.image, b.image) and torch.equal(a.depth, b.depth)
