@@ -48,6 +48,7 @@ def run(
     reference: str = "paper",
     once: Sequence[str] = ("opencv",),
     seeds: int = 5,
+    stand_ins: Mapping[str, str] | None = None,
     progress: Progress = protocol.quiet,
 ) -> Outcome:
     """Run several methods on the same pairs, several seeds each, and compare them with the reference.
@@ -55,7 +56,7 @@ def run(
     Rows are those of the first seed; scene rows of a compared method carry ``against_<reference>``: its numbers over
     all seeds. The summary holds, for every compared method, the numbers of
     :func:`dhtorch.evaluate.compare.method_ratios`. A method of several views is replaced, on scenes too short for
-    three, by the first compared method.
+    three, by its stand-in.
 
     Args:
         recordings, chosen, pairs, settings, progress: as :func:`dhtorch.experiments.protocol.run`.
@@ -63,6 +64,7 @@ def run(
         reference: name of the method to compare with.
         once: methods that are shown for one seed and not compared.
         seeds: how many, from the job's own upwards.
+        stand_ins: method of several views → method of one; None = the first compared method for all.
 
     Raises:
         ValueError: no reference, or nothing to compare with it; else as the main job.
@@ -80,7 +82,7 @@ def run(
     rooms = {r.name: getattr(r, "room", None) or r.name for r in recordings}
     apart = {r.name for r in recordings if r.role is not None}
     found = {name: _by_scene(outcome, name, seeds, apart) for name in (reference, *compared)}
-    fallback = {name: compared[0] for name in compared if n_views(methods[name]) > 1}
+    fallback = stand_ins or {name: compared[0] for name in compared if n_views(methods[name]) > 1}
     judged = compare.method_ratios(found, reference=reference, rooms=rooms, fallback=fallback)
     later = {_named(name, k) for name in methods for k in range(1, seeds)}
     outcome.rows = [r for r in outcome.rows if r["method"] not in later]

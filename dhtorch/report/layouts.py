@@ -213,6 +213,12 @@ def _comparison(result: Result) -> list[Table]:
     return [by_variant(result, "Methods, over scenes", ["n_scenes", *measured])]
 
 
+def _part_ablation(result: Result) -> list[Table]:
+    columns: tuple[str, ...] = ("n_scenes", "coverage", "median_rel_ratio_at_equal_coverage", "aurc_ratio")
+    columns += ("coverage_at_5", "within_sigma", "within_2sigma", "ece", "pair_ms", "extra_ms")
+    return [by_variant(result, "Parts alone and left out, ratios to the paper's method", columns)]
+
+
 def _helix(result: Result) -> list[Table]:
     columns = ("n_scenes", "corr", "rank_corr", "corr_answered", "coverage", "flow_share", "along_share")
     title = "Shift as a depth cue: correlation with the sensor's inverse depth, medians over scenes"
@@ -247,6 +253,7 @@ LAYOUTS: dict[str, Callable[[Result], list[Table]]] = {
     "ablation": _ablation,
     "latency": timings.latency,
     "method_comparison": _comparison,
+    "part_ablation": _part_ablation,
     "helix_correlation": _helix,
     "icp": _icp,
     "hole_attention": _attention,

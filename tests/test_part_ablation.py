@@ -1,0 +1,94 @@
+"""The whole taken apart: every variant differs from its neighbour in what its name says, costs are told, both verdicts."""
+
+from functools import partial
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+
+from dhtorch.data.pairs import by_gap
+from dhtorch.data.synthetic import open_rooms
+from dhtorch.experiments import part_ablation
+from dhtorch.experiments.protocol import Settings
+from dhtorch.run import config_dir
+
+
+@pytest.fixture(scope="module")
+def methods():
+    with initialize_config_dir(str(config_dir()), version_base="1.3"):
+        settings = {m: compose("run", [f"method={m}", "method.n=768"]) for m in ("paper", "map", "window")}
+    return {m: instantiate(s.method, _convert_="all") for m, s in settings.items()}
+
+
+def differences(a, b, path=""):
+    """Dotted names of what two methods do differently."""
+    if isinstance(a, partial) and isinstance(b, partial) and a.func is b.func:
+        names = dict.fromkeys([*a.keywords, *b.keywords])
+        return [d for k in names for d in differences(a.keywords.get(k), b.keywords.get(k), f"{path}.{k}")]
+    return [] if a == b else [path.lstrip(".") or "join"]
+
+
+@pytest.mark.parametrize(
+    ("name", "base", "changed"),
+    [
+        ("+ affine tracks", "paper", {"track"}),
+        ("+ weighted near pose", "paper", {"pose"}),
+        ("+ near and far pose", "paper", {"pose"}),
+        ("+ score by error", "paper", {"score"}),
+        ("+ views", "paper", {"join"}),
+        ("- affine tracks", "map", {"track"}),
+        ("- far tracks", "map", {"pose.far_weight"}),
+        ("- turn", "map", {"pose.turn_sigma"}),
+        ("- pose", "map", {"pose"}),
+        ("- score by error", "map", {"score"}),
+    ],
+)
+def test_a_variant_differs_in_what_it_is_named_after(methods, name, base, changed):
+    variants = part_ablation.taken_apart(*methods.values())
+    assert set(differences(methods[base], variants[name])) == changed
+
+
+def test_gates_and_sigma_are_told_apart(methods):
+    variants = part_ablation.taken_apart(*methods.values())
+    gates, sigma = (set(differences(methods["map"], variants[f"- {part}"])) for part in ("gates", "sigma"))
+    assert not gates & sigma and {d.rpartition(".")[2] for d in gates} <= set(part_ablation.GATES)
+    seats = [methods[m].keywords["triangulate"] for m in ("map", "paper")]
+    assert gates | sigma == {f"triangulate.{d}" for d in differences(*seats)}
+    assert variants["- gates"].keywords["triangulate"].keywords["min_parallax_deg"] == 0.3
+    assert variants["- sigma"].keywords["triangulate"].keywords["sigma_scale"] == 1.0
+
+
+def test_every_variant_runs_and_tells_its_cost(methods):
+    rooms = open_rooms(("walk",), n_frames=4, hw=(192, 256), gap=3, lidar="exact")
+    outcome = part_ablation.run(rooms, methods, by_gap, Settings(), seeds=1)
+    variants = part_ablation.taken_apart(*methods.values())
+    assert {r["method"] for r in outcome.rows} == set(variants)
+    assert all(outcome.summary[f"{name}.pair_ms"]["value"] > 0 for name in variants)
+    assert outcome.summary["paper.extra_ms"]["value"] == 0
+    numbers = ("median_rel_ratio_at_equal_coverage", "aurc_ratio", "coverage_at_5", "within_sigma")
+    assert all(f"{name}.{k}" in outcome.summary for name in variants if name != "paper" for k in numbers)
+
+
+def judged(**changes):
+    equal = {"+ tracks": 0.9, "+ pose": 0.7, "map": 0.5, "- tracks": 0.6} | changes
+    found = {f"{k}.median_rel_ratio_at_equal_coverage": {"value": v} for k, v in equal.items()}
+    return found | {f"{k}.aurc_ratio": {"value": v} for k, v in equal.items()}
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, True),
+        ({"+ pose": 0.4}, False),
+        ({"- tracks": 0.45}, False),
+        ({"- tracks": 0.49}, True),
+        ({"map": None}, None),
+    ],
+)
+def test_verdict_goes_either_way(changes, expected):
+    assert part_ablation.verdict(judged(**changes))[0] is expected
+
+
+def test_all_three_methods_are_needed(methods):
+    with pytest.raises(ValueError, match=r"experiment\.methods: found paper, expected map, window too"):
+        part_ablation.run([], {"paper": methods["paper"]}, by_gap, Settings())
