@@ -1,8 +1,9 @@
 """The ``dhtorch`` command: Hydra turns names into functions, everything else happens in the library.
 
-A first word that names a sub-command goes to that module; anything else is a list of Hydra overrides. Every job has a
-folder of its own, named by its overrides inside a sweep, and reports how it ended instead of raising: one failing job
-stops no other, whichever launcher runs them.
+A first word that names a sub-command goes to that module, which reads its own arguments or is handed what the settings
+of that name compose to; anything else is a list of Hydra overrides for experiments. Each of their jobs has a folder of
+its own, named by its overrides inside a sweep, and reports how it ended instead of raising: one failing job stops no
+other, whichever launcher runs them.
 """
 
 from __future__ import annotations
@@ -23,6 +24,10 @@ from typing import Any
 
 #: Sub-command → module with ``main(argv) -> int``.
 COMMANDS = {"inspect": "dhtorch.capture", "report": "dhtorch.report"}
+
+#: Sub-command with settings of its own, ``conf/<word>.yaml`` → module with ``run(settings, parts, *, progress)``, which
+#: is given all options as plain values, and as objects those that name a function. It returns the exit code.
+CONFIGURED: dict[str, str] = {}
 
 #: Exit codes, as ``dhtorch --help`` lists them.
 DONE, SOME_FAILED, FAILED, INTERRUPTED = 0, 1, 2, 130
@@ -52,11 +57,13 @@ def main(argv: list[str] | None = None) -> int:
         try:
             if argv and argv[0] in COMMANDS:
                 return int(importlib.import_module(COMMANDS[argv[0]]).main(argv[1:]) or 0)
+            if argv and argv[0] in CONFIGURED:
+                return _run_configured(argv[0], argv[1:])
             return _run_hydra(argv)
         except USER_ERRORS as error:
             return _fail(error, show="--traceback" in argv)
-        except KeyboardInterrupt:
-            print("dhtorch: interrupted", file=sys.stderr)
+        except KeyboardInterrupt as stop:  # a sub-command may say how to go on
+            print(": ".join(["dhtorch: interrupted", *map(str, stop.args)]), file=sys.stderr)
             return INTERRUPTED
 
 
@@ -83,6 +90,51 @@ def job_name(overrides: str) -> str:
     return f"{plain[: LONGEST_NAME - 9]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
+def _run_configured(word: str, argv: list[str]) -> int:
+    """A sub-command that takes Hydra overrides: one job, in this process."""
+    import hydra  # noqa: PLC0415
+    from hydra.core.hydra_config import HydraConfig  # noqa: PLC0415
+    from hydra.errors import HydraException  # noqa: PLC0415
+    from hydra.utils import instantiate  # noqa: PLC0415
+    from omegaconf import OmegaConf  # noqa: PLC0415
+    from omegaconf.errors import OmegaConfBaseException  # noqa: PLC0415
+
+    if SHOW & {a.split("=")[0] for a in argv}:
+        return _show(word, argv)
+    _refuse_flags(argv, SHOW)
+    try:
+        with hydra.initialize_config_dir(str(config_dir()), version_base="1.3", job_name="dhtorch"):
+            cfg = hydra.compose(word, argv, return_hydra_config=True)
+            HydraConfig.instance().set_config(cfg)  # for what the settings take from Hydra, as the folder's name
+            groups = {k: v for k, v in cfg.hydra.runtime.choices.items() if k.isidentifier()}
+        OmegaConf.set_struct(cfg, False)
+        del cfg["hydra"]
+        settings: Any = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
+        named = [k for k, v in settings.items() if isinstance(v, dict) and "_target_" in v]
+        parts = {k: instantiate(cfg[k], _convert_="all") for k in named}
+    except (HydraException, OmegaConfBaseException) as error:
+        return _fail(_cause(error), show="traceback=true" in argv)
+    module = importlib.import_module(CONFIGURED[word])
+    try:
+        return int(module.run({**settings, "choices": groups}, parts, progress=_progress) or DONE)
+    except USER_ERRORS as error:
+        return _fail(error, show=settings.get("traceback", False))
+
+
+def _show(name: str, argv: list[str]) -> int:
+    """Hydra's own flags: help, the composed settings, shell completion."""
+    import hydra  # noqa: PLC0415
+
+    sys.argv = [sys.argv[0], *argv]
+    hydra.main(config_path=str(config_dir()), config_name=name, version_base="1.3")(_job)()
+    return DONE
+
+
+def _refuse_flags(argv: Iterable[str], known: set[str]) -> None:
+    for flag in (a for a in argv if a.startswith("-") and a not in known):
+        raise ValueError(f"{flag}: found an unknown flag, expected {', '.join(sorted(known))}")
+
+
 def _run_hydra(argv: list[str]) -> int:
     import hydra  # noqa: PLC0415  (a sub-command must not pay for it)
     from hydra.core.global_hydra import GlobalHydra  # noqa: PLC0415
@@ -93,12 +145,8 @@ def _run_hydra(argv: list[str]) -> int:
 
     OmegaConf.register_new_resolver("dhtorch.job_name", job_name, replace=True)
     if SHOW & {a.split("=")[0] for a in argv}:
-        sys.argv = [sys.argv[0], *argv]
-        hydra.main(config_path=str(config_dir()), config_name="run", version_base="1.3")(_job)()
-        return DONE
-    unknown = [a for a in argv if a.startswith("-") and a not in SWEEP]
-    if unknown:
-        return _fail(ValueError(f"{unknown[0]}: found an unknown flag, expected {', '.join(sorted(SWEEP | SHOW))}"))
+        return _show("run", argv)
+    _refuse_flags(argv, SWEEP | SHOW)
     overrides, sweep = [a for a in argv if a not in SWEEP], bool({*SWEEP, "hydra.mode=MULTIRUN"} & set(argv))
     try:
         with hydra.initialize_config_dir(str(config_dir()), version_base="1.3", job_name="dhtorch"):
@@ -175,7 +223,7 @@ def _job(cfg: Any) -> Any:
         progress = _progress if alone else lambda items, _text, _total: items
         return job.run(settings, parts, dict(runtime.choices), Path(runtime.output_dir), progress=progress)
     except Exception as error:
-        cause = error.__cause__ if isinstance(error, InstantiationException) and error.__cause__ else error
+        cause = _cause(error)
         expected = isinstance(cause, (*USER_ERRORS, OmegaConfBaseException, InstantiationException))
         _fail(cause, show=cfg.traceback or not expected)
         with contextlib.suppress(OSError):
@@ -204,16 +252,30 @@ def _quote(text: str) -> str:
 
 
 def _progress(items: Iterable[Any], text: str, total: int) -> Iterator[Any]:
-    """A progress bar on a terminal, nothing elsewhere."""
-    from rich.progress import track  # noqa: PLC0415
+    """A progress bar with rate and time left on a terminal, nothing elsewhere."""
+    from rich.console import Console  # noqa: PLC0415
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn  # noqa: PLC0415
 
-    yield from track(items, description=f"{text:24}", total=total, disable=not sys.stderr.isatty(), transient=True)
+    columns = ("{task.description:24}", BarColumn(), MofNCompleteColumn(), "{task.fields[rate]}", TimeRemainingColumn())
+    hidden = not sys.stderr.isatty()
+    with Progress(*columns, console=Console(stderr=True), disable=hidden, transient=True) as bar:
+        task = bar.add_task(text, total=total, rate="")
+        for item in items:
+            yield item
+            speed = bar.tasks[task].speed
+            bar.update(task, advance=1, rate=f"{speed:.1f}/s" if speed else "")
 
 
 def _hush() -> None:
     """Warnings that other libraries cause are not the user's business, unless Python's -W asks for them."""
     if not sys.warnoptions:
         warnings.filterwarnings("ignore", module=r"(?!dhtorch\b)")
+
+
+def _cause(error: BaseException) -> BaseException:
+    """What a part of the settings raised while Hydra built it."""
+    named = type(error).__name__ == "InstantiationException"
+    return error.__cause__ if named and error.__cause__ else error
 
 
 def _fail(error: BaseException, show: bool = False) -> int:
