@@ -15,7 +15,7 @@ LEVELS = [
     {"geometry"},
     {"records"},
     {"stages", "negative", "data", "evaluate", "baselines"},
-    {"pair", "window", "integrate", "calibration"},
+    {"pair", "window", "integrate", "calibration", "seats"},
     {"transform", "extract", "experiments", "figures"},
     {"run", "job", "report", "viewer", "capture", "__main__"},
 ]

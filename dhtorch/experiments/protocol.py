@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import torch
@@ -27,16 +26,13 @@ from dhtorch.experiments.shared_tracks import SharedTracks
 from dhtorch.geometry.lookup import nearest, patches, round_half_up
 from dhtorch.pair import Trace
 from dhtorch.records import Estimate, Frame, PoseFit, Samples
+from dhtorch.seats import Method, adapt, n_views, refill  # noqa: F401  (experiments take refill from here)
 
-Method = partial[Estimate]  # of dhtorch.pair.extend (or extend_window), with its seats and options
 Pairs = Callable[[Any], Sequence[tuple[int, int]]]
 Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
 
 #: A pair with fewer candidates says nothing: it is dropped and counted.
 MIN_CANDIDATES = 20
-
-#: Search radius in a sparse depth map, px: the truth test reads sparse returns in 7×7 windows, so do the samples.
-SPARSE_SEARCH_PX = 3
 
 #: A track looks at this many pixels across (LK window and a margin): what lies within may pull at it.
 REACH_PX = 25
@@ -261,33 +257,6 @@ def run(
         outcome.points |= {(recording.name, *k): tree.collate(p) for k, p in scene.pooled.items()}
     outcome.summary = summarise(outcome.rows, list(protocol.variants), list(protocol.cohorts))
     return outcome
-
-
-def refill(method: Method, func: Callable[..., Estimate] | None = None, **seats: Any) -> Method:
-    """The method with some seats or options replaced; ``{seat: {option: value}}`` changes options of a seat.
-
-    ``func`` replaces what joins the seats (``extend``).
-    Nested partials are joined into one, so that ``.keywords`` always shows every seat.
-    """
-    merged = dict(method.keywords)
-    for name, value in seats.items():
-        merged[name] = refill(merged[name], **value) if isinstance(value, Mapping) else value
-    return partial(func or method.func, *method.args, **merged)
-
-
-def adapt(method: Method, recording: Any) -> Method:
-    """The method with what this scene's data asks for: pyramid levels, a search in sparse depth."""
-    seats: dict[str, Any] = {}
-    if recording.levels is not None and "track" in method.keywords:
-        seats["track"] = {"levels": recording.levels}
-    if recording.sparse and "backproject" in method.keywords:
-        seats["backproject"] = {"search_px": SPARSE_SEARCH_PX}
-    return refill(method, **seats)
-
-
-def n_views(method: Method) -> int:
-    """How many further views a method looks at: 1, or its option ``views``."""
-    return int(method.keywords.get("views", 1))
 
 
 #: anchor, further views, anchor with its truth as depth, kinds of surface, disagreement of truth and sensor
