@@ -141,13 +141,18 @@ def write(path: str | Path, result: Mapping[str, Any]) -> Path:
     Raises:
         ValueError: the result is not valid; nothing is written.
     """
-    path = Path(path)
     validate(result, str(path))
+    return replace_file(path, _text(result).encode("utf-8"))
+
+
+def replace_file(path: str | Path, content: bytes) -> Path:
+    """Write a file so that, whatever happens, ``path`` holds either what it held before or all of the new content."""
+    path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=_UNFINISHED, dir=path.parent)
     try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(_text(result))
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())
         Path(name).chmod(0o644)
