@@ -23,6 +23,7 @@ LEVEL = {name: level for level, group in enumerate(LEVELS) for name in group}
 SIDEWAYS = {
     ("window", "pair"),
     ("extract", "transform"),
+    ("experiments", "transform"),
     ("run", "job"),
     ("run", "report"),
     ("job", "report"),

@@ -12,7 +12,7 @@ from contract import PROMISES, Row, equal, leaves, reorder, take, tensor_map
 import dhtorch
 from dhtorch import window
 from dhtorch.baselines.device_pose import given_pose
-from dhtorch.evaluate import holdout
+from dhtorch.evaluate import holdout, probe
 from dhtorch.geometry import (
     affine,
     camera,
@@ -100,6 +100,17 @@ def tracked(batch, n, dtype, noise=0.2):
 def estimated(batch, n, dtype):
     samples, tracks, fit, camera_0, camera_1 = tracked(batch, n, dtype)
     return triangulate.two_view(samples, tracks, fit, camera_0, camera_1), samples, tracks, fit
+
+
+def probed(batch, n, dtype):
+    """Features and targets, the former repeating themselves a little."""
+    x = uniform(batch, n, 3, dtype=dtype, low=-1)
+    return torch.cat((x, 2 * x[..., :1] - 1), -1), uniform(batch, n, 2, dtype=dtype, seed=8)
+
+
+def solved(batch, n, dtype):
+    x, y = probed(batch, n, dtype)
+    return probe.ridge(probe.moments(x, y), torch.tensor([0.1, 1.0])), x
 
 
 def two_views(batch, n, dtype):
@@ -349,6 +360,10 @@ ROWS = [
     Row(focus_stack.sharpest, lambda b, n, d: (focus_stack.sharpness(stacks(b, n, d)),), "dtype batch vmap capture raises", bad=lambda a: (a[0][0],)),
     Row(focus_stack.depth_at, lambda b, n, d: (uniform(b, *HW, dtype=d, high=3), torch.tensor([0.5, 1.0, 2.0, 4.0], dtype=d).expand(b, 4)), "dtype batch gradcheck raises", grad=(0, 1), bad=lambda a: (a[0][0], a[1])),
     Row(focus_stack.align, lambda b, n, d: (stacks(b, n, d),), "dtype raises", bad=lambda a: (a[0][0],)),
+    Row(probe.moments, probed, "vmap capture gradcheck empty raises", grad=(0, 1), bad=lambda a: (a[0][:, 1:], a[1])),
+    Row(probe.join, lambda b, n, d: (probe.moments(*probed(b, n, d)), probe.moments(*probed(b, n + 2, d))), "vmap capture gradcheck empty raises", grad=(0, 1), bad=lambda a: (a[0], probe.columns(a[1], torch.tensor([0])))),
+    Row(probe.ridge, lambda b, n, d: (probe.moments(*probed(b, n, d)), torch.tensor([0.1, 1.0], dtype=d)), "capture gradcheck empty raises", grad=(1,), bad=lambda a: (a[0], torch.ones(2, 3))),
+    Row(probe.predict, solved, "vmap capture gradcheck empty raises", grad=(0, 1), bad=wrong_last_axis(1)),
     Row(defocus_fusion.bilinear, lambda b, n, d: (sensed(b, n, d)[0], HW), "dtype batch vmap capture raises", bad=lambda a: (a[0][0], a[1])),
     Row(defocus_fusion.joint_bilateral, sensed, "dtype vmap capture gradcheck raises", grad=(1,), bad=lambda a: (a[0][0], a[1])),
     Row(defocus_fusion.guided_filter, sensed, "dtype batch vmap capture gradcheck raises", grad=(1,), bad=lambda a: (a[0][0], a[1])),
@@ -381,6 +396,7 @@ ELSEWHERE = {
     "dhtorch.evaluate.curves.sampled",
     *(f"dhtorch.evaluate.correlation.{name}" for name in ("pearson", "spearman", "ranks")),
     *(f"dhtorch.evaluate.bootstrap.{name}" for name in ("interval", "interval_of", "resample")),
+    *(f"dhtorch.evaluate.probe.{name}" for name in ("columns", "folds", "mean_error", "ratio", "equivalent")),
 }
 
 

@@ -29,16 +29,21 @@ def write_rh20t(
     depth_root: Path | None = None,
     lag: float = 0.0,
     calibrated_hw: tuple[int, int] = (720, 1280),
+    name: str = "task_0001_user_0001_scene_0001",
+    stamp: int = _STAMP,
+    joint: np.ndarray | None = None,
+    width: np.ndarray | None = None,
 ) -> Path:
     """A scene folder below ``root`` (returned) with the calibration beside it; times are whole milliseconds.
 
     The camera whose serial is the first on the hand of ``configuration`` carries the robot with it: the tcp is where
     the mount puts it. Its extrinsics were taken at another place, ``hand_at_calibration`` (4×4 camera to world), and so
     were those of the other cameras on the hand, moved along. Colour is coded as RGB without loss, depth as full-range
-    luma without loss, ``lag`` s later.
+    luma without loss, ``lag`` s later. ``joint`` (n, d) rad and ``width`` (n,) of the gripper, in mm, are the robot's
+    at the times of each camera; None = they follow a known law. Scenes that share a ``stamp`` share a calibration.
     """
-    scene = root / f"task_0001_user_0001_scene_0001_cfg_{configuration:04d}"
-    arm, folder = ARMS[configuration], root / "calib" / str(_STAMP)
+    scene = root / f"{name}_cfg_{configuration:04d}"
+    arm, folder = ARMS[configuration], root / "calib" / str(stamp)
     world_from_base = np.eye(4) if T_world_from_base is None else T_world_from_base
     first = cameras.get(arm.in_hand[0])
     start = pose_matrix(first[0]) if first else np.eye(4)
@@ -63,13 +68,14 @@ def write_rh20t(
             published = [np.linalg.inv(arm.align_base) @ _tcp(world_from_base, h, arm.X) @ arm.align_tcp for h in hand]
             entries = zip(stamps, published, strict=False)
             tcp[serial] = [{"timestamp": t, "tcp": _vector(T), "robot_ft": np.zeros(6)} for t, T in entries]
-    for name, content in (("intrinsics", K), ("extrinsics", E)):
-        _save(folder / f"{name}.npy", content)
+    for kind, content in (("intrinsics", K), ("extrinsics", E)):
+        _save(folder / f"{kind}.npy", content)
     _save(folder / "tcp.npy", robot_notation(arm.robot, _tcp(world_from_base, calibrated, arm.X)))
     if first:
         _save(scene / "transformed" / "tcp_base.npy", tcp)
-    _write_streams(scene / "transformed", {s: [round(1000 * seconds(f)) for f in fs] for s, fs in cameras.items()})
-    write(scene / "metadata.json", json.dumps({"calib": _STAMP, "finish_time": _STAMP + 10**6, "rating": 9}))
+    stamps_of = {s: [round(1000 * seconds(f)) for f in fs] for s, fs in cameras.items()}
+    _write_streams(scene / "transformed", stamps_of, joint, width)
+    write(scene / "metadata.json", json.dumps({"calib": stamp, "finish_time": stamp + 10**6, "rating": 9}))
     return scene
 
 
@@ -115,8 +121,10 @@ def _full_K(frame: Frame, calibrated_hw: tuple[int, int]) -> np.ndarray:
     return K
 
 
-def _write_streams(folder: Path, stamps: Mapping[str, Sequence[int]]) -> None:
-    """Streams that follow a known law of t, in s since the start: joint j is j + t, the width 50 − t, a force t.
+def _write_streams(
+    folder: Path, stamps: Mapping[str, Sequence[int]], joints: np.ndarray | None, widths: np.ndarray | None
+) -> None:
+    """Streams, where not given by a law of t, in s since the start: joint j is j + t, the width 50 − t, a force t.
 
     The sensor at the wrist has a zero of 3; in the frame of a camera forces are twice those in the frame of the base.
     """
@@ -124,8 +132,9 @@ def _write_streams(folder: Path, stamps: Mapping[str, Sequence[int]]) -> None:
     joint: dict[str, dict[int, Any]] = {}
     gripper: dict[str, dict[int, Any]] = {}
     for serial, times in stamps.items():
-        joint[serial] = {t: np.arange(7) + (t - start) / 1000 for t in times}
-        width = {t: 50 - (t - start) / 1000 for t in times}
+        laws = [(t - start) / 1000 for t in times]
+        joint[serial] = dict(zip(times, [np.arange(7) + t for t in laws] if joints is None else joints, strict=True))
+        width = dict(zip(times, [50 - t for t in laws] if widths is None else widths.tolist(), strict=True))
         gripper[serial] = {t: {"gripper_command": [w, 1, 2], "gripper_info": [w, 0, 0]} for t, w in width.items()}
     for name, scale in (("force_torque", 2.0), ("force_torque_base", 1.0)):
         loads = {s: [(t, scale * np.full(6, (t - start) / 1000)) for t in times] for s, times in stamps.items()}
