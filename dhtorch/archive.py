@@ -14,7 +14,7 @@ import os
 import platform
 import subprocess
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -237,6 +237,20 @@ def result_key(config: Mapping[str, Any], digest: str, *, code_dir: str | Path |
     return total.hexdigest()
 
 
+def files_below(roots: Iterable[Path | None]) -> dict[str, Path]:
+    """Name → file of everything below some folders (or files); a folder's own name and place do not count."""
+    files: dict[str, Path] = {}
+    for k, root in enumerate(dict.fromkeys(root for root in roots if root is not None)):
+        below = [p for p in root.rglob("*") if p.is_file()] if root.is_dir() else [root]
+        files |= {f"{k}/{p.relative_to(root).as_posix() if p != root else p.name}": p for p in below}
+    return files
+
+
+def files_named(settings: Mapping[str, Any]) -> dict[str, Path]:
+    """Option → file that it names, as weights are: the place leaves the key of a result, the content enters it."""
+    return {f"settings/{name}": path for name, path in _paths("", settings) if path.is_file()}
+
+
 def data_digest(files: Mapping[str, str | Path]) -> str:
     """SHA-256 over data files: their relative names, sizes, first and last 64 KiB. No file: data made by the code.
 
@@ -368,6 +382,17 @@ def _keyed(config: Any) -> Any:
     if isinstance(config, Mapping):
         return {str(k): _keyed(v) for k, v in config.items() if str(k) not in UNKEYED}
     return [_keyed(v) for v in config] if isinstance(config, list | tuple) else config
+
+
+def _paths(name: str, value: Any) -> Iterator[tuple[str, Path]]:
+    if isinstance(value, Mapping):
+        for key, inner in value.items():
+            yield from _paths(f"{name}.{key}", inner)
+    elif isinstance(value, list | tuple):
+        for k, inner in enumerate(value):
+            yield from _paths(f"{name}.{k}", inner)
+    elif isinstance(value, str) and os.sep in value:
+        yield name, Path(value).expanduser()
 
 
 def _shorter(path: Path, base: str | Path | None) -> str:

@@ -5,8 +5,7 @@ The result is written last, after its pictures: a folder with a valid ``result.j
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -128,25 +127,10 @@ def _common(settings: Mapping[str, Any]) -> Settings:
 
 
 def _files(recordings: Iterable[Any]) -> dict[str, Path]:
-    """Name → file of everything below the recordings' folders; a folder's own name and place do not count."""
-    files: dict[str, Path] = {}
-    for k, root in enumerate(dict.fromkeys(r.root for r in recordings if r.root is not None)):
-        below = [p for p in root.rglob("*") if p.is_file()] if root.is_dir() else [root]
-        files |= {f"{k}/{p.relative_to(root).as_posix() if p != root else p.name}": p for p in below}
-    return files
+    """Name → file of all data below the recordings' folders."""
+    return archive.files_below(r.root for r in recordings)
 
 
 def _named_files(settings: Mapping[str, Any]) -> dict[str, Path]:
-    """Option → file that it names, as weights are: the place leaves the key of a result, the content enters it."""
-    return {f"settings/{name}": path for name, path in _paths("", {k: settings[k] for k in GROUPS}) if path.is_file()}
-
-
-def _paths(name: str, value: Any) -> Iterator[tuple[str, Path]]:
-    if isinstance(value, Mapping):
-        for key, inner in value.items():
-            yield from _paths(f"{name}.{key}", inner)
-    elif isinstance(value, list | tuple):
-        for k, inner in enumerate(value):
-            yield from _paths(f"{name}.{k}", inner)
-    elif isinstance(value, str) and os.sep in value:
-        yield name, Path(value).expanduser()
+    """Option → file that the settings of a group name."""
+    return archive.files_named({k: settings[k] for k in GROUPS})

@@ -27,7 +27,10 @@ COMMANDS = {"inspect": "dhtorch.capture", "report": "dhtorch.report"}
 
 #: Sub-command with settings of its own, ``conf/<word>.yaml`` → module with ``run(settings, parts, *, progress)``, which
 #: is given all options as plain values, and as objects those that name a function. It returns the exit code.
-CONFIGURED: dict[str, str] = {}
+CONFIGURED = {"extract": "dhtorch.extract", "view": "dhtorch.viewer"}
+
+#: Sub-command → the option that a first word without a name sets.
+FIRST_WORD = {"view": "result"}
 
 #: Exit codes, as ``dhtorch --help`` lists them.
 DONE, SOME_FAILED, FAILED, INTERRUPTED = 0, 1, 2, 130
@@ -102,6 +105,8 @@ def _run_configured(word: str, argv: list[str]) -> int:
     if SHOW & {a.split("=")[0] for a in argv}:
         return _show(word, argv)
     _refuse_flags(argv, SHOW)
+    if argv and word in FIRST_WORD and ("=" not in argv[0] or Path(argv[0]).exists()):
+        argv = [f"{FIRST_WORD[word]}={_quote(argv[0])}", *argv[1:]]
     try:
         with hydra.initialize_config_dir(str(config_dir()), version_base="1.3", job_name="dhtorch"):
             cfg = hydra.compose(word, argv, return_hydra_config=True)

@@ -261,6 +261,7 @@ class _Rig:
             poses=poses,
             rate_hz=meta.fps,
             report=tuple(report),
+            episode=episode.number,
         )
 
     def _cameras(

@@ -45,6 +45,7 @@ class Recording(Sequence[Frame]):
     levels: int | None = None  # pyramid levels that the motion in this scene asks for
     room: str | None = None  # recordings of one place bear one name: what is learnt on one says little about the others
     role: str | None = None  # "rotation" = almost no baseline: never enters a mean
+    episode: int | None = None  # its number in the data set, where episodes have one
     report: tuple[str, ...] = ()  # what was left out, and why
 
     def __post_init__(self) -> None:

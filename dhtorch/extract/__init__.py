@@ -1,0 +1,199 @@
+"""Features of a whole data set, written once: ``dhtorch extract`` and what reads it back.
+
+dhtorch extract data=lerobot data.root=PATH data.gap=5 out=features workers=8
+
+Every recording is an episode, every frame a row: ``plan`` numbers the rows, ``rows`` makes one (with
+:class:`dhtorch.transform.ExtendDepth`), ``engines`` say where, ``columns`` and ``shards`` write Parquet files, and
+``features`` reads them for a data loader.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from dhtorch import archive
+from dhtorch.data import Recordings
+from dhtorch.data.files import need
+from dhtorch.extract import columns, engines, plan, shards
+from dhtorch.extract.features import Features, JoinedDataset
+from dhtorch.extract.rows import Answer, Rows
+from dhtorch.seats import n_views
+from dhtorch.transform import CHANNELS, ExtendDepth, SampleError, grid
+from dhtorch.transform.extend_depth import ON_ERROR
+from dhtorch.transform.tokens import FITS
+
+__all__ = ["Features", "JoinedDataset", "Options", "run"]
+
+#: Of the files: raised when a reader of older ones would be wrong.
+FORMAT = 1
+
+#: Options that change where and how fast rows are made, and no row.
+_UNKEYED = ("engine", "address")
+
+#: Frames that cannot be read, named in the report.
+_SHOWN = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """What to extract, where it is made, and how it is stored.
+
+    Raises:
+        ValueError: an option that cannot be.
+    """
+
+    engine: str = "local"  # local: this machine; ray: a cluster, through Ray Data
+    address: str | None = None  # of the Ray cluster; None = one that is started here
+    gap: int | None = None  # frames back to the other view; None = the recording's own, 0 = none: front end alone
+    patch: int = 14  # px
+    tokens_hw: Sequence[int] = (224, 224)  # size of the network's picture: with it all rows have one shape
+    fit: str = "stretch"  # how the picture is brought to that size
+    on_error: str = "raise"  # a frame that cannot be read: raise, skip, or flag = zeros and a problem
+    columns: Sequence[str] | None = None  # to write; None = all
+    half: bool = False  # depths, scores and tokens as float16
+    shard_rows: int = 512
+
+    def __post_init__(self) -> None:
+        for name, known in {"engine": ("local", "ray"), "on_error": ON_ERROR, "fit": FITS}.items():
+            if getattr(self, name) not in known:
+                raise ValueError(f"extract.{name}: found {getattr(self, name)!r}, expected one of {', '.join(known)}")
+        for name, low in {"gap": 0, "patch": 1, "shard_rows": 1}.items():
+            value = getattr(self, name)
+            if not (isinstance(value, int) and value >= low) and not (name == "gap" and value is None):
+                raise ValueError(f"extract.{name}: found {value!r}, expected a whole number of at least {low}")
+        if not (isinstance(self.tokens_hw, Sequence) and len(self.tokens_hw) == 2):
+            raise ValueError(f"extract.tokens_hw: found {self.tokens_hw!r}, expected height and width")
+
+
+def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Callable[..., Iterable[Any]]) -> int:
+    """``dhtorch extract``: write the shards of ``out`` that are not there yet.
+
+    Args:
+        settings: ``out``, ``workers``, ``seed``, ``choices`` and the groups' options, as plain values.
+        parts: ``data`` (a recording or many), ``method`` and ``extract`` (:class:`Options`).
+        progress: wraps the loop over rows: (items, text, number of items) → items.
+
+    Raises:
+        ValueError, OSError, ImportError: bad options or data, a folder that cannot be written or belongs to another
+            extraction, a library that is missing.
+        KeyboardInterrupt: Ctrl-C; what is finished stays.
+    """
+    options: Options = parts["extract"]
+    need("pyarrow.parquet", extra="scale")
+    if not isinstance(settings["workers"], int) or settings["workers"] < 0:
+        raise ValueError(f"workers: found {settings['workers']!r}, expected a whole number of at least 0")
+    recordings = parts["data"] if isinstance(parts["data"], list | Recordings) else [parts["data"]]
+    whole = plan.make(recordings, options.gap, n_views(parts["method"]))
+    rows = _rows(recordings, whole, parts["method"], settings["seed"], options)
+    shared = _shared(settings, options, whole, rows)
+    folder = _folder(settings["out"])
+    every = whole.shards(options.shard_rows)
+    done = shards.finished(folder, shared)
+    counts = dict(done)
+    todo = [shard for shard in every if shard.name not in done]
+    positions = [position for shard in todo for position in shard.rows]
+    complaints: list[str] = []
+    engine = _engine(options, rows, positions, settings["workers"])
+    try:
+        with closing(progress(engine, f"{len(whole)} frames", len(positions))) as answers:  # type: ignore[type-var]
+            for shard in todo:
+                kept = _kept(islice(answers, len(shard.rows)), options.on_error, rows, complaints)
+                counts[shard.name] = shards.write(folder, shard, kept, rows.wanted, shared)
+    except KeyboardInterrupt:
+        whole_ones = f"{len(counts)} of {len(every)} shards in {folder} are whole and stay"
+        raise KeyboardInterrupt(f"{whole_ones}; the same command does the rest") from None
+    _say(folder, counts, len(done), complaints)
+    return 0
+
+
+def _rows(recordings: Sequence[Any], whole: plan.Plan, method: Any, seed: int, options: Options) -> Rows:
+    hw = (int(options.tokens_hw[0]), int(options.tokens_hw[1]))
+    rows, across = grid(hw, patch=options.patch, tokens_hw=hw)
+    n = ExtendDepth(method=method, depth_unit="m").n
+    every = columns.columns(n, rows * across, half=options.half)
+    return Rows(
+        recordings,
+        whole,
+        columns.choose(every, options.columns),
+        method=method,
+        gap=options.gap,
+        seed=seed,
+        patch=options.patch,
+        tokens_hw=hw,
+        fit=options.fit,
+    )
+
+
+def _engine(options: Options, rows: Rows, positions: Sequence[int], workers: int) -> Iterator[Answer]:
+    if options.engine == "ray":
+        return engines.on_ray(rows, positions, options.address)
+    return engines.here(rows, positions, workers)
+
+
+def _kept(answers: Iterable[Answer], on_error: str, rows: Rows, complaints: list[str]) -> Iterator[columns.Row]:
+    """Rows to write: what becomes of a frame that cannot be read is decided here, for every engine alike."""
+    for place, features, complaint in answers:
+        if features is None and on_error == "raise":
+            raise SampleError(f"{complaint} (with extract.on_error=skip or flag the rest goes on)")
+        if features is None:
+            complaints.append(complaint)
+        if features is not None or on_error == "flag":
+            yield {**place, **(columns.blank(rows.wanted) if features is None else features)}
+
+
+def _shared(settings: Mapping[str, Any], options: Options, whole: plan.Plan, rows: Rows) -> dict[str, Any]:
+    """Metadata of all shards: what the columns mean and where they come from."""
+    asked = {k: v for k, v in asdict(options).items() if k not in _UNKEYED}
+    config = {**{k: settings[k] for k in ("data", "method", "seed")}, "extract": asked}
+    files = {**archive.files_below(whole.roots), **archive.files_named(config)}
+    name, digest = settings["choices"]["data"], archive.data_digest(files)
+    made = archive.meta(device="cpu", dtype="float32", threads=1, seed=settings["seed"])
+    found: dict[str, Any] = archive.strict(
+        {
+            "format": FORMAT,
+            "version": made["versions"]["dhtorch"],
+            "git": made["git"],
+            "versions": made["versions"],
+            "key": archive.result_key({**config, "name": name, "format": FORMAT}, digest),
+            "config": archive.portable(config),
+            "data": {"name": name, "digest": digest, "recordings": len(whole.episodes), "frames": len(whole)},
+            "columns": {k: c._asdict() for k, c in rows.wanted.items()},
+            "codes": columns.code_tables(),
+            "channels": CHANNELS,
+            "grid": grid(rows.options["tokens_hw"], patch=options.patch),
+        }
+    )
+    return found
+
+
+def _folder(out: str) -> Path:
+    """The folder of the shards, made where it is missing, without what a killed run left there."""
+    folder = Path(str(out)).expanduser()
+    if folder.exists() and not folder.is_dir():
+        raise NotADirectoryError(f"out: {folder} is a file, expected a folder, or a place for one")
+    folder.mkdir(parents=True, exist_ok=True)
+    shards.clear(folder)
+    return folder
+
+
+def _say(folder: Path, counts: Mapping[str, Counter[str]], n_before: int, complaints: Sequence[str]) -> None:
+    """What is there now, and what was wrong with frames."""
+    total = sum(counts.values(), Counter())
+    skipped, size = total.pop("skipped", 0), sum(file.stat().st_size for file in shards.shard_files(folder))
+    before = f" ({n_before} left untouched)" if n_before else ""
+    print(f"{folder}: {len(counts)} shard{'s' * (len(counts) != 1)}{before}, {total.total()} rows, {size / 1e6:.1f} MB")
+    said = [
+        f"{n} {name.replace('_', ' ')}" for name, n in (*total.items(), ("skipped", skipped)) if n and name != "none"
+    ]
+    if said:
+        print(f"frames with a problem: {', '.join(said)}")
+    for complaint in complaints[:_SHOWN]:
+        print(f"  {complaint}")
+    if len(complaints) > _SHOWN:
+        print(f"  and {len(complaints) - _SHOWN} more")

@@ -1,0 +1,86 @@
+"""Where rows are made: data-loader workers of this machine, or the tasks of a Ray cluster. The rows are the same.
+
+An engine yields the answers of some positions in their order. Each is made by one call of one sample on one thread,
+and no worker raises: what is wrong with a frame travels in its answer.
+"""
+
+from __future__ import annotations
+
+import logging
+import pickle
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from torch.utils.data import DataLoader
+
+from dhtorch.data.files import need, set_opencv_threads
+from dhtorch.extract.rows import Answer, Rows
+from dhtorch.transform import one_thread
+
+#: Rows of one Ray task: what is done again where a node is lost.
+TASK_ROWS = 16
+
+#: Bytes of shared memory of a Ray that is started on this machine.
+STORE_BYTES = 300_000_000
+
+
+def here(rows: Rows, positions: Sequence[int], workers: int) -> Iterator[Answer]:
+    """In this process, or in so many data-loader workers.
+
+    Raises:
+        ChildProcessError: a worker was killed.
+    """
+    one_thread()
+    set_opencv_threads(1)
+    loader = DataLoader(
+        rows,
+        batch_size=None,
+        sampler=positions,
+        num_workers=workers,
+        worker_init_fn=one_thread,
+        collate_fn=_as_it_is,
+    )
+    try:
+        yield from loader
+    except RuntimeError as error:
+        if "DataLoader worker" not in str(error):
+            raise
+        raise ChildProcessError(f"{error}; is there memory for {workers} workers?") from error
+
+
+def on_ray(rows: Rows, positions: Sequence[int], address: str | None) -> Iterator[Answer]:
+    """In the tasks of a Ray cluster, through Ray Data; lost nodes are made up for.
+
+    Args:
+        rows: what the tasks are sent; data files must lie at the same place on every node.
+        positions: in the plan.
+        address: of the cluster; None = one that is started on this machine and ends with the last row.
+
+    Raises:
+        ConnectionError: no cluster at the address.
+    """
+    ray, data = need("ray", extra="scale"), need("ray.data", extra="scale")
+    own = {} if address else {"include_dashboard": False, "object_store_memory": STORE_BYTES}
+    logging.getLogger("ray.data").setLevel(logging.ERROR)
+    ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **own)
+    try:
+        context = data.DataContext.get_current()
+        context.execution_options.preserve_order = True
+        context.enable_progress_bars = False
+        shared = ray.put(rows)
+        cuts = range(TASK_ROWS, len(positions), TASK_ROWS)
+        blocks = np.split(np.asarray(positions, np.int64), cuts)
+
+        def task(batch: dict[str, Any]) -> dict[str, Any]:
+            return {"answer": [pickle.dumps(answer) for answer in here(ray.get(shared), batch["data"].tolist(), 0)]}
+
+        tasks = data.from_numpy(blocks).map_batches(task, batch_size=None, num_cpus=1)
+        for block in tasks.iter_batches(batch_size=None, prefetch_batches=1):
+            yield from map(pickle.loads, block["answer"])
+    finally:
+        ray.shutdown()
+
+
+def _as_it_is(answer: Any) -> Any:
+    return answer

@@ -1,0 +1,132 @@
+"""Reading extracted features back: by row, by episode and frame, or joined to the data set they belong to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from dhtorch.data.codec_parquet import parquet_header, read_columns
+from dhtorch.data.files import FormatError
+from dhtorch.extract.columns import PLACE
+from dhtorch.extract.shards import described, shard_files
+from dhtorch.transform.leaves import find
+
+#: Row groups that a process keeps in memory.
+_HELD = 4
+
+
+class Features(Sequence[dict[str, Tensor]]):
+    """The rows of an extraction, sorted by episode and frame; read when asked for.
+
+    A row is a dict with the keys and shapes that :class:`dhtorch.transform.ExtendDepth` adds to a sample, so a model
+    need not know whether its features were made before or in the loader. Halves become floats again.
+
+    Args:
+        folder: that ``dhtorch extract`` wrote.
+        columns: what to read; None = all. Fewer are faster.
+        prefix: of the keys.
+
+    Attributes:
+        about: metadata of the extraction: ``columns``, ``codes``, ``config``, ``data``, ``version``, ``git``, ``key``.
+        place: column → (rows,) array: ``episode_index``, ``frame_index``, ``timestamp``.
+
+    Raises:
+        FormatError: no extraction there, an unfinished one, or an unknown column.
+        ImportError: pyarrow is missing.
+    """
+
+    def __init__(self, folder: str | Path, columns: Sequence[str] | None = None, *, prefix: str = "dhtorch.") -> None:
+        self.files = shard_files(Path(folder))
+        if not self.files:
+            raise FormatError(folder, "shards", "none", "a folder that dhtorch extract wrote")
+        self.about, own = described(self.files[0])
+        if len(self.files) != own["of"]:
+            expected = f"{own['of']}: the same dhtorch extract once more makes those that are missing"
+            raise FormatError(folder, "shards", len(self.files), expected)
+        known = [name for name in self.about["columns"] if name not in PLACE]
+        for name in columns or ():
+            if name not in known:
+                raise FormatError(folder, "columns", name, f"some of {', '.join(known)}")
+        self.columns, self.prefix = tuple(known if columns is None else columns), prefix
+        places = [read_columns(file, PLACE[:3]) for file in self.files]
+        self.place = {name: np.concatenate([np.asarray(part[name]) for part in places]) for name in PLACE[:3]}
+        self._starts = np.cumsum([0, *(len(part["episode_index"]) for part in places)])
+        pairs = zip(self.place["episode_index"].tolist(), self.place["frame_index"].tolist(), strict=True)
+        self._row = {pair: i for i, pair in enumerate(pairs)}
+
+    def __len__(self) -> int:
+        return int(self._starts[-1])
+
+    def __getitem__(self, index: int) -> dict[str, Tensor]:  # type: ignore[override]  # one row at a time
+        i = range(len(self))[index]
+        k = int(np.searchsorted(self._starts, i, "right")) - 1
+        at, values = _row_of(self.files[k], i - int(self._starts[k]), self.columns)
+        return {self.prefix + name: _tensor(values[name][at]) for name in self.columns}
+
+    def at(self, episode: int, frame: int) -> dict[str, Tensor]:
+        """The row of one frame.
+
+        Raises:
+            KeyError: there is none: the frame was skipped, or belongs to another data set.
+        """
+        try:
+            return self[self._row[episode, frame]]
+        except KeyError:
+            raise KeyError(f"no features of frame {frame} of episode {episode}") from None
+
+
+class JoinedDataset(Dataset[Any]):
+    """A map-style data set whose items carry their extracted features, found by episode and frame.
+
+    Args:
+        dataset: ``dataset[i]`` is a dict with the numbers of its episode and frame, as LeRobot's are.
+        features: of the same frames.
+        episode_key, frame_key: of those numbers.
+    """
+
+    def __init__(
+        self,
+        dataset: Any,
+        features: Features,
+        *,
+        episode_key: str = "episode_index",
+        frame_key: str = "frame_index",
+    ) -> None:
+        self.dataset, self.features, self.keys = dataset, features, (episode_key, frame_key)
+
+    def __len__(self) -> int:
+        return len(self.dataset)
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        sample = self.dataset[index]
+        return {**sample, **self.features.at(*(int(find(sample, key)) for key in self.keys))}
+
+
+def _row_of(file: Path, row: int, columns: tuple[str, ...]) -> tuple[int, dict[str, Any]]:
+    """(place in its row group, the group) of a row."""
+    starts = _starts(file)
+    group = int(np.searchsorted(starts, row, "right")) - 1
+    return row - starts[group], _group(file, starts[group], starts[group + 1], columns)
+
+
+@lru_cache(maxsize=1024)
+def _starts(file: Path) -> tuple[int, ...]:
+    return parquet_header(file).groups
+
+
+@lru_cache(maxsize=_HELD)
+def _group(file: Path, first: int, end: int, columns: tuple[str, ...]) -> dict[str, Any]:
+    return read_columns(file, columns, (first, end))
+
+
+def _tensor(value: Any) -> Tensor:
+    """A copy of its own, in the types that the transform uses."""
+    x = torch.from_numpy(np.array(value))
+    return x if x.dtype == torch.bool else x.float() if x.is_floating_point() else x.int()

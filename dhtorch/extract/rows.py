@@ -1,0 +1,143 @@
+"""A frame of a recording → its row: the frame and an earlier one become a sample, the transform answers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from dhtorch.extract.columns import PLACE, Column, Row
+from dhtorch.extract.plan import Plan, steps_back
+from dhtorch.geometry import camera as cam
+from dhtorch.records import Camera, Frame
+from dhtorch.seats import Method, adapt, n_views
+from dhtorch.transform import ExtendDepth
+
+#: Readers give metres, and the camera of these very pixels: there is no unit that could be wrong.
+_TRUSTED = {"depth_unit": "m", "layout": "chw", "max_depth": np.inf, "min_depth": 0.0, "max_offset": np.inf}
+
+
+class Answer(NamedTuple):
+    """What came of one row of the plan."""
+
+    place: Row  # the columns that say where it belongs
+    features: Row | None  # the other columns; None = the frame cannot be read
+    complaint: str = ""  # why
+
+
+class Rows(Dataset[Answer]):
+    """Position in the plan → answer. Depends on nothing but the position: not on the worker, its engine or the order.
+
+    The sample is what a robot's data loader with ``delta_timestamps`` makes: the picture ``gap`` frames earlier (for a
+    method of many views several, spread over the way), then the frame itself. Where there is no such frame, or it
+    cannot be read, a copy of the frame pads, and the front end runs alone.
+
+    Args:
+        recordings: of the data set.
+        plan: from :func:`dhtorch.extract.plan.make`.
+        wanted: columns of the rows.
+        method: a partial of :func:`dhtorch.extend`, adapted to each recording.
+        gap: frames back to the other view; None = the recording's own, 0 = no other view.
+        options: of :class:`dhtorch.transform.ExtendDepth`.
+    """
+
+    def __init__(
+        self,
+        recordings: Sequence[Any],
+        plan: Plan,
+        wanted: dict[str, Column],
+        *,
+        method: Method,
+        gap: int | None,
+        **options: Any,
+    ) -> None:
+        self.recordings, self.plan, self.wanted = recordings, plan, wanted
+        self.method, self.gap, self.options = method, gap, options
+        self._opened: tuple[int, _Opened] | None = None
+
+    def __len__(self) -> int:
+        return len(self.plan)
+
+    def __getitem__(self, position: int) -> Answer:
+        k, episode, i = self.plan.place(position)
+        if self._opened is None or self._opened[0] != k:
+            self._opened = (k, _Opened(self.recordings[k], self.method, self.gap, self.options))
+        opened = self._opened[1]
+        recording = opened.recording
+        stamp = np.nan if recording.times is None else float(recording.times[i])
+        place: Row = dict(zip(PLACE, (episode, int(recording.number[i]), stamp, recording.name), strict=True))
+        try:
+            with torch.no_grad():
+                added = opened.answer(i)
+        except Exception as error:  # whatever a decoder raises; lack of memory is no property of a frame
+            if isinstance(error, MemoryError | torch.OutOfMemoryError):
+                raise
+            text = f"{recording.name}, frame {place['frame_index']}: {error}"
+            return Answer(place, None, " ".join(text.split()))
+        keep = {k: c for k, c in self.wanted.items() if k not in PLACE}
+        return Answer(place, {k: added[k].numpy().astype(c.kind) for k, c in keep.items()})
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_opened": None}
+
+
+class _Opened:
+    """One recording, and the transforms that fit its frames."""
+
+    def __init__(self, recording: Any, method: Method, gap: int | None, options: dict[str, Any]) -> None:
+        self.recording, self.method, self.options = recording, adapt(method, recording), options
+        self.steps = steps_back(recording, gap, n_views(method))
+        self.position = {int(number): i for i, number in enumerate(recording.number)} if self.steps else {}
+        self.transforms: dict[tuple[str, ...], ExtendDepth] = {}
+
+    def answer(self, i: int) -> dict[str, Tensor]:
+        anchor: Frame = self.recording[i]
+        sample = _sample(anchor, [self._earlier(i, step) for step in self.steps])
+        optional = tuple(key for key in ("confidence", "distortion", "depth_intrinsics") if key in sample)
+        if optional not in self.transforms:
+            self.transforms[optional] = self._transform(optional)
+        transform = self.transforms[optional]
+        out = transform(sample)
+        assert out is not None  # on_error is raise
+        return {k.removeprefix(transform.prefix): v for k, v in out.items() if k.startswith(transform.prefix)}
+
+    def _earlier(self, i: int, step: int) -> Frame | None:
+        at = self.position.get(int(self.recording.number[i]) - step)
+        try:
+            return None if at is None else self.recording[at]
+        except MemoryError:
+            raise
+        except Exception:
+            return None  # said where that frame is the anchor
+
+    def _transform(self, optional: tuple[str, ...]) -> ExtendDepth:
+        options: dict[str, Any] = {**_TRUSTED, **self.options, **{key: key for key in optional}}
+        other_at = list(range(len(self.steps))) if len(self.steps) > 1 else 0
+        return ExtendDepth(method=self.method, other_at=other_at, **options)
+
+
+def _sample(anchor: Frame, others: Sequence[Frame | None]) -> dict[str, Any]:
+    """Frames along time, the anchor last, as the transform reads them."""
+    frames = [*(anchor if other is None else other for other in others), anchor]
+    cameras = [frame.camera for frame in frames]
+    sample = {
+        "image": torch.cat([frame.image for frame in frames]),
+        "image_is_pad": torch.tensor([*(other is None for other in others), False]),
+        "depth": anchor.depth,
+        "intrinsics": torch.cat([cam.to_matrix(camera) for camera in cameras]),
+    }
+    if anchor.conf is not None:
+        sample["confidence"] = anchor.conf
+    if anchor.camera.distortion is not None:
+        sample["distortion"] = torch.cat([_distortion(camera, anchor.camera.distortion) for camera in cameras])
+    if anchor.depth_camera is not None:
+        sample["depth_intrinsics"] = cam.to_matrix(anchor.depth_camera)[0]
+    return sample
+
+
+def _distortion(camera: Camera, like: Tensor) -> Tensor:
+    return torch.zeros_like(like) if camera.distortion is None else camera.distortion

@@ -1,0 +1,135 @@
+"""Files of rows: written whole or not at all, and recognised when they need not be written again.
+
+Every shard tells where it comes from. The metadata under ``dhtorch`` are the same in all shards of an extraction: the
+meaning of columns and codes, version, settings, key, and a digest of the data. Those under ``dhtorch.shard`` are its
+own: its number, and how many of its frames had which problem. No time is noted: the same question gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from dhtorch.data.files import FormatError, need
+from dhtorch.extract.columns import Column, Row, schema, table
+from dhtorch.extract.plan import Shard
+
+#: Key of the metadata that all shards share, and of those of one shard.
+SHARED, OWN = b"dhtorch", b"dhtorch.shard"
+
+#: Rows that are decoded together: few, because a shuffled loader asks for one.
+GROUP_ROWS = 16
+
+_PATTERN = "shard-*.parquet"
+_UNFINISHED = ".tmp"
+
+
+def write(
+    folder: Path, shard: Shard, rows: Iterable[Row], wanted: Mapping[str, Column], shared: Mapping[str, Any]
+) -> Counter[str]:
+    """Write one shard, rows as they come; the file appears when it is whole.
+
+    Args:
+        folder: exists.
+        shard: which one.
+        rows: of this shard, fewer where frames were skipped.
+        wanted: columns.
+        shared: metadata of the extraction.
+
+    Returns:
+        Number of rows by problem, and ``skipped``.
+    """
+    parquet = need("pyarrow.parquet", extra="scale")
+    layout = schema(wanted, {SHARED.decode(): json.dumps(shared, ensure_ascii=False)})
+    problems = shared["codes"]["problem"]
+    counts: Counter[str] = Counter()
+    unfinished = folder / f".{shard.name}{_UNFINISHED}"
+    try:
+        with unfinished.open("wb") as file:
+            with parquet.ParquetWriter(file, layout, compression="zstd") as writer:
+                for group in _groups(rows):
+                    counts.update(problems[str(int(row["problem"]))].lower() for row in group)
+                    writer.write_table(table(group, wanted, layout))
+                counts["skipped"] = len(shard.rows) - counts.total()
+                own = {"number": shard.number, "of": shard.of, "counts": dict(sorted(counts.items()))}
+                writer.add_key_value_metadata({OWN: json.dumps(own)})
+            file.flush()
+            os.fsync(file.fileno())
+        unfinished.replace(folder / shard.name)
+    except BaseException:
+        unfinished.unlink(missing_ok=True)
+        raise
+    return counts
+
+
+def shard_files(folder: Path) -> list[Path]:
+    """The shards in a folder, in the order of their rows."""
+    return sorted(folder.glob(_PATTERN))
+
+
+def clear(folder: Path) -> None:
+    """Remove what a writer left that was killed. Nobody may be writing there meanwhile."""
+    for left in folder.glob(f".{_PATTERN}{_UNFINISHED}"):
+        left.unlink(missing_ok=True)
+
+
+def finished(folder: Path, shared: Mapping[str, Any]) -> dict[str, Counter[str]]:
+    """Shards in a folder that are whole: name → number of rows by problem.
+
+    Raises:
+        FileExistsError: a shard of another extraction; the message says what differs.
+    """
+    found = {}
+    for path in shard_files(folder):
+        try:
+            other, own = described(path)
+        except FormatError:
+            continue  # torn: it is written again
+        if other["key"] != shared["key"]:
+            found_there = f"a shard of another extraction ({_difference(other, shared)})"
+            raise FileExistsError(f"{path}: found {found_there}, expected one of this, or another folder for out")
+        found[path.name] = Counter(own["counts"])
+    return found
+
+
+def described(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The metadata of a shard: what all share, and its own.
+
+    Raises:
+        FormatError: no shard of ours, or a torn one.
+    """
+    parquet = need("pyarrow.parquet", extra="scale")
+    try:
+        metadata = parquet.read_metadata(path).metadata or {}
+        return json.loads(metadata[SHARED]), json.loads(metadata[OWN])
+    except (OSError, ValueError, KeyError) as error:
+        raise FormatError(path, "metadata", f"{type(error).__name__}: {error}", "a shard of dhtorch extract") from None
+
+
+def _groups(rows: Iterable[Row]) -> Iterator[list[Row]]:
+    rows = iter(rows)
+    while group := list(islice(rows, GROUP_ROWS)):
+        yield group
+
+
+def _difference(a: Mapping[str, Any], b: Mapping[str, Any]) -> str:
+    """The first thing that differs between two extractions, in words."""
+    ours, theirs = _flat("", b["config"]), _flat("", a["config"])
+    for name in sorted(ours.keys() | theirs.keys()):
+        if ours.get(name) != theirs.get(name):
+            return f"{name} {theirs.get(name)} there, {ours.get(name)} here"
+    if a["data"]["digest"] != b["data"]["digest"]:
+        return "other data"
+    versions = [meta["git"] or meta["version"] for meta in (a, b)]
+    return "other code" + (f": {versions[0]} there, {versions[1]} here" if versions[0] != versions[1] else "")
+
+
+def _flat(name: str, value: Any) -> dict[str, Any]:
+    if not isinstance(value, Mapping):
+        return {name: value}
+    return {k: v for key, inner in value.items() for k, v in _flat(f"{name}.{key}".lstrip("."), inner).items()}
