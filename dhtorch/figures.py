@@ -1,4 +1,4 @@
-"""Pictures and point clouds: arrays → PNG and PLY.
+"""Pictures: arrays → PNG; what a pair found → its pictures and its point cloud.
 
 Arrays may be torch tensors or numpy arrays, on any device, of one pair (no batch dimension). matplotlib is imported
 when first needed and only through its figure objects, so no global state, window or font setting is touched.
@@ -15,6 +15,7 @@ import numpy as np
 from dhtorch.codes import ROUTE_OF_HOLE, Gate, Hole, Route, Source, names, words
 from dhtorch.evaluate import errors
 from dhtorch.evaluate.risk import risk_coverage
+from dhtorch.export import write_ply
 from dhtorch.geometry.camera import unproject
 from dhtorch.pair import merge
 
@@ -48,58 +49,6 @@ MARKERS: dict[str, dict[str, Any]] = {
     "answer": {"marker": "o", "s": 14, "linewidth": 0.3, "edgecolor": "white"},
 }
 LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-
-
-def write_ply(
-    path: str | Path,
-    xyz: Any,  # (P, 3) m
-    rgb: Any = None,  # (P, 3) uint8, or float in [0, 1]
-    *,
-    source: Any = None,  # (P,) codes.Source
-    sigma: Any = None,  # (P,) m
-    score: Any = None,  # (P,) in [0, 1]
-    colour_by: str = "source",
-) -> int:
-    """Write points as a binary little-endian PLY: x y z, red green blue, sigma, score, source.
-
-    Args:
-        path: of the file.
-        xyz: points, camera axes (x right, y down, z forward); non-finite ones are left out.
-        rgb: colours of the image.
-        source: where each point comes from; None = recovered.
-        sigma, score: of each point; None = 0.
-        colour_by: ``source`` (sensor blue, recovered orange) or ``image`` (``rgb``).
-
-    Returns:
-        Number of points written.
-
-    Raises:
-        ValueError: another word for ``colour_by``, or ``image`` without ``rgb``.
-    """
-    if colour_by not in ("source", "image") or (colour_by == "image" and rgb is None):
-        raise ValueError(f"write_ply: found colour_by={colour_by!r}, expected 'source', or 'image' together with rgb")
-    points = _array(xyz).reshape(-1, 3)
-    n = len(points)
-    source = np.full(n, Source.RECOVERED) if source is None else _array(source).reshape(n)
-    if colour_by == "source":
-        colours = np.where((source == Source.SENSOR)[:, None], _rgb(SENSOR), _rgb(RECOVERED))
-    else:
-        colours = _array(rgb).reshape(n, 3)
-        colours = colours if colours.dtype == np.uint8 else np.round(255 * np.clip(colours, 0, 1))
-    layout = [(axis, "<f4") for axis in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
-    vertex = np.zeros(n, [*layout, ("sigma", "<f4"), ("score", "<f4"), ("source", "u1")])
-    for k, (axis, channel) in enumerate(zip("xyz", ("red", "green", "blue"), strict=True)):
-        vertex[axis], vertex[channel] = points[:, k], colours[:, k]
-    vertex["source"] = source
-    vertex["sigma"] = 0 if sigma is None else _array(sigma).reshape(n)
-    vertex["score"] = 0 if score is None else _array(score).reshape(n)
-    vertex = vertex[np.isfinite(points).all(1)]
-    words = {"<f4": "float", "|u1": "uchar"}
-    head = ["ply", "format binary_little_endian 1.0", "comment metres; x right, y down, z forward"]
-    head += ["comment source 1 sensor, 2 recovered", f"element vertex {len(vertex)}"]
-    head += [f"property {words[vertex.dtype[name].str]} {name}" for name in vertex.dtype.names or ()]
-    Path(path).write_bytes("\n".join([*head, "end_header\n"]).encode("ascii") + vertex.tobytes())
-    return len(vertex)
 
 
 def draw_samples(
@@ -242,9 +191,16 @@ def draw_example(folder: str | Path, example: Any) -> list[Path]:
         written += ["depth.png", "risk_coverage.png"]
     filled = whole.source[0] != Source.NONE
     xyz = unproject(e.frame.camera, whole.uv, whole.depth)[0][filled]
-    columns = {name: getattr(whole, name)[0][filled] for name in ("source", "sigma", "score")}
-    write_ply(folder / "points.ply", xyz, **columns)
+    columns = {name: getattr(whole, name)[0][filled] for name in ("sigma", "score")}
+    columns |= {"hole": e.samples.hole[0][filled], "source": whole.source[0][filled]}
+    write_ply(folder / "points.ply", xyz, source_colours(columns["source"]), **columns)
     return [folder / name for name in written]
+
+
+def source_colours(source: Any) -> np.ndarray:
+    """Colours (P, 3) uint8 of points by codes.Source: sensor blue, recovered orange."""
+    sensed = _array(source)[:, None] == Source.SENSOR
+    return np.where(sensed, _rgb(SENSOR), _rgb(RECOVERED)).astype(np.uint8)
 
 
 def _array(x: Any) -> np.ndarray:

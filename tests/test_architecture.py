@@ -15,7 +15,7 @@ LEVELS = [
     {"geometry"},
     {"records"},
     {"stages", "negative", "data", "evaluate", "baselines"},
-    {"pair", "window", "integrate", "calibration", "seats"},
+    {"pair", "window", "integrate", "export", "calibration", "seats"},
     {"transform", "extract", "experiments", "figures"},
     {"run", "job", "report", "viewer", "capture", "__main__"},
 ]

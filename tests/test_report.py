@@ -2,7 +2,6 @@
 
 import io
 import math
-import struct
 import subprocess
 import sys
 
@@ -118,48 +117,6 @@ def test_the_command_prints_both_forms_and_refuses_what_is_no_result(tmp_path, c
         assert len({line.replace("\\|", "").count("|") for line in lines}) <= 1, "every row has as many cells"
     with pytest.raises(FileNotFoundError, match="expected a result"):
         report.main([str(tmp_path / "nothing")])
-
-
-# ---------------------------------------------------------------------------------------------------- point cloud
-
-
-def read_ply(path):
-    """An independent reader: header by line, rows by struct."""
-    head, body = path.read_bytes().split(b"end_header\n", 1)
-    lines = head.decode("ascii").splitlines()
-    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
-    n = int(next(line for line in lines if line.startswith("element vertex")).split()[-1])
-    fields = [line.split()[1:] for line in lines if line.startswith("property")]
-    form = struct.Struct("<" + "".join({"float": "f", "uchar": "B"}[kind] for kind, _ in fields))
-    assert len(body) == n * form.size
-    return [dict(zip([name for _, name in fields], row, strict=True)) for row in form.iter_unpack(body)]
-
-
-def test_ply_holds_what_was_written(tmp_path):
-    xyz = torch.tensor([[0.5, -1.0, 2.0], [math.nan, 0.0, 1.0], [3.0, 4.0, 5.0]])
-    rgb = torch.tensor([[0.0, 0.5, 1.0], [1.0, 1.0, 1.0], [2.0, 0.2, -1.0]])
-    source = torch.tensor([Source.SENSOR, Source.SENSOR, Source.RECOVERED], dtype=torch.int32)
-    about = {"source": source, "sigma": torch.tensor([0.1, 0.2, 0.25]), "score": torch.tensor([1.0, 0.0, 0.5])}
-    path = tmp_path / "points.ply"
-    assert figures.write_ply(path, xyz, rgb, colour_by="image", **about) == 2
-    first, second = read_ply(path)
-    assert list(first) == ["x", "y", "z", "red", "green", "blue", "sigma", "score", "source"]
-    assert [first[k] for k in ("x", "y", "z", "red", "green", "blue", "source")] == [0.5, -1, 2, 0, 128, 255, 1]
-    assert [second[k] for k in ("z", "red", "green", "blue", "sigma", "score", "source")] == [
-        5,
-        255,
-        51,
-        0,
-        0.25,
-        0.5,
-        2,
-    ]
-    figures.write_ply(path, xyz, **about)
-    colours = [tuple(p[k] for k in ("red", "green", "blue")) for p in read_ply(path)]
-    assert len(set(colours)) == 2, "sensor and recovered differ in colour"
-    assert figures.write_ply(path, np.zeros((0, 3))) == 0 and read_ply(path) == []
-    with pytest.raises(ValueError, match="colour_by='image', expected"):
-        figures.write_ply(path, xyz, colour_by="image")
 
 
 # ---------------------------------------------------------------------------------------------------- figures

@@ -1,0 +1,48 @@
+"""What the writers share: arrays from anywhere, colours, and which points can be written."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+
+def array(x: Any) -> np.ndarray:
+    """A numpy array of a tensor (detached, on the CPU) or of anything numpy takes."""
+    return x.detach().cpu().numpy() if hasattr(x, "detach") else np.asarray(x)
+
+
+def rows(where: str, name: str, x: Any, n: int | None, width: int | None) -> np.ndarray:
+    """``x`` as (n, width), or (n,) where ``width`` is None.
+
+    Raises:
+        ValueError: another shape.
+    """
+    values = array(x)
+    shape = (len(values) if n is None and values.ndim else n, *([] if width is None else [width]))
+    if values.shape != shape:
+        expected = ", ".join("P" if s is None else str(s) for s in (n, *([] if width is None else [width])))
+        raise ValueError(f"{where}: {name} has shape {values.shape}, expected ({expected})")
+    return values
+
+
+def bytes_of_colour(rgb: np.ndarray) -> np.ndarray:
+    """Colours as uint8: those are kept, others are in [0, 1], rounded and cut off there; NaN is black."""
+    if rgb.dtype == np.uint8:
+        return rgb
+    return np.round(255 * np.clip(np.nan_to_num(rgb.astype(np.float64)), 0, 1)).astype(np.uint8)
+
+
+def finite(xyz: np.ndarray, face: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+    """Which points (P,) are finite, and the triangles between such points, numbered among them.
+
+    Raises:
+        ValueError: a triangle with a corner that does not exist.
+    """
+    good = np.isfinite(xyz).all(1)
+    if face is None:
+        return good, None
+    if face.size and not (face.min() >= 0 and face.max() < len(xyz)):
+        raise ValueError(f"export: face names points {face.min()} to {face.max()}, expected 0 to {len(xyz) - 1}")
+    renumbered = np.cumsum(good) - 1
+    return good, renumbered[face[good[face].all(1)]] if face.size else face.reshape(0, 3)

@@ -1,0 +1,115 @@
+"""COLMAP's text model: cameras.txt, images.txt and points3D.txt, for structure-from-motion tools and splat trainers.
+
+COLMAP counts pixels from the corner of the image, so that the centre of the first pixel is (0.5, 0.5); ours is (0, 0).
+Half a pixel is added to everything written here. Poses there map the world into the camera.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dhtorch import archive
+from dhtorch.export.arrays import bytes_of_colour, rows
+from dhtorch.geometry import se3
+from dhtorch.records import Camera, Pose
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A picture and where it was taken from (batch size 1)."""
+
+    name: str  # of the picture's file
+    camera: Camera
+    hw: tuple[int, int]
+    T_world_from_cam: Pose
+
+
+def write_colmap(
+    folder: str | Path,
+    shots: Sequence[Shot],
+    xyz: Any,  # (P, 3) m in the world
+    rgb: Any,  # (P, 3) uint8, or float in [0, 1]
+    error: Any,  # (P,) px, reprojection error
+    seen_by: Any,  # (P, V) numbers of shots, -1 = none
+    uv: Any,  # (P, V, 2) px in those shots, as photographed
+) -> None:
+    """Write a model: cameras, pictures with their observations, and points with their tracks.
+
+    Equal cameras are written once. Lenses without distortion become PINHOLE, those with up to four coefficients OPENCV,
+    others FULL_OPENCV. Non-finite points, and observations that are not finite, are left out; a point that nothing
+    observes is written with an empty track. All numbers in the files count from 1, in the order given.
+
+    Raises:
+        ValueError: wrong shapes, or an observation in a shot that does not exist.
+    """
+    points = rows("write_colmap", "xyz", xyz, None, 3).astype(np.float64)
+    P = len(points)
+    colours = bytes_of_colour(rows("write_colmap", "rgb", rgb, P, 3))
+    errors = rows("write_colmap", "error", error, P, None)
+    seen = np.asarray(rows("write_colmap", "seen_by", seen_by, P, np.shape(seen_by)[-1]), np.int64)
+    pixels = np.asarray(uv.detach().cpu() if hasattr(uv, "detach") else uv, np.float64)
+    if pixels.shape != (*seen.shape, 2):
+        raise ValueError(f"write_colmap: uv has shape {pixels.shape}, expected {(*seen.shape, 2)}")
+    if seen.size and seen.max() >= len(shots):
+        raise ValueError(f"write_colmap: seen_by names shot {seen.max()}, expected at most {len(shots) - 1}")
+    observed: list[list[str]] = [[] for _ in shots]
+    lines = []
+    for number, p in enumerate(np.nonzero(np.isfinite(points).all(1))[0], start=1):
+        track = []
+        for shot, (u, v) in zip(seen[p], pixels[p], strict=True):
+            if shot >= 0 and math.isfinite(u + v):
+                track += [str(shot + 1), str(len(observed[shot]))]
+                observed[shot].append(f"{_text(u + 0.5)} {_text(v + 0.5)} {number}")
+        head = " ".join([str(number), *map(_text, points[p]), *map(str, colours[p]), _text(errors[p])])
+        lines.append(" ".join([head, *track]))
+    cameras = [_camera(shot) for shot in shots]
+    known = list(dict.fromkeys(cameras))
+    pictures = []
+    for k, shot in enumerate(shots):
+        pictures.append(f"{k + 1} {_pose(shot)} {known.index(cameras[k]) + 1} {shot.name}")
+        pictures.append(" ".join(observed[k]))
+    files = {
+        "cameras.txt": ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", *(f"{k + 1} {c}" for k, c in enumerate(known))],
+        "images.txt": ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; POINTS2D[] as X, Y, POINT3D_ID"],
+        "points3D.txt": ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)", *lines],
+    }
+    files["images.txt"] += pictures
+    for name, text in files.items():
+        archive.replace_file(Path(folder) / name, ("\n".join(text) + "\n").encode("utf-8"))
+
+
+def _camera(shot: Shot) -> str:
+    """Model, size and parameters."""
+    (fx, fy), (cx, cy) = shot.camera.f[0].tolist(), shot.camera.c[0].tolist()
+    lens = [] if shot.camera.distortion is None else shot.camera.distortion[0].tolist()
+    model, length = ("PINHOLE", 0) if not any(lens) else ("OPENCV", 4) if not any(lens[4:]) else ("FULL_OPENCV", 8)
+    numbers = [fx, fy, cx + 0.5, cy + 0.5, *(lens + [0.0] * 8)[:length]]
+    return " ".join([model, str(shot.hw[1]), str(shot.hw[0]), *map(_text, numbers)])
+
+
+def _pose(shot: Shot) -> str:
+    """Quaternion w, x, y, z and translation of the camera from the world."""
+    T = se3.invert(shot.T_world_from_cam.map(lambda v: v.double()))
+    return " ".join(map(_text, [*_quaternion(T.R[0].tolist()), *T.t[0].tolist()]))
+
+
+def _quaternion(R: list[list[float]]) -> list[float]:
+    """w, x, y, z of a rotation matrix, from its largest component, so that no digit is lost; w >= 0."""
+    d = [R[k][k] for k in range(3)]
+    four = [1 + d[0] + d[1] + d[2], 1 + d[0] - d[1] - d[2], 1 - d[0] + d[1] - d[2], 1 - d[0] - d[1] + d[2]]
+    wx, wy, wz = R[2][1] - R[1][2], R[0][2] - R[2][0], R[1][0] - R[0][1]
+    xy, xz, yz = R[0][1] + R[1][0], R[0][2] + R[2][0], R[1][2] + R[2][1]
+    rows_of = [[four[0], wx, wy, wz], [wx, four[1], xy, xz], [wy, xy, four[2], yz], [wz, xz, yz, four[3]]]
+    best = rows_of[max(range(4), key=lambda k: four[k])]
+    length = math.copysign(math.sqrt(sum(v * v for v in best)), best[0] or 1.0)
+    return [v / length for v in best]
+
+
+def _text(value: float) -> str:
+    return f"{float(value):.10g}"

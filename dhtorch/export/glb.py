@@ -1,0 +1,152 @@
+"""GLB, the binary form of glTF 2.0: browsers, Blender, MeshLab and Windows show it without a plug-in.
+
+glTF's world is y up and its colours of points are linear light; ours are turned and converted here, so that a room
+stands upright and looks as photographed.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dhtorch import archive
+from dhtorch.export.arrays import array, bytes_of_colour, finite, rows
+
+_FLOAT, _UINT = 5126, 5125
+_POINTS, _TRIANGLES = 0, 4
+_VERTICES, _INDICES = 34962, 34963  # what a buffer view is for
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A cloud of points, or a mesh where it has triangles."""
+
+    name: str
+    xyz: Any  # (P, 3) m
+    rgb: Any = None  # (P, 3) uint8, or float in [0, 1]; None = grey
+    normal: Any = None  # (P, 3)
+    face: Any = None  # (F, 3)
+    values: Mapping[str, Any] = field(default_factory=dict)  # (P,) each; become attributes _NAME of float
+
+
+def write_glb(path: str | Path, shapes: Sequence[Shape], *, up: Sequence[float] = (0.0, -1.0, 0.0)) -> None:
+    """Write clouds and meshes into one file, each a node of its own.
+
+    Args:
+        path: of the file.
+        shapes: non-finite points are left out, with their triangles; a shape without any point is left out.
+        up: the direction in the shapes' own axes that points upwards; becomes glTF's +y. The default suits camera axes.
+
+    Raises:
+        ValueError: wrong shapes, a triangle without its corners, or an ``up`` without a direction.
+    """
+    parts = _Parts()
+    turn = _turn_to_y(np.asarray(up, np.float64))
+    for shape in shapes:
+        parts.add(shape, turn)
+    document = parts.document()
+    text = json.dumps(document, allow_nan=False, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    if parts.data:
+        chunks += struct.pack("<I4s", len(parts.data), b"BIN\0") + bytes(parts.data)
+    archive.replace_file(path, struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+
+
+class _Parts:
+    """Collects nodes, meshes, accessors and the one binary buffer."""
+
+    def __init__(self) -> None:
+        self.data = bytearray()
+        self.views: list[dict[str, Any]] = []
+        self.accessors: list[dict[str, Any]] = []
+        self.meshes: list[dict[str, Any]] = []
+        self.nodes: list[dict[str, Any]] = []
+
+    def add(self, shape: Shape, turn: list[float]) -> None:
+        points = rows("write_glb", "xyz", shape.xyz, None, 3)
+        n = len(points)
+        corners = None if shape.face is None else rows("write_glb", "face", array(shape.face), None, 3)
+        good, corners = finite(points, corners)
+        if not good.any():
+            return
+        rgb = np.full((n, 3), 0.6) if shape.rgb is None else rows("write_glb", "rgb", shape.rgb, n, 3)
+        attributes = {"POSITION": self._floats(points[good], bounds=True), "COLOR_0": self._colours(rgb[good])}
+        if shape.normal is not None:
+            normal = rows("write_glb", "normal", shape.normal, n, 3)[good].astype(np.float64)
+            length = np.linalg.norm(normal, axis=1, keepdims=True)
+            known = np.isfinite(length) & (length > 0)
+            up = np.array([0.0, 1.0, 0.0])
+            attributes["NORMAL"] = self._floats(np.where(known, normal / np.where(known, length, 1), up))
+        for name, value in shape.values.items():
+            column = rows("write_glb", name, value, n, None)[good].astype(np.float64)
+            attributes[f"_{name.upper()}"] = self._floats(np.nan_to_num(column))
+        primitive: dict[str, Any] = {"attributes": attributes, "material": 0, "mode": _POINTS}
+        if corners is not None and len(corners):
+            index = self._accessor(corners.astype("<u4").reshape(-1), _UINT, "SCALAR", target=_INDICES)
+            primitive |= {"indices": index, "mode": _TRIANGLES}
+        self.nodes.append({"name": shape.name, "mesh": len(self.meshes), "rotation": turn})
+        self.meshes.append({"name": shape.name, "primitives": [primitive]})
+
+    def document(self) -> dict[str, Any]:
+        """The JSON part."""
+        whole: dict[str, Any] = {"asset": {"version": "2.0", "generator": "dhtorch"}, "scene": 0}
+        whole["scenes"] = [{"nodes": list(range(len(self.nodes)))}] if self.nodes else [{}]
+        if not self.nodes:
+            return whole
+        plain = {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": 0, "roughnessFactor": 1}
+        unlit = "KHR_materials_unlit"  # the light is in the pictures already
+        whole |= {"extensionsUsed": [unlit], "nodes": self.nodes, "meshes": self.meshes}
+        whole["materials"] = [{"pbrMetallicRoughness": plain, "doubleSided": True, "extensions": {unlit: {}}}]
+        return whole | {
+            "accessors": self.accessors,
+            "bufferViews": self.views,
+            "buffers": [{"byteLength": len(self.data)}],
+        }
+
+    def _floats(self, values: np.ndarray, bounds: bool = False) -> int:
+        kind = "VEC3" if values.ndim == 2 else "SCALAR"
+        return self._accessor(np.ascontiguousarray(values, "<f4"), _FLOAT, kind, bounds=bounds)
+
+    def _colours(self, rgb: np.ndarray) -> int:
+        """Linear light as floats: 8 bits would not keep what is dark apart, and some readers trip over 16."""
+        display = bytes_of_colour(rgb) / 255.0
+        return self._floats(np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4))
+
+    def _accessor(
+        self,
+        values: np.ndarray,
+        component: int,
+        kind: str,
+        *,
+        target: int = _VERTICES,
+        bounds: bool = False,
+    ) -> int:
+        entry: dict[str, Any] = {"bufferView": len(self.views), "componentType": component}
+        entry |= {"count": len(values), "type": kind}
+        if bounds:
+            entry |= {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
+        size = values.nbytes
+        self.views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": size, "target": target})
+        self.data += values.tobytes() + b"\0" * (-size % 4)
+        self.accessors.append(entry)
+        return len(self.accessors) - 1
+
+
+def _turn_to_y(up: np.ndarray) -> list[float]:
+    """The quaternion x, y, z, w of the smallest turn that takes ``up`` to +y; half a turn goes about x."""
+    length = np.linalg.norm(up)
+    if up.shape != (3,) or not length > 0 or not math.isfinite(length):
+        raise ValueError(f"write_glb: up is {up.tolist()}, expected a direction of three numbers")
+    x, y, z = (up / length).tolist()
+    if y < -1 + 1e-9:
+        return [1.0, 0.0, 0.0, 0.0]
+    turn = np.array([-z, 0.0, x, 1 + y])  # (up × y, 1 + up · y)
+    return (turn / np.linalg.norm(turn)).tolist()

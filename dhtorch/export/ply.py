@@ -1,0 +1,82 @@
+"""PLY, the Stanford polygon format, binary and little-endian: MeshLab, CloudCompare, Blender and Open3D read it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dhtorch import archive
+from dhtorch.export.arrays import array, bytes_of_colour, finite, rows
+
+_WORDS = {"f4": "float", "u1": "uchar", "i4": "int"}
+
+
+def write_ply(
+    path: str | Path,
+    xyz: Any,  # (P, 3) m
+    rgb: Any = None,  # (P, 3) uint8, or float in [0, 1]
+    *,
+    normal: Any = None,  # (P, 3)
+    face: Any = None,  # (F, 3) triangles
+    comments: Sequence[str] = ("metres; x right, y down, z forward",),
+    **values: Any,  # (P,) each
+) -> int:
+    """Write points, or a mesh, with any numbers beside each point.
+
+    Properties: x y z, nx ny nz, red green blue, then ``values`` in the order given. Small whole numbers (codes) become
+    uchar, other whole numbers int, everything else float. ``sigma``, ``score``, ``hole`` (why the sensor is silent
+    there, codes.Hole; written as ``class``) and ``source`` (codes.Source) are the names used throughout.
+
+    Args:
+        path: of the file.
+        xyz: points; non-finite ones are left out, with their triangles.
+        rgb, normal, values: of each point.
+        face: corners as numbers of points; makes it a mesh.
+        comments: lines of the header.
+
+    Returns:
+        Number of points written.
+
+    Raises:
+        ValueError: arrays of unequal length or wrong shape, or a triangle without its corners.
+    """
+    points = rows("write_ply", "xyz", xyz, None, 3)
+    n = len(points)
+    columns: dict[str, np.ndarray] = dict(zip("xyz", points.T.astype("<f4"), strict=True))
+    if normal is not None:
+        normals = np.nan_to_num(rows("write_ply", "normal", normal, n, 3)).T.astype("<f4")
+        columns |= dict(zip(("nx", "ny", "nz"), normals, strict=True))
+    if rgb is not None:
+        colours = bytes_of_colour(rows("write_ply", "rgb", rgb, n, 3)).T
+        columns |= dict(zip(("red", "green", "blue"), colours, strict=True))
+    for name, value in values.items():
+        if value is not None:
+            columns["class" if name == "hole" else name] = _number(rows("write_ply", name, value, n, None))
+    corners = None if face is None else rows("write_ply", "face", array(face), None, 3)
+    good, corners = finite(points, corners)
+    vertex = np.zeros(n, [(name, column.dtype) for name, column in columns.items()])
+    for name, column in columns.items():
+        vertex[name] = column
+    vertex = vertex[good]
+    head = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
+    head += [f"element vertex {len(vertex)}"]
+    head += [f"property {_WORDS[column.dtype.str[1:]]} {name}" for name, column in columns.items()]
+    body = vertex.tobytes()
+    if corners is not None:
+        head += [f"element face {len(corners)}", "property list uchar int vertex_indices"]
+        triangles = np.zeros(len(corners), [("n", "u1"), ("corner", "<i4", 3)])
+        triangles["n"], triangles["corner"] = 3, corners
+        body += triangles.tobytes()
+    archive.replace_file(path, "\n".join([*head, "end_header\n"]).encode("ascii") + body)
+    return len(vertex)
+
+
+def _number(values: np.ndarray) -> np.ndarray:
+    """As uchar, int or float, little-endian."""
+    if values.dtype.kind == "b" or (values.dtype.kind in "iu" and (not values.size or values.min() >= 0)):
+        small = not values.size or values.max() <= 255
+        return values.astype("u1" if small else "<i4")
+    return values.astype("<i4" if values.dtype.kind in "iu" else "<f4")
