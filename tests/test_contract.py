@@ -16,6 +16,7 @@ from dhtorch.evaluate import holdout, probe
 from dhtorch.geometry import (
     affine,
     camera,
+    cells,
     covariance,
     epipolar,
     filters,
@@ -212,6 +213,11 @@ def waves(batch, n, dtype):
     return signal[:, :-3], signal[:, 3:], site, site
 
 
+def places(batch, n):
+    """Cells of a grid."""
+    return torch.randint(-9, 9, (batch, n, 3), generator=generator(5))
+
+
 def clustered(batch, n, dtype):
     return pixels(batch, n, dtype), torch.rand(batch, n, generator=generator(3)) < 0.6
 
@@ -288,6 +294,10 @@ ROWS = [
     Row(lookup.luma, lambda b, n, d: (frames(b, n, d)[0].image, 1), POINTLESS, grad=(0,)),
     Row(lookup.nearest, lambda b, n, d: (frames(b, n, d)[0].depth, pixels(b, n, d)), "dtype batch vmap capture gradcheck empty shuffle padding nan raises", (1,), (0,), bad=wrong_last_axis(1)),
     Row(lookup.round_half_up, lambda b, n, d: (pixels(b, n, d),), "dtype batch vmap capture empty shuffle padding nan", (0,)),
+    Row(cells.pack, lambda b, n, d: (places(b, n),), "batch vmap capture empty shuffle padding raises", (0,), bad=wrong_last_axis(0)),
+    Row(cells.unpack, lambda b, n, d: (cells.pack(places(b, n)),), "batch vmap capture empty shuffle padding", (0,)),
+    Row(cells.find, lambda b, n, d: (cells.pack(places(b, 40)).unique(), cells.pack(places(b, n))), "batch capture empty shuffle padding raises", (1,), shared=(0,), bad=lambda a: (a[0][None], a[1])),
+    Row(cells.near, lambda b, n, d: (cells.pack(places(1, n)[0]), cells.pack(places(b, 9)).unique()), "capture empty raises", bad=lambda a: (a[0][None], a[1])),
     Row(epipolar.triangulate, two_views, ALL, (0, 1), (0, 1, 2, 3, 4), bad=wrong_last_axis(0)),
     Row(epipolar.describe, lambda b, n, d: (camera.unproject(two_views(b, n, d)[2], two_views(b, n, d)[0], uniform(b, n, dtype=d, low=1, high=2)), *two_views(b, n, d)), ALL, (0, 1, 2), (0, 1, 2, 3, 4, 5), bad=wrong_last_axis(0)),
     Row(epipolar.point_jacobians, lambda b, n, d: (cameras(b, d), uniform(b, n, 3, dtype=d, low=1, high=2)), ALL, (1,), (0, 1), bad=wrong_last_axis(1)),
@@ -300,6 +310,8 @@ ROWS = [
     Row(triangulate.two_view, tracked, ALL, (0, 1), (1, 3, 4), bad=lambda a: (a[0], a[1].replace(uv_0=a[1].uv_0[:, 1:]), *a[2:])),
     Row(score.rank, estimated, ALL, (0, 1, 2), (0,), bad=lambda a: (a[0], a[1].replace(uv=a[1].uv[:, 1:]), *a[2:])),
     Row(score.rank_by_error, estimated, ALL, (0, 1, 2), (0,), bad=lambda a: (a[0], a[1].replace(uv=a[1].uv[:, 1:]), *a[2:])),
+    Row(score.evidence, estimated, "dtype batch vmap capture gradcheck empty shuffle nan raises", (0, 1, 2), (0,), bad=lambda a: (a[0], a[1].replace(uv=a[1].uv[:, 1:]), *a[2:])),
+    Row(score.expected_error_loss, lambda b, n, d: (uniform(n, dtype=d, low=-5), uniform(n, dtype=d), uniform(n, dtype=d)), "dtype capture gradcheck raises", grad=(0,), bad=wrong_last_axis(1)),
     Row(pose.pnp_ransac, posed, "dtype batch vmap capture empty padding raises", (0, 1), bad=lambda a: (a[0], a[1].replace(uv_1=a[1].uv_1[:, 1:]), *a[2:]), atol=1e-4),
     Row(pose.map_pose, posed, "dtype batch vmap capture empty padding raises", (0, 1), bad=lambda a: (a[0], a[1].replace(uv_1=a[1].uv_1[:, 1:]), *a[2:]), atol=1e-4),
     Row(track.lucas_kanade, shifted, "dtype batch capture empty shuffle padding nan raises", (2,), bad=wrong_last_axis(2), atol=1e-4),
@@ -371,10 +383,13 @@ ROWS = [
 ]  # fmt: skip
 
 #: Functions without a batch of points: samplers, loops over a callable, flat lists of pooled points. Their promises are
-#: tested where they are at home (test_front_end.py, test_pose.py, test_evaluate.py).
+#: tested where they are at home (test_front_end.py, test_pose.py, test_evaluate.py, test_integrate.py).
 ELSEWHERE = {
     *(f"dhtorch.stages.sample.{name}" for name in ("spiral", "vogel", "grid")),
     "dhtorch.geometry.shapes.check",
+    *(f"dhtorch.geometry.cells.{name}" for name in ("occupied", "components")),
+    *(f"dhtorch.integrate.volume.{name}" for name in ("empty", "fuse", "splat")),
+    *(f"dhtorch.integrate.surface.{name}" for name in ("points", "mesh")),
     "dhtorch.geometry.filters.gaussian_taps",
     *(f"dhtorch.window.{name}" for name in ("inverse_variance", "key_views", "extend_window")),
     "dhtorch.geometry.least_squares.minimise",
@@ -527,7 +542,7 @@ def test_wrong_shapes_raise(row):
 
 
 def public_functions():
-    for package in ("geometry", "stages", "evaluate", "negative"):
+    for package in ("geometry", "stages", "evaluate", "negative", "integrate"):
         module = importlib.import_module(f"dhtorch.{package}")
         for info in pkgutil.iter_modules(module.__path__, f"dhtorch.{package}."):
             part = importlib.import_module(info.name)

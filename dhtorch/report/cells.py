@@ -42,6 +42,7 @@ HEADS = {
     "median_rel_ratio": "error ratio",
     "median_rel_ratio_at_equal_coverage": "error ratio, equal coverage",
     "aurc_ratio": "AURC ratio",
+    "aurc_ratio_by_error": "AURC ratio to by_error",
     "pair_ms": "ms per pair",
     "extra_ms": "ms more",
     "seconds_per_video": "s per video",

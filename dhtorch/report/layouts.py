@@ -219,6 +219,11 @@ def _part_ablation(result: Result) -> list[Table]:
     return [by_variant(result, "Parts alone and left out, ratios to the paper's method", columns)]
 
 
+def _learned_score(result: Result) -> list[Table]:
+    columns = ("n_scenes", "n_kept", "aurc", "aurc_excess", "aurc_ratio", "aurc_ratio_by_error", "coverage_at_5")
+    return [by_variant(result, "The same answers in the order of each score, over scenes", columns)]
+
+
 def _helix(result: Result) -> list[Table]:
     columns = ("n_scenes", "corr", "rank_corr", "corr_answered", "coverage", "flow_share", "along_share")
     title = "Shift as a depth cue: correlation with the sensor's inverse depth, medians over scenes"
@@ -253,6 +258,7 @@ LAYOUTS: dict[str, Callable[[Result], list[Table]]] = {
     "ablation": _ablation,
     "latency": timings.latency,
     "method_comparison": _comparison,
+    "learned_score": _learned_score,
     "part_ablation": _part_ablation,
     "helix_correlation": _helix,
     "icp": _icp,

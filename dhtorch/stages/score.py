@@ -1,14 +1,22 @@
-"""Stage 7, how sure: the selective score and its threshold, which is the last gate."""
+"""Stage 7, how sure: the selective score and its threshold, which is the last gate.
+
+Two scores made by hand and one that learns. Alphabet of the latter: ``x`` (…, 8) evidence of an answer in logarithms,
+``e`` the relative error to expect of it.
+"""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Self
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from dhtorch.codes import Gate
 from dhtorch.geometry.shapes import check
+from dhtorch.geometry.steady import steady
 from dhtorch.records import Estimate, PoseFit, Samples, Tracks
 
 #: The pose's part of a variance is subtracted from the whole; no own part is believed to be a smaller share of it.
@@ -16,6 +24,24 @@ OWN_SHARE = 1e-6
 
 #: Relative errors and ratios beyond these limits are not told apart: their squares stay in the range of float32.
 SMALLEST, LARGEST = 1e-6, 1e6
+
+#: What a learned score looks at, each as a logarithm, with the limits beyond which values are not told apart.
+EVIDENCE: dict[str, tuple[float, float]] = {
+    "expected_error": (1e-5, 1e2),  # e of rank_by_error
+    "shared_error": (1e-5, 1e2),  # the pose's part of sigma / depth
+    "parallax_deg": (1e-3, 1e2),
+    "residual_px": (1e-2, 1e2),
+    "round_trip_px": (1e-3, 1e2),
+    "photometric": (1e-4, 1.0),
+    "trackability": (1e-7, 1.0),
+    "reach": (1e-2, 1e2),  # depth over the mean depth of the returns that hold the pose
+}
+
+#: The largest factor, as a logarithm, by which a learned score changes the error to expect.
+MOST = 4.0
+
+#: Residual and round trip, px, that count as much as a track's own noise.
+RESIDUAL_PX, ROUND_TRIP_PX = 0.5, 0.4
 
 
 def rank(
@@ -62,9 +88,9 @@ def rank_by_error(
     tracks: Tracks,
     fit: PoseFit,
     *,
-    residual_scale_px: float = 0.5,
+    residual_scale_px: float = RESIDUAL_PX,
     photometric_scale: float | None = None,
-    round_trip_scale_px: float | None = 0.4,
+    round_trip_scale_px: float | None = ROUND_TRIP_PX,
     half_error: float = 0.1,
     recalibration: Callable[[Tensor], Tensor] | None = None,
     min_score: float = 0.0,
@@ -109,6 +135,146 @@ def rank_by_error(
     return _silence(estimate, score, min_score)
 
 
+def evidence(estimate: Estimate, samples: Samples, tracks: Tracks, fit: PoseFit) -> tuple[Tensor, Tensor]:
+    """What speaks for and against every answer: logarithms (B, N, 8) in the order of :data:`EVIDENCE`.
+
+    Returns:
+        The logarithms, 0 where there is no answer with a sigma, and a mask (B, N) of where there is.
+
+    Raises:
+        ValueError: wrong shapes.
+
+    Gradient: to depth, sigma, parallax and residual; zero beyond the limits and where there is no answer.
+    """
+    check("evidence", gate=(estimate.gate, "B N"), uv=(samples.uv, "B N 2"), valid=(tracks.valid, "B N"))
+    terms = [(estimate.residual_px, RESIDUAL_PX), (tracks.error, ROUND_TRIP_PX)]
+    expected, stated = _expected_error(estimate, terms)
+    others = (estimate.parallax_deg, estimate.residual_px, tracks.error, tracks.photometric, samples.trackability)
+    for x in others:
+        stated = stated & x.isfinite()
+    one, zero = torch.ones_like(expected), torch.zeros_like(expected)
+    depth = torch.where(stated, estimate.depth, one)
+    inlier = fit.inlier & (samples.depth > 0)
+    near = torch.where(inlier, samples.depth, zero).sum(-1, keepdim=True) / inlier.sum(-1, keepdim=True).clamp_min(1)
+    reach = depth / torch.where(near > 0, near, torch.ones_like(near))
+    shared = torch.where(stated, estimate.sigma_shared, zero) / depth
+    columns = (expected, shared, *(torch.where(stated, x, one) for x in others), reach)
+    logs = [steady(torch.log, x.clamp(*limits)) for x, limits in zip(columns, EVIDENCE.values(), strict=True)]
+    return torch.stack([torch.where(stated, x, zero) for x in logs], -1), stated
+
+
+class LearnedScore(nn.Module):
+    """A seat-7 function with weights: h / (h + e), e the relative error that the evidence lets expect.
+
+    e = exp(g(x)) times the error that :func:`rank_by_error` expects, g a network with one hidden layer. Untrained, g is
+    0 and the score that of ``rank_by_error``. Train it on answers with truth by :func:`expected_error_loss`; it travels
+    as JSON or, through ``state_dict``, as any module does.
+
+    Args:
+        hidden: width of the hidden layer.
+        half_error: e at which the score is one half.
+        min_score: answers below it are silenced with LOW_SCORE.
+        seed: of the first layer's weights.
+
+    Gradient: to the weights, and to what :func:`evidence` passes on; the threshold carries none.
+    """
+
+    mean: Tensor
+    spread: Tensor
+
+    def __init__(self, hidden: int = 16, *, half_error: float = 0.1, min_score: float = 0.0, seed: int = 0) -> None:
+        super().__init__()
+        n = len(EVIDENCE)
+        start = torch.rand(hidden, n + 1, generator=torch.Generator().manual_seed(seed)) * 2 - 1
+        self.register_buffer("mean", torch.zeros(n))  # of the evidence it is trained on
+        self.register_buffer("spread", torch.ones(n))
+        self.first = nn.Parameter(start[:, :n] / n**0.5)  # (hidden, 8)
+        self.first_bias = nn.Parameter(start[:, n] / n**0.5)
+        self.last = nn.Parameter(torch.zeros(hidden))
+        self.last_bias = nn.Parameter(torch.zeros(()))
+        self.half_error, self.min_score = half_error, min_score
+        self.provenance: dict[str, Any] = {}
+
+    def forward(self, estimate: Estimate, samples: Samples, tracks: Tracks, fit: PoseFit) -> Estimate:
+        """The estimate with its score; 0 where silent or where no error can be stated."""
+        x, stated = evidence(estimate, samples, tracks, fit)
+        e = steady(torch.exp, self.log_error(x))
+        zero = torch.zeros_like(e)
+        score = torch.where(stated, self.half_error / (self.half_error + e), zero)
+        return _silence(estimate, score, self.min_score)
+
+    def log_error(
+        self,
+        x: Tensor,  # (…, 8) evidence
+    ) -> Tensor:
+        """Logarithm (…) of the relative error to expect. Sums are written out: an answer never depends on its mates."""
+        z = (x - self.mean.to(x)) / self.spread.to(x)
+        first = self.first.to(x)
+        hidden = self.first_bias.to(x).expand(*x.shape[:-1], -1)
+        for k in range(x.shape[-1]):
+            hidden = hidden + z[..., k, None] * first[:, k]
+        hidden = hidden / (1 + hidden.abs())
+        more = self.last_bias.to(x).expand(x.shape[:-1])
+        for k, weight in enumerate(self.last.to(x).unbind()):
+            more = more + weight * hidden[..., k]
+        return x[..., 0] + MOST * more / (MOST + more.abs())
+
+    def to_json(self) -> str:
+        """Everything as strict JSON: weights, options and where they come from. Nothing in it can be executed."""
+        weights = {k: v.tolist() for k, v in self.state_dict().items()}
+        options = {"half_error": self.half_error, "min_score": self.min_score}
+        content = {"evidence": [*EVIDENCE], **options, "weights": weights, "provenance": self.provenance}
+        return json.dumps(content, indent=1, allow_nan=False) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str, where: str = "learned score") -> Self:
+        """What :meth:`to_json` wrote.
+
+        Raises:
+            ValueError: not strict JSON, other evidence, or weights of another shape; the message names ``where``.
+        """
+        try:
+            content = json.loads(text, parse_constant=_refuse)
+            if content["evidence"] != [*EVIDENCE]:
+                raise ValueError(f"evidence is {content['evidence']}")
+            weights = {k: torch.tensor(v, dtype=torch.float32) for k, v in content["weights"].items()}
+            half_error, min_score = float(content["half_error"]), float(content["min_score"])
+            found = cls(len(weights["last"]), half_error=half_error, min_score=min_score)
+            found.load_state_dict(weights)
+            found.provenance = dict(content["provenance"])
+        except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
+            raise ValueError(f"{where}: found {error}, expected a learned score on {', '.join(EVIDENCE)}") from error
+        return found
+
+    def save(self, path: str | Path) -> Path:
+        """Write :meth:`to_json` to a file."""
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(self.to_json(), encoding="utf-8")
+        return path
+
+    @classmethod
+    def read(cls, path: str | Path) -> Self:
+        """The scorer in that file. Raises FileNotFoundError, or ValueError naming the file as :meth:`from_json`."""
+        return cls.from_json(Path(path).read_text(encoding="utf-8"), str(path))
+
+
+def expected_error_loss(
+    log_error: Tensor,  # (n,) of the scorer
+    error: Tensor,  # (n,) relative error that turned out
+    weight: Tensor,  # (n,) adds up to 1
+) -> Tensor:
+    """How badly errors were foreseen: Σ w (ln e + min(error, 1) / e), least where e is the mean error of such answers.
+
+    The negative log-likelihood of an exponential distribution. It asks for the mean, as the risk of selected answers
+    is one, and weighs factors: a foreseen 1 % for 2 % is as wrong as 10 % for 20 %.
+
+    Gradient: to ``log_error``. Raises ValueError for wrong shapes.
+    """
+    check("expected_error_loss", log_error=(log_error, "n"), error=(error, "n"), weight=(weight, "n"))
+    return (weight * (log_error + error.clamp(max=1) * (-log_error).exp())).sum()
+
+
 def _expected_error(estimate: Estimate, terms: list[tuple[Tensor, float]]) -> tuple[Tensor, Tensor]:
     """Relative error (B, N) to expect, from the own part of sigma and (term, scale) pairs, and where it can be said."""
     whole, shared, depth = estimate.sigma, estimate.sigma_shared, estimate.depth
@@ -140,3 +306,7 @@ def _silence(estimate: Estimate, score: Tensor, min_score: float) -> Estimate:
         score=torch.where(keep, score, torch.zeros_like(score)),
         gate=gate,
     )
+
+
+def _refuse(word: str) -> None:
+    raise ValueError(f"the constant {word}")
