@@ -26,7 +26,7 @@ from dhtorch.evaluate import bootstrap
 from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, adapt, quiet, refill
 from dhtorch.experiments.rows import Row
 from dhtorch.experiments.screening import Item, paired, screen
-from dhtorch.geometry import se3
+from dhtorch.geometry import cells, se3
 from dhtorch.negative.icp import Registration, normals, register
 from dhtorch.records import Frame, Pose
 
@@ -203,10 +203,9 @@ class _Chain:
         placed[item[1]] = (se3.compose(placed[item[0]][0], se3.invert(T)), sure)
 
     def voxels(self, placed: Mapping[int, tuple[Pose, bool]], sure_only: bool) -> Tensor:
-        """Cells (V, 3) that the points of the frames fall into."""
+        """Numbers (V,) of the cells that the points of the frames fall into."""
         points = [se3.apply(T, self.cloud(i).double())[0] for i, (T, sure) in placed.items() if sure or not sure_only]
-        every = torch.cat(points)
-        return (every[every.isfinite().all(-1)] / self.voxel).floor().long().unique(dim=0)
+        return cells.occupied(torch.cat(points), self.voxel)
 
     def summary(self, variant: str) -> Row:
         """What a variant's chain covers and where it ends."""
@@ -221,7 +220,7 @@ class _Chain:
             "n_voxels": len(covered),
             "voxels_vs_pose": len(covered) / max(len(alone), 1),
             "n_voxels_all": len(self.voxels(placed, sure_only=False)),
-            "right_share": _near(covered, real),
+            "right_share": float(cells.near(covered, real).double().mean()) if len(covered) else None,
             "confident_share": sum(links) / len(links),
             "drift_deg": drift[0],
             "drift_rel": drift[1] / self.scale,
@@ -241,12 +240,3 @@ def _link(chain: _Chain, item: Item, T: Pose, fit: Registration | None, sure: bo
 def _off(T: Pose, true: Pose) -> tuple[float, float]:
     """Angle (degrees) and distance (m) between two motions."""
     return math.degrees(float(se3.rotation_angle(T.R @ true.R.mT)[0])), float((T.t - true.t).norm())
-
-
-def _near(cells: Tensor, others: Tensor) -> float | None:
-    """Share of the cells (V, 3) with one of the others at most one step away in each direction."""
-    if not len(cells):
-        return None
-    steps = torch.cartesian_prod(*(torch.arange(-1, 2, device=cells.device),) * 3)
-    grown = {tuple(c) for c in (others[:, None] + steps).flatten(0, 1).unique(dim=0).tolist()}
-    return sum(tuple(c) in grown for c in cells.tolist()) / len(cells)

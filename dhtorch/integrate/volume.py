@@ -1,0 +1,315 @@
+"""A signed distance field in blocks: near surfaces only, growing as views are fused into it.
+
+Alphabet: a *voxel* is a point of a regular grid in the world, ``voxel`` metres apart; a *block* is 8×8×8 of them, and
+only blocks that a ray has ended in (or near) exist. Each voxel holds ``distance``, how far it lies in front of the
+surface as seen along the rays that looked at it (m, negative behind, at most ``truncation``), the ``weight`` of what
+has been said, 1/m², and the weighted mean of ``features`` such as colour.
+
+A view speaks only where it has an answer: along the ray to a pixel with depth, from the camera to a little behind the
+surface. Elsewhere nothing changes, so that what was never looked at stays unknown.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dhtorch.codes import Source
+from dhtorch.geometry import camera as cameras
+from dhtorch.geometry import cells
+from dhtorch.geometry.lookup import round_half_up
+from dhtorch.geometry.shapes import check
+from dhtorch.records import Camera, Pose
+from dhtorch.tree import Record, record
+
+#: Voxels along a block's side, and in it.
+SIDE = 8
+INSIDE = SIDE**3
+#: Blocks that are updated at a time: bounds the memory of intermediates.
+_CHUNK = 1024
+#: Sources with a weight of their own, in the order in which a voxel keeps them.
+SOURCES = (Source.SENSOR, Source.RECOVERED)
+
+
+@record
+class Volume(Record):
+    """Blocks of a signed distance field; made by :func:`empty`, grown by :func:`fuse`, never changed in place."""
+
+    key: Tensor  # (K,) int64, rising: numbers of the blocks, see geometry.cells
+    distance: Tensor  # (K, 512) m, positive in front of the surface
+    weight: Tensor  # (K, 512, 2) 1/m², of the sensor and of recovered depth; 0 = nothing known
+    features: Tensor  # (K, 512, 1 + C) float16: how much of the weight came with features, and that times their mean
+    voxel: float  # m
+    truncation: float  # m
+
+    @property
+    def bytes(self) -> int:
+        """Memory of the blocks."""
+        parts = (self.key, self.distance, self.weight, self.features)
+        return sum(x.numel() * x.element_size() for x in parts)
+
+
+@record
+class View(Record):
+    """Depth maps to be fused; pixels without an answer hold depth 0."""
+
+    depth: Tensor  # (B, h, w) m, 0 = no answer
+    sigma: Tensor  # (B, h, w) m, standard deviation of depth
+    features: Tensor  # (B, h, w, C), averaged along with the distance
+    camera: Camera
+    T_world_from_cam: Pose
+
+
+def empty(
+    voxel: float = 0.02,
+    *,
+    truncation: float | None = None,
+    channels: int = 4,
+    device: torch.device | str | None = None,
+) -> Volume:
+    """A volume in which nothing is known.
+
+    Args:
+        voxel: m from voxel to voxel.
+        truncation: m, how far from a surface distances are kept. None = 4 voxels.
+        channels: of the features.
+        device: of the blocks.
+
+    Raises:
+        ValueError: a voxel that is not positive, or a truncation below one voxel.
+    """
+    truncation = 4 * voxel if truncation is None else truncation
+    if not (voxel > 0 and truncation >= voxel):
+        raise ValueError(f"integrate: voxel={voxel}, truncation={truncation}, expected 0 < voxel <= truncation")
+    key = torch.zeros(0, dtype=torch.int64, device=device)
+    values = torch.zeros(0, INSIDE, device=device)
+    features = torch.zeros(0, INSIDE, 1 + channels, dtype=torch.float16, device=device)
+    return Volume(key, values, values[..., None].expand(-1, -1, 2), features, float(voxel), float(truncation))
+
+
+def fuse(
+    volume: Volume,
+    view: View,
+    *,
+    source: int = Source.SENSOR,
+    max_reach: float = 3.0,
+    carve: bool = True,
+) -> Volume:
+    """The volume after B views more: distances averaged by 1/sigma², overlap blended, nothing overwritten.
+
+    Every voxel of a block in sight is projected into the view and reads the nearest pixel. It learns how far it lies in
+    front of the surface there, at most the truncation, or behind it, as far as the surface could well be: twice sigma,
+    but at least the truncation; what is said behind the surface fades out over the far half of that reach. Voxels in
+    front are carved free all along the ray; those without an answer at their pixel, and those further behind, are left
+    alone.
+
+    Args:
+        volume: what is known so far.
+        view: B views, fused in their order.
+        source: of their depth, Source.SENSOR or Source.RECOVERED; decides which weight grows.
+        max_reach: in truncations; a depth whose twofold sigma exceeds it says nothing.
+        carve: False leaves voxels alone that lie in front of the surface by more than the reach.
+
+    Returns:
+        Volume with the blocks that the views' surfaces pass through. Depths that are not finite, not positive or
+        without a usable sigma, views without a finite pose, and places out of the grid's reach leave no trace.
+
+    Raises:
+        ValueError: wrong shapes, or another source.
+
+    Gradient: none.
+    Cost: per view, one projection for each voxel of the blocks in sight.
+    Source: B. Curless, M. Levoy 1996; sparse blocks as in M. Nießner et al. 2013, sorted instead of hashed.
+    """
+    _check(volume, view)
+    if source not in SOURCES:
+        raise ValueError(f"integrate.fuse: source is {source}, expected SENSOR ({SOURCES[0]}) or RECOVERED")
+    with torch.no_grad():
+        views = [_Sight(volume, view[b : b + 1], max_reach) for b in range(len(view.depth))]
+        volume = _grown(volume, [s.blocks() for s in views])
+        for sight in views:
+            sight.add_to(volume, SOURCES.index(source), carve)
+    return volume
+
+
+def splat(
+    camera: Camera,  # B
+    hw: tuple[int, int],
+    uv: Tensor,  # (B, N, 2) px
+    depth: Tensor,  # (B, N) m; not finite or 0 = no answer
+    sigma: Tensor,  # (B, N) m
+    features: Tensor,  # (B, N, C)
+    T_world_from_cam: Pose,  # B
+    *,
+    radius: float = 0.03,
+    max_radius_px: int = 12,
+) -> View:
+    """Sparse answers as a depth map: each becomes a small disc that faces the camera.
+
+    A lone ray would touch a voxel here and there; a disc of a few voxels makes a patch of surface, and claims no more
+    than its radius. Where discs overlap the nearer one covers the other, as surfaces do.
+
+    Args:
+        camera, hw: of the image in which ``uv`` are pixels.
+        uv, depth, sigma, features: the answers.
+        T_world_from_cam: where the camera was.
+        radius: m of a disc, at least half a pixel.
+        max_radius_px: largest radius in the image, for points close to the camera.
+
+    Raises:
+        ValueError: wrong shapes.
+
+    Gradient: none.
+    """
+    sizes = check("integrate.splat", f=(camera.f, "B 2"), uv=(uv, "B N 2"), depth=(depth, "B N"), sigma=(sigma, "B N"))
+    check("integrate.splat", depth=(depth, "B N"), features=(features, "B N C"))
+    (h, w), B, C = hw, sizes["B"], features.shape[-1]
+    with torch.no_grad():
+        usable = depth.isfinite() & (depth > 0) & sigma.isfinite() & (sigma > 0) & uv.isfinite().all(-1)
+        z = torch.where(usable, depth, 1.0)
+        size = (radius * camera.f.amax(-1)[:, None] / z).clamp(0.5, max_radius_px)
+        reach = int(size[usable].max().ceil()) if bool(usable.any()) else 0
+        step = torch.arange(-reach, reach + 1, device=uv.device)
+        offset = torch.cartesian_prod(step, step)  # (O, 2)
+        centre = torch.where(usable[..., None], uv, 0.0)
+        at = round_half_up(centre).long()[:, :, None] + offset  # (B, N, O, 2)
+        there = usable[..., None] & ((at - centre[:, :, None]).square().sum(-1).sqrt() <= size[..., None])
+        there |= usable[..., None] & (offset == 0).all(-1)
+        there &= (at >= 0).all(-1) & (at[..., 0] < w) & (at[..., 1] < h)
+        b, n, o = there.nonzero(as_tuple=True)
+        pixel = (b * h + at[b, n, o, 1]) * w + at[b, n, o, 0]
+        owner = _nearest_first(pixel, z[b, n], n, B * h * w)
+        held = (owner >= 0).view(B, h, w)
+        index = owner.clamp_min(0).view(B, h * w)
+
+        def spread(values: Tensor) -> Tensor:
+            flat = values.gather(1, index[..., None].expand(-1, -1, values.shape[-1])) if values.shape[1] else None
+            full = torch.zeros(B, h * w, values.shape[-1]).to(values) if flat is None else flat
+            return torch.where(held[..., None], full.view(B, h, w, -1), 0.0)
+
+        maps = spread(torch.cat((z[..., None], sigma.nan_to_num()[..., None], features), -1))
+    return View(maps[..., 0], maps[..., 1], maps[..., 2 : 2 + C], camera, T_world_from_cam)
+
+
+class _Sight:
+    """One view (B = 1) of a volume."""
+
+    def __init__(self, volume: Volume, view: View, max_reach: float) -> None:
+        self.voxel, self.truncation = volume.voxel, volume.truncation
+        h, w = view.depth.shape[-2:]
+        self.hw, self.camera = (h, w), view.camera
+        self.R, self.t = view.T_world_from_cam.R[0].double(), view.T_world_from_cam.t[0].double()
+        depth, sigma = view.depth.flatten(), view.sigma.flatten()
+        self.reach = (2 * sigma).clamp_min(self.truncation)
+        usable = (depth > 0) & (depth < cells.REACH * volume.voxel) & sigma.isfinite() & (sigma > 0)
+        usable &= self.reach <= max_reach * self.truncation
+        usable &= self.R.isfinite().all() & self.t.isfinite().all()
+        self.pixel = usable.nonzero()[:, 0]
+        self.depth = torch.where(usable, depth, 0.0)
+        self.precision = torch.where(usable, 1 / sigma.square(), 0.0)
+        self.features = torch.nn.functional.pad(view.features.reshape(h * w, -1), (1, 0), value=1.0)
+        edge = cameras.rays(view.camera, _border(h, w).to(view.camera.f)[None])[0]
+        self.extent = edge[edge.isfinite().all(-1)].abs().amax(0)[:2] if len(edge) else edge.new_zeros(2)
+
+    def blocks(self) -> Tensor:
+        """Numbers of the blocks that the band around the surface passes through."""
+        uv = torch.stack((self.pixel % self.hw[1], self.pixel // self.hw[1]), -1).to(self.camera.f)
+        ray = cameras.rays(self.camera, uv[None])[0].double()
+        fine = ray.isfinite().all(-1)
+        ray, at = ray[fine], self.pixel[fine]
+        unit = ray / ray.norm(dim=-1, keepdim=True)
+        surface, reach = ray * self.depth[at, None], self.reach[at]
+        world, way = surface @ self.R.T + self.t, unit @ self.R.T
+        side, found = SIDE * self.voxel, []
+        longest = float(reach.max()) if len(reach) else 0.0
+        steps = max(2, int((self.truncation + longest) / (side / 2)) + 2)
+        for k in range(steps):
+            along = -self.truncation + (self.truncation + reach) * k / (steps - 1)
+            found.append(cells.occupied(world + along[:, None] * way, side))
+        return torch.cat(found).unique()
+
+    def add_to(self, volume: Volume, source: int, carve: bool) -> None:
+        """Update a fresh volume in place."""
+        corner = cells.unpack(volume.key).double() * SIDE * self.voxel
+        corner = (corner - self.t) @ self.R  # in camera axes: the rotation's transpose
+        local = torch.cartesian_prod(*(torch.arange(SIDE, device=corner.device),) * 3).double() * self.voxel
+        local = (local @ self.R).to(self.depth.dtype)
+        for part in self._in_sight(corner, local).split(_CHUNK):
+            xyz = corner[part].to(local.dtype)[:, None] + local  # (k, 512, 3)
+            self._update(volume, part, xyz, source, carve)
+
+    def _in_sight(self, corner: Tensor, local: Tensor) -> Tensor:
+        """Blocks (k,) that may hold a voxel in the view's field and in front of its farthest surface."""
+        centre = corner + local.double().mean(0)
+        radius = float(local.norm(dim=-1).max())
+        z = centre[:, 2]
+        farthest = float((self.depth + self.reach)[self.pixel].max()) if len(self.pixel) else 0.0
+        extent = self.extent.double()
+        wide = centre[:, :2].abs() <= extent * z[:, None] + radius * (1 + extent.square()).sqrt()
+        return ((z > -radius) & (z < farthest + radius) & wide.all(-1)).nonzero()[:, 0]
+
+    def _update(self, volume: Volume, part: Tensor, xyz: Tensor, source: int, carve: bool) -> None:
+        z = xyz[..., 2]
+        ahead = (z > 0.01) & (xyz[..., :2].abs() <= self.extent * z[..., None] * 1.01).all(-1)
+        uv = cameras.project(self.camera, xyz.flatten(0, 1)[None])[0].view(*z.shape, 2)
+        uv = round_half_up(uv)
+        ahead &= (uv >= 0).all(-1) & (uv[..., 0] < self.hw[1]) & (uv[..., 1] < self.hw[0])
+        pixel = torch.where(ahead, uv[..., 1] * self.hw[1] + uv[..., 0], 0.0).long()
+        depth, reach = self.depth[pixel], self.reach[pixel]
+        along = (depth - z) * xyz.norm(dim=-1) / z.clamp_min(0.01)
+        told = ahead & (depth > 0) & (along > -reach)
+        if not carve:
+            told &= along <= reach
+        fade = (2 + 2 * along / reach).clamp(0, 1)
+        weight = torch.where(told, self.precision[pixel] * fade, 0.0)
+        total = volume.weight[part].sum(-1) + weight
+        share = weight / torch.where(total > 0, total, 1.0)
+        old = volume.distance[part]
+        volume.distance[part] = old + share * (along.clamp(-self.truncation, self.truncation) - old)
+        close = torch.where(along.abs() <= self.truncation, share, 0.0)[..., None]
+        colour = volume.features[part].to(share.dtype)
+        volume.features[part] = (colour + close * (self.features[pixel] - colour)).to(volume.features.dtype)
+        volume.weight[part, :, source] += weight
+
+
+def _grown(volume: Volume, keys: list[Tensor]) -> Volume:
+    """A copy of the volume with room for further blocks."""
+    key = torch.cat((volume.key, *keys)).unique()
+    at = cells.find(key, volume.key)[0]
+
+    def wider(x: Tensor) -> Tensor:
+        return x.new_zeros(len(key), *x.shape[1:]).index_copy_(0, at, x)
+
+    return volume.replace(
+        key=key, distance=wider(volume.distance), weight=wider(volume.weight), features=wider(volume.features)
+    )
+
+
+def _nearest_first(pixel: Tensor, depth: Tensor, owner: Tensor, n_pixels: int) -> Tensor:
+    """For each pixel the owner of the nearest depth, of equals the first; -1 where there is none."""
+    best = torch.full((n_pixels,), torch.inf, dtype=depth.dtype, device=depth.device)
+    best = best.scatter_reduce(0, pixel, depth, "amin")
+    first = torch.full((n_pixels,), torch.iinfo(torch.int64).max, device=pixel.device)
+    won = depth == best[pixel]
+    first = first.scatter_reduce(0, pixel[won], owner[won], "amin")
+    return torch.where(best.isfinite(), first, -1)
+
+
+def _border(h: int, w: int) -> Tensor:
+    """Pixels (…, 2) along the edge of an image."""
+    u, v = torch.arange(w), torch.arange(h)
+    sides = [torch.stack((u, torch.full_like(u, k)), -1) for k in (0, h - 1)]
+    sides += [torch.stack((torch.full_like(v, k), v), -1) for k in (0, w - 1)]
+    return torch.cat(sides)
+
+
+def _check(volume: Volume, view: View) -> None:
+    check("integrate.fuse", key=(volume.key, "K"), distance=(volume.distance, f"K {INSIDE}"))
+    check("integrate.fuse", depth=(view.depth, "B h w"), sigma=(view.sigma, "B h w"), f=(view.camera.f, "B 2"))
+    sizes = check("integrate.fuse", depth=(view.depth, "B h w"), features=(view.features, "B h w C"))
+    check("integrate.fuse", R=(view.T_world_from_cam.R, "B 3 3"), t=(view.T_world_from_cam.t, "B 3"))
+    kept = volume.features.shape[-1] - 1
+    if sizes["C"] != kept or sizes["B"] != len(view.camera.f):
+        raise ValueError(f"integrate.fuse: features have {sizes['C']} channels, expected the volume's {kept}, B equal")
+    if len(view.T_world_from_cam.t) != sizes["B"]:
+        raise ValueError(f"integrate.fuse: {len(view.T_world_from_cam.t)} poses, expected one for each of {sizes['B']}")

@@ -1,0 +1,390 @@
+"""Global integration: on scenes that are known exactly, against Open3D, and by what must never happen."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from box import BOX, HW, off_wall, walk
+
+from dhtorch import integrate
+from dhtorch.codes import Source
+from dhtorch.data.room import furnished_room
+from dhtorch.data.synthetic import SyntheticRoom
+from dhtorch.geometry import camera as cameras
+from dhtorch.geometry import cells, se3
+from dhtorch.integrate import View, empty, fuse, mesh, points, splat
+from dhtorch.records import Camera, Pose
+from dhtorch.tree import collate
+
+VOXEL = 0.05
+
+
+def view(frame, sigma=0.005, T=None):
+    """A frame of exact depth as something to fuse; features are its colours."""
+    colour = frame.image.permute(0, 2, 3, 1).float() / 255
+    camera = frame.depth_camera or frame.camera
+    T = frame.T_world_from_cam if T is None else T
+    return View(frame.depth, torch.full_like(frame.depth, sigma), colour, camera, T)
+
+
+def wall(z=2.0, sigma=0.01, colour=0.5, hw=(60, 80)):
+    """A wall across the view of a camera that looks along z."""
+    camera = Camera(torch.tensor([[100.0, 100.0]]), torch.tensor([[39.5, 29.5]]))
+    depth = torch.full((1, *hw), z)
+    features = torch.full((1, *hw, 1), colour)
+    return View(depth, torch.full_like(depth, sigma), features, camera, se3.identity(1, depth))
+
+
+def height(surface):
+    return float(surface.xyz[:, 2].mean())
+
+
+@pytest.fixture(scope="module")
+def box():
+    volume = empty(VOXEL, channels=3)
+    for frame in walk(4, hw=(96, 128), camera=Camera(torch.tensor([[123.0, 116.5]]), torch.tensor([[67.5, 44.0]]))):
+        volume = fuse(volume, view(frame))
+    return volume
+
+
+# ------------------------------------------------------------------------------------------------------------ surfaces
+
+
+def test_points_and_mesh_lie_on_the_walls_of_the_box(box):
+    pytest.importorskip("skimage")
+    for surface in (points(box), mesh(box)):
+        off = off_wall(surface.xyz) * BOX.min()
+        assert len(surface.xyz) > 3000 and float(off.median()) < 0.001 and float(off.quantile(0.99)) < VOXEL / 4
+        inward = (surface.normal.double() * -surface.xyz.double().sign()).amax(-1)
+        assert float((inward > 0.98).double().mean()) > 0.95, "normals face the open side"
+
+
+def test_a_mesh_faces_the_open_side_and_has_no_seams(box):
+    pytest.importorskip("skimage")
+    surface = mesh(box)
+    a, b, c = surface.xyz.double()[surface.face].unbind(1)
+    area = torch.linalg.cross(b - a, c - a)
+    towards = (area * -a).sum(-1)
+    assert float((towards > 0).double().mean()) > 0.995
+    edges = torch.cat([surface.face[:, [i, j]] for i, j in ((0, 1), (1, 2), (2, 0))]).sort(1).values
+    uses = edges.unique(dim=0, return_counts=True)[1]
+    assert int(uses.max()) == 2, "no edge between more than two triangles"
+    block = (surface.xyz / (VOXEL * 64)).floor().long()
+    assert len(block.unique(dim=0)) > 1, "more than one brick"
+    trimesh = pytest.importorskip("trimesh")
+    whole = trimesh.Trimesh(surface.xyz.numpy(), surface.face.numpy(), process=False)
+    main = max(whole.split(only_watertight=False), key=lambda part: len(part.faces))
+    assert len(main.faces) > 0.95 * len(surface.face), "bricks are joined"
+
+
+def test_colours_are_those_of_the_pictures(box):
+    surface = points(box)
+    tone = [
+        torch.sin(3 * surface.xyz[:, 0] + 1),
+        torch.sin(4 * surface.xyz[:, 1] - surface.xyz[:, 0]),
+        torch.sin(5 * surface.xyz[:, 2]),
+    ]
+    error = (surface.features - (torch.stack(tone, -1) * 0.5 + 0.5)).abs()
+    assert float(error.median()) < 0.02 and float(error.quantile(0.95)) < 0.08
+
+
+def room_distance(xyz):
+    """Distance (P,) of points from the nearest surface of the built-in room, exact."""
+    solids = furnished_room().solids
+    best = torch.full((len(xyz),), torch.inf, dtype=torch.float64)
+    for k in range(len(solids.each)):
+        q = (xyz.double() - solids.centre[k].double()) @ solids.R[k].double()
+        half = solids.half[k].double()
+        out = q.abs() - half
+        flat = (out.clamp_min(0).norm(dim=-1) + out.amax(-1).clamp_max(0)).abs()
+        best = torch.minimum(best, (q.norm(dim=-1) - half[0]).abs() if solids.ball[k] else flat)
+    return best
+
+
+@pytest.fixture(scope="module")
+def room():
+    """Exact depth of the built-in room from four places: recording, volume, all that was seen."""
+    recording = SyntheticRoom(lidar="exact", hw=(240, 320), supersample=1)
+    volume, seen = empty(0.02, channels=3), []
+    for i in (0, 3, 6, 9):
+        one = view(recording[i], T=recording.true_poses[i : i + 1])
+        volume = fuse(volume, one)
+        v, u = torch.meshgrid(torch.arange(240), torch.arange(320), indexing="ij")
+        uv = torch.stack((u, v), -1).view(1, -1, 2).float()
+        xyz = cameras.unproject(one.camera, uv, one.depth.flatten(1))
+        seen.append(se3.apply(one.T_world_from_cam.to(torch.float32), xyz)[0])
+    return recording, volume, torch.cat(seen)
+
+
+def test_the_furnished_room_is_found_exactly_and_completely(room):
+    pytest.importorskip("skimage")
+    _, volume, seen = room
+    surface = mesh(volume)
+    error = room_distance(surface.xyz)
+    assert float(error.median()) < 0.0005 and float(error.mean()) < 0.002 and float(error.quantile(0.99)) < 0.03
+    there, found = cells.occupied(seen, 0.02), cells.occupied(surface.xyz, 0.02)
+    assert float(cells.near(there, found).double().mean()) > 0.95, "complete: what was seen is in the map"
+
+
+def test_no_surface_where_nothing_was_seen(room):
+    pytest.importorskip("skimage")
+    _, volume, seen = room
+    reach = cells.occupied(seen, volume.truncation + volume.voxel)
+    for surface in (mesh(volume), points(volume)):
+        assert bool(cells.near(cells.occupied(surface.xyz, volume.truncation + volume.voxel), reach).all())
+        near = cells.near(cells.occupied(surface.xyz, 0.02), cells.occupied(seen, 0.02))
+        assert float(near.double().mean()) > 0.98, "nor far beside what was seen"
+
+
+def test_open3d_finds_the_same_surface(room):
+    o3d = pytest.importorskip("open3d")
+    pytest.importorskip("skimage")
+    spatial = pytest.importorskip("scipy.spatial")
+    recording, volume, _ = room
+    theirs = o3d.pipelines.integration.UniformTSDFVolume(
+        length=5.12,
+        resolution=256,
+        sdf_trunc=0.08,
+        color_type=o3d.pipelines.integration.TSDFVolumeColorType.NoColor,
+        origin=np.array([-2.81, -2.81, -0.61]),  # its voxels' centres on ours
+    )
+    for i in (0, 3, 6, 9):
+        frame = recording[i]
+        (fx, fy), (cx, cy) = frame.camera.f[0].tolist(), frame.camera.c[0].tolist()
+        depth = o3d.geometry.Image(frame.depth[0].numpy())
+        picture = o3d.geometry.Image(frame.image[0].permute(1, 2, 0).contiguous().numpy())
+        rgbd = o3d.geometry.RGBDImage.create_from_color_and_depth(picture, depth, 1.0, 10.0, False)
+        lens = o3d.camera.PinholeCameraIntrinsic(320, 240, fx, fy, cx, cy)
+        theirs.integrate(rgbd, lens, np.linalg.inv(se3.to_matrix(recording.true_poses[i : i + 1])[0].numpy()))
+    other = np.asarray(theirs.extract_triangle_mesh().vertices)
+    surface = mesh(volume)
+    ours = surface.xyz.numpy()
+    there, back = spatial.cKDTree(other).query(ours)[0], spatial.cKDTree(ours).query(other)[0]
+    assert np.median(there) < 1e-4 and np.quantile(there, 0.9) < 0.002 and np.quantile(there, 0.99) < 0.01
+    assert np.median(back) < 1e-4 and (back < 0.02).mean() > 0.9, "they keep rims that we leave out"
+    assert room_distance(surface.xyz).mean() < room_distance(torch.from_numpy(other)).mean()
+
+
+# ------------------------------------------------------------------------------------------------------------- blending
+
+
+def test_overlap_is_blended_by_precision_and_order_does_not_matter():
+    near, far = wall(2.00, sigma=0.01), wall(2.03, sigma=0.02)
+    one = fuse(fuse(empty(0.02, channels=1), near), far)
+    other = fuse(fuse(empty(0.02, channels=1), far), near)
+    expected = (2.00 * 4 + 2.03) / 5
+    assert height(points(one)) == pytest.approx(expected, abs=0.002)
+    assert height(points(other)) == pytest.approx(height(points(one)), abs=1e-5)
+    sigma = points(one).sigma
+    assert float(sigma.median()) == pytest.approx(1 / math.sqrt(1 / 0.01**2 + 1 / 0.02**2), rel=0.05)
+
+
+def test_a_batch_of_views_is_one_after_the_other_bit_for_bit():
+    both = collate([wall(2.0), wall(2.02)])
+    together = fuse(empty(0.02, channels=1), both)
+    apart = fuse(fuse(empty(0.02, channels=1), wall(2.0)), wall(2.02))
+    again = fuse(empty(0.02, channels=1), both)
+    for name in ("key", "distance", "weight", "features"):
+        assert torch.equal(getattr(together, name), getattr(again, name)), "the same every time"
+    at, found = cells.find(together.key, apart.key)
+    assert bool(found.all())
+    known = apart.weight.sum(-1) > 0
+    torch.testing.assert_close(together.distance[at][known], apart.distance[known], atol=0.02, rtol=0)
+
+
+def test_the_volume_that_was_fused_into_is_unchanged():
+    before = fuse(empty(0.02, channels=1), wall(2.0))
+    kept = before.map(torch.clone)
+    fuse(before, wall(2.02))
+    for name in ("key", "distance", "weight", "features"):
+        assert torch.equal(getattr(before, name), getattr(kept, name))
+
+
+def test_sources_keep_their_own_weights_and_the_larger_one_names_a_point():
+    volume = fuse(fuse(empty(0.02, channels=1), wall(2.0)), wall(2.01, sigma=0.03), source=Source.RECOVERED)
+    assert set(points(volume).source.tolist()) == {Source.SENSOR}
+    assert bool((volume.weight.amax((0, 1)) > 0).all())
+    volume = fuse(empty(0.02, channels=1), wall(2.0, sigma=0.02), source=Source.RECOVERED)
+    assert set(points(volume).source.tolist()) == {Source.RECOVERED}
+    assert height(points(volume)) == pytest.approx(2.0, abs=1e-3)
+
+
+def test_what_is_unsure_is_spread_as_far_as_it_is_unsure():
+    """Answers 20 cm apart of sigma 10 cm are one wall between them, not two, nor the farther one alone."""
+    volume = empty(0.02, channels=1)
+    for z in (2.9, 3.1, 2.95, 3.05):
+        volume = fuse(volume, wall(z, sigma=0.1), source=Source.RECOVERED)
+    z = points(volume).xyz[:, 2]
+    assert float((z - 3.0).abs().quantile(0.9)) < 0.05
+
+
+# -------------------------------------------------------------------------------------------------------------- carving
+
+
+def hovering(volume):
+    """Points of a surface that hangs in front of a wall at 2.5 m."""
+    return int((points(volume).xyz[:, 2] < 2.2).sum())
+
+
+def test_rays_that_end_behind_carve_away_what_was_wrong():
+    ghost, truth = wall(2.0, sigma=0.05), wall(2.5, sigma=0.01)
+    before = fuse(empty(0.02, channels=1), ghost, source=Source.RECOVERED)
+    assert hovering(before) > 1000
+    assert hovering(fuse(before, truth)) == 0
+    assert hovering(fuse(before, truth, carve=False)) > 1000
+
+
+def test_carving_follows_answered_rays_only():
+    truth = wall(2.5)
+    depth = truth.depth.clone()
+    depth[..., :40] = 0  # no answer on the left
+    volume = fuse(fuse(empty(0.02, channels=1), wall(2.0, sigma=0.05)), truth.replace(depth=depth))
+    left = points(volume).xyz[:, 0] < -0.03
+    z = points(volume).xyz[:, 2]
+    assert bool((z[left] < 2.2).any()) and not bool((z[~left & (points(volume).xyz[:, 0] > 0.03)] < 2.2).any())
+    assert float(z[left].min()) == pytest.approx(2.0, abs=0.01), "unchanged, where nobody looked"
+
+
+# -------------------------------------------------------------------------------------------------------------- splats
+
+
+def test_sparse_answers_become_patches_of_surface():
+    uv = torch.tensor([[[20.0, 30.0], [60.0, 30.0], [61.0, 30.0], [5.0, 5.0], [70.0, 50.0]]])
+    depth = torch.tensor([[2.0, 3.0, 1.5, math.nan, 2.0]])
+    sigma = torch.tensor([[0.02, 0.02, 0.02, 0.02, math.nan]])
+    features = torch.arange(5.0).view(1, 5, 1)
+    camera = wall().camera
+    one = splat(camera, (60, 80), uv, depth, sigma, features, se3.identity(1, uv), radius=0.06)
+    assert one.depth.shape == (1, 60, 80) and one.features.shape == (1, 60, 80, 1)
+    assert (
+        float(one.depth[0, 30, 20]) == 2.0 and float(one.depth[0, 30, 23]) == 2.0 and float(one.depth[0, 30, 24]) == 0
+    )
+    assert float(one.depth[0, 30, 60]) == 1.5 and float(one.features[0, 30, 60]) == 2.0, "the nearer one covers"
+    assert set(one.depth.unique().tolist()) == {0.0, 1.5, 2.0}
+    volume = fuse(empty(0.02, channels=1), one, source=Source.RECOVERED)
+    surface = points(volume)
+    where = cameras.unproject(camera, uv[:, [0, 2]], depth[:, [0, 2]])[0]
+    nearest = torch.cdist(surface.xyz, where).amin(1)
+    assert len(surface.xyz) > 10 and float(nearest.max()) < 0.06 + 2 * 0.02, "no more than the disc is claimed"
+
+
+def no_points(camera, n=0, wrong=0):
+    """Splats of ``n`` answers at depth 0, or a call whose depths are too many."""
+    uv, zero = torch.zeros(1, n, 2), torch.zeros(1, n)
+    return splat(camera, (60, 80), uv, torch.zeros(1, n + wrong), zero, zero[..., None], se3.identity(1, zero))
+
+
+def test_no_answer_leaves_no_trace():
+    nothing = wall(2.0)
+    hopeless = [
+        nothing.replace(depth=torch.zeros_like(nothing.depth)),
+        nothing.replace(depth=torch.full_like(nothing.depth, math.nan)),
+        nothing.replace(depth=torch.full_like(nothing.depth, math.inf)),
+        nothing.replace(sigma=torch.full_like(nothing.depth, math.nan)),
+        nothing.replace(sigma=torch.full_like(nothing.depth, 5.0)),
+        nothing.replace(depth=torch.full_like(nothing.depth, 1e9)),
+        nothing.replace(T_world_from_cam=Pose(torch.full((1, 3, 3), math.nan), torch.zeros(1, 3))),
+        no_points(nothing.camera),
+    ]
+    for one in hopeless:
+        volume = fuse(empty(0.02, channels=1), one)
+        assert len(volume.key) == 0 and len(points(volume).xyz) == 0
+    before = fuse(empty(0.02, channels=1), nothing)
+    for one in hopeless:
+        after = fuse(before, one)
+        assert all(torch.equal(getattr(before, k), getattr(after, k)) for k in ("key", "distance", "weight"))
+    pytest.importorskip("skimage")
+    assert mesh(empty()).xyz.shape == mesh(empty()).face.shape == (0, 3)
+
+
+def test_wrong_shapes_and_options_raise():
+    good, volume = wall(), empty(0.02, channels=1)
+    for wrong in (
+        good.replace(sigma=good.sigma[..., 1:]),
+        good.replace(features=good.features[0]),
+        good.replace(features=good.features.expand(-1, -1, -1, 2)),
+        good.replace(camera=Camera(good.camera.f[0], good.camera.c[0])),
+        good.replace(T_world_from_cam=se3.identity(2, good.depth)),
+    ):
+        with pytest.raises(ValueError, match=r"integrate\.fuse"):
+            fuse(volume, wrong)
+    with pytest.raises(ValueError, match="source is 0"):
+        fuse(volume, good, source=Source.NONE)
+    for options in ({"voxel": 0.0}, {"voxel": -1.0}, {"voxel": 0.02, "truncation": 0.01}):
+        with pytest.raises(ValueError, match="expected 0 < voxel <= truncation"):
+            empty(**options)
+    with pytest.raises(ValueError, match="min_weight is -1"):
+        points(volume, min_weight=-1)
+    with pytest.raises(ValueError, match=r"integrate\.(fuse|splat)"):
+        no_points(good.camera, 3, wrong=1)
+
+
+def test_a_mesh_without_scikit_image_names_the_extra(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "skimage.measure", None)
+    with pytest.raises(ImportError, match=r"dhtorch\[mesh\]"):
+        mesh(empty())
+
+
+def test_distorted_lenses_and_far_worlds():
+    """A lens with distortion, and a world whose origin is kilometres away, change nothing about the surface."""
+    lens = Camera(
+        torch.tensor([[61.5, 58.25]]), torch.tensor([[33.5, 21.75]]), torch.tensor([[-0.1, 0.02, 0.001, 0.0]])
+    )
+    for shift in (0.0, 5000.0):
+        volume = empty(VOXEL, channels=3)
+        for frame in walk(2, camera=lens):
+            T = frame.T_world_from_cam
+            volume = fuse(volume, view(frame, T=Pose(T.R, T.t + shift)))
+        off = off_wall(points(volume).xyz.double() - shift) * BOX.min()
+        assert len(points(volume).xyz) > 500 and float(off.median()) < 0.005, HW
+
+
+# ---------------------------------------------------------------------------------------------------------------- cells
+
+
+def test_cells_number_places_in_order_and_back():
+    ijk = torch.randint(-cells.REACH, cells.REACH, (500, 3), generator=torch.Generator().manual_seed(0))
+    key = cells.pack(ijk)
+    assert torch.equal(cells.unpack(key), ijk)
+    rows = sorted(map(tuple, ijk.tolist()))
+    assert [tuple(r) for r in cells.unpack(key.sort().values).tolist()] == rows
+    assert cells.pack(torch.tensor([[0, 0, cells.REACH], [-cells.REACH - 1, 0, 0]])).tolist() == [cells.NOWHERE] * 2
+    xyz = torch.tensor([[0.1, -0.1, 0.0], [math.nan, 0, 0], [math.inf, 0, 0], [0.15, -0.05, 0.1], [1e12, 0, 0]])
+    assert cells.unpack(cells.occupied(xyz, 0.2)).tolist() == [[0, -1, 0]]
+    with pytest.raises(ValueError, match="side is 0"):
+        cells.occupied(xyz, 0)
+
+
+def test_components_are_those_of_a_flood_fill():
+    ndimage = pytest.importorskip("scipy.ndimage")
+    for n, size in ((0, 5), (1, 5), (300, 9), (2000, 24), (3000, 14)):
+        ijk = torch.randint(0, size, (n, 3), generator=torch.Generator().manual_seed(n))
+        key = cells.pack(ijk).unique()
+        label = cells.components(key)
+        grid = np.zeros((size,) * 3, bool)
+        place = tuple(cells.unpack(key).T.numpy())
+        grid[place] = True
+        theirs, count = ndimage.label(grid, np.ones((3, 3, 3)))
+        assert len(label.unique()) == count == len(set(zip(theirs[place].tolist(), label.tolist(), strict=True)))
+
+
+def test_a_long_chain_of_cells_is_one_component():
+    spiral = torch.tensor([[round(9 * math.cos(k / 9)), round(9 * math.sin(k / 9)), k] for k in range(3000)])
+    assert int(cells.components(cells.pack(spiral).unique()).max()) == 0
+    broken = torch.cat((spiral[:1000], spiral[1001:2000], spiral[2001:]))
+    assert cells.components(cells.pack(broken).unique()).unique().tolist() == [0, 1, 2]
+
+
+def test_neighbours_touch_by_corners():
+    key = cells.pack(torch.tensor([[0, 0, 0], [5, 5, 5], [1, 1, 1]])).unique()
+    other = cells.pack(torch.tensor([[1, 1, 1], [7, 5, 5]])).unique()
+    assert cells.near(key, other).tolist() == [True, True, False]
+    assert not cells.near(key, other[:0]).any() and cells.near(key[:0], other).shape == (0,)
+
+
+def test_memory_is_that_of_the_blocks(room):
+    _, volume, _ = room
+    assert volume.bytes == len(volume.key) * (8 + 512 * (4 + 2 * 4 + (1 + 3) * 2))
+    assert volume.bytes < 30 * 2**20, "a side of the room at 2 cm"
+    assert isinstance(integrate.__doc__, str)
