@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from dhtorch.data.codec_parquet import parquet_header, read_columns
-from dhtorch.data.files import FormatError
+from dhtorch.data.files import FormatError, last_change
 from dhtorch.extract.columns import PLACE
 from dhtorch.extract.shards import described, shard_files
 from dhtorch.transform.leaves import find
@@ -111,19 +111,20 @@ class JoinedDataset(Dataset[Any]):
 
 def _row_of(file: Path, row: int, columns: tuple[str, ...]) -> tuple[int, dict[str, Any]]:
     """(place in its row group, the group) of a row."""
-    starts = _starts(file)
+    changed = last_change(file)
+    starts = _starts(file, changed)
     group = int(np.searchsorted(starts, row, "right")) - 1
-    return row - starts[group], _group(file, starts[group], starts[group + 1], columns)
+    return row - starts[group], _group(file, changed, (starts[group], starts[group + 1]), columns)
 
 
 @lru_cache(maxsize=1024)
-def _starts(file: Path) -> tuple[int, ...]:
+def _starts(file: Path, _changed: int) -> tuple[int, ...]:
     return parquet_header(file).groups
 
 
 @lru_cache(maxsize=_HELD)
-def _group(file: Path, first: int, end: int, columns: tuple[str, ...]) -> dict[str, Any]:
-    return read_columns(file, columns, (first, end))
+def _group(file: Path, _changed: int, rows: tuple[int, int], columns: tuple[str, ...]) -> dict[str, Any]:
+    return read_columns(file, columns, rows)
 
 
 def _tensor(value: Any) -> Tensor:
