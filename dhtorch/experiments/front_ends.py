@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from dhtorch.baselines import dinov2
-from dhtorch.experiments.protocol import Method, adapt
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.shapes import check
 from dhtorch.records import Frame
+from dhtorch.seats import Method, adapt
 from dhtorch.transform import CHANNELS, ExtendDepth, grid
 
 #: Channels of a depth token that say something only where the patch has an answer.

@@ -135,6 +135,7 @@ def judge(
     shards: Shards,
     arms: Mapping[str, Sequence[str]],
     *,
+    told: Mapping[str, str] | None = None,
     n_folds: int = 5,
     penalties: Sequence[float] = PENALTIES,
     seed: int = 0,
@@ -143,31 +144,33 @@ def judge(
 
     The penalty of the context is chosen with the context alone and shared by all arms, so that an arm differs from the
     baseline by its visual features only; each visual block then has a penalty of its own. Errors are in units of the
-    targets' standard deviations over the samples learnt from, mean over the targets.
+    targets' variances over all samples, mean over the targets: 1 is what saying the overall mean gives.
 
     Args:
         shards: samples.
         arms: name → blocks beside the context.
+        told: name of a further arm → block that is the answer itself: no regression, judged on the same samples.
         n_folds, seed: of the split.
         penalties: to choose from.
 
     Raises:
         ValueError: fewer than three groups.
     """
-    groups = sorted(shards.groups)
+    groups, told = sorted(shards.groups), told or {}
     found = Judged(groups)
     place = {name: k for k, name in enumerate(groups)}
     for cohort in (MOVING, ALL):
         found.counts[cohort] = torch.zeros(len(groups), dtype=torch.float64)
-        found.squares |= {(arm, cohort): torch.zeros(len(groups), dtype=torch.float64) for arm in arms}
-    grid = torch.tensor(list(penalties), dtype=torch.float64)
+        found.squares |= {(arm, cohort): torch.zeros(len(groups), dtype=torch.float64) for arm in (*arms, *told)}
+    grid, scale = torch.tensor(list(penalties), dtype=torch.float64), _spread(shards)
     for fold in probe.folds(groups, n_folds, seed=seed):
-        fitted = _fit(shards, fold, arms, grid)
+        fitted = _fit(shards, fold, arms, grid, scale)
         for arm, (_, _, chosen) in fitted.probes.items():
             found.penalties.setdefault(arm, []).append(chosen)
         for shard in shards.read(fold.test):
             k = place[shard.group]
             errors = {arm: fitted.errors(arm, shard)[0] for arm in arms}
+            errors |= {arm: off(shard.blocks[block], shard.target, scale) for arm, block in told.items()}
             use = torch.stack([e.isfinite() for e in errors.values()]).all(0)
             for cohort, counted in ((MOVING, use & shard.moving), (ALL, use)):
                 found.counts[cohort][k] += counted.sum()
@@ -186,22 +189,30 @@ class _Fitted:
     def errors(self, arm: str, shard: Shard) -> Tensor:
         """Squared errors (P, n), mean over the targets; NaN where a sample has no number."""
         index, linear, _ = self.probes[arm]
-        return squared(linear, shard.features()[:, index], shard.target, self.scale)
+        return off(probe.predict(linear, shard.features()[:, index]), shard.target, self.scale)
 
 
-def squared(linear: probe.Linear, x: Tensor, y: Tensor, scale: Tensor) -> Tensor:
-    """Squared errors (P, n) in units of ``scale`` (D,), mean over the targets."""
-    off = (probe.predict(linear, x) - y.double()) / scale
-    return (off * off).mean(-1)
+def off(answer: Tensor, target: Tensor, scale: Tensor) -> Tensor:
+    """Squared errors of answers (…, n, D) in units of ``scale`` (D,), mean over the targets."""
+    return ((answer.double() - target.double()) / scale).square().mean(-1)
 
 
-def _fit(shards: Shards, fold: probe.Fold, arms: Mapping[str, Sequence[str]], grid: Tensor) -> _Fitted:
-    first = next(shards.read(fold.train))
-    stream = probe.Stream(sum(shards.widths.values()), first.target.shape[-1])
+def _spread(shards: Shards) -> Tensor:
+    """Standard deviations (D,) of the targets, 1 where one does not vary."""
+    total = None
+    for shard in shards.read(shards.groups):
+        one = probe.moments(shard.target[:, :0], shard.target)
+        total = one if total is None else probe.join(total, one)
+    if total is None:
+        raise ValueError("probe: found no sample")
+    variance = total.yy / total.n.clamp_min(1)
+    return torch.where(variance > 0, variance, 1.0).sqrt()
+
+
+def _fit(shards: Shards, fold: probe.Fold, arms: Mapping[str, Sequence[str]], grid: Tensor, scale: Tensor) -> _Fitted:
+    stream, fitted = probe.Stream(sum(shards.widths.values()), len(scale)), _Fitted(scale)
     for shard in shards.read(fold.train):
         stream.add(shard.features(), shard.target)
-    variance = stream.moments.yy / stream.moments.n.clamp_min(1)
-    fitted = _Fitted(torch.where(variance > 0, variance, 1.0).sqrt())
     shared = _choose(shards, fold, stream.moments, fitted, CONTEXT, (), grid[:, None])
     base = shared[0] if shared else float(grid[0])
     for arm, blocks in arms.items():
@@ -228,7 +239,8 @@ def _choose(
     linear = probe.ridge(probe.columns(moments, index), penalties[:, spread])
     total = torch.zeros(len(penalties), dtype=torch.float64)
     for shard in shards.read(fold.choose):
-        total += squared(linear, shard.features()[:, index], shard.target, fitted.scale).nan_to_num(0.0).sum(-1)
+        answer = probe.predict(linear, shard.features()[:, index])
+        total += off(answer, shard.target, fitted.scale).nan_to_num(0.0).sum(-1)
     best = slice(k := int(total.argmin()), k + 1)
     chosen: list[float] = penalties[k].tolist()
     fitted.probes[arm] = (index, linear[best], chosen)

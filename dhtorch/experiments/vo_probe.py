@@ -1,11 +1,11 @@
 """Question: within one scene, do depth features tell a ridge probe more of the camera's own motion than DINOv2's do?
 
-Samples are pairs of frames ``interval`` apart; the target is how the camera moved between them, rotation vector and
-translation by the recording's own trajectory. The probe is given the features of the first frame and how they change to
-the second; depth tokens of either frame have the other one as second view. A sequence is cut into consecutive blocks,
-none of which shares a frame with another, and whole blocks are held out: every block is judged on once. There is no
-context, so the arm ``context`` says the mean motion. ``dhtorch_pose`` is given the method's own two-view pose and no
-features: what the geometry says once it is allowed to finish.
+Samples are pairs of frames, a third of the scene's usable gap apart; the target is how the camera moved between them,
+rotation vector and translation by the recording's own trajectory. The probe is given the features of the first frame
+and how they change to the second; depth tokens of either frame have the other one as second view. A sequence is cut
+into consecutive blocks, none of which shares a frame with another, and whole blocks are held out: every block is judged
+on once. There is no context, so the arm ``context`` says the mean motion. ``two_view_pose`` is no probe: it is the
+method's own pose, no motion where there is none, what the geometry says once it is allowed to finish.
 
 Expectation (written before the run): yes; on every scene the error with depth features is smaller than DINOv2's (the
 paper: 1.32 against 1.63, ratio 0.81, one scene, geometry-favoured as it says itself).
@@ -34,8 +34,11 @@ from dhtorch.records import Frame, Pose
 QUESTION = "Within one scene, do depth features tell a ridge probe more of the camera's motion than DINOv2's do?"
 EXPECTATION = "Yes: on every scene the error with depth features is smaller than DINOv2's."
 
-OURS, POSE = "dhtorch", "dhtorch_pose"
-VO_ARMS = {**ARMS, POSE: ("pose",)}
+#: Block of a shard that holds the method's own answer.
+OWN = "pose"
+
+OURS, POSE = "dhtorch", "two_view_pose"
+EVERY = [*ARMS, POSE]
 
 
 def run(
@@ -44,7 +47,7 @@ def run(
     pairs: Pairs,
     settings: Settings,
     *,
-    interval: float = 0.2,
+    gap_parts: int = 3,
     blocks: int = 5,
     min_pairs: int = 30,
     moving: float = 0.01,
@@ -58,11 +61,11 @@ def run(
     """Probes of every scene alone; recordings of one room are one scene.
 
     Args:
-        recordings: with poses and times; those without, with a role, or of rooms with few pairs are noted and left out.
+        recordings: with poses; those without, with a role, or of rooms with few pairs are noted and left out.
         methods: name → method; the first fills the depth tokens.
-        pairs: not used: pairs are all those ``interval`` apart.
+        pairs: not used: every frame starts a pair, so that there are enough.
         settings: of the job; nothing is hidden from the method.
-        interval: s between the frames of a pair.
+        gap_parts: a pair spans the recording's own gap, divided by this, and at least one frame.
         blocks: consecutive parts of a scene, at least three; dealt out evenly over the recordings of a room.
         min_pairs: fewest pairs of a scene.
         moving: m; a pair moves where the camera has gone farther.
@@ -84,13 +87,13 @@ def run(
     outcome = Outcome()
     rooms: dict[str, list[Any]] = {}
     for recording in recordings:
-        rooms.setdefault(recording.room or recording.name, []).append(recording)
+        rooms.setdefault(getattr(recording, "room", None) or recording.name, []).append(recording)
     for room, members in rooms.items():
-        cut = {r.name: in_blocks(r, interval, max(1, -(-blocks // len(members)))) for r in members}
+        cut = {r.name: in_blocks(r, gap_parts, max(1, -(-blocks // len(members)))) for r in members}
         n = sum(len(block) for own in cut.values() for block in own)
         if n < min_pairs:
             note = f"{n} pairs with known motion, fewer than {min_pairs}"
-            outcome.rows += [_silent(room, arm, cohort, note) for cohort in ("moving", ALL) for arm in VO_ARMS]
+            outcome.rows += [_silent(room, arm, cohort, note) for cohort in ("moving", ALL) for arm in EVERY]
             continue
         with Shards() as shards:
             for recording in members:
@@ -103,30 +106,22 @@ def run(
                 rows = iter([look(*pair) for pair in progress(found, recording.name, len(found))])
                 for k, block in enumerate(cut[recording.name]):
                     shards.add(_shard(f"{recording.name} {k}", [next(rows) for _ in block], recording, block, moving))
-            arms = {k: names for k, names in VO_ARMS.items() if set(names) <= set(shards.widths)}
-            n_folds = len(shards.groups)
-            judged = probing.judge(shards, arms, n_folds=n_folds, penalties=penalties, seed=settings.seed)
+            arms = {k: names for k, names in ARMS.items() if set(names) <= set(shards.widths)}
+            options = {"n_folds": len(shards.groups), "penalties": penalties, "seed": settings.seed}
+            judged = probing.judge(shards, arms, told={POSE: OWN}, **options)
         probing.record(outcome, judged, room)
         outcome.n_pairs += n
-    outcome.summary = probing.over_scenes(outcome, list(VO_ARMS))
+    outcome.summary = probing.over_scenes(outcome, EVERY)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, real))
 
 
-def in_blocks(recording: Any, interval: float, n: int) -> list[list[tuple[int, int]]]:
-    """Pairs of frames ``interval`` s apart, in ``n`` consecutive blocks that share no frame; none without motion known.
-
-    A partner is the frame nearest to that time, if it is no farther from it than half of a median step.
-    """
-    if recording.poses is None or recording.times is None or recording.role is not None or len(recording) < 2 * n:
+def in_blocks(recording: Any, gap_parts: int, n: int) -> list[list[tuple[int, int]]]:
+    """Pairs of frames in ``n`` consecutive blocks that share no frame; none where the motion is not known."""
+    if recording.poses is None or recording.role is not None or len(recording) < 2 * n:
         return []
-    times = recording.times
-    step = float(times.diff().median())
-    off = (times[None] - times[:, None] - interval).abs()
-    partner, within = off.argmin(1), off.amin(1) <= step / 2 + 1e-9
+    step = max(1, round((recording.gap or 1) / gap_parts))
     edges = [round(k * len(recording) / n) for k in range(n + 1)]
-    return [
-        [(i, int(partner[i])) for i in range(a, b) if within[i] and i < int(partner[i]) < b] for a, b in pairwise(edges)
-    ]
+    return [[(i, i + step) for i in range(a, b - step)] for a, b in pairwise(edges)]
 
 
 def verdict(outcome: Outcome, real: bool) -> tuple[bool | None, str]:
@@ -169,10 +164,8 @@ class _Look:
         back = self.two(b, a)
         found = {name: torch.cat((x, alone_b[name] - x), 1) for name, x in alone_a.items()}
         found["depth"] = torch.cat((forth, back - forth), 1)
-        ok = added["pose_ok"].view(1, 1)
         # The transform's pose maps the anchor into the other view: the same way round as the target.
-        told = _motion(added["T_1_from_0"][None].double())
-        found["pose"] = torch.cat((torch.where(ok, told, 0.0), ok), 1).float()
+        found[OWN] = torch.where(added["pose_ok"], _motion(added["T_1_from_0"][None].double()), 0.0)
         return {name: x.cpu() for name, x in found.items()}
 
     def _alone(self, i: int) -> tuple[Frame, dict[str, Tensor]]:
