@@ -356,7 +356,7 @@ def test_the_robot_probe_runs_and_does_not_decide_with_random_weights(robot_set)
         robot_set, {"map": small()}, None, Settings(), dinov2=NETWORK, horizon=0.2, history=0.2, penalties=(0.1, 10.0)
     )
     assert outcome.verdict == "undecided" and "random weights" in outcome.why and outcome.n_pairs == 15
-    rows = outcome.scenes("dhtorch + dinov2", "all")
+    rows = outcome.scenes("dhtorch + dinov2", probing.TRUTH)
     assert set(rows) == {"task_0001", "task_0002", "task_0003"} and rows["task_0001"]["n_samples"] == 5
     assert outcome.summary["dinov2.vs_dinov2_90"]["value"] == 1.0
     assert outcome.summary["dhtorch.mse"]["low"] < outcome.summary["dhtorch.mse"]["high"]
@@ -407,9 +407,9 @@ def test_visual_odometry_within_the_room():
         [room, short], {"map": small()}, None, Settings(), dinov2=NETWORK, blocks=3, min_pairs=6, penalties=(0.01, 1.0)
     )
     assert outcome.verdict == "undecided" and "random weights" in outcome.why
-    error = {arm: outcome.scenes(arm, "all")["synthetic_room"]["mse"] for arm in vo_probe.EVERY}
+    error = {arm: outcome.scenes(arm, probing.TRUTH)["synthetic_room"]["mse"] for arm in vo_probe.EVERY}
     assert error["two_view_pose"] < 0.5 * error["context"], error
-    assert "fewer than 6" in outcome.scenes("dhtorch", "all")["short"]["note"]
+    assert "fewer than 6" in outcome.scenes("dhtorch", probing.TRUTH)["short"]["note"]
     assert outcome.summary["dhtorch.vs_dinov2"]["n"] == 1
 
 

@@ -42,8 +42,11 @@ RANDOM = (
     "DINOv2 had random weights (experiment.dinov2.weights=FOLDER gives its own), so nothing follows for or against it"
 )
 
-#: Cohorts: the samples that errors are taken over; the last one decides.
+#: Cohorts: the samples that errors are taken over.
 MOVING, ALL = "moving", "all"
+
+#: What answers are held against, for the rows.
+TRUTH = "trajectory"
 
 
 @dataclass(frozen=True)
@@ -119,6 +122,11 @@ class Judged:
     squares: dict[tuple[str, str], Tensor] = field(default_factory=dict)  # (arm, cohort) → (G,)
     counts: dict[str, Tensor] = field(default_factory=dict)  # cohort → (G,) samples
     penalties: dict[str, list[list[float]]] = field(default_factory=dict)  # arm → fold → by block
+
+    @property
+    def arms(self) -> list[str]:
+        """Names, in order."""
+        return list(dict.fromkeys(arm for arm, _ in self.squares))
 
     def mean(self, arm: str, cohort: str, **options: Any) -> Interval:
         """Mean squared error of an arm."""
@@ -254,23 +262,18 @@ def record(outcome: Outcome, judged: Judged, scene: str | None = None) -> None:
     """Rows of one set of groups: one for each arm and group, or, with ``scene``, one for each arm.
 
     ``mse`` in units of the targets' variance, ``n_samples``, ``vs_context`` and ``vs_dinov2``, errors as multiples of
-    those arms'. A row of a whole scene has the 95 % interval of ``vs_dinov2`` over its groups, ``vs_dinov2_low`` and
-    ``vs_dinov2_high``.
+    those arms'; the same of the samples that move below ``moving``. A row of a whole scene also has the 95 % interval
+    of ``vs_dinov2`` over its groups, ``vs_dinov2_low`` and ``vs_dinov2_high``.
     """
-    arms = dict.fromkeys(arm for arm, _ in judged.squares)
-    for cohort in (MOVING, ALL):
-        for arm in arms:
-            common: Row = {"pair": None, "method": arm, "truth": cohort, "role": None}
-            if scene is not None:
-                whole = {"n_samples": int(judged.counts[cohort].sum()), "mse": judged.mean(arm, cohort).value}
-                against = judged.ratio(arm, REFERENCE, cohort)
-                whole |= {"vs_context": judged.ratio(arm, CONTEXT, cohort).value, "vs_dinov2": against.value}
-                outcome.rows.append(
-                    {"scene": scene, **common, **whole, "vs_dinov2_low": against.low, "vs_dinov2_high": against.high}
-                )
-                continue
-            for k, group in enumerate(judged.groups):
-                outcome.rows.append({"scene": group, **common, **_of_group(judged, arm, cohort, k)})
+    for arm in judged.arms:
+        common: Row = {"pair": None, "method": arm, "truth": TRUTH, "role": None}
+        if scene is not None:
+            numbers = {cohort: _of_all(judged, arm, cohort) for cohort in (ALL, MOVING)}
+            outcome.rows.append({"scene": scene, **common, **numbers[ALL], MOVING: numbers[MOVING]})
+            continue
+        for k, group in enumerate(judged.groups):
+            numbers = {cohort: _of_group(judged, arm, cohort, k) for cohort in (ALL, MOVING)}
+            outcome.rows.append({"scene": group, **common, **numbers[ALL], MOVING: numbers[MOVING]})
 
 
 def summarise(judged: Judged) -> dict[str, Any]:
@@ -280,8 +283,8 @@ def summarise(judged: Judged) -> dict[str, Any]:
     on equivalence.
     """
     summary: dict[str, Any] = {}
-    for arm in dict.fromkeys(arm for arm, _ in judged.squares):
-        for cohort, prefix in ((MOVING, f"{arm}.{MOVING}."), (ALL, f"{arm}.")):
+    for arm in judged.arms:
+        for cohort, prefix in ((ALL, f"{arm}."), (MOVING, f"{arm}.{MOVING}.")):
             deciding = judged.ratio(arm, REFERENCE, cohort, level=probe.EQUIVALENCE_LEVEL)
             numbers = {
                 "mse": judged.mean(arm, cohort),
@@ -297,12 +300,24 @@ def over_scenes(outcome: Outcome, arms: Sequence[str]) -> dict[str, Any]:
     """The same numbers where every scene has probes of its own: geometric means over scenes."""
     summary: dict[str, Any] = {}
     for arm in arms:
-        for cohort, prefix in ((MOVING, f"{arm}.{MOVING}."), (ALL, f"{arm}.")):
-            rows = outcome.scenes(arm, cohort).values()
+        whole = list(outcome.scenes(arm, TRUTH).values())
+        for rows, prefix in ((whole, f"{arm}."), ([r.get(MOVING, {}) for r in whole], f"{arm}.{MOVING}.")):
             for name in ("mse", "vs_context", "vs_dinov2"):
                 found = bootstrap.interval([row.get(name) for row in rows], statistic="geometric_mean")
                 summary[prefix + name] = {**found._asdict(), "unit": "1"}
     return summary
+
+
+def _of_all(judged: Judged, arm: str, cohort: str) -> Row:
+    against = judged.ratio(arm, REFERENCE, cohort)
+    return {
+        "n_samples": int(judged.counts[cohort].sum()),
+        "mse": judged.mean(arm, cohort).value,
+        "vs_context": judged.ratio(arm, CONTEXT, cohort).value,
+        "vs_dinov2": against.value,
+        "vs_dinov2_low": against.low,
+        "vs_dinov2_high": against.high,
+    }
 
 
 def _of_group(judged: Judged, arm: str, cohort: str, k: int) -> Row:

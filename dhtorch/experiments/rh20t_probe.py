@@ -81,7 +81,7 @@ def run(
         progress: wraps the loop over a scene's samples.
 
     Returns:
-        Outcome with one row per task and arm, cohorts ``moving`` and ``all``; see :func:`probing.record`.
+        Outcome with one row per task and arm; see :func:`probing.record`.
 
     Raises:
         ImportError: ``transformers`` is missing; the message says what to install.

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from dhtorch.baselines import dinov2 as visual_branch
 from dhtorch.experiments import front_ends, probing
-from dhtorch.experiments.probing import ALL, ARMS, CONTEXT, PENALTIES, REFERENCE, Shard, Shards
+from dhtorch.experiments.probing import ARMS, CONTEXT, PENALTIES, REFERENCE, TRUTH, Shard, Shards
 from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
 from dhtorch.experiments.rows import Row
 from dhtorch.geometry import se3
@@ -73,7 +73,7 @@ def run(
             :func:`dhtorch.experiments.rh20t_probe.run`.
 
     Returns:
-        Outcome with one row per scene and arm, cohorts ``moving`` and ``all``; see :func:`probing.record`.
+        Outcome with one row per scene and arm; see :func:`probing.record`.
 
     Raises:
         ImportError: ``transformers`` is missing; the message says what to install.
@@ -93,7 +93,7 @@ def run(
         n = sum(len(block) for own in cut.values() for block in own)
         if n < min_pairs:
             note = f"{n} pairs with known motion, fewer than {min_pairs}"
-            outcome.rows += [_silent(room, arm, cohort, note) for cohort in ("moving", ALL) for arm in EVERY]
+            outcome.rows += [_silent(room, arm, note) for arm in EVERY]
             continue
         with Shards() as shards:
             for recording in members:
@@ -126,7 +126,7 @@ def in_blocks(recording: Any, gap_parts: int, n: int) -> list[list[tuple[int, in
 
 def verdict(outcome: Outcome, real: bool) -> tuple[bool | None, str]:
     """Is the error smaller than DINOv2's on every scene? Never decided without DINOv2's own weights."""
-    ours, theirs = outcome.scenes(OURS, ALL), outcome.scenes(REFERENCE, ALL)
+    ours, theirs = outcome.scenes(OURS, TRUTH), outcome.scenes(REFERENCE, TRUTH)
     scenes = [s for s in ours if ours[s].get("mse") is not None and theirs.get(s, {}).get("mse") is not None]
     if not scenes:
         return None, "no scene with enough pairs, or DINOv2 was left out"
@@ -195,8 +195,8 @@ def _motion(T: Tensor) -> Tensor:
     return torch.cat((rotation_matrix_to_axis_angle(T[:, :3, :3].contiguous()), T[:, :3, 3]), 1)
 
 
-def _silent(scene: str, arm: str, cohort: str, note: str) -> Row:
-    return {"scene": scene, "pair": None, "method": arm, "truth": cohort, "role": None, "note": note}
+def _silent(scene: str, arm: str, note: str) -> Row:
+    return {"scene": scene, "pair": None, "method": arm, "truth": TRUTH, "role": None, "note": note}
 
 
 def _between(row: Row) -> str:
