@@ -1,0 +1,180 @@
+// The data of the page, its colours, and the layers of points and lines made of it.
+
+const DATA = JSON.parse(document.getElementById("data").textContent);
+const $ = (id) => document.getElementById(id);
+const TYPES = { f4: Float32Array, u2: Uint16Array, u1: Uint8Array };
+
+function unpack(packed) {
+  const bytes = Uint8Array.from(atob(packed.base64), (c) => c.charCodeAt(0));
+  return new TYPES[packed.type](bytes.buffer);
+}
+
+function cloud(packed) {
+  const steps = unpack(packed.xyz), n = steps.length / 3, xyz = new Float32Array(3 * n);
+  for (let k = 0; k < 3 * n; k++) xyz[k] = packed.low[k % 3] + packed.step[k % 3] * steps[k];
+  return { n, xyz, rgb: unpack(packed.rgb) };
+}
+
+const shots = DATA.shots.map((s) => {
+  const columns = Object.fromEntries(Object.entries(s.samples).map(([name, packed]) => [name, unpack(packed)]));
+  for (const name of ["uv_0", "uv_1"]) columns[name] = Float32Array.from(columns[name], (v) => v / DATA.per_pixel - DATA.margin_px);
+  columns.score = Float32Array.from(columns.score, (v) => v / 65535);
+  return { ...s, ...columns, n: columns.depth.length, seen: cloud(s.seen), held: cloud(s.held) };
+});
+const outcomes = DATA.outcomes, gateOf = Object.fromEntries(DATA.gates.map((g) => [g.code, g])), holeOf = Object.fromEntries(DATA.holes.map((h) => [h.code, h]));
+const SENSOR = hex(DATA.colours.sensor), RECOVERED = hex(DATA.colours.recovered), SILENT = hex(DATA.colours.silent);
+const everything = (name, wanted = () => true) => shots.flatMap((s) => Array.from(s[name]).filter((_, k) => wanted(s, k)));
+const answered = (s, k) => s.source[k] === 2;
+const hasErrors = shots.some((s) => s.error.some(Number.isFinite));
+const hasViews = DATA.views.length > 0;
+
+const scales = {
+  depth: new Scale(everything("depth", (s, k) => s.source[k] > 0), "far", { unit: "m" }),
+  sigma: new Scale(shots.flatMap((s) => Array.from(s.sigma).map((v, k) => v / s.depth[k]).filter((_, k) => answered(s, k))), "sure", { unit: "%" }),
+  score: new Scale([], "score", { log: false, range: [0, 1] }),
+  error: new Scale(everything("error"), "sure", { unit: "%", range: [0.003, 0.3] }),
+};
+const MODES = [["picture", "picture"], ["source", "source"], ["hole", "class of hole"], ["gate", "gate"], ["depth", "depth"], ["sigma", "sigma / depth"], ["score", "score"], ["error", "error against held-back returns"]]
+  .filter(([key]) => (key !== "error" || hasErrors) && (key !== "picture" || hasViews));
+const state = { now: 0, all: false, mode: "source", threshold: 0, picked: null, playing: null };
+const show = Object.fromEntries([...document.querySelectorAll("[data-show]")].map((box) => [box.dataset.show, box.checked]));
+
+// The colour of sample k: in categories the code's, on scales the number's, silent ones pale.
+function sampleColour(s, k) {
+  const mode = state.mode, source = s.source[k];
+  if (mode === "hole") return holeOf[s.hole[k]] ? hex(holeOf[s.hole[k]].colour) : SENSOR;
+  if (mode === "gate") return source === 1 ? SENSOR : source === 2 ? RECOVERED : hex(gateOf[s.gate[k]]?.colour || DATA.colours.silent);
+  if (mode === "source" || mode === "picture") return [SILENT, SENSOR, RECOVERED][source];
+  if (source === 0 || (source === 1 && mode !== "depth")) return source ? [0.45, 0.47, 0.5] : SILENT;
+  const value = mode === "sigma" ? s.sigma[k] / s.depth[k] : s[mode][k];
+  return Number.isFinite(value) ? scales[mode].colour(value) : SILENT;
+}
+
+// The colour of a return of a depth map: the picture's, tinted where the mode tells sources apart.
+function returnColour(cloud, k, held) {
+  const rgb = [0, 1, 2].map((c) => cloud.rgb[3 * k + c] / 255), grey = luma(rgb);
+  if (state.mode === "picture") return rgb;
+  if (state.mode === "depth") return scales.depth.colour(cloud.xyz[3 * k + 2]).map((v) => v * (0.5 + 0.6 * grey));
+  if (scales[state.mode]) return [0.3, 0.3, 0.3].map((v) => v + 0.45 * grey);
+  if (held) return [0.45, 0.62, 0.5].map((v) => v * (0.5 + grey));
+  return SENSOR.map((v, c) => 0.75 * v * (0.35 + 1.3 * grey) + 0.25 * rgb[c]);
+}
+
+function colours(n, colour) {
+  const out = new Float32Array(3 * n);
+  for (let k = 0; k < n; k++) out.set(colour(k), 3 * k);
+  return out;
+}
+
+// ------------------------------------------------------------------------------------------------- layers in space
+
+const space = new Space($("space"));
+const eye = new Eye(shots[0].T_world_from_0);
+
+function transformed(T, xyz) {
+  const out = new Float32Array(xyz.length);
+  for (let k = 0; k < xyz.length; k += 3) out.set(place(T, xyz[k], xyz[k + 1], xyz[k + 2]), k);
+  return out;
+}
+
+// Rows of some samples of a shot, with the ends of their bars of ± sigma along the ray.
+function buildShot(s) {
+  const T = s.T_world_from_0, o = centre(T), pick = (wanted) => [...Array(s.n).keys()].filter((k) => s.source[k] === wanted);
+  const groups = { sensor: pick(1), recovered: pick(2) }, world = transformed(T, s.xyz), at = (k) => world.subarray(3 * k, 3 * k + 3);
+  const rows = (ks) => Float32Array.from(ks.flatMap((k) => [...at(k)]));
+  const bars = groups.recovered.flatMap((k) => [-1, 1].flatMap((sign) => add(at(k), sub(at(k), o), Math.max(-0.9, (sign * s.sigma[k]) / s.depth[k]))));
+  const step = Math.ceil(groups.recovered.length / 90), some = groups.recovered.filter((_, k) => k % step === 0);
+  const ends = [o, ...(s.T_world_from_1 ? [centre(s.T_world_from_1)] : [])];
+  const rays = some.flatMap((k) => ends.flatMap((end) => [...end, ...at(k)]));
+  const twice = (ks, n) => Float32Array.from(ks.flatMap((k) => Array(n).fill(s.score[k])));
+  const tone = (n) => new Float32Array(3 * n);
+  return {
+    groups, world,
+    sensor: space.layer({ position: rows(groups.sensor), colour: tone(groups.sensor.length) }),
+    recovered: space.layer({ position: rows(groups.recovered), colour: tone(groups.recovered.length), score: twice(groups.recovered, 1) }),
+    bars: space.layer({ position: Float32Array.from(bars), colour: tone(2 * groups.recovered.length), score: twice(groups.recovered, 2) }),
+    rays: space.layer({ position: Float32Array.from(rays), colour: colours(rays.length / 3, () => RECOVERED), score: twice(some, 2 * ends.length) }),
+    seen: space.layer({ position: transformed(T, s.seen.xyz), colour: tone(s.seen.n) }),
+    held: space.layer({ position: transformed(T, s.held.xyz), colour: tone(s.held.n) }),
+    frustums: frustums(s),
+  };
+}
+
+// Cameras as pyramids, a tenth of the typical depth high.
+function frustums(s) {
+  const made = [];
+  for (const [T, index, colour] of [[s.T_world_from_0, s.view_0, SENSOR], [s.T_world_from_1, s.view_1, RECOVERED]]) {
+    if (!T || index === null) continue;
+    const v = DATA.views[index], z = 0.12 * size.depth, tip = centre(T);
+    const corner = (x, y) => place(T, ((x - v.c[0]) / v.f[0]) * z, ((y - v.c[1]) / v.f[1]) * z, z);
+    const [a, b, c, d] = [corner(-0.5, -0.5), corner(v.hw[1] - 0.5, -0.5), corner(v.hw[1] - 0.5, v.hw[0] - 0.5), corner(-0.5, v.hw[0] - 0.5)];
+    const position = Float32Array.from([tip, a, tip, b, tip, c, tip, d, a, b, b, c, c, d, d, a].flat());
+    made.push({
+      index, tip, lines: space.layer({ position, colour: colours(16, () => colour) }),
+      quad: space.gl && { position: space.buffer(Float32Array.from([a, b, c, a, c, d].flat())), corner: space.buffer(Float32Array.from([0, 0, 1, 0, 1, 1, 0, 0, 1, 1, 0, 1])) },
+    });
+  }
+  return made;
+}
+
+const size = { depth: quantile(everything("depth", (s, k) => s.source[k] > 0), 0.5) || 1 };
+const layers = space.gl ? shots.map(buildShot) : [];
+const path = space.gl && DATA.path ? (() => {
+  const p = unpack(DATA.path), rows = [];
+  for (let k = 3; k < p.length; k += 3) rows.push(...p.subarray(k - 3, k + 3));
+  return space.layer({ position: Float32Array.from(rows), colour: colours(rows.length / 3, () => [0.55, 0.55, 0.55]) });
+})() : null;
+
+function recolour() {
+  shots.forEach((s, n) => {
+    const l = layers[n];
+    if (!l) return;
+    const own = (k) => (state.mode === "picture" ? [0, 1, 2].map((c) => s.rgb[3 * k + c] / 255) : sampleColour(s, k));
+    for (const name of ["sensor", "recovered"]) space.recolour(l[name], colours(l.groups[name].length, (k) => own(l.groups[name][k])));
+    space.recolour(l.bars, colours(2 * l.groups.recovered.length, (k) => own(l.groups.recovered[k >> 1])));
+    for (const name of ["seen", "held"]) space.recolour(l[name], colours(s[name].n, (k) => returnColour(s[name], k, name === "held")));
+    s.css = Array.from({ length: s.n }, (_, k) => css(sampleColour(s, k)));
+  });
+  if (!layers.length) shots.forEach((s) => { s.css = Array.from({ length: s.n }, (_, k) => css(sampleColour(s, k))); });
+}
+
+const visible = (s) => (k) => {
+  const source = s.source[k];
+  if (source === 2) return show.recovered && s.score[k] >= state.threshold;
+  return source === 1 ? show.sensor : show.silent;
+};
+
+function drawSpace() {
+  if (!space.gl) return;
+  const dark = matchMedia("(prefers-color-scheme: dark)").matches;
+  space.begin(eye, dark ? [0.043, 0.051, 0.059] : [0.914, 0.922, 0.918]);
+  const grain = 0.006 * size.depth, threshold = state.threshold;
+  layers.forEach((l, n) => {
+    if (!state.all && n !== state.now) return;
+    if (show.sensor) {
+      space.points(l.seen, { size: grain, smallest: 1.4 });
+      space.points(l.sensor, { size: 1.3 * grain, smallest: l.seen ? 1.6 : 2.5 });
+    }
+    if (show.held) space.points(l.held, { size: grain, smallest: 1.4 });
+    if (show.recovered) {
+      space.points(l.recovered, { size: 2.8 * grain, smallest: 4, threshold, rim: dark ? [0.05, 0.05, 0.05] : [0.25, 0.2, 0.1], rimmed: 0.75 });
+      if (show.sigma) space.lines(l.bars, { threshold });
+    }
+    if (hasViews && show.tracks && show.recovered && n === state.now) space.lines(l.rays, { alpha: 0.1, threshold });
+    if (show.frustums) for (const f of l.frustums) {
+      if (Math.hypot(...sub(f.tip, eye.position)) < 0.4 * size.depth) continue; // it would stand before everything else
+      space.lines(f.lines);
+      if (n === state.now && textures[f.index]) space.picture(f.quad, textures[f.index], 0.85);
+    }
+  });
+  if (show.frustums && DATA.placed) space.lines(path);
+  mark();
+}
+
+// A ring around the picked sample: an element over the canvas, so that nothing in space hides it.
+function mark() {
+  const p = state.picked === null ? [NaN] : layers[state.now].world.subarray(3 * state.picked, 3 * state.picked + 3);
+  const at = Number.isFinite(p[0]) ? space.onScreen(p) : null;
+  $("mark").toggleAttribute("hidden", !at);
+  if (at) $("mark").style.transform = `translate(${at[0]}px, ${at[1]}px)`;
+}
