@@ -21,9 +21,10 @@ from dhtorch.data.synthetic import SyntheticRoom
 from dhtorch.evaluate import probe
 from dhtorch.evaluate.bootstrap import Interval
 from dhtorch.experiments import front_ends, probing, rh20t_probe, vo_probe
-from dhtorch.experiments.protocol import Settings
+from dhtorch.experiments.protocol import Outcome, Settings
 from dhtorch.geometry import se3
 from dhtorch.pair import METHODS
+from dhtorch.report.layouts import in_layout
 from dhtorch.seats import refill
 from dhtorch.transform import CHANNELS, ExtendDepth
 
@@ -384,6 +385,32 @@ def test_the_verdict_follows_the_interval_and_the_weights():
     assert rh20t_probe.verdict(judged(0.90), True, 0.02)[0] is False
     assert rh20t_probe.verdict(judged(1.0, spread=0.3), True, 0.02)[0] is None
     assert rh20t_probe.verdict(judged(1.006), False, 0.02)[0] is None
+
+
+def reported(experiment, outcome, weights):
+    meta = {"utc": "2026", "git": None}
+    data_ = {"name": "made", "scenes": ["a"], "n_pairs": 1}
+    config = {"experiment": {"dinov2": {"weights": weights}}}
+    result = {"experiment": experiment, "rows": outcome.rows, "summary": outcome.summary, "verdict": None}
+    return {**result, "meta": meta, "data": data_, "config": config}
+
+
+def test_the_tables_quote_the_paper_and_name_random_weights():
+    outcome, rooms = Outcome(), Outcome()
+    probing.record(outcome, judged(1.5))
+    probing.record(rooms, judged(1.5), "kitchen")
+    rooms.rows.append({"scene": "yard", "pair": None, "method": "context", "truth": "trajectory", "note": "3 pairs"})
+    outcome.summary = probing.summarise(judged(1.5))
+    every, moving = in_layout(reported("rh20t_probe", outcome, None))
+    assert every.rows[0][0] == "dhtorch" and every.rows[0][5:] == ["1.500", "1.500–1.500", "1.500–1.500", "1.006"]
+    assert moving.rows[0][-1] == "1.013" and every.rows[1][0] == "dinov2 (random weights)"
+    assert "random weights" in every.note and "RH20T, 799 tasks" in every.note
+    (odometry,) = in_layout(reported("vo_probe", rooms, "/some/folder"))
+    assert odometry.rows[1][1] == "dinov2" and "random" not in odometry.note
+    assert odometry.rows[3][:2] == ["yard", "3 pairs"] and odometry.rows[-2][3:6] == ["1.32", "–", "0.81"]
+    assert odometry.rows[-2][0].startswith("published") and odometry.quoted == 2
+    for table in (every, moving, odometry):
+        assert all(len(row) == len(table.head) for row in table.rows)
 
 
 # ------------------------------------------------------------------------------------------------------ visual odometry

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 
-from dhtorch.report import published, timings
+from dhtorch.report import probes, published, timings
 from dhtorch.report.cells import NOTHING, head, show
 from dhtorch.report.reading import Result, cohorts, entry, last_cohort, variants
 from dhtorch.report.tables import DERIVED, OURS, PUBLISHED, Line, Table, by_scene, by_variant, source
@@ -263,6 +263,8 @@ LAYOUTS: dict[str, Callable[[Result], list[Table]]] = {
     "helix_correlation": _helix,
     "icp": _icp,
     "hole_attention": _attention,
+    "rh20t_probe": probes.future_motion,
+    "vo_probe": probes.visual_odometry,
 }
 #: Columns that stand in these tables and need not be repeated.
 SHOWN = ("trackability_hole", "trackability_valid", "passes", "parameters", "weight_bytes", *DERIVED)

@@ -234,6 +234,32 @@ FUSION = Published(
 )
 
 
+_PROBES = (
+    "No test of equivalence was run. Features of any kind gain 0.6–2.4 % on the context; raw RGB is not beaten.",
+)
+
+PROBE = Published(
+    "section 6.7",
+    "RH20T, 799 tasks, ∼100k samples, DINOv2-L",
+    _table("vs_dinov2", {"DH-Active": "1.006"}),
+    _PROBES,
+)
+
+PROBE_MOVING = Published(
+    "section 6.7",
+    "RH20T, 799 tasks, DINOv2-L, moving samples",
+    _table("vs_dinov2", {"DH-Active": "1.013"}),
+    _PROBES,
+)
+
+VISUAL_ODOMETRY = Published(
+    "section 6.7",
+    "a single scene, not named",
+    _table("mse vs_dinov2", {"DH-Active": "1.32 | 0.81", "DINOv2": "1.63 | –"}),
+    ("The paper itself calls the task geometry-favoured.",),
+)
+
+
 def number(text: str | None) -> float | None:
     """A printed figure as a number, per cent as a share; None where it is a range, a word or nothing."""
     found = re.fullmatch(r"([+−-]?[\d,]+(?:\.\d+)?) ?(%|M|B)?", text or "")
