@@ -199,6 +199,10 @@ def triples(batch, n, dtype):
     return Y / Y[..., 2:], Y
 
 
+def mean_and_corner(patch):
+    return patch.mean((0, 1, 2)), patch[-1, 0, 0]
+
+
 def registered(batch, n, dtype):
     """Two sets of points of which one is the other moved a little, and where to start."""
     xyz = uniform(batch, n, 3, dtype=dtype, low=1, high=2)
@@ -291,6 +295,8 @@ ROWS = [
     Row(se3.rotation_angle, lambda b, n, d: (poses(b, d).R,), POINTLESS, grad=(0,)),
     Row(lookup.patches, lambda b, n, d: (frames(b, n, d)[0].image, pixels(b, n, d).long(), 5), "dtype batch vmap capture gradcheck empty shuffle padding raises", (1,), (0,), bad=wrong_last_axis(1)),
     Row(lookup.windows, lambda b, n, d: (frames(b, n, d)[0].depth, torch.arange(b)[:, None] * HW[0] * HW[1] + torch.arange(n) % 900, 5), "dtype capture gradcheck empty", grad=(0,)),
+    Row(lookup.summarise, lambda b, n, d: (frames(b, n, d)[0].image, pixels(b, n, d).long(), 5, mean_and_corner), "dtype batch vmap capture gradcheck empty shuffle padding raises", (1,), (0,), bad=wrong_last_axis(1)),
+    Row(lookup.nearest_index, lambda b, n, d: (HW, pixels(b, n, d)), "batch vmap capture empty shuffle padding nan", (1,)),
     Row(lookup.luma, lambda b, n, d: (frames(b, n, d)[0].image, 1), POINTLESS, grad=(0,)),
     Row(lookup.nearest, lambda b, n, d: (frames(b, n, d)[0].depth, pixels(b, n, d)), "dtype batch vmap capture gradcheck empty shuffle padding nan raises", (1,), (0,), bad=wrong_last_axis(1)),
     Row(lookup.round_half_up, lambda b, n, d: (pixels(b, n, d),), "dtype batch vmap capture empty shuffle padding nan", (0,)),

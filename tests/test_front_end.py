@@ -7,6 +7,7 @@ import torch
 
 from dhtorch.codes import ROUTE_OF_HOLE, Flag, Hole, Route, names
 from dhtorch.geometry import camera as cam
+from dhtorch.geometry import lookup
 from dhtorch.geometry.lookup import luma, nearest, patches
 from dhtorch.records import Camera, Frame
 from dhtorch.stages.backproject import backproject
@@ -192,6 +193,27 @@ def test_trackability_is_opencvs_minimum_eigenvalue(block):
     theirs = torch.from_numpy(cv2.cornerMinEigenVal(image[0, 0].numpy(), block, ksize=3))
     pixel = (uv + 0.5).floor().long()
     assert torch.allclose(ours, theirs[pixel[:, 1], pixel[:, 0]], atol=2e-6, rtol=1e-4)
+
+
+@pytest.mark.parametrize("colour", [1, 3])
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
+def test_summaries_are_those_of_the_patches_for_planar_and_interleaved_pictures(monkeypatch, colour, dtype):
+    monkeypatch.setattr(lookup, "NUMBERS", 5 * 5 * colour * 64)  # several pieces
+    image = torch.randint(0, 255, (2, colour, *HW), generator=torch.Generator().manual_seed(0)).to(dtype)
+    corner = torch.randint(-9, 140, (2, 300, 2), generator=torch.Generator().manual_seed(1))
+    expected = patches(image, corner, 5).float()
+    for picture in (image, image.contiguous(memory_format=torch.channels_last), image.repeat(1, 1, 1, 2)[..., : HW[1]]):
+        first, total = lookup.summarise(picture, corner, 5, lambda p: (p[-1, 1, 0], p.float().sum((0, 1, 2))))
+        assert torch.equal(first.float(), expected[:, :, -1, 1, 0])
+        torch.testing.assert_close(total, expected.sum((2, 3, 4)))
+    with pytest.raises(ValueError, match="smaller than a patch"):
+        lookup.summarise(image[..., :4], corner, 5, lambda p: (p[0, 0, 0],))
+
+
+def test_a_spiral_asked_for_twice_is_the_same_and_each_is_its_own():
+    first = spiral(HW, 50, dtype=torch.float64)
+    first.zero_()
+    assert torch.equal(spiral(HW, 50), spiral(HW, 50, dtype=torch.float64).float()) and spiral(HW, 50).abs().min() > 0
 
 
 def test_every_hole_has_one_class_and_a_route():

@@ -5,6 +5,8 @@ Alphabet: ``image`` (B, C, H, W); ``corner`` (B, N, 2) integer (u, v) of a patch
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -12,6 +14,73 @@ from dhtorch.geometry.shapes import check
 
 #: ITU-R BT.601 luma, the weights of ``cv2.cvtColor`` and ``kornia.color.rgb_to_grayscale``.
 LUMA = (0.299, 0.587, 0.114)
+
+#: Numbers of patches that are summarised together: few enough to stay in cache, and to need no fresh memory pages.
+NUMBERS = 1 << 17
+
+#: Rows of this many points leave no tail to vector loops, which may round differently there.
+LANES = 64
+
+
+def summarise(
+    image: Tensor,  # (B, C, H, W), planar or interleaved in memory
+    corner: Tensor,  # (B, N, 2) integer
+    size: int,
+    reduce: Callable[[Tensor], tuple[Tensor, ...]],
+) -> tuple[Tensor, ...]:
+    """A few numbers (B, N) about each patch whose top-left pixel is ``corner``, without keeping the patches.
+
+    ``reduce`` sees some points at a time and turns their pixels (C, size, size, P), points last, into tensors (P,).
+    Whatever it does pixel by pixel then runs along contiguous points. It must treat every point alike and may not
+    count on P, which is a multiple of LANES: the last ones are there to fill up. A patch that would leave the image
+    is shifted back inside.
+
+    Raises:
+        ValueError: wrong shapes, or an image smaller than a patch.
+
+    Gradient: to the image, through ``reduce``.
+    """
+    sizes = check("lookup.summarise", image=(image, "B C H W"), corner=(corner, "B N 2"))
+    B, N, C, H, W = (sizes[k] for k in "BNCHW")
+    _fits("summarise", size, H, W)
+    flat, (b, c, v, u) = _flat(image)
+    whole = torch.int32 if image.numel() < 1 << 31 else torch.int64
+    left, top = corner.unbind(-1)
+    first = torch.add(top.clamp(0, H - size) * v, left.clamp(0, W - size), alpha=u)
+    if B > 1:
+        first = first + torch.arange(B, device=image.device)[:, None] * b
+    first = torch.nn.functional.pad(first.to(whole).flatten(), (0, -(B * N) % LANES))
+    down, right = (torch.arange(0, size * k, k, device=image.device, dtype=whole) for k in (v, u))
+    steps = down[:, None, None] + right[:, None]
+    at_once = max(NUMBERS // (C * size * size * LANES), 1) * LANES
+    if torch.compiler.is_compiling():
+        # A view by strides needs memory: made so, the index is computed once per point and not again for every pixel.
+        first, at_once = first.as_strided(first.shape, (1,)), len(first)
+    parts = (first,) if len(first) <= at_once else first.split(at_once)
+    found = [reduce(_take(flat, steps + points, C, c)) for points in parts]
+    joined = found[0] if len(parts) == 1 else [torch.cat(x) for x in zip(*found, strict=True)]
+    return tuple(x[: B * N].view(B, N) for x in joined)
+
+
+def _take(flat: Tensor, index: Tensor, C: int, c: int) -> Tensor:
+    """Numbers (C, *index.shape) at an index and at C - 1 further steps ``c`` from it."""
+    if torch.compiler.is_compiling():
+        return torch.stack([flat[index + k * c] for k in range(C)])
+    row = index.flatten()
+    return torch.stack([flat[k * c :].index_select(0, row) for k in range(C)]).view(C, *index.shape)
+
+
+def _flat(image: Tensor) -> tuple[Tensor, tuple[int, int, int, int]]:
+    """All images as one row of numbers, and the steps in it from image to image, channel, row and column."""
+    C, H, W = image.shape[1:]
+    if C > 1 and image.stride(1) == 1 and image.stride(3) == C:
+        return image.permute(0, 2, 3, 1).reshape(-1), (H * W * C, 1, W * C, C)
+    return image.reshape(-1), (C * H * W, H * W, W, 1)
+
+
+def _fits(where: str, size: int, H: int, W: int) -> None:
+    if size > min(H, W):
+        raise ValueError(f"lookup.{where}: image of {H}x{W} pixels is smaller than a patch of {size}x{size}")
 
 
 def patches(image: Tensor, corner: Tensor, size: int) -> Tensor:
@@ -27,8 +96,7 @@ def patches(image: Tensor, corner: Tensor, size: int) -> Tensor:
     """
     sizes = check("lookup.patches", image=(image, "B C H W"), corner=(corner, "B N 2"))
     B, C, H, W = (sizes[k] for k in "BCHW")
-    if size > min(H, W):
-        raise ValueError(f"lookup.patches: image of {H}x{W} pixels is smaller than a patch of {size}x{size}")
+    _fits("patches", size, H, W)
     u = corner[..., 0].clamp(0, W - size)
     v = corner[..., 1].clamp(0, H - size)
     plane = torch.arange(B * C, device=image.device).view(B, 1, C) * (H * W)
@@ -44,10 +112,11 @@ def windows(image: Tensor, first: Tensor, size: int) -> Tensor:
     """
     W = image.shape[-1]
     image = image.contiguous()
-    if _view_is_safe(image):
-        view = image.as_strided((max(image.numel() - (size - 1) * (W + 1), 0), size, size), (1, W, 1))
-        return view.index_select(0, first.flatten()).view(*first.shape, size, size)
     steps = torch.arange(size, device=image.device)
+    if _view_is_safe(image):
+        # Row by row: a contiguous slice is copied as a block of memory, which is several times faster.
+        view = image.as_strided((max(image.numel() - size + 1, 0), size), (1, 1))
+        return view.index_select(0, (first.reshape(-1, 1) + steps * W).flatten()).view(*first.shape, size, size)
     index = first[..., None, None] + steps[:, None] * W + steps
     return image.flatten()[index]
 
@@ -57,11 +126,11 @@ def luma(rgb: Tensor, dim: int) -> Tensor:
 
     The channel dimension is kept with size 1. Floating images keep their dtype, uint8 becomes float32.
     """
-    grey = rgb / 255.0 if rgb.dtype == torch.uint8 else rgb
-    if grey.shape[dim] == 1:
-        return grey
-    r, g, b = grey.split(1, dim)
-    return LUMA[0] * r + LUMA[1] * g + LUMA[2] * b
+    if rgb.shape[dim] == 1:
+        return rgb / 255.0 if rgb.dtype == torch.uint8 else rgb
+    r, g, b = rgb.split(1, dim)
+    grey = torch.add(torch.add(LUMA[0] * r, g, alpha=LUMA[1]), b, alpha=LUMA[2])
+    return grey / 255.0 if rgb.dtype == torch.uint8 else grey
 
 
 def nearest(grid: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
@@ -70,11 +139,19 @@ def nearest(grid: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
     Outside the grid, and for non-finite ``uv``, the value is that of some border pixel and ``inside`` is false.
     """
     sizes = check("lookup.nearest", grid=(grid, "B h w"), uv=(uv, "B N 2"))
-    h, w = sizes["h"], sizes["w"]
-    centre = round_half_up(uv)
-    inside = (centre >= 0).all(-1) & (centre[..., 0] <= w - 1) & (centre[..., 1] <= h - 1)
-    index = torch.where(inside, centre[..., 1] * w + centre[..., 0], torch.zeros_like(centre[..., 0])).long()
+    index, inside = nearest_index((sizes["h"], sizes["w"]), uv)
     return grid.flatten(1).gather(1, index), inside
+
+
+def nearest_index(hw: tuple[int, int], uv: Tensor) -> tuple[Tensor, Tensor]:
+    """Flat index (B, N) of the nearest pixel of ``uv`` (B, N, 2) in a grid of size ``hw``, and whether it exists.
+
+    Where it does not, and for non-finite ``uv``, the index is 0.
+    """
+    u, v = round_half_up(uv).unbind(-1)
+    inside = (u >= 0) & (v >= 0) & (u < hw[1]) & (v < hw[0])
+    u, v = torch.where(inside, u, 0), torch.where(inside, v, 0)
+    return torch.add(u.long(), v.long(), alpha=hw[1]), inside
 
 
 def round_half_up(uv: Tensor) -> Tensor:

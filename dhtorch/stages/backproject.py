@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dhtorch.codes import Flag, Hole
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry.lookup import luma, patches, round_half_up
+from dhtorch.geometry.lookup import luma, nearest_index, patches, round_half_up, summarise
 from dhtorch.geometry.shapes import check
 from dhtorch.records import Frame, Samples
 
@@ -68,94 +68,106 @@ def backproject(
     if uv.dim() == 2:
         uv = uv.expand(sizes["B"], *uv.shape)
     check("backproject", uv=(uv, "B N 2"), f=(frame.camera.f, "B 2"))
-    depth, conf, edge = _read_depth(frame, uv, search_px, edge_rel)
+    depth, level, edge = _read_depth(frame, uv, search_px, edge_rel)
+    border, dim, white, shine = _appearance(frame.image, uv, dark, saturated, highlight)
     returned = depth > 0
-    low_conf = returned & (conf < min_conf)
-    beyond = returned & (depth > near_limit)
-    appearance = _appearance(frame.image, uv, dark, saturated, highlight)
-    flag = (
-        _bit(~returned, Flag.NO_DEPTH)
-        | _bit(low_conf, Flag.LOW_CONF)
-        | _bit(beyond, Flag.BEYOND_NEAR)
-        | _bit(edge, Flag.DEPTH_EDGE)
-        | appearance
-    )
-    usable = (flag & Flag.UNUSABLE) == 0
-    safe = torch.where(usable, depth, torch.ones_like(depth))
-    xyz = cam.unproject(frame.camera, uv, safe)
-    usable = usable & xyz.isfinite().all(-1)  # a pixel outside the lens model has no ray
-    halvings = edge.int() + _has(appearance, Flag.SPECULAR).int() + _has(appearance, Flag.SATURATED).int()
-    confidence = conf.to(depth.dtype).clamp(0, 2) / 2 * 0.5**halvings
+    unsure, beyond = returned & (level < min_conf), returned & (depth > near_limit)
+    usable = returned & ~(unsure | beyond)
+    xyz = cam.unproject(frame.camera, uv, torch.where(usable, depth, 1))
+    usable = usable & (xyz.detach().abs().amax(-1) < torch.inf)  # a pixel outside the lens model has no ray
+    halvings = edge.int().add(shine).add(white)
+    confidence = (level.to(depth.dtype) / 2).clamp(0, 1) * 0.5**halvings
     return Samples(
         uv=uv,
         depth=depth,
         sigma=(sigma_m**2 + (sigma_rel * depth) ** 2).sqrt() if sigma_m > 0 else sigma_rel * depth,
-        xyz=torch.where(usable[..., None], xyz, torch.full_like(xyz, torch.nan)),
-        confidence=torch.where(usable, confidence, torch.zeros_like(confidence)),
-        flag=flag,
+        xyz=torch.where(usable[..., None], xyz, torch.nan),
+        confidence=torch.where(usable, confidence, 0),
+        flag=_bits(
+            (~returned, Flag.NO_DEPTH),
+            (unsure, Flag.LOW_CONF),
+            (beyond, Flag.BEYOND_NEAR),
+            (edge, Flag.DEPTH_EDGE),
+            (border, Flag.BORDER),
+            (dim, Flag.UNDEREXPOSED),
+            (white, Flag.SATURATED),
+            (shine, Flag.SPECULAR),
+        ),
         trackability=torch.zeros_like(depth),
-        hole=torch.full_like(flag, Hole.NONE),
+        hole=torch.full_like(depth, Hole.NONE, dtype=torch.int32),
     )
 
 
 def _read_depth(frame: Frame, uv: Tensor, search_px: int, edge_rel: float) -> tuple[Tensor, Tensor, Tensor]:
     """Depth (B, N), 0 = none; sensor confidence level (B, N); whether returns around it differ (B, N)."""
     h, w = frame.depth.shape[-2:]
-    size = min(max(NEIGHBOURHOOD, 2 * search_px + 1), h, w)
     place = cam.depth_pixels(frame.camera, frame.hw, frame.depth_camera, (h, w), uv)
-    centre = round_half_up(place.nan_to_num(-1e6)).clamp(-1e6, 1e6).long()
-    inside = ((centre >= 0) & (centre < torch.tensor([w, h], device=uv.device))).all(-1)
-    corner = centre - size // 2
-    window = patches(frame.depth[:, None], corner, size)[:, :, 0].flatten(-2)  # (B, N, size²)
-    window = torch.where(window.isfinite() & (window > 0), window, torch.zeros_like(window))
-    # Patches are shifted inside at the border: find each pixel's offset from the wanted one by its true coordinates.
-    first = torch.stack((corner[..., 0].clamp(0, w - size), corner[..., 1].clamp(0, h - size)), -1)
-    steps = torch.arange(size, device=uv.device)
-    du = (first[..., 0, None] + steps - centre[..., 0, None])[..., None, :]
-    dv = (first[..., 1, None] + steps - centre[..., 1, None])[..., :, None]
-    reach = torch.maximum(du.abs(), dv.abs()).flatten(-2)
+    size = min(max(NEIGHBOURHOOD, 2 * search_px + 1), h, w)
+    corner = _pixel(place) - size // 2
+    low, high = summarise(frame.depth[:, None], corner, size, _extremes)
+    index, inside = nearest_index((h, w), place)
+    if search_px > 0:
+        index, _ = nearest_index((h, w), _nearest_return(frame.depth, place, corner, size, search_px))
+    value = frame.depth.flatten(1).gather(1, index)
+    returned = inside & (value > 0) & (value < torch.inf)
+    value = torch.where(returned, value, 0)
+    edge = returned & (high > low * (1 + edge_rel))
+    level = torch.full_like(value, 2) if frame.conf is None else frame.conf.flatten(1).gather(1, index)
+    return value, level, edge
+
+
+def _extremes(window: Tensor) -> tuple[Tensor, Tensor]:
+    """Smallest and largest return of windows (1, size, size, P): infinity and 0 where there is none."""
+    window = window.detach().nan_to_num(0, 0, 0)
+    none = torch.nn.functional.threshold(window, 0.0, torch.inf)
+    return none.amin((0, 1, 2)), window.amax((0, 1, 2)).clamp_min(0)
+
+
+def _nearest_return(depth: Tensor, place: Tensor, corner: Tensor, size: int, search_px: int) -> Tensor:
+    """The pixel (B, N, 2) with a return nearest to each ``place``, ``place`` itself where none is within reach."""
+    h, w = depth.shape[-2:]
+    window = patches(depth.detach()[:, None], corner, size).flatten(2)  # (B, N, size²), moved inside at the border
+    last = torch.tensor([w - size, h - size], device=depth.device)
+    first = torch.minimum(corner.clamp_min(0), last)
+    steps = torch.arange(size, device=depth.device)
+    du, dv = ((first - _pixel(place))[..., k, None] + steps for k in (0, 1))
+    du, dv = du[..., None, :], dv[..., :, None]
+    reachable = (torch.maximum(du.abs(), dv.abs()) <= search_px).flatten(-2) & (window > 0) & (window < torch.inf)
     distance = (du * du + dv * dv).flatten(-2)
-    reachable = (reach <= search_px) & (window > 0)
     pick = torch.where(reachable, distance, distance.new_full((), 1 << 30)).argmin(-1, keepdim=True)
-    found = reachable.gather(-1, pick)[..., 0] & inside
-    value = torch.where(found, window.gather(-1, pick)[..., 0], torch.zeros_like(window[..., 0]))
-    high = window.amax(-1)
-    low = torch.where(window > 0, window, torch.full_like(window, torch.inf)).amin(-1)
-    edge = found & (high > low * (1 + edge_rel))
-    if frame.conf is None:
-        level = torch.full_like(value, 2).to(torch.uint8)
-    else:
-        level = patches(frame.conf[:, None], corner, size)[:, :, 0].flatten(-2).gather(-1, pick)[..., 0]
-    return value, level, edge.detach()
+    found = first + torch.cat((pick % size, torch.div(pick, size, rounding_mode="floor")), -1)
+    return torch.where(reachable.gather(-1, pick), found.to(place.dtype), place)
 
 
-def _appearance(image: Tensor, uv: Tensor, dark: float, saturated: float, highlight: float) -> Tensor:
-    """Flag bits (B, N) that the picture alone decides."""
+def _pixel(uv: Tensor) -> Tensor:
+    """The pixel that ``uv`` lies in, as integers; somewhere far outside where it is no place at all."""
+    return round_half_up(uv.nan_to_num(-1e6)).clamp(-1e6, 1e6).long()
+
+
+def _appearance(image: Tensor, uv: Tensor, dark: float, saturated: float, highlight: float) -> tuple[Tensor, ...]:
+    """What the picture alone decides, (B, N) each: at the border, too dark, clipped at white, a highlight."""
     H, W = image.shape[-2:]
     size = min(NEIGHBOURHOOD, H, W)
-    half = size // 2
-    corner = round_half_up(uv.nan_to_num(-1e6)).clamp(-1e6, 1e6).long() - half
-    pixels = patches(image.detach(), corner, size)
-    grey = luma(pixels, 2)[:, :, 0]
-    mean = grey.mean((-1, -2))
-    centre = grey[..., half, half]
-    colour = pixels[..., half, half].to(grey.dtype)
-    top = colour.amax(-1)
-    colourless = top - colour.amin(-1) <= 0.15 * top
-    shine = colourless & (centre >= highlight) & (centre - mean >= 0.1)
-    limit = torch.tensor([W - size, H - size], device=uv.device)
-    border = ((corner < 0) | (corner > limit)).any(-1)
-    return (
-        _bit(mean <= dark, Flag.UNDEREXPOSED)
-        | _bit(mean >= saturated, Flag.SATURATED)
-        | _bit(shine, Flag.SPECULAR)
-        | _bit(border, Flag.BORDER)
-    )
+    corner = _pixel(uv) - size // 2
+    mean, centre, top, bottom = summarise(image.detach(), corner, size, _brightness)
+    u, v = corner.unbind(-1)
+    border = (u < 0) | (v < 0) | (u > W - size) | (v > H - size)
+    shine = (top - bottom <= 0.15 * top) & (centre >= highlight) & (centre - mean >= 0.1)
+    return border, mean <= dark, mean >= saturated, shine
 
 
-def _bit(mask: Tensor, bit: int) -> Tensor:
-    return mask.to(torch.int32) * bit
+def _brightness(pixels: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Mean grey, and of the pixel in the middle grey, largest and smallest channel; of (C, size, size, P)."""
+    half = pixels.shape[1] // 2
+    values, white = (pixels, 1) if pixels.is_floating_point() else (pixels.float(), 255)
+    colour = torch.stack((values.mean((1, 2)), values[:, half, half]), 1) / white
+    mean, centre = luma(colour, 0)[0]
+    return mean, centre, colour[:, 1].amax(0), colour[:, 1].amin(0)
 
 
-def _has(flag: Tensor, bit: int) -> Tensor:
-    return (flag & bit) != 0
+def _bits(*masks: tuple[Tensor, int]) -> Tensor:
+    """One int32 bit set of (mask, bit) pairs."""
+    flag = torch.zeros_like(masks[0][0], dtype=torch.int32)
+    for mask, bit in masks:
+        flag = torch.add(flag, mask, alpha=bit)
+    return flag

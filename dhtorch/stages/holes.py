@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.codes import ROUTE_OF_HOLE, Flag, Hole, first_reason
-from dhtorch.geometry.lookup import luma, patches, round_half_up
+from dhtorch.geometry.lookup import luma, round_half_up, summarise
 from dhtorch.geometry.shapes import check
 from dhtorch.records import Frame, Samples
 
@@ -73,18 +73,25 @@ def min_eigenvalue(
     Gradient: to the image; at equal eigenvalues the subgradient without the split is taken.
     """
     check("min_eigenvalue", image=(image, "B C H W"), uv=(uv, "B N 2"))
-    size = block + 2
-    corner = round_half_up(uv.nan_to_num(-1e6)).clamp(-1e6, 1e6).long() - size // 2
-    grey = luma(patches(image, corner, size), 2)[:, :, 0]  # (B, N, size, size)
-    across = grey[..., :, 2:] - grey[..., :, :-2]
-    down = grey[..., 2:, :] - grey[..., :-2, :]
-    gx = (across[..., :-2, :] + 2 * across[..., 1:-1, :] + across[..., 2:, :]).flatten(-2) / 4
-    gy = (down[..., :-2] + 2 * down[..., 1:-1] + down[..., 2:]).flatten(-2) / 4
-    a, b, c = (gx * gx).mean(-1), (gx * gy).mean(-1), (gy * gy).mean(-1)
+    corner = round_half_up(uv.nan_to_num(-1e6)).clamp(-1e6, 1e6).long() - (block + 2) // 2
+    a, b, c = (x / (16 * block * block) for x in summarise(image, corner, block + 2, _gradient_sums))
     split2 = (a - c) ** 2 / 4 + b * b
     positive = split2 > 0
     split = torch.where(positive, torch.where(positive, split2, torch.ones_like(split2)).sqrt(), split2)
     return (a + c) / 2 - split
+
+
+def _gradient_sums(pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Σ gx², Σ gx gy and Σ gy² of the Sobel filters over all but the outermost pixels (C, size, size, P)."""
+    gx, gy = _sobel(luma(pixels, 0)[0])
+    return (gx * gx).sum((0, 1)), (gx * gy).sum((0, 1)), (gy * gy).sum((0, 1))
+
+
+def _sobel(grey: Tensor) -> tuple[Tensor, Tensor]:
+    """Four times the gradient (size - 2, size - 2, P) of windows (size, size, P)."""
+    across, down = grey[:, 2:] - grey[:, :-2], grey[2:] - grey[:-2]
+    gx = torch.add(across[:-2] + across[2:], across[1:-1], alpha=2)
+    return gx, torch.add(down[:, :-2] + down[:, 2:], down[:, 1:-1], alpha=2)
 
 
 def route(hole: Tensor) -> Tensor:

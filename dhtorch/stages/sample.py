@@ -6,6 +6,7 @@ Every sampler returns exactly ``n`` pixels inside the image, in a fixed order, w
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -52,13 +53,29 @@ def spiral(
     """
     if foveation <= 0:
         raise ValueError(f"spiral: foveation is {foveation}, expected > 0")
+    make = _arms.__wrapped__ if torch.compiler.is_compiling() else _arms
+    centre = None if gaze is None else (gaze[0], gaze[1])
+    uv = make((hw[0], hw[1]), n, turns, foveation, centre, inner_px, margin_px)
+    return uv.to(device=device, dtype=dtype, copy=True)
+
+
+@lru_cache(maxsize=16)
+def _arms(
+    hw: tuple[int, int],
+    n: int,
+    turns: float | None,
+    foveation: float,
+    gaze: tuple[float, float] | None,
+    inner_px: float,
+    margin_px: float,
+) -> Tensor:
+    """:func:`spiral` in float64; the same few patterns are asked for again and again."""
     box = _frame(hw, n, gaze, margin_px)
     k = torch.arange(n, dtype=torch.float64)
     arm, s = k % 2, (torch.div(k, 2, rounding_mode="floor") + 0.5) / max(math.ceil(n / 2), 1)
     if turns is None:
         turns = math.sqrt(foveation * n / (2 * math.pi))
-    uv = _polar(box, 2 * math.pi * turns * s.sqrt() + math.pi * arm, s**foveation, inner_px)
-    return uv.to(device=device, dtype=dtype)
+    return _polar(box, 2 * math.pi * turns * s.sqrt() + math.pi * arm, s**foveation, inner_px)
 
 
 def vogel(
