@@ -305,6 +305,7 @@ ROWS = [
     Row(cells.find, lambda b, n, d: (cells.pack(places(b, 40)).unique(), cells.pack(places(b, n))), "batch capture empty shuffle padding raises", (1,), shared=(0,), bad=lambda a: (a[0][None], a[1])),
     Row(cells.near, lambda b, n, d: (cells.pack(places(1, n)[0]), cells.pack(places(b, 9)).unique()), "capture empty raises", bad=lambda a: (a[0][None], a[1])),
     Row(epipolar.triangulate, two_views, ALL, (0, 1), (0, 1, 2, 3, 4), bad=wrong_last_axis(0)),
+    Row(epipolar.depths, two_views, ALL, (0, 1), (0, 1, 2, 3, 4), bad=wrong_last_axis(0)),
     Row(epipolar.describe, lambda b, n, d: (camera.unproject(two_views(b, n, d)[2], two_views(b, n, d)[0], uniform(b, n, dtype=d, low=1, high=2)), *two_views(b, n, d)), ALL, (0, 1, 2), (0, 1, 2, 3, 4, 5), bad=wrong_last_axis(0)),
     Row(epipolar.point_jacobians, lambda b, n, d: (cameras(b, d), uniform(b, n, 3, dtype=d, low=1, high=2)), ALL, (1,), (0, 1), bad=wrong_last_axis(1)),
     Row(epipolar.depth_variance, lambda b, n, d: (epipolar.triangulate(*two_views(b, n, d)), tracked(b, n, d)[1].cov, tracked(b, n, d)[2].cov), "dtype batch vmap capture gradcheck empty shuffle padding nan", (0, 1), (0, 1, 2)),

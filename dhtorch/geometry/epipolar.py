@@ -20,6 +20,9 @@ from dhtorch.geometry.se3 import Pose
 from dhtorch.geometry.shapes import check
 from dhtorch.geometry.steady import steady
 
+#: Points of all pairs that :func:`depths` works on at once.
+POINTS = 1 << 15
+
 
 class TwoView(NamedTuple):
     """What :func:`triangulate` finds for B × N points; finite everywhere, meaningful where both depths are positive."""
@@ -52,20 +55,60 @@ def triangulate(
     Source: R. Hartley, A. Zisserman, "Multiple View Geometry", section 12.3, with one noise-free view.
     """
     check("triangulate", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), f0=(camera_0.f, "B 2"), f1=(camera_1.f, "B 2"))
-    a0, a1, a2 = se3.rotate(T_1_from_0.R, cam.rays(cam.ideal(camera_0), uv_0)).unbind(-1)  # direction R x in camera 1
-    t0, t1, t2 = (T_1_from_0.t[:, None, k] for k in range(3))
-    f, c = camera_1.f[:, None], camera_1.c[:, None]
-    y0, y1 = ((uv_1 - c) / f).unbind(-1)
+    direction = _directions(uv_0, camera_0, T_1_from_0)
+    depth = _meet(direction, uv_1, camera_1, T_1_from_0)
+    return _describe(depth, torch.stack(direction, -1), uv_1, camera_1, T_1_from_0)
+
+
+def depths(
+    uv_0: Tensor,  # (B, N, 2) ideal px
+    uv_1: Tensor,  # (B, N, 2) ideal px
+    camera_0: Camera,
+    camera_1: Camera,
+    T_1_from_0: Pose,
+) -> Tensor:
+    """Depth (B, N) of :func:`triangulate` and nothing else, for many points: m, z in camera 0.
+
+    Works through the points in pieces that stay in cache.
+
+    Raises:
+        ValueError: wrong shapes.
+
+    Gradient: as :func:`triangulate`.
+    """
+    check("depths", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), f0=(camera_0.f, "B 2"), f1=(camera_1.f, "B 2"))
+    step = max(POINTS // max(uv_0.shape[0], 1), 1)
+    pieces = (
+        [(uv_0, uv_1)] if torch.compiler.is_compiling() else zip(uv_0.split(step, 1), uv_1.split(step, 1), strict=True)
+    )
+    found = [_meet(_directions(a, camera_0, T_1_from_0), b, camera_1, T_1_from_0) for a, b in pieces]
+    return torch.cat(found, 1)
+
+
+def _directions(uv_0: Tensor, camera_0: Camera, T_1_from_0: Pose) -> tuple[Tensor, Tensor, Tensor]:
+    """The anchor's rays turned into camera 1, R x, as three planes (B, N)."""
+    u, v = uv_0.unbind(-1)
+    (fx, fy), (cx, cy), R = camera_0.f.split(1, 1), camera_0.c.split(1, 1), T_1_from_0.R[..., None]
+    x, y = (u - cx) / fx, (v - cy) / fy
+    a0, a1, a2 = (x * R[:, k, 0] + y * R[:, k, 1] + R[:, k, 2] for k in range(3))
+    return a0, a1, a2
+
+
+def _meet(direction: tuple[Tensor, Tensor, Tensor], uv_1: Tensor, camera_1: Camera, T_1_from_0: Pose) -> Tensor:
+    """Depth (B, N) where the anchor's rays meet those of ``uv_1`` moved onto the epipolar lines."""
+    (a0, a1, a2), (t0, t1, t2) = direction, T_1_from_0.t.split(1, 1)
+    u, v = uv_1.unbind(-1)
+    (fx, fy), (cx, cy) = camera_1.f.split(1, 1), camera_1.c.split(1, 1)
+    y0, y1 = (u - cx) / fx, (v - cy) / fy
     # Epipolar line l = t × R x in normalised coordinates; in pixels its normal is (l0 / fx, l1 / fy).
     l0, l1, l2 = t1 * a2 - t2 * a1, t2 * a0 - t0 * a2, t0 * a1 - t1 * a0
-    n0, n1 = l0 / f[..., 0], l1 / f[..., 1]
+    n0, n1 = l0 / fx, l1 / fy
     lift = (l0 * y0 + l1 * y1 + l2) / _guard(n0 * n0 + n1 * n1)
-    y0, y1 = y0 - lift * n0 / f[..., 0], y1 - lift * n1 / f[..., 1]
+    y0, y1 = y0 - lift * n0 / fx, y1 - lift * n1 / fy
     # (R x − (R x)₃ y) depth = t₃ y − t on the first two rows.
     p0, p1 = a0 - a2 * y0, a1 - a2 * y1
     q0, q1 = t2 * y0 - t0, t2 * y1 - t1
-    depth = (p0 * q0 + p1 * q1) / _guard(p0 * p0 + p1 * p1)
-    return _describe(depth, torch.stack((a0, a1, a2), -1), uv_1, camera_1, T_1_from_0)
+    return (p0 * q0 + p1 * q1) / _guard(p0 * p0 + p1 * p1)
 
 
 def describe(
@@ -140,7 +183,7 @@ def depth_variance(
 
 def _guard(x: Tensor) -> Tensor:
     """A non-negative denominator kept away from zero."""
-    return torch.where(x < 1e-18, torch.full_like(x, 1e-18), x)
+    return x.clamp_min(1e-18)
 
 
 def _length(v: Tensor) -> Tensor:
