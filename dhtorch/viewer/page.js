@@ -35,7 +35,7 @@ function facts(list, entries) {
 
 function tellPair() {
   const s = shots[state.now], [a, b] = [s.view_0, s.view_1].map((k) => (k === null ? null : DATA.views[k]));
-  const when = a && a.time !== null ? `, ${(a.time - DATA.views[shots[0].view_0].time).toFixed(2)} s` : "";
+  const when = a && a.time !== null ? `, ${a.time.toFixed(2)} s` : "";
   $("pair-name").textContent = shots.length > 1 ? `pair ${state.now + 1} of ${shots.length}: ${s.label}${when}` : `pair ${s.label}${when}`;
   $("pair").setAttribute("aria-valuetext", $("pair-name").textContent);
   [a, b].forEach((view, k) => {
@@ -152,7 +152,8 @@ function lookFrom(name) {
     return redraw();
   }
   eye.turn(...{ over: [-0.55, 0.45], above: [0, 1.5 - eye.pitch], side: [-1.3, 0.15], camera: [0, 0] }[name]);
-  eye.fit([...Array(s.n).keys()].filter((k) => s.source[k]).map((k) => l.world.subarray(3 * k, 3 * k + 3)).concat([o]), space.canvas.clientWidth / Math.max(space.canvas.clientHeight, 1));
+  const points = [...Array(s.n).keys()].filter((k) => s.source[k]).map((k) => l.world.subarray(3 * k, 3 * k + 3));
+  eye.fit([...points, o], space.canvas.clientWidth / Math.max(space.canvas.clientHeight, 1), 0.12 * size.depth);
   redraw();
 }
 

@@ -37,7 +37,7 @@ class View:
     """A picture and where it was taken."""
 
     number: int  # place of the frame in the recording
-    time: float | None  # s
+    time: float | None  # s since the recording's first frame
     jpeg: bytes
     jpeg_hw: tuple[int, int]
     hw: tuple[int, int]  # of the full picture, to which pixels refer
@@ -205,7 +205,7 @@ def _shot(answer: Answer, shown: Sequence[int]) -> Shot:
 
 
 def _view(recording: Any, k: int, frame: Frame) -> View:
-    time = None if recording.times is None else float(recording.times[k])
+    time = None if recording.times is None else float(recording.times[k] - recording.times[0])
     return View(int(recording.number[k]), time, *_jpeg(_pixels(frame)), frame.hw, *_intrinsics(frame.camera))
 
 

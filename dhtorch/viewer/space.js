@@ -89,8 +89,8 @@ class Eye {
 
   zoom(factor) { this.distance = Math.max(1e-3, Math.min(1e5, this.distance * factor)); }
 
-  // Moves target and distance until nearly all of the points, and the last one in any case, lie in the picture.
-  fit(points, aspect) {
+  // Moves target and distance until nearly all of the points lie in the picture, the last one with room around it.
+  fit(points, aspect, room) {
     const d = this.direction, x = unit(cross(d, this.down.map((v) => -v))), y = cross(x, d), last = points[points.length - 1];
     const middle = (a) => {
       const at = points.map((p) => dot(p, a)), low = quantile(at, 0.01), high = quantile(at, 0.99), own = dot(last, a);
@@ -98,8 +98,8 @@ class Eye {
     };
     const [cx, cy, cz] = [x, y, d].map(middle), t = Math.tan(this.fov / 2) * 0.86;
     this.target = [0, 1, 2].map((k) => cx * x[k] + cy * y[k] + cz * d[k]);
-    const need = points.map((p) => Math.max(Math.abs(dot(p, x) - cx) / (t * aspect), Math.abs(dot(p, y) - cy) / t) - (dot(p, d) - cz));
-    this.distance = Math.max(1e-3, quantile(need, 0.99), need[need.length - 1]);
+    const need = (p, r) => Math.max((Math.abs(dot(p, x) - cx) + r) / (t * aspect), (Math.abs(dot(p, y) - cy) + r) / t) - (dot(p, d) - cz);
+    this.distance = Math.max(1e-3, quantile(points.map((p) => need(p, 0)), 0.99), need(last, room));
   }
 
   matrix(aspect) {
