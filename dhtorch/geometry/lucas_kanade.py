@@ -31,18 +31,23 @@ CHUNK = 256
 #: rounding does not depend on how many others there are.
 LANES = 64
 
-#: Radii of the maps that a point may use up on one level; one of radius r covers the offsets from -r to r + 1. On the
-#: coarsest level nothing is known yet.
-RADII, RADII_TOP = (1, 2, 2, 2, 2), (2, 2, 2, 2, 2, 2, 2)
-
-#: Steps between two looks at who still moves.
-BLOCK = 5
-
-#: Width of a cell, px of the finest level, and the finest level whose points share a search per cell.
-CELL, CELL_LEVEL = 16, 3
+#: Width of a cell, px of its level, and the finest level with cells. Coarse levels only say where the next one starts:
+#: there the points of a cell share one search. Cells are nested, so that they share its start as well.
+CELL, CELL_LEVEL = 4, 2
 
 #: On coarse levels a step has converged at so many times ``epsilon_px``.
 COARSE_EPSILON = 4.0
+
+
+class Plan(NamedTuple):
+    """What a level is worth."""
+
+    radii: tuple[int, ...]  # of a point's successive maps; one of radius r covers the offsets from -r to r + 1
+    steps: int  # on one map
+
+
+#: At the top nothing is known yet and few cells are to be searched.
+TOP, BETWEEN, FINEST = Plan((2, 2, 2, 2), 10), Plan((1, 2, 2), 8), Plan((1, 2, 2, 2), 8)
 
 #: A ratio of contrasts beyond these limits is not believed.
 GAIN = (0.2, 5.0)
@@ -84,27 +89,26 @@ def search(
     top = min(len(source.levels), len(target.levels)) - 1
     rough = o._replace(epsilon_px=o.epsilon_px * COARSE_EPSILON)
 
-    def descend(level: int, o: Options, x: Tensor, d: Tensor, batch: Tensor, known: Tensor):
-        pair = _Pair(source, target, level, *target.bounds(level))
-        return _descend(pair, o, RADII_TOP if level == top else RADII, x, d, batch, known)
+    def start(level: int, x: Tensor, d: Tensor, batch: Tensor) -> Tensor:
+        """Where the search on ``level`` starts: the displacement found on the level above."""
+        if level == top:
+            return d * 0.5**top
+        if not alike or level + 1 < CELL_LEVEL:
+            return coarse(level + 1, x, d, batch)[0] * 2
+        size = CELL * 2.0 ** (level + 1)
+        cell = ((x + 0.5) / size).floor()
+        middle = torch.minimum((cell + 0.5) * size, source.bounds(0)[1] - 0.5)
+        return _once_each(torch.cat([cell, batch[None]]).long(), partial(coarse, level + 1), (middle, d, batch))[0] * 2
 
-    def coarse(levels: range, x: Tensor, d: Tensor, batch: Tensor, known: Tensor) -> tuple[Tensor]:
-        for level in levels:
-            pixel = source.corner(level, x * 0.5**level + 0.5)  # read between pixels only where it decides the answer
-            d = descend(level, rough, pixel, d, batch, known)[0] * 2
-        return (d,)
+    def coarse(level: int, x: Tensor, d: Tensor, batch: Tensor) -> tuple[Tensor]:
+        pair, plan = _Pair(source, target, level, *target.bounds(level)), TOP if level == top else BETWEEN
+        pixel = source.corner(level, x * 0.5**level + 0.5)  # read between pixels only where it decides the answer
+        every = torch.ones_like(batch, dtype=torch.bool)
+        return (_descend(pair, rough, plan, pixel, start(level, x, d, batch), batch, every)[0],)
 
-    cell = (x / CELL + 0.5).floor() * CELL
-    shared, own = range(top, CELL_LEVEL - 1, -1), range(min(top, CELL_LEVEL - 1), 0, -1)
-    columns = (cell, d * 0.5**top, batch, torch.ones_like(known))
-    if alike and shared:
-        (d,) = _once_each(torch.cat([cell, batch[None]]).long(), partial(coarse, shared), columns)
-    else:
-        (d,) = coarse(shared, *columns)
-    (d,) = coarse(own, x, d, batch, known)
-    d, textured, A = descend(0, o, x, d, batch, known)
-    low, high = target.bounds(0)
-    return d, known & textured & within(x + d, low, high), A
+    pair = _Pair(source, target, 0, *target.bounds(0))
+    d, textured, A = _descend(pair, o, FINEST if top else TOP, x, start(0, x, d, batch), batch, known)
+    return d, known & textured & within(x + d, pair.low, pair.high), A
 
 
 def step(source: Pyramid, target: Pyramid, o: Options, x: Tensor, x_1: Tensor, batch: Tensor) -> tuple[Tensor, Tensor]:
@@ -170,62 +174,46 @@ def _once_each(key: Tensor, fn: Callable, columns: tuple[Tensor, ...]) -> tuple[
     return tuple(y.index_select(-1, place) for y in fn(*(column.index_select(-1, some) for column in columns)))
 
 
-def _descend(pair: _Pair, o: Options, radii: tuple[int, ...], x: Tensor, d: Tensor, batch: Tensor, known: Tensor):
-    """One level: all points on a first map, then those that outran it on further ones.
+def _descend(pair: _Pair, o: Options, plan: Plan, x: Tensor, d: Tensor, batch: Tensor, known: Tensor):
+    """One level: all points on a first map, then those that need it on further ones.
 
     Returns the displacement, whether the window is textured (M,), and A (3, M).
     """
-    corner = pair.target.corner(pair.level, x + d) - radii[0]
-    C, moments = _map(pair, o, radii[0], x, corner, batch)
+    corner = pair.target.corner(pair.level, x + d) - plan.radii[0]
+    C, moments = _map(pair, o, plan.radii[0], x, corner, batch)
     A_inv, textured = _inverse(moments[2:5], o.min_eigenvalue * o.window**2)
     live = known & textured & within(x + d, pair.low, pair.high)
-    state = _on_map(pair, o, _steps(C, moments, A_inv), corner, x, d, torch.zeros_like(d[0]), live)
-    for radius in radii[1:]:
-        state = for_some(state[2], partial(_on_new_map, pair, o, radius), state, (x, *state, batch, moments, A_inv))
+    first, *further = (min(plan.steps, o.iterations - k * plan.steps) for k in range(len(plan.radii)))
+    state = _on_map(pair, o, first, _steps(C, moments, A_inv), corner, x, d, live)
+    for radius, steps in zip(plan.radii[1:], further, strict=True):
+        if steps > 0:
+            columns = (x, *state, batch, moments, A_inv)
+            state = for_some(state[1], partial(_on_new_map, pair, o, radius, steps), state, columns)
     return state[0], textured, moments[2:5]
 
 
-def _on_new_map(pair: _Pair, o: Options, radius: int, x, d, taken, live, batch, moments, A_inv):  # noqa: PLR0917
+def _on_new_map(pair: _Pair, o: Options, radius: int, steps: int, x, d, live, batch, moments, A_inv):  # noqa: PLR0917
     """:func:`_on_map` with a map around where the points are, of windows whose moments are known."""
     corner = pair.target.corner(pair.level, x + d) - radius
     C, _ = _map(pair, o, radius, x, corner, batch, moments)
-    return _on_map(pair, o, _steps(C, moments, A_inv), corner, x, d, taken, live)
+    return _on_map(pair, o, steps, _steps(C, moments, A_inv), corner, x, d, live)
 
 
 def _on_map(
     pair: _Pair,
     o: Options,
+    steps: int,
     field: Tensor,  # (2 or 3, n, n, M) see _steps
     corner: Tensor,  # (2, M) the target's pixel where the map begins
     x: Tensor,  # (2, M)
     d: Tensor,  # (2, M)
-    taken: Tensor,  # (M,) steps so far
     live: Tensor,  # (M,) wants to move
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The displacement after all steps on one map, the number of steps, and who left the map and wants another.
-
-    A point stops for good at a short step, outside the level's bounds and after ``iterations`` steps.
-    """
-    low, high, end = pair.low - corner, pair.high - corner, field.shape[1] - 1.0  # all positions are on the map now
-    start = x + d - corner
-    still = (field, low.clamp_min(0), high.clamp_max(end))
-    state = start, taken, live
-    for done in range(0, o.iterations, BLOCK):
-        walk = partial(_walk, o, min(BLOCK, o.iterations - done))
-        columns = (*state, *still)
-        state = for_some(state[2], walk, state, columns) if done else walk(*columns)
-    p, taken, _ = state
-    p = torch.where(p.isfinite(), p, start)
-    outran = (p != p.clamp(0, end)).any(0) & within(p, low, high)
-    return p + corner - x, taken, live & outran & (taken < o.iterations)
-
-
-def _walk(o: Options, steps: int, p: Tensor, taken: Tensor, moving: Tensor, field: Tensor, low: Tensor, high: Tensor):
-    """``steps`` Gauss-Newton steps of map positions ``p`` (2, M) that are ``moving`` (M,), and who still is afterwards.
+) -> tuple[Tensor, Tensor]:
+    """The displacement after ``steps`` Gauss-Newton steps on one map, and who wants to go on from there on another.
 
     Beyond a map's border its field fades to zero, so that a point that leaves is held near it.
     """
-    moving = moving & (taken + steps <= o.iterations)
+    start = p = x + d - corner
     node = torch.arange(field.shape[1], dtype=p.dtype, device=p.device)[:, None]
     step = torch.zeros_like(p)
     for _ in range(steps):
@@ -233,9 +221,10 @@ def _walk(o: Options, steps: int, p: Tensor, taken: Tensor, moving: Tensor, fiel
         step = ((field * hat[0]).sum(2) * hat[1]).sum(1)
         if len(field) == 3:
             step = step[:2] / step[2].clamp(*GAIN)
-        p = torch.where(moving, p - step, p)
-    taken = torch.where(moving, taken + steps, taken)
-    return p, taken, moving & ((step * step).sum(0) > o.epsilon_px**2) & (p == p.clamp(low, high)).all(0)
+        p = p - step
+    p = torch.where(live & p.isfinite().all(0), p, start)
+    restless = (p != p.clamp(0, field.shape[1] - 1.0)).any(0) | ((step * step).sum(0) > o.epsilon_px**2)
+    return p + corner - x, live & restless & within(p, pair.low - corner, pair.high - corner)
 
 
 def _steps(C: Tensor, moments: Tensor, A_inv: Tensor) -> Tensor:
@@ -261,9 +250,9 @@ def _map(pair: _Pair, o: Options, radius: int, x: Tensor, corner: Tensor, batch:
         if moments is None:
             sums.append(_moments(G, o.normalise))
         kernel = _kernels(G, o.normalise)
-        K, m = kernel.shape[:2]
-        J = pair.target.read(pair.level, j.expand(K, m), side).view(1, K * m, side, side)
-        maps.append(F.conv2d(J, kernel.reshape(K * m, 1, w, w), groups=K * m).view(K, m, side - w + 1, side - w + 1))
+        m = kernel.shape[1]
+        J = pair.target.read(pair.level, j, side).view(1, m, side, side)
+        maps.append(torch.cat([F.conv2d(J, k.reshape(m, 1, w, w), groups=m) for k in kernel]))
     C = torch.cat(maps, 1).permute(0, 2, 3, 1).contiguous()
     return C, torch.cat(sums, -1) if moments is None else moments
 

@@ -68,13 +68,12 @@ class Pyramid(NamedTuple):
         """Windows (P, M, size²) that begin at ``first`` (P, M), or (bilinear) ``fraction`` (2, M) right and below."""
         if fraction is None:
             return windows(self.levels[level], first, size).flatten(-2)
-        # Between neighbours by shifting the window as one long row, which runs at full speed; what the shift carries
-        # over a row's end lands in the last column, which is left out.
+        # Between columns by shifting the window as one long row, which runs at full speed; what the shift carries over
+        # a row's end lands in the last column, which is left out.
         side = size + 1
         w = windows(self.levels[level], first, side).flatten(-2)
-        w = torch.lerp(w[..., :-1], w[..., 1:], fraction[0][:, None])
-        w = torch.lerp(w[..., :-side], w[..., side:], fraction[1][:, None])
-        return w.unfold(-1, size, side).flatten(-2)
+        w = torch.lerp(w[..., :-1], w[..., 1:], fraction[0][:, None]).unfold(-1, size, side)
+        return torch.lerp(w[..., :-1, :], w[..., 1:, :], fraction[1][:, None, None]).flatten(-2)
 
     def windows(self, level: int, x: Tensor, batch: Tensor, size: int, planes=(GRAD_X, GRAD_Y, GREY)) -> Tensor:
         """Windows (P, M, size²) around ``x`` (2, M), between pixels."""
