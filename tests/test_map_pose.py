@@ -187,6 +187,15 @@ def test_rows_that_turn_are_found_and_undone():
     assert (still.shutter.turn.abs() < 1e-9).double().mean() > 0.9  # 2 % of the cost is not taken away by chance
 
 
+def test_a_turn_that_was_not_believed_is_not_known_to_be_none():
+    """Where turns are too small to be seen the pose takes their part, and its covariance says so."""
+    args, T, _, _ = pairs(300, 60, 140, turn=0.0015)
+    fit, rigid = map_pose(*args, isotropic=0.0), map_pose(*args, isotropic=0.0, turn_sigma=0.0)
+    unseen = fit.shutter.turn.abs().amax(-1) < 1e-9
+    assert unseen.sum() > 30 and rigid.ok.all()
+    assert 0.7 < nees(fit, T)[unseen].mean() < 1.3 < 1.5 < nees(rigid, T)[unseen].mean()
+
+
 def test_far_tracks_that_contradict_are_left_out():
     """The far scene turns on its own: the near tracks alone are answered, and it is said."""
     args, T, _, _ = pairs(10, 80, 400, baseline=0.3, noise=0.1, depth=0.002)

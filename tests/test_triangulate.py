@@ -183,6 +183,10 @@ def test_what_widens_sigma():
     close = lambda a, b: torch.testing.assert_close(a.nan_to_num(), b.nan_to_num())  # noqa: E731
     close(two_view(*seat, sigma_scale=2.0).sigma, 2 * plain.sigma)
     close(two_view(*seat, mismatch_px=0.2).sigma, 2**0.5 * plain.sigma)
+    trip = tracks.replace(error=0.3 + 0 * tracks.error)
+    close(two_view(samples, trip, *seat[2:], round_trip_px=0.3).sigma, 2**0.5 * plain.sigma)
+    residual = plain.residual_px / 0.5
+    close(two_view(*seat, residual_px=0.5).sigma, plain.sigma * (1 + residual**2).sqrt())
     close(two_view(*seat, fitted_noise=True).sigma, 2 * plain.sigma)  # isotropic tracks of 0.3 px, fitted 0.6 px
     near = torch.arange(40) < 10
     sensed = samples.replace(depth=near * 2.0 + 0 * samples.depth, sigma=0.02 + 0 * samples.sigma)

@@ -145,7 +145,8 @@ def covariance(problem: Problem, solution: Solution, o: Options) -> tuple[Tensor
     Neither the far weight nor a robust weight is an inverse variance, so this is the sandwich A⁻¹ M A⁻¹ of an
     M-estimator: A = Σ ω ψ′ Jᵀ S⁻¹ J is how steeply the equations rise, M = Σ ω² ψ² Jᵀ S⁻¹ J how much they scatter, with
     the inverse depths eliminated from both. ψ′ and ψ² are taken as means over each kind of track, so residuals that
-    are heavier in their tails than assumed widen the answer.
+    are heavier in their tails than assumed widen the answer. A turn that was not believed is not known to be none:
+    wherever one may be, it is as free here as its prior says.
 
     Source: P. Huber, "Robust Statistics", 1981, section 7.6.
     """
@@ -162,7 +163,8 @@ def covariance(problem: Problem, solution: Solution, o: Options) -> tuple[Tensor
     rows = residuals(problem, linear, solution.noise).double()
     A, _ = normal_equations(rows, bread.double())
     M, _ = normal_equations(rows, meat.double())
-    known = torch.diag_embed(prior(solution.turn_precision.double()))
+    free = o.turn_sigma**-2 if o.turn_sigma > 0 else RIGID
+    known = torch.diag_embed(prior(torch.full_like(solution.turn_precision, free).double()))
     A, M = A + known, M + known
     inverse, ok = solve_spd(A, torch.eye(9, dtype=A.dtype, device=A.device).expand_as(A))
     half = (inverse[:, :, :, None] * M[:, None]).sum(2)

@@ -35,6 +35,8 @@ def two_view(
     fitted_noise: bool = False,
     isotropic: float = 0.1,
     mismatch_px: float | None = None,
+    residual_px: float | None = None,
+    round_trip_px: float | None = None,
     sigma_scale: float = 1.0,
     sensor_share: float = 0.0,
     solver: Callable[..., epipolar.TwoView] = epipolar.triangulate,
@@ -59,6 +61,8 @@ def two_view(
             tracks' covariances only its shape; else the covariances as they are.
         isotropic: share of that shape which does not depend on the patch, see ``covariance.noise_shape``.
         mismatch_px: such a shift that widens a track's noise as much as what is fitted; None: none does.
+        residual_px, round_trip_px: a reprojection residual and a round trip that do: a track that contradicts the pose,
+            or itself, is worse than others of its patch; None: none does.
         sigma_scale: factor on what the tracks and the pose give to sigma, as a calibration found it.
         sensor_share: share of the sensor's relative noise that all its returns have in common (a wrong scale): it
             passes whole to every recovered depth, however many near points there are.
@@ -94,8 +98,7 @@ def two_view(
     cov = _fitted(tracks.cov, tracked, fit, isotropic) if fitted_noise else tracks.cov
     own, shared = _variance(geometry, cov, fit, y)
     own, shared = own * sigma_scale**2, shared * sigma_scale**2
-    if mismatch_px is not None:
-        own = own * (1 + (mismatch / mismatch_px) ** 2)
+    own = own * _doubt((mismatch, mismatch_px), (geometry.residual_px, residual_px), (tracks.error, round_trip_px))
     if sensor_share > 0:
         shared = shared + (sensor_share * _relative_noise(samples, fit) * geometry.depth) ** 2
     behind = ~((geometry.depth > 0) & (geometry.depth_1 > 0))
@@ -144,6 +147,15 @@ def _fitted(cov: Tensor, tracked: Tensor, fit: PoseFit, isotropic: float) -> Ten
     """Covariances of the tracks with the shape they state and the scale that the pose's residuals have."""
     scale = torch.where(fit.ok[:, None], fit.sigma_px[:, None], 1.0).to(cov.dtype)
     return noise_shape(cov, tracked, isotropic) * (scale * scale)[..., None, None]
+
+
+def _doubt(*signs: tuple[Tensor, float | None]) -> Tensor | float:
+    """Factor on a track's variance from signs that it is worse than its patch says: 1 + Σ (sign / scale)²."""
+    factor: Tensor | float = 1.0
+    for sign, scale in signs:
+        if scale is not None:
+            factor = factor + (sign / scale) ** 2
+    return factor
 
 
 def _above(x: Tensor, limit: Tensor | float | None) -> Tensor:
