@@ -48,6 +48,7 @@ def inverse_variance(
     max_chi2: float = 9.0,
     correlation: float = 1.0,
     max_sigma_rel: float | None = 0.1,
+    max_still: float = 0.5,
 ) -> Estimate:
     """Join the answers of several views of the same samples; where they contradict each other, say nothing.
 
@@ -63,13 +64,16 @@ def inverse_variance(
             views: all poses rest on the same near returns.
         max_sigma_rel: sigma / depth of the fused answer above which it is withheld; None asks nothing. Views may answer
             far less surely than that.
+        max_still: share of the views without a baseline above which none is believed: the few that found one where the
+            camera hardly moved have most likely taken something else for it.
 
     Returns:
         Estimate (B, N); a single view's as it is. ``n_views`` counts the anchor; ``parallax_deg`` is the largest of
         all views, ``residual_px`` the weighted rms of those that answered (of none: the last view's); ``score`` is 1
         where answered.
 
-    Gates: with too few views, the reason of the last view that is silent; INCONSISTENT, UNCERTAIN.
+    Gates: NO_BASELINE for all points of an anchor whose views mostly have none; with too few views, the reason of the
+    last view that is silent; INCONSISTENT, UNCERTAIN.
 
     Raises:
         ValueError: wrong shapes, or no view.
@@ -100,7 +104,9 @@ def inverse_variance(
     sigma = depth * depth * (own_2 * widening + shared_2).sqrt()
     unsure = torch.zeros_like(n, dtype=torch.bool) if max_sigma_rel is None else sigma > max_sigma_rel * depth
     gate = first_reason((~(chi2 <= max_chi2), Gate.INCONSISTENT), (unsure, Gate.UNCERTAIN))
-    gate = torch.where(n < min(max(min_views, 1), V), _last_reason(estimates.gate, said), gate).to(torch.int32)
+    gate = torch.where(n < min(max(min_views, 1), V), _last_reason(estimates.gate, said), gate)
+    still = (estimates.gate == Gate.NO_BASELINE).any(-1).sum(0) > max_still * V
+    gate = torch.where(still[:, None], Gate.NO_BASELINE, gate).to(torch.int32)
     keep = gate == Gate.ANSWER
     residual_px = torch.where(said, estimates.residual_px, torch.zeros_like(estimates.residual_px))
     residual_px = _root((weight * residual_px.square()).sum(0)).to(estimates.depth.dtype)

@@ -172,6 +172,18 @@ def test_key_views_are_those_that_leave_the_smallest_sigma():
         key_views(views, 6)
 
 
+def test_where_most_views_stand_still_nothing_is_answered():
+    """Two of five views claim a baseline that the others do not see; three of five are believed."""
+    views, _ = noisy(V=5, N=20)
+    still = torch.full_like(views.gate, Gate.NO_BASELINE)
+    for n_still, believed in ((2, True), (3, False)):
+        said = views.replace(gate=torch.where(torch.arange(5)[:, None, None] < n_still, still, views.gate))
+        fused = SURE(said, max_chi2=1e9)
+        assert fused.keep.all() if believed else (fused.gate == Gate.NO_BASELINE).all()
+        assert SURE(said, max_chi2=1e9, max_still=1.0).keep.all()
+        assert torch.equal(fused.depth.isnan(), ~fused.keep)
+
+
 def test_it_captures():
     views, _ = noisy(N=8)
     compiled = torch.compile(inverse_variance, fullgraph=True, backend="eager")
