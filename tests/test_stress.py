@@ -9,9 +9,13 @@ import torch
 from dhtorch.data import stress
 from dhtorch.data.stress import STRESSES, StressRoom, open_stress
 from dhtorch.data.synthetic import SyntheticRoom
+from dhtorch.experiments import protocol
 from dhtorch.geometry import camera, se3
+from dhtorch.pair import extend
 from dhtorch.stages.backproject import backproject
+from dhtorch.stages.holes import classify
 from dhtorch.stages.sample import spiral
+from dhtorch.stages.track import lucas_kanade
 
 SMALL = {"hw": (96, 128), "n_frames": 8, "supersample": 1, "depth_hw": (96, 128)}
 NEAR = 2.0
@@ -108,15 +112,45 @@ def test_rows_of_a_rolling_shutter_are_seen_one_after_the_other():
     assert (rolling[3].image.int() - middle._render(0).image.int()).abs().float().mean() > 0.5
 
 
-def test_mistracks_leave_anchors_alone(walk):
-    moved = room("mistracks")
+def test_moved_squares_leave_anchors_alone(walk):
+    moved = room("moved")
     assert torch.equal(moved[5].image, walk[5].image) and torch.equal(moved[7].depth, walk[7].depth)
     share = (moved[7].image != walk[7].image).any(1).float().mean()
     assert 0.2 < share < 0.35
 
 
+def test_three_in_ten_tracks_end_elsewhere_and_say_nothing_of_it(walk):
+    rolling, wrong = room("rolling_shutter"), room("mistracks")
+    assert torch.equal(wrong[7].image, walk[7].image) and rolling.spoil_track(lucas_kanade) is lucas_kanade
+    uv = spiral(wrong.hw, 512)[None].expand(2, -1, -1)
+    image_0, image_1 = torch.cat((wrong[0].image, wrong[1].image)), torch.cat((wrong[6].image, wrong[7].image))
+    plain, spoiled = (track(image_0, image_1, uv) for track in (lucas_kanade, wrong.spoil_track(lucas_kanade)))
+    shift = (spoiled.uv_1 - plain.uv_1).norm(dim=-1)
+    low, high = (px * 128 / 640 for px in stress.MOVED_PX)
+    assert 0.25 < (shift > 0).float().mean() < 0.35
+    assert low - 1e-3 < shift[shift > 0].min() and shift.max() < high + 1e-3
+    assert not torch.equal(shift[0] > 0, shift[1] > 0)
+    for said in ("error", "photometric", "valid", "cov"):
+        assert torch.equal(getattr(spoiled, said), getattr(plain, said))
+    alone = wrong.spoil_track(lucas_kanade)(image_0[1:], image_1[1:], uv[1:])
+    assert torch.equal(alone.uv_1[0], spoiled.uv_1[1])
+
+
+def test_experiments_ask_the_spoiled_tracker():
+    method = partial(extend, n=256, backproject=backproject, classify=classify, track=lucas_kanade)
+    found = []
+
+    def columns(answer):
+        found.append(answer.trace["tracks"].uv_1)
+        return {}
+
+    asked = protocol.Protocol({"any": protocol.Variant(method)}, columns=columns, min_candidates=0)
+    protocol.run([SyntheticRoom(**SMALL), room("mistracks")], asked, lambda _: [(0, 6)], protocol.Settings())
+    assert 0.2 < ((found[0] - found[1]).norm(dim=-1) > 0).float().mean() < 0.4
+
+
 def test_frames_are_the_same_in_another_process():
-    for name in ("few_near", "mistracks"):
+    for name in ("few_near", "moved"):
         one = room(name, n_frames=7, places=partial(spiral, foveation=1.0))
         two = pickle.loads(pickle.dumps(one))
         a, b = one[6], two[6]

@@ -1,12 +1,14 @@
 """The built-in room under stress: one recording for each thing that goes wrong with a capture, all truth known.
 
 Paths that give little to triangulate with, near returns that hardly fix a pose, a worse sensor, a rolling shutter,
-places that are found again elsewhere. Recordings bear the name ``stress_<name>``.
+places that are shown elsewhere, tracks that end elsewhere. Recordings bear the name ``stress_<name>``.
 """
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -19,7 +21,7 @@ from dhtorch.data.room import furnished_room
 from dhtorch.data.synthetic import SyntheticRoom
 from dhtorch.geometry.camera import Camera, depth_pixels
 from dhtorch.geometry.lookup import round_half_up
-from dhtorch.records import Frame, Pose
+from dhtorch.records import Frame, Pose, Tracks
 
 #: Near returns that are left in ``few_near``.
 FEW = 20
@@ -30,8 +32,8 @@ DEPTH_NOISE = 0.025
 #: Rolling shutter: seconds from the first row to the last, in so many bands of rows that share a pose.
 READOUT_S, BANDS = 0.02, 30
 
-#: Share of the picture that is shown elsewhere in ``mistracks``, in squares of so many pixels at 640 columns, moved by
-#: between ``MOVED_PX`` px (at 640 columns).
+#: Share of the picture (``moved``) or of the tracks (``mistracks``) that is shown or found elsewhere, by between so
+#: many pixels at 640 columns; the picture in squares of ``TILE_PX`` px.
 MOVED_SHARE, TILE_PX, MOVED_PX = 0.3, 80, (6.0, 24.0)
 
 #: Where samples will be taken: ``(hw, n) -> uv (n, 2)``.
@@ -68,6 +70,14 @@ class StressRoom(SyntheticRoom):
             return super().truth(i)
         parts = [self._true_view(camera, pose, hw) for camera, pose, hw in self._rows(i)]
         return {k: torch.cat([part[k] for part in parts], 1) for k in parts[0]}
+
+    def spoil_track(self, track: Callable[..., Tracks]) -> Callable[..., Tracks]:
+        """A method's tracker as it works in this room: under ``mistracks`` many of its tracks end elsewhere."""
+        if self.stress != "mistracks":
+            return track
+        spoiled = partial(_mistrack, track)
+        spoiled.__signature__ = inspect.signature(track)  # type: ignore[attr-defined]  # what it may be asked for is seen
+        return spoiled
 
     def _picture(self, i: int) -> Tensor:
         if not self.bands:
@@ -175,6 +185,23 @@ def _elsewhere(room: StressRoom, i: int, frame: Frame) -> Frame:
     return frame.replace(image=frame.image[..., row, column])
 
 
+def _mistrack(track: Callable[..., Tracks], image_0: Tensor, image_1: Tensor, uv_0: Tensor, **options: Any) -> Tracks:
+    """Tracks of which :data:`MOVED_SHARE` end elsewhere, while all that they say of themselves stays as it was.
+
+    Which ones and where to depends on the second image alone, so every method that looks at it errs alike.
+    """
+    tracks = track(image_0, image_1, uv_0, **options)
+    low, high = (px * image_1.shape[-1] / 640 for px in MOVED_PX)
+    shifts = []
+    for image in image_1:
+        grey_levels = image if image.dtype == torch.uint8 else (255 * image).round()
+        g = torch.Generator().manual_seed(int(grey_levels.long().sum()))
+        wrong, length, angle = torch.rand(3, uv_0.shape[1], 1, generator=g)
+        way = torch.cat((torch.cos(2 * torch.pi * angle), torch.sin(2 * torch.pi * angle)), -1)
+        shifts.append(torch.where(wrong < MOVED_SHARE, way * (low + (high - low) * length), 0.0))
+    return tracks.replace(uv_1=tracks.uv_1 + torch.stack(shifts).to(tracks.uv_1))
+
+
 def _without(frame: Frame, gone: Tensor) -> Frame:
     """The frame without the returns under the flat mask."""
     depth = torch.where(gone.view(frame.depth.shape), torch.zeros_like(frame.depth), frame.depth)
@@ -199,5 +226,6 @@ STRESSES: dict[str, Stress] = {
     "few_near": Stress({"path": "walk"}, _few),
     "depth_noise": Stress({"path": "walk"}, _noisy),
     "rolling_shutter": Stress({"path": "walk"}),
-    "mistracks": Stress({"path": "walk"}, _elsewhere),
+    "moved": Stress({"path": "walk"}, _elsewhere),
+    "mistracks": Stress({"path": "walk"}),
 }
