@@ -243,7 +243,8 @@ class LearnedScore(nn.Module):
             found.load_state_dict(weights)
             found.provenance = dict(content["provenance"])
         except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
-            raise ValueError(f"{where}: found {error}, expected a learned score on {', '.join(EVIDENCE)}") from error
+            why = " ".join(str(error).split())
+            raise ValueError(f"{where}: found {why}, expected a learned score on {', '.join(EVIDENCE)}") from error
         return found
 
     def save(self, path: str | Path) -> Path:
