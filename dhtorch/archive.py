@@ -23,6 +23,9 @@ SCHEMA = 1
 
 VERDICTS = ("supported", "refuted", "undecided")
 
+#: Jobs that ask no question: the main job, and the map of a recording.
+UNASKED = ("pair", "integrate")
+
 #: Options that do not change what is computed: where files lie, what else is written, on which machine part it runs.
 UNKEYED = frozenset(
     {"root", "folder", "cache", "output", "figures", "device", "resume", "traceback", "workers", "hydra"}
@@ -316,11 +319,11 @@ def _fields(value: Any, kinds: Mapping[str, Any], where: str, more: bool = False
 
 def _verdict(result: Mapping[str, Any], where: str) -> None:
     for name in ("question", "expectation", "verdict", "why"):
-        if result["experiment"] == "pair":
-            _expect(result[name] is None, f"{where}.{name}", result[name], "null, the main job asks no question")
+        if result["experiment"] in UNASKED:
+            _expect(result[name] is None, f"{where}.{name}", result[name], "null, this job asks no question")
         else:
             _expect(bool(result[name]), f"{where}.{name}", result[name], "a text")
-    if result["experiment"] != "pair":
+    if result["experiment"] not in UNASKED:
         _expect(result["verdict"] in VERDICTS, f"{where}.verdict", result["verdict"], ", ".join(VERDICTS))
 
 

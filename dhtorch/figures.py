@@ -11,13 +11,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from dhtorch.codes import ROUTE_OF_HOLE, Gate, Hole, Route, Source, names, words
 from dhtorch.evaluate import errors
 from dhtorch.evaluate.risk import risk_coverage
 from dhtorch.export import write_ply
-from dhtorch.geometry.camera import unproject
+from dhtorch.geometry import se3
+from dhtorch.geometry.camera import project, unproject
+from dhtorch.integrate import Surface, splat
 from dhtorch.pair import merge
+from dhtorch.records import Camera, Pose
 
 #: Colours that stay apart for the colour-blind (Okabe and Ito); what was silent is paler than what was answered.
 SENSOR, RECOVERED, SILENT, INK = "#0072B2", "#E69F00", "#B4B4B4", "#333333"
@@ -195,6 +199,55 @@ def draw_example(folder: str | Path, example: Any) -> list[Path]:
     columns |= {"hole": e.samples.hole[0][filled], "source": whole.source[0][filled]}
     write_ply(folder / "points.ply", xyz, source_colours(columns["source"]), **columns)
     return [folder / name for name in written]
+
+
+def draw_map(
+    path: str | Path,
+    surface: Surface,
+    cameras: Sequence[Pose],  # T_world_from_cam (1) of the views it is made of
+    up: Sequence[float],  # in the world
+    *,
+    voxel: float,
+    hw: tuple[int, int] = (600, 800),
+) -> None:
+    """Draw a map from behind its first camera, a little above: in its own colours, and by where it comes from."""
+    T, focal = _viewpoint(surface, cameras[0], up), float(hw[1])
+    light = se3.rotate(T.R.mT, surface.normal[None].double())[0] @ torch.tensor([0.3, -0.5, -0.8]).double()
+    shade = 0.35 + 0.65 * light.abs().nan_to_num(0.5).clamp(0, 1)[:, None]
+    by_source = torch.from_numpy(source_colours(surface.source)) / 255 * shade
+    xyz = se3.apply(se3.invert(T), surface.xyz[None].double())
+    ahead = xyz[..., 2] > voxel
+    lens = Camera(torch.full((1, 2), focal).double(), torch.tensor([[hw[1] / 2, hw[0] / 2]]).double())
+    uv, depth = project(lens, xyz), torch.where(ahead, xyz[..., 2], 0.0)
+    colours = torch.cat((surface.features[:, :3].double(), by_source), -1)[None]
+    seen = splat(lens, hw, uv, depth, torch.ones_like(depth), colours, T, radius=0.8 * voxel)
+    picture = torch.where(seen.depth[0, ..., None] > 0, seen.features[0], 1.0).clamp(0, 1).numpy()
+    way = torch.cat([se3.apply(se3.invert(T), pose.t[None].double())[0] for pose in cameras])
+    dots = (focal * way[:, :2] / way[:, 2:] + lens.c[0]).numpy()[(way[:, 2] > voxel).numpy()]
+    figure, left = _axes(4.8, 4.8 * hw[0] / hw[1], f"Map of {len(cameras)} views")
+    right = figure.add_axes((1.03, 0, 1, 1))
+    right.set_title("sensor and recovered", loc="left", fontsize=11)
+    for axes, part in ((left, picture[..., :3]), (right, picture[..., 3:])):
+        axes.imshow(part, interpolation="antialiased")
+        axes.plot(*dots.T, color=INK, linewidth=0.8, marker="o", markersize=1.5)
+        axes.set(xlim=(-0.5, hw[1] - 0.5), ylim=(hw[0] - 0.5, -0.5))
+        axes.set_axis_off()
+    for code, colour, name in ((Source.SENSOR, SENSOR, "sensor"), (Source.RECOVERED, RECOVERED, "recovered")):
+        right.plot([], [], "s", color=colour, label=f"{name}  {int((surface.source == code).sum())}")
+    _legend(right, *right.get_legend_handles_labels())
+    _save(figure, path)
+
+
+def _viewpoint(surface: Surface, first: Pose, up: Sequence[float]) -> Pose:
+    """Behind and above a camera, looking at the middle of what lies in front of it."""
+    R, t = first.R[0].double().cpu(), first.t[0].double().cpu()
+    above = torch.nn.functional.normalize(torch.tensor(up, dtype=torch.float64), dim=0)
+    ahead = (surface.xyz.double() - t) @ R[:, 2]
+    far = float(ahead.quantile(0.5)) if 0 < len(ahead) < 10_000_000 else 1.0
+    eye = t + R @ torch.tensor([0.25, 0.0, -0.45], dtype=torch.float64) * far + 0.3 * far * above
+    z = torch.nn.functional.normalize(t + far * R[:, 2] - eye, dim=0)
+    x = torch.nn.functional.normalize(torch.linalg.cross(-above, z), dim=0)
+    return Pose(torch.stack((x, torch.linalg.cross(z, x), z), 1)[None], eye[None])
 
 
 def source_colours(source: Any) -> np.ndarray:

@@ -17,7 +17,7 @@ LEVELS = [
     {"stages", "negative", "data", "evaluate", "baselines"},
     {"pair", "window", "integrate", "export", "calibration", "seats"},
     {"transform", "extract", "experiments", "figures"},
-    {"run", "job", "report", "viewer", "capture", "__main__"},
+    {"run", "job", "mapping", "report", "viewer", "capture", "__main__"},
 ]
 LEVEL = {name: level for level, group in enumerate(LEVELS) for name in group}
 SIDEWAYS = {
@@ -27,6 +27,7 @@ SIDEWAYS = {
     ("run", "job"),
     ("run", "report"),
     ("job", "report"),
+    ("integrate", "seats"),
     ("run", "capture"),
     ("run", "viewer"),
     ("__main__", "run"),

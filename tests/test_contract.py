@@ -397,6 +397,10 @@ ELSEWHERE = {
     *(f"dhtorch.geometry.cells.{name}" for name in ("occupied", "components")),
     *(f"dhtorch.integrate.volume.{name}" for name in ("empty", "fuse", "splat")),
     *(f"dhtorch.integrate.surface.{name}" for name in ("points", "mesh")),
+    *(
+        f"dhtorch.integrate.recording.{name}"
+        for name in ("ask", "place", "chain", "build", "coverage", "sensed", "recovered")
+    ),
     "dhtorch.geometry.filters.gaussian_taps",
     *(f"dhtorch.window.{name}" for name in ("inverse_variance", "key_views", "extend_window")),
     "dhtorch.geometry.least_squares.minimise",

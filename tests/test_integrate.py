@@ -1,5 +1,6 @@
 """Global integration: on scenes that are known exactly, against Open3D, and by what must never happen."""
 
+import functools
 import math
 
 import numpy as np
@@ -8,13 +9,15 @@ import torch
 from box import BOX, HW, off_wall, walk
 
 from dhtorch import integrate
+from dhtorch.baselines.device_pose import given_pose
 from dhtorch.codes import Source
 from dhtorch.data.room import furnished_room
 from dhtorch.data.synthetic import SyntheticRoom
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import cells, se3
-from dhtorch.integrate import View, empty, fuse, mesh, points, splat
-from dhtorch.records import Camera, Pose
+from dhtorch.integrate import View, empty, fuse, mesh, points, recording, splat
+from dhtorch.pair import extend
+from dhtorch.records import Camera, Estimate, Pose, Samples, Tracks
 from dhtorch.tree import collate
 
 VOXEL = 0.05
@@ -105,16 +108,16 @@ def room_distance(xyz):
 @pytest.fixture(scope="module")
 def room():
     """Exact depth of the built-in room from four places: recording, volume, all that was seen."""
-    recording = SyntheticRoom(lidar="exact", hw=(240, 320), supersample=1)
+    source = SyntheticRoom(lidar="exact", hw=(240, 320), supersample=1)
     volume, seen = empty(0.02, channels=3), []
     for i in (0, 3, 6, 9):
-        one = view(recording[i], T=recording.true_poses[i : i + 1])
+        one = view(source[i], T=source.true_poses[i : i + 1])
         volume = fuse(volume, one)
         v, u = torch.meshgrid(torch.arange(240), torch.arange(320), indexing="ij")
         uv = torch.stack((u, v), -1).view(1, -1, 2).float()
         xyz = cameras.unproject(one.camera, uv, one.depth.flatten(1))
         seen.append(se3.apply(one.T_world_from_cam.to(torch.float32), xyz)[0])
-    return recording, volume, torch.cat(seen)
+    return source, volume, torch.cat(seen)
 
 
 def test_the_furnished_room_is_found_exactly_and_completely(room):
@@ -141,7 +144,7 @@ def test_open3d_finds_the_same_surface(room):
     o3d = pytest.importorskip("open3d")
     pytest.importorskip("skimage")
     spatial = pytest.importorskip("scipy.spatial")
-    recording, volume, _ = room
+    walk_through, volume, _ = room
     theirs = o3d.pipelines.integration.UniformTSDFVolume(
         length=5.12,
         resolution=256,
@@ -150,13 +153,13 @@ def test_open3d_finds_the_same_surface(room):
         origin=np.array([-2.81, -2.81, -0.61]),  # its voxels' centres on ours
     )
     for i in (0, 3, 6, 9):
-        frame = recording[i]
+        frame = walk_through[i]
         (fx, fy), (cx, cy) = frame.camera.f[0].tolist(), frame.camera.c[0].tolist()
         depth = o3d.geometry.Image(frame.depth[0].numpy())
         picture = o3d.geometry.Image(frame.image[0].permute(1, 2, 0).contiguous().numpy())
         rgbd = o3d.geometry.RGBDImage.create_from_color_and_depth(picture, depth, 1.0, 10.0, False)
         lens = o3d.camera.PinholeCameraIntrinsic(320, 240, fx, fy, cx, cy)
-        theirs.integrate(rgbd, lens, np.linalg.inv(se3.to_matrix(recording.true_poses[i : i + 1])[0].numpy()))
+        theirs.integrate(rgbd, lens, np.linalg.inv(se3.to_matrix(walk_through.true_poses[i : i + 1])[0].numpy()))
     other = np.asarray(theirs.extract_triangle_mesh().vertices)
     surface = mesh(volume)
     ours = surface.xyz.numpy()
@@ -338,6 +341,141 @@ def test_distorted_lenses_and_far_worlds():
             volume = fuse(volume, view(frame, T=Pose(T.R, T.t + shift)))
         off = off_wall(points(volume).xyz.double() - shift) * BOX.min()
         assert len(points(volume).xyz) > 500 and float(off.median()) < 0.005, HW
+
+
+# ----------------------------------------------------------------------------------------------------------- recordings
+
+
+def answered(i, j, T, ok=True):
+    """A pair of frames whose relative pose the method found, or not."""
+    n, zero = 3, torch.zeros(1, 3)
+    code = zero.to(torch.int32)
+    xyz = torch.full((1, n, 3), math.nan)
+    samples = Samples(torch.zeros(1, n, 2), zero, zero, xyz, zero, code, zero, code)
+    estimate = Estimate(samples.uv, zero + 2, zero + 0.1, zero, zero, zero, code, zero, code)
+    tracks = Tracks(samples.uv, samples.uv, zero, zero, torch.zeros(1, n, 2, 2), code == 0)
+    fit = given_pose(T if ok else T.map(lambda v: v * math.nan), n)
+    return recording.Answer((i, j), samples, estimate, tracks, fit, torch.zeros(1, n, 3), wall().camera, (60, 80))
+
+
+class Trajectory:
+    """What placing asks of a recording."""
+
+    name = "walk"
+
+    def __init__(self, poses):
+        self.poses = poses
+
+
+TRUE = se3.exp(0.3 * torch.rand(9, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64))
+
+
+def relative(i, j):
+    return se3.relative(TRUE[i : i + 1], TRUE[j : j + 1])
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_anchored_poses_are_chained_and_the_largest_fragment_is_the_map(known):
+    links = [(0, 3), (3, 6), (1, 4), (6, 8), (2, 5), (5, 8), (4, 7)]
+    answers = [answered(i, j, relative(i, j), ok=(i, j) != (4, 7)) for i, j in links]
+    places = recording.place(Trajectory(TRUE if known else None), answers, poses="anchored")
+    assert set(places.poses) == {0, 2, 3, 5, 6, 8} and places.n_fragments == 3 and places.n_unplaced == 3
+    start = TRUE[:1] if known else se3.identity(1, TRUE.t)
+    for k, T in places.poses.items():
+        wanted = se3.compose(start, relative(k, 0))
+        torch.testing.assert_close(T.R, wanted.R, atol=1e-9, rtol=0)
+        torch.testing.assert_close(T.t, wanted.t, atol=1e-9, rtol=0)
+
+
+def test_device_poses_are_the_recordings_own_where_finite():
+    broken = Pose(TRUE.R.clone(), TRUE.t.clone())
+    broken.t[3] = math.nan
+    places = recording.place(Trajectory(broken), [answered(0, 3, relative(0, 3)), answered(1, 4, relative(1, 4))])
+    assert set(places.poses) == {0, 1, 4} and (places.n_fragments, places.n_unplaced) == (1, 1)
+    assert torch.equal(places.poses[4].t, TRUE.t[4:5])
+    with pytest.raises(ValueError, match="walk has no trajectory of its own, expected poses=anchored"):
+        recording.place(Trajectory(None), [])
+    with pytest.raises(ValueError, match="found 'gps', expected one of device, anchored"):
+        recording.place(Trajectory(None), [], poses="gps")
+
+
+@pytest.mark.parametrize(
+    "pairs", [[(i, i + 20) for i in range(0, 20, 2)], [(i, i + 4) for i in range(5)], [(0, 1), (1, 2)]]
+)
+def test_links_of_another_width_join_all_frames(pairs):
+    links = recording.chain(pairs)
+    assert not set(links) & set(pairs)
+    answers = [answered(i, j, se3.identity(1, TRUE.t)) for i, j in [*pairs, *links]]
+    places = recording.place(Trajectory(None), answers, poses="anchored")
+    assert places.n_fragments == 1 and places.n_unplaced == 0
+
+
+def test_the_camera_knows_where_up_is():
+    turned = se3.exp(torch.tensor([[math.pi / 2, 0, 0, 0, 0, 0]]).double())
+    assert recording.Places({0: se3.identity(1, TRUE.t)}, 1, 0).up == pytest.approx([0, -1, 0])
+    assert recording.Places({0: turned}, 1, 0).up == pytest.approx([0, 0, -1], abs=1e-6)
+    assert recording.Places({}, 0, 0).up == [0, -1, 0]
+
+
+@pytest.mark.parametrize("own", [None, Camera(torch.tensor([[40.0, 38.0]]), torch.tensor([[17.0, 12.0]]))])
+def test_a_frames_depth_wears_the_pictures_colours(own):
+    (frame,) = walk(1, hw=(96, 128), camera=Camera(torch.tensor([[123.0, 116.5]]), torch.tensor([[67.5, 44.0]])))
+    small = walk(1, depth_camera=own)[0].replace(image=frame.image, camera=frame.camera, depth_camera=own)
+    conf = torch.full_like(small.depth, 2).to(torch.uint8)
+    conf[:, :5] = 0
+    spoilt = small.depth.clone()
+    spoilt[0, 20, 30] = 0.5
+    one = recording.sensed(small.replace(conf=conf, depth=spoilt), small.T_world_from_cam)
+    assert float(one.depth[:, :5].max()) == 0 and float(one.depth[0, 19:22, 29:32].max()) == 0, "and no depth edges"
+    assert float((one.depth > 0).double().mean()) > 0.7 and float(one.features[..., 3].max()) == 1
+    surface = points(fuse(empty(VOXEL), one))
+    tone = [torch.sin(3 * surface.xyz[:, 0] + 1), torch.sin(4 * surface.xyz[:, 1] - surface.xyz[:, 0])]
+    error = (surface.features[:, :2] - (torch.stack(tone, -1) * 0.5 + 0.5)).abs()
+    assert float(error.median()) < 0.04
+
+
+def test_sparse_returns_become_discs():
+    frame = walk(1)[0]
+    few = torch.zeros_like(frame.depth)
+    few[0, ::8, ::8] = frame.depth[0, ::8, ::8]
+    one = recording.sensed(frame.replace(depth=few), frame.T_world_from_cam, radius=0.15)
+    assert 4 * int((few > 0).sum()) < int((one.depth > 0).sum()) < 0.9 * few.numel()
+
+
+def test_coverage_counts_cells_and_islands():
+    xyz = torch.tensor(
+        [[0.05, 0.05, 0.05], [0.15, 0.15, 0.05], [0.95, 0.05, 0.05], [math.nan, 0, 0], [0.06, 0.06, 0.06]]
+    )
+    found = recording.coverage(xyz, 0.1)
+    assert found == {"n_voxels": 3, "n_islands": 2, "largest_island": pytest.approx(2 / 3)}
+    assert recording.coverage(xyz[3:4], 0.1) == {"n_voxels": 0, "n_islands": 0, "largest_island": None}
+
+
+@pytest.fixture(scope="module")
+def walked():
+    """A small recording of the built-in room, its pairs and what the method says about them."""
+    room = SyntheticRoom(hw=(240, 320), n_frames=5, gap=4, supersample=1, step_m=0.03)
+    method = functools.partial(extend, n=1024)
+    return room, list(recording.ask(room, method, [(0, 4)], cutoff=2.0))
+
+
+def test_recovered_points_widen_the_map_beyond_the_sensor(walked):
+    room, answers = walked
+    places = recording.place(room, answers)
+    near = recording.build(room, empty(0.04), answers, places, sources=[Source.SENSOR], cutoff=2.0)
+    both = recording.build(room, near, answers, places, sources=[Source.RECOVERED], cutoff=2.0)
+    one, two = points(near), points(both)
+    assert recording.coverage(two.xyz, 0.04)["n_voxels"] > 1.02 * recording.coverage(one.xyz, 0.04)["n_voxels"]
+    new = two.xyz[two.source == Source.RECOVERED]
+    (answer,), T = answers, places.poses[0]
+    raw = cameras.unproject(answer.camera, answer.estimate.uv, answer.estimate.depth)[answer.recovered]
+    raw = se3.apply(T, raw[None].double())[0]
+    assert len(raw) > 200 and len(new) > len(raw)
+    assert float(room_distance(new).median()) < 1.1 * float(room_distance(raw).median()), "no worse than its points"
+    assert float(torch.cdist(new.double(), raw).amin(1).quantile(0.99)) < 0.15, "and nowhere but at them"
+    assert float(two.xyz[:, 2].max()) > 1 + float(one.xyz[:, 2].max()), "farther than the sensor"
+    again = recording.build(room, empty(0.04), answers, places, cutoff=2.0)
+    assert torch.equal(again.distance, both.distance) and torch.equal(again.key, both.key)
 
 
 # ---------------------------------------------------------------------------------------------------------------- cells

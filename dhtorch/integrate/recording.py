@@ -1,0 +1,287 @@
+"""A recording as something to integrate: what the method says about its pairs, where its frames stand, what they add.
+
+Frames are placed either by the recording's own trajectory (``device``) or by the poses that the method found between
+them (``anchored``): those hold frames together only where a pose could be fixed, so that the recording may fall into
+fragments. Nothing joins fragments; the one with the most frames is the map.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dhtorch.codes import Source
+from dhtorch.data.pairs import between
+from dhtorch.evaluate.holdout import range_split
+from dhtorch.geometry import camera as cameras
+from dhtorch.geometry import cells, se3
+from dhtorch.geometry.lookup import nearest
+from dhtorch.integrate.volume import View, Volume, fuse, splat
+from dhtorch.records import Camera, Estimate, Frame, Pose, PoseFit, Samples, Tracks
+from dhtorch.seats import Method, adapt, n_views
+from dhtorch.tree import stack
+
+POSES = ("device", "anchored")
+
+#: Radius of a recovered point's patch, in voxels.
+PATCH = 1.5
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What the method said about one pair, and what of the pictures a map needs."""
+
+    pair: tuple[int, int]
+    samples: Samples
+    estimate: Estimate
+    tracks: Tracks  # as tracked, in the pictures' own pixels
+    fit: PoseFit
+    rgb: Tensor  # (1, N, 3) in [0, 1] at the samples
+    camera: Camera  # of the anchor
+    hw: tuple[int, int]
+
+    @property
+    def recovered(self) -> Tensor:
+        """(1, N) bool: answered where the sensor has no usable return, as in ``merge``."""
+        return self.estimate.keep & ~self.samples.xyz.isfinite().all(-1)
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where the frames of the map stand."""
+
+    poses: dict[int, Pose]  # frame → T_world_from_cam (1), float64
+    n_fragments: int  # into which the frames fall
+    n_unplaced: int  # frames of other fragments, or without a finite pose
+
+    @property
+    def up(self) -> list[float]:
+        """The cameras' mean upward direction in the world; camera axes where they cancel out."""
+        mean = torch.stack([-T.R[0, :, 1] for T in self.poses.values()]).mean(0) if self.poses else torch.zeros(3)
+        return mean.tolist() if float(mean.norm()) > 1e-3 else [0.0, -1.0, 0.0]
+
+
+def ask(
+    recording: Any,
+    method: Method,
+    pairs: Iterable[tuple[int, int]],
+    *,
+    cutoff: float | None = None,
+    seed: int = 0,
+    device: str = "cpu",
+    dtype: torch.dtype = torch.float32,
+) -> Iterator[Answer]:
+    """The method's answer to each pair, one after the other.
+
+    Args:
+        recording, pairs: see ``dhtorch.data``.
+        method: ``dhtorch.pair.extend`` or ``dhtorch.window.extend_window`` with its seats.
+        cutoff: m; returns beyond it are hidden from the method. None hides nothing.
+        seed, device, dtype: of the method's run; answers come back on the CPU.
+
+    Raises:
+        ValueError: as the method, the readers and the hold-out raise it.
+    """
+    method, views = adapt(method, recording), n_views(method)
+    for i, j in pairs:
+        shown = [range_split(recording[k].to(dtype).to(device), cutoff) for k in (i, *between(i, j, views))]
+        trace: dict[str, Any] = {}
+        with torch.no_grad():
+            estimate = method(shown[0], stack(shown[1:]) if views > 1 else shown[-1], seed=seed, trace=trace)
+            samples, rgb = trace["samples"].to("cpu"), _colour(shown[0], trace["samples"].uv)
+        tracks, fit = (trace[k].to("cpu") for k in ("tracks", "fit"))
+        camera = shown[0].camera.to("cpu")
+        yield Answer((i, j), samples, estimate.to("cpu"), tracks, fit, rgb.cpu(), camera, shown[0].hw)
+
+
+def place(recording: Any, answers: Sequence[Answer], *, poses: str = "device") -> Places:
+    """Where the frames stand that the answers speak of.
+
+    Args:
+        recording: with ``poses`` where they are asked for.
+        answers: of all pairs.
+        poses: ``device``, the recording's own trajectory; ``anchored``, chained from the pairs' own poses along the
+            fewest links, from the first frame of a fragment, which stands where the recording's trajectory has it, or
+            at the origin.
+
+    Raises:
+        ValueError: another word, or ``device`` for a recording without a trajectory.
+    """
+    if poses not in POSES:
+        raise ValueError(f"poses: found {poses!r}, expected one of {', '.join(POSES)}")
+    frames = sorted({k for answer in answers for k in answer.pair})
+    given = {} if recording.poses is None else {k: _own(recording, k) for k in frames}
+    given = {k: T for k, T in given.items() if bool(T.R.isfinite().all() and T.t.isfinite().all())}
+    if poses == "device":
+        if recording.poses is None:
+            raise ValueError(f"poses: {recording.name} has no trajectory of its own, expected poses=anchored")
+        return Places(given, int(bool(given)), len(frames) - len(given))
+    links: dict[int, list[tuple[int, Pose]]] = {k: [] for k in frames}
+    for answer in answers:
+        if bool(answer.fit.ok[0]):
+            (i, j), T = answer.pair, answer.fit.T_1_from_0.to(torch.float64)
+            links[i].append((j, se3.invert(T)))
+            links[j].append((i, T))
+    fragments: list[dict[int, Pose]] = []
+    for k in frames:
+        if not any(k in fragment for fragment in fragments):
+            start = given.get(k, se3.identity(1, torch.zeros(1, dtype=torch.float64)))
+            fragments.append(_reached(k, start, links))
+    largest = max(fragments, key=len) if fragments else {}
+    return Places(largest, len(fragments), len(frames) - len(largest))
+
+
+def chain(pairs: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Further pairs, nearly as wide as the given ones, so that poses found for all of them can reach every frame.
+
+    Steps of one width alone never join neighbours; steps of two widths without a common factor do. The wider a step
+    the surer its translation, so the second is the widest that does it.
+    """
+    frames = sorted({k for pair in pairs for k in pair})
+    place = {k: n for n, k in enumerate(frames)}
+    widths = sorted(place[j] - place[i] for i, j in pairs)
+    wide = widths[len(widths) // 2] if widths else 1
+    other = [w for w in range(1, wide) if math.gcd(w, wide) == 1 and w + wide - 1 <= len(frames)]
+    links = [(frames[n], frames[n + w]) for w in other[-1:] for n in range(len(frames) - w)]
+    return [link for link in links if link not in set(pairs)]
+
+
+def build(
+    recording: Any,
+    volume: Volume,
+    answers: Sequence[Answer],
+    places: Places,
+    *,
+    sources: Sequence[int] = (Source.SENSOR, Source.RECOVERED),
+    cutoff: float | None = None,
+    sigma_m: float = 0.0,
+    sigma_rel: float = 0.01,
+    min_conf: int = 1,
+    progress: Callable[[Iterable[Any], str, int], Iterable[Any]] = lambda items, _text, _total: items,
+) -> Volume:
+    """The volume after all placed frames: first what the sensor says, frame by frame, then what was recovered.
+
+    Args:
+        recording: read once more, frame by frame.
+        volume: with four feature channels: red, green, blue and score.
+        answers, places: from :func:`ask` and :func:`place`.
+        sources: which of the two to fuse.
+        cutoff: m; returns beyond it are hidden.
+        sigma_m, sigma_rel, min_conf: the sensor's noise and least confidence, as in stage 2.
+        progress: wraps the loop over frames: (items, text, number of items) → items.
+
+    Returns:
+        Volume; recovered points are splats of 1.5 voxels, added where the sensor has no usable return.
+    """
+    if Source.SENSOR in sources:
+        for k in progress(list(places.poses), f"{recording.name}: sensor", len(places.poses)):
+            frame = range_split(recording[k].to(volume.distance.dtype), cutoff)
+            options: dict[str, Any] = {"sigma_m": sigma_m, "sigma_rel": sigma_rel, "min_conf": min_conf}
+            one = sensed(frame, places.poses[k], radius=PATCH * volume.voxel if recording.sparse else None, **options)
+            volume = fuse(volume, one)
+    if Source.RECOVERED in sources:
+        placed = [a for a in answers if a.pair[0] in places.poses and bool(a.recovered.any())]
+        for answer in progress(placed, f"{recording.name}: recovered", len(placed)):
+            one = recovered(answer, places.poses[answer.pair[0]], radius=PATCH * volume.voxel)
+            volume = fuse(volume, one, source=Source.RECOVERED)
+    return volume
+
+
+def coverage(xyz: Tensor, cell: float) -> dict[str, Any]:
+    """How much space points (P, 3) reach and whether it hangs together, in cells of ``cell`` metres.
+
+    ``n_voxels`` covered; ``n_islands`` of touching ones; ``largest_island``, its share; None without any.
+    """
+    key = cells.occupied(xyz, cell)
+    if not len(key):
+        return {"n_voxels": 0, "n_islands": 0, "largest_island": None}
+    sizes = cells.components(key).bincount()
+    return {"n_voxels": len(key), "n_islands": len(sizes), "largest_island": int(sizes.max()) / len(key)}
+
+
+def sensed(
+    frame: Frame,
+    T_world_from_cam: Pose,
+    *,
+    sigma_m: float = 0.0,
+    sigma_rel: float = 0.01,
+    min_conf: int = 1,
+    edge_rel: float = 0.1,
+    radius: float | None = None,
+) -> View:
+    """The sensor's own depth of one frame (B = 1), with colours from the picture and its confidence as score.
+
+    Returns below ``min_conf`` are left out, and those beside a depth step of more than ``edge_rel``, which belong to
+    neither side. Of sparse depth every return becomes a disc of ``radius`` metres instead.
+    """
+    depth = torch.where(frame.depth.isfinite() & (frame.depth > 0), frame.depth, 0.0)
+    hw = (depth.shape[-2], depth.shape[-1])
+    camera = frame.depth_camera or (frame.camera if hw == frame.hw else cameras.resize(frame.camera, frame.hw, hw))
+    score = torch.ones_like(depth) if frame.conf is None else frame.conf.to(depth) / 2
+    if frame.conf is not None:
+        depth = torch.where(frame.conf >= min_conf, depth, 0.0)
+    if radius is None:
+        depth = torch.where(_edges(depth) > edge_rel, 0.0, depth)
+    sigma = (sigma_m**2 + (sigma_rel * depth).square()).sqrt()
+    v, u = torch.meshgrid(*(torch.arange(n, device=depth.device) for n in hw), indexing="ij")
+    uv = torch.stack((u, v), -1).view(1, -1, 2).to(depth)
+    same = frame.depth_camera is None and hw == frame.hw
+    features = torch.cat((_colour(frame, uv if same else _in_picture(frame, camera, uv)), score.view(1, -1, 1)), -1)
+    if radius is not None:
+        some = (depth.flatten() > 0).nonzero()[:, 0]
+        values = (uv[:, some], depth.flatten(1)[:, some], sigma.flatten(1)[:, some], features[:, some])
+        return splat(camera, hw, *values, T_world_from_cam, radius=radius)
+    return View(depth, sigma, features.view(1, *hw, 4), camera, T_world_from_cam)
+
+
+def recovered(answer: Answer, T_world_from_cam: Pose, *, radius: float) -> View:
+    """The recovered points of a pair as patches of ``radius`` metres."""
+    estimate = answer.estimate
+    depth = torch.where(answer.recovered, estimate.depth, 0.0)
+    features = torch.cat((answer.rgb, estimate.score[..., None]), -1)
+    return splat(
+        answer.camera, answer.hw, estimate.uv, depth, estimate.sigma, features, T_world_from_cam, radius=radius
+    )
+
+
+def _own(recording: Any, k: int) -> Pose:
+    pose: Pose = recording.poses[k : k + 1]
+    return pose.to(torch.float64)
+
+
+def _reached(first: int, start: Pose, links: dict[int, list[tuple[int, Pose]]]) -> dict[int, Pose]:
+    """Poses of all frames that links join to the first one, along the fewest."""
+    found, queue = {first: start}, deque([first])
+    while queue:
+        k = queue.popleft()
+        for other, T_k_from_other in links[k]:
+            if other not in found:
+                found[other] = se3.compose(found[k], T_k_from_other)
+                queue.append(other)
+    return found
+
+
+def _colour(frame: Frame, uv: Tensor) -> Tensor:
+    """(1, N, 3) in [0, 1] at the nearest pixels."""
+    image = frame.image[0].expand(3, -1, -1)
+    value = nearest(image, uv.expand(3, -1, -1))[0].T[None]
+    return value.to(uv) / 255 if image.dtype == torch.uint8 else value
+
+
+def _in_picture(frame: Frame, camera: Camera, uv: Tensor) -> Tensor:
+    """Pixels of the picture (1, N, 2) that see what pixels of the depth map see."""
+    return cameras.project(frame.camera, cameras.rays(camera, uv).nan_to_num())
+
+
+def _edges(depth: Tensor) -> Tensor:
+    """Farthest over nearest return in 3×3 pixels, minus one; what has no return does not count."""
+    far = torch.nn.functional.max_pool2d(depth[:, None], 3, 1, 1)[:, 0]
+    inverse = torch.where(depth > 0, 1 / torch.where(depth > 0, depth, 1.0), 0.0)
+    near = torch.nn.functional.max_pool2d(inverse[:, None], 3, 1, 1)[:, 0]
+    return far * near - 1

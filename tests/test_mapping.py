@@ -1,0 +1,185 @@
+"""``dhtorch integrate``: from a recording to files that other programs read, and a result that counts."""
+
+import os
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from dhtorch import archive, mapping, report
+from dhtorch.data import writers
+from dhtorch.data.synthetic import SyntheticRoom
+from dhtorch.run import main
+
+TINY = [
+    "data.hw=[240,320]",
+    "data.n_frames=4",
+    "data.supersample=1",
+    "data.step_m=0.04",
+    "data.gap=3",
+    "method.n=512",
+    "voxel=0.06",
+]
+FILES = {"map.ply", "map.glb", "points.ply", "map.png", "cameras.txt", "images.txt", "points3D.txt"}
+
+
+@pytest.fixture(scope="module")
+def job(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("map")
+    env = {k: v for k, v in os.environ.items() if k != "DHTORCH_DATA"}
+    command = [sys.executable, "-m", "dhtorch", "integrate", *TINY, "cutoff=2.0", "output=here"]
+    done = subprocess.run(command, check=False, cwd=folder, env=env, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == "", "neither warnings nor a progress bar"
+    return folder / "here", done.stdout
+
+
+def test_every_file_is_written_and_named(job):
+    folder, said = job
+    assert {p.name for p in (folder / "synthetic_room").rglob("*") if p.is_file()} == FILES
+    assert said.count("here/synthetic_room/") == len(FILES) and "here/result.json" in said
+    for words in ("2 of 2 frames placed by device poses, 1 fragment;", "voxels of 6 cm", "times the sensor's", "MiB"):
+        assert words in said
+    newest = max((folder / "synthetic_room").rglob("*.*"), key=lambda p: p.stat().st_mtime_ns)
+    assert (folder / "result.json").stat().st_mtime_ns >= newest.stat().st_mtime_ns, "written last"
+
+
+def test_the_result_counts_what_was_widened(job):
+    folder, _ = job
+    result = archive.read(folder)
+    assert result["experiment"] == "integrate" and result["question"] is None and result["verdict"] is None
+    pair, scene = result["rows"]
+    assert pair["pair"] == [0, 3] and pair["placed"] == 1 and scene["n_frames"] == 2 and scene["n_fragments"] == 1
+    assert scene["n_voxels"] > scene["n_voxels_sensor"] > 100
+    assert scene["voxels_vs_sensor"] == scene["n_voxels"] / scene["n_voxels_sensor"]
+    assert result["summary"]["map.n_voxels"]["value"] == scene["n_voxels"]
+    assert report.tables(result), "the report shows it as any other"
+
+
+def test_plyfile_and_trimesh_read_the_map(job):
+    folder, _ = job
+    plyfile, trimesh = pytest.importorskip("plyfile"), pytest.importorskip("trimesh")
+    row = archive.read(folder)["rows"][-1]
+    vertex = plyfile.PlyData.read(folder / "synthetic_room" / "map.ply")["vertex"]
+    assert len(vertex) == row["n_points"] and set(np.unique(vertex["source"])) == {1, 2}
+    assert bool((vertex["sigma"] > 0).all()) and bool(((vertex["score"] >= 0) & (vertex["score"] <= 1.001)).all())
+    points = plyfile.PlyData.read(folder / "synthetic_room" / "points.ply")["vertex"]
+    assert set(np.unique(points["source"])) == {1, 2}
+    assert bool((points["class"][points["source"] == 2] > 0).all()), "what was recovered fills a hole"
+    scene = trimesh.load(folder / "synthetic_room" / "map.glb")
+    assert set(scene.geometry) == {"surface", "recovered"}
+    assert len(scene.geometry["recovered"].vertices) == int((points["source"] == 2).sum())
+
+
+def test_colmap_reads_views_and_tracks(job):
+    folder, _ = job
+    pycolmap = pytest.importorskip("pycolmap")
+    model = pycolmap.Reconstruction(str(folder / "synthetic_room" / "colmap"))
+    assert len(model.images) == 2 and len(model.cameras) == 1
+    assert len(model.points3D) == archive.read(folder)["rows"][0]["n_kept"] > 30
+    (camera,) = model.cameras.values()
+    misses = [
+        np.linalg.norm(camera.img_from_cam(image.cam_from_world() * model.points3D[p.point3D_id].xyz) - p.xy)
+        for image in model.images.values()
+        for p in image.points2D
+    ]
+    assert len(misses) == 2 * len(model.points3D) and np.median(misses) < 1.0, "poses, lens and half pixels agree"
+
+
+@pytest.fixture
+def command(tmp_path, monkeypatch, capsys):
+    """The command in this process, from an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("NO_COLOR", "1")
+
+    def call(*args):
+        try:
+            code = main(["integrate", *args])
+        except SystemExit as stop:
+            code = stop.code
+        return code, *capsys.readouterr()
+
+    return call
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        ("poses=gps", "poses: found 'gps', expected one of device, anchored"),
+        ("voxel=0", "voxel=0, truncation=0, expected 0 < voxel <= truncation"),
+        ("truncation=0.001", "expected 0 < voxel <= truncation"),
+        ("min_weight=-1", "min_weight is -1, expected 0 or more"),
+        ("dtype=int32", "dtype: found 'int32', expected float32 or float64"),
+        ("cutoff=-1", "cutoff: found -1, expected a positive number of metres, or null"),
+        ("pairs.gap=99", "pairs.gap: found 99"),
+        ("voxle=1", "voxle"),
+    ],
+)
+def test_wrong_options_end_in_one_line_and_no_file(command, tmp_path, option, words):
+    code, out, err = command(*TINY, option, "output=here")
+    assert code == 2 and out == "" and words in err and err.count("\n") == 1
+    assert not (tmp_path / "here").exists()
+
+
+def test_a_recording_without_a_trajectory_asks_for_anchored_poses(command, tmp_path):
+    room = SyntheticRoom(hw=(240, 320), n_frames=4, supersample=1, step_m=0.04, lidar="exact")
+    folder = tmp_path / "walk"
+    writers.write_tum(folder, [room[i] for i in range(4)])
+    (folder / "groundtruth.txt").unlink()
+    data = ["data=tum", f"data.root={folder}", "pairs.gap=3", "method.n=512", "voxel=0.06", "output=here"]
+    code, _, err = command(*data)
+    assert code == 2 and "walk has no trajectory of its own, expected poses=anchored" in err
+    code, out, err = command(*data, "poses=anchored", "mesh=false")
+    assert code == 0, err
+    assert "2 of 2 frames placed by anchored poses, 1 fragment" in out and "triangles" not in out
+
+
+def test_ctrl_c_keeps_the_scenes_that_are_whole(tmp_path, monkeypatch):
+    made = []
+
+    def make(source, *_args, **_options):
+        if made:
+            raise KeyboardInterrupt
+        made.append(source)
+        return mapping.Scene(source, [], None, None, None, {"seconds": 0.0, "scene": source.name})
+
+    monkeypatch.setattr(mapping, "make", make)
+    monkeypatch.setattr(mapping, "write", lambda *_: [])
+    monkeypatch.setattr(mapping, "_pair_rows", lambda _: [])
+    settings = {"output": str(tmp_path), "dtype": "float32", "poses": "device", "mesh": None, "threads": None}
+    settings |= {"voxel": 0.1, "truncation": None, "min_weight": 0.0, "cutoff": None}
+    rooms = [SyntheticRoom(n_frames=2), SyntheticRoom(n_frames=2)]
+    with pytest.raises(KeyboardInterrupt, match=f"1 of 2 scenes in {tmp_path} are whole and stay"):
+        mapping.run(settings, {"data": rooms, "method": None, "pairs": None}, progress=lambda items, _text, _n: items)
+    assert not (tmp_path / "result.json").exists()
+
+
+def test_help_shows_every_option(command):
+    code, out, _ = command("--help")
+    assert code == 0
+    for word in ("poses", "voxel", "truncation", "sensor_sigma_rel", "min_weight", "mesh", "anchored", "Exit code"):
+        assert word in out
+
+
+@pytest.mark.data
+@pytest.mark.skipif("DHTORCH_DATA" not in os.environ, reason="DHTORCH_DATA is unset")
+def test_a_real_desk_becomes_a_map(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    root = os.path.join(os.environ["DHTORCH_DATA"], "tum_fr1_desk9")  # noqa: PTH118
+    options = [
+        "data=tum",
+        f"data.root={root}",
+        "pairs.gap=4",
+        "pairs.stride=4",
+        "method.n=512",
+        "voxel=0.04",
+        "output=here",
+    ]
+    assert main(["integrate", *options, "mesh=false"]) == 0
+    (scene,) = [r for r in archive.read(tmp_path / "here")["rows"] if r["pair"] is None]
+    assert scene["n_frames"] == 3 and scene["n_voxels"] > 1000 and scene["largest_island"] > 0.5
+    assert torch.get_num_threads() == 1 and "tum_fr1_desk9: 3 of 3 frames" in capsys.readouterr().out
+    shutil.rmtree(tmp_path / "here")
