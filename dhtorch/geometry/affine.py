@@ -83,6 +83,7 @@ def register(
     uv_0: Tensor,  # (B, N, 2) px
     uv_1: Tensor,  # (B, N, 2) px, the start
     *,
+    wanted: Tensor | None = None,  # (B, N) bool
     window: int = 21,
     iterations: int = 10,
     epsilon_px: float = 0.01,
@@ -98,6 +99,7 @@ def register(
         source, target: ``build_pyramid(image, levels, window)`` of both images; the second level of ``target`` is read
             where a window is magnified by more than 1.5.
         uv_1: closer than about a quarter of the window; the search begins there, unturned.
+        wanted: points to register, by default all; the others cost nothing and are not ok, their numbers of no meaning.
         window: width in pixels, odd.
         iterations: most Gauss–Newton steps.
         epsilon_px: a step that moves no corner of the window further has converged.
@@ -116,15 +118,17 @@ def register(
     Gradient: none; take :func:`step` from the result.
     Cost: reads a patch of image 1 once and 441 pixels of it per point and step.
     """
-    B, N = (check("register", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"))[k] for k in "BN")
+    B, N = (check("register", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), wanted=(wanted, "B N"))[k] for k in "BN")
     with torch.no_grad():
         here, there, batch, usable = _rows(source, target, uv_0, uv_1)
+        if wanted is not None:
+            usable = usable & wanted.reshape(-1)
         q = round_half_up(here)
         d = here - q
         still = torch.eye(2, dtype=d.dtype, device=d.device)[..., None].expand(2, 2, B * N)
         search = partial(_search, source, target, epsilon_px=epsilon_px, window=window)
         together = min(STEPS_TOGETHER, iterations)
-        state = search((q, there - d, still, batch), level=0, steps=together)
+        state = _resume(usable, _nothing(there - d, still), partial(search, level=0, steps=together), q, batch)
         start = state._replace(x=there - d, A=still, fit=state.first)
         if iterations > together:
             on = partial(search, level=0, steps=iterations - together)
@@ -244,6 +248,13 @@ def _descend(
         fit = _quality(G[2], J, x, A)
     inverse = torch.where(textured[:, None, None], inverse, eye / DAMPING).permute(1, 2, 0)
     return _State(x, A, textured, moving, fit, first, inverse)
+
+
+def _nothing(x: Tensor, A: Tensor) -> _State:
+    """The state of points that are not registered."""
+    none, fit = torch.zeros_like(x[0], dtype=torch.bool), x.new_zeros(3, x.shape[1])
+    eye = torch.eye(8, dtype=x.dtype, device=x.device)[..., None]
+    return _State(x, A, none, none, fit, fit, (eye / DAMPING).expand(8, 8, x.shape[1]))
 
 
 def _resume(wanted: Tensor, state: _State, search: Callable[..., _State], q: Tensor, batch: Tensor) -> _State:

@@ -229,6 +229,7 @@ def lucas_kanade_affine(
             target,
             uv_0,
             tracks.uv_1,
+            wanted=tracks.valid,
             window=window,
             iterations=iterations,
             epsilon_px=epsilon_px,
