@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import pickle
+import socket
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -23,6 +24,9 @@ TASK_ROWS = 16
 
 #: Bytes of shared memory of a Ray that is started on this machine.
 STORE_BYTES = 300_000_000
+
+#: Time that a cluster is given to answer, s.
+PATIENCE_S = 10
 
 
 def here(rows: Rows, positions: Sequence[int], workers: int) -> Iterator[Answer]:
@@ -61,6 +65,7 @@ def on_ray(rows: Rows, positions: Sequence[int], address: str | None) -> Iterato
         ConnectionError: no cluster at the address.
     """
     ray, data = need("ray", extra="scale"), need("ray.data", extra="scale")
+    _reach(address)
     own = {} if address else {"include_dashboard": False, "object_store_memory": STORE_BYTES}
     logging.getLogger("ray.data").setLevel(logging.ERROR)
     ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **own)
@@ -80,6 +85,17 @@ def on_ray(rows: Rows, positions: Sequence[int], address: str | None) -> Iterato
             yield from map(pickle.loads, block["answer"])
     finally:
         ray.shutdown()
+
+
+def _reach(address: str | None) -> None:
+    """Ask whether anything answers: Ray itself goes on trying for minutes."""
+    host, _, port = str(address).removeprefix("ray://").rpartition(":")
+    if not port.isdigit():
+        return
+    try:
+        socket.create_connection((host, int(port)), timeout=PATIENCE_S).close()
+    except OSError as error:
+        raise ConnectionError(f"extract.address: nothing answers at {address} ({error}), expected a cluster") from None
 
 
 def _as_it_is(answer: Any) -> Any:

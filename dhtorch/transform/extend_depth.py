@@ -95,6 +95,7 @@ class ExtendDepth(torch.nn.Module):
         grid((max(patch, 1),) * 2, patch=patch, tokens_hw=tokens_hw)  # raises where no patch fits
         self.views = Views(**views)
         self.method = METHODS[method] if isinstance(method, str) else method
+        self.seats = {name: _option(self.method, name, default) for name, default in FRONT_END.items()}
         self.learned = torch.nn.ModuleList(_modules(self.method))  # so that .to() and .parameters() find them
         self.n = int(_option(self.method, "n") if n is None else n)
         self.seed, self.index_key = seed, index_key
@@ -157,7 +158,7 @@ class ExtendDepth(torch.nn.Module):
         xyz = cam.unproject(frame.camera, found.uv, torch.where(valid, found.depth, 1.0))
         zero = torch.zeros_like(paired, dtype=torch.int32)
         problem = torch.where(paired, zero, Problem.NO_SECOND_VIEW)
-        problem = torch.where((frame.depth > 0).flatten(1).any(1), problem, Problem.NO_DEPTH)
+        problem = torch.where(frame.depth.flatten(1).amax(1) > 0, problem, Problem.NO_DEPTH)
         added = {
             "uv": found.uv,
             "xyz": torch.where(valid[..., None], xyz, 0.0),
@@ -177,9 +178,9 @@ class ExtendDepth(torch.nn.Module):
         return {**out, "problem": torch.where(bad, zero + Problem.UNREADABLE, problem)}
 
     def _front_end(self, frame: Frame) -> Samples:
-        seat = {name: _option(self.method, name, default) for name, default in FRONT_END.items()}
-        uv = seat["sample"](frame.hw, self.n, device=frame.camera.f.device, dtype=frame.camera.f.dtype)
-        samples: Samples = seat["classify"](frame, seat["backproject"](frame, uv))
+        like = frame.camera.f
+        uv = self.seats["sample"](frame.hw, self.n, device=like.device, dtype=like.dtype)
+        samples: Samples = self.seats["classify"](frame, self.seats["backproject"](frame, uv))
         return samples
 
     def _seeds(self, sample: Mapping[str, Any], batch: int) -> int | Tensor:

@@ -19,6 +19,10 @@ from dhtorch.records import Camera
 Numbers = str | Sequence[float]
 
 
+#: torch knows little of unsigned words.
+_SIGNED = {torch.uint16: torch.int32, torch.uint32: torch.int64}
+
+
 class SampleError(ValueError):
     """A sample cannot be read as stated; the message names the key, what was found and what was expected."""
 
@@ -46,12 +50,13 @@ def to_tensor(value: Any, key: str) -> Tensor:
         SampleError: it holds no numbers.
     """
     if isinstance(value, Tensor):
-        return value.as_subclass(Tensor)
+        x = value.as_subclass(Tensor)
+        return x.to(_SIGNED[x.dtype]) if x.dtype in _SIGNED else x
     array = np.asarray(value)
     if array.dtype.kind not in "buif":
         raise SampleError(f"{key}: found {type(value).__name__} of {array.dtype}, expected an array of numbers")
     if array.dtype.kind == "u" and array.dtype.itemsize in (2, 4):
-        array = array.astype(np.int64)  # torch knows little of unsigned words
+        array = array.astype(np.int32 if array.dtype.itemsize == 2 else np.int64)
     array = array.astype(array.dtype.newbyteorder("="), copy=not array.flags.writeable)
     return torch.from_numpy(np.ascontiguousarray(array))
 

@@ -25,7 +25,7 @@ from dhtorch.tree import stack
 UNITS = {"m": 1.0, "mm": 1000.0}
 
 #: Pixels at most by which the median depth of a frame is judged.
-PROBES = 16384
+PROBES = 4096
 
 #: The shapes of the image and the depth map may differ by this share; a transposed map differs by far more.
 MAX_ASPECT = 0.1
@@ -109,8 +109,10 @@ class Views:
             if conf.shape != depth.shape:
                 raise SampleError(f"{self.confidence}: found {_size(conf)}, expected {_size(depth)} as {self.depth}")
         camera = self._camera(leaves, self.intrinsics, hw, T, at, checks)
-        anchor = Frame(images[:, at].contiguous(), depth, camera, self._depth_camera(leaves, depth, hw, T, at), conf)
+        anchor = Frame(images[:, at], depth, camera, self._depth_camera(leaves, depth, hw, T, at), conf)
         other, paired = self._other(leaves, images, depths, anchor, checks)
+        if other is not None:  # tracking reads all pixels, the front end alone a few where they lie
+            anchor = anchor.replace(image=anchor.image.contiguous())
         bad = torch.stack([c[0] for c in checks]).any(0)
         return Read(anchor, other, paired, bad, tuple(checks))
 
@@ -157,9 +159,12 @@ class Views:
         if self.depth_unit == "m" and not x.is_floating_point():
             raise SampleError(f"{self.depth}: found whole numbers ({x.dtype}), expected metres; is the unit mm?")
         per_metre = UNITS.get(self.depth_unit) if isinstance(self.depth_unit, str) else None
-        z = x / per_metre if per_metre is not None else x * float(self.depth_unit)
+        # Every pass over a whole map costs as much as the front end: no more of them than the numbers ask for.
+        x = x.nan_to_num(0.0, 0.0, 0.0) if x.is_floating_point() else x
+        x = x.clamp_min(0)
+        z = x if per_metre == 1.0 else x / per_metre if per_metre is not None else x * float(self.depth_unit)
         low, high = self.depth_range
-        return torch.where(z.isfinite() & (z > max(low, 0.0)) & (z <= high), z, torch.zeros_like(z))
+        return z if low <= 0 and high == float("inf") else torch.where((z > low) & (z <= high), z, 0.0)
 
     def _depth_checks(self, depth: Tensor) -> list[tuple[Tensor, Tensor, str]]:
         flat = depth.detach().flatten(1)
