@@ -30,8 +30,9 @@ from dhtorch.baselines import dinov2 as visual_branch
 from dhtorch.data import convert, rh20t
 from dhtorch.evaluate import probe
 from dhtorch.experiments import front_ends, probing
-from dhtorch.experiments.probing import ALL, ARMS, CONTEXT, MOVING, PENALTIES, REFERENCE, Judged, Shard, Shards
+from dhtorch.experiments.probing import ALL, ARMS, CONTEXT, MOVING, PENALTIES, REFERENCE, TRUTH, Judged, Shard, Shards
 from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
+from dhtorch.experiments.rows import Row
 
 QUESTION = "Do depth features tell a ridge probe as much of a robot's next motion as DINOv2's do?"
 EXPECTATION = "Yes: its error is that of DINOv2 within 2 %, over all samples and over those that move."
@@ -96,6 +97,7 @@ def run(
         for recording in recordings:
             index, before, context, target = robot(recording, horizon=horizon, history=history, stride=stride)
             if not len(index):
+                outcome.rows.append(_left_out(recording))
                 continue
             options: dict[str, Any] = {"cells": depth_cells, "seed": settings.seed}
             two, one = (front_ends.adapted(method, recording, views=v, **options) for v in (2, 1))
@@ -131,14 +133,15 @@ def robot(
         (n, 6): translation (m) and rotation vector (rad) to the tool centre ``horizon`` later, in the hand's axes.
 
     Raises:
-        ValueError: no RH20T scene, or one without the hand's poses.
+        ValueError: no RH20T scene. One without the hand's poses has no sample.
     """
-    streams = rh20t.streams(recording.root) if recording.root and recording.format == "rh20t" else {}
-    if "tcp_base" not in streams or recording.times is None:
+    if recording.format != "rh20t":
         expected = "an RH20T scene (data=rh20t_set data.root=PATH, or data=rh20t_synthetic)"
-        raise ValueError(f"rh20t_probe: {recording.name} has no tcp_base, expected {expected}")
-    times = recording.times.numpy()
-    tcp = streams["tcp_base"]
+        raise ValueError(f"rh20t_probe: {recording.name} is {recording.format}, expected {expected}")
+    streams = rh20t.streams(recording.root)
+    if "tcp_base" not in streams:
+        return [], [], torch.zeros(0, 16 + JOINTS), torch.zeros(0, 6)
+    times, tcp = recording.times.numpy(), streams["tcp_base"]
     (now, a), (then, b), (past, c) = (tcp.at(times + shift) for shift in (0.0, horizon, -history))
     before = np.abs(times[:, None] - history - times[None]).argmin(1)
     use = a & b & c & (before < np.arange(len(times)))
@@ -181,6 +184,11 @@ def task_of(recording: Any) -> str:
     """The task that a scene shows, by the name of its folder."""
     named = re.search(r"task_\d+", recording.name)
     return named[0] if named else str(recording.name)
+
+
+def _left_out(recording: Any) -> Row:
+    note = "no sample: no pose of the hand over so long a time"
+    return {"scene": recording.name, "pair": None, "method": CONTEXT, "truth": TRUTH, "role": None, "note": note}
 
 
 def _look(
