@@ -175,11 +175,23 @@ def uniform_draws(seed: int | Tensor, batch: int, hypotheses: int) -> Tensor:
         ValueError: ``seed`` is a tensor of another shape than (batch,).
     """
     if isinstance(seed, int):
-        one = torch.rand(hypotheses, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-        return one.expand(batch, -1, -1)
+        return _draws(torch.tensor([seed]), hypotheses).expand(batch, -1, -1)
     if seed.shape != (batch,):
         raise ValueError(f"extend: seed has shape {tuple(seed.shape)}, expected an int or ({batch},) int64")
-    return torch.cat([uniform_draws(int(s), 1, hypotheses) for s in seed.tolist()])
+    return _draws(seed.cpu(), hypotheses)
+
+
+# One operation to torch.compile and vmap: neither can look into a generator, nor needs to, for nothing here is random.
+@torch.library.custom_op("dhtorch::uniform_draws", mutates_args=())
+def _draws(seed: Tensor, hypotheses: int) -> Tensor:
+    made = [torch.Generator().manual_seed(int(s)) for s in seed.tolist()]
+    rows = [torch.rand(hypotheses, 3, generator=g, dtype=torch.float64) for g in made]
+    return torch.stack(rows) if rows else torch.zeros(0, hypotheses, 3, dtype=torch.float64)
+
+
+@_draws.register_fake
+def _(seed: Tensor, hypotheses: int) -> Tensor:
+    return torch.empty(len(seed), hypotheses, 3, dtype=torch.float64)
 
 
 class _Clock:

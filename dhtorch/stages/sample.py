@@ -126,16 +126,20 @@ def _frame(
     hw: tuple[int, int], n: int, gaze: tuple[float, float] | None, margin_px: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Gaze, lowest and highest admissible pixel, each (2,) as (u, v) in float64."""
-    high = torch.tensor([hw[1] - 1 - margin_px, hw[0] - 1 - margin_px], dtype=torch.float64)
-    low = torch.full((2,), float(margin_px), dtype=torch.float64)
+    high = (hw[1] - 1 - margin_px, hw[0] - 1 - margin_px)
     if n < 0:
         raise ValueError(f"sampler: n is {n}, expected >= 0")
-    if margin_px < 0 or bool((high < low).any()):
+    if margin_px < 0 or min(high) < margin_px:
         raise ValueError(f"sampler: margin_px = {margin_px} does not fit an image of {hw[0]}x{hw[1]} pixels")
-    centre = (low + high) / 2 if gaze is None else torch.tensor(gaze, dtype=torch.float64)
-    if not bool(((centre >= low) & (centre <= high)).all()):
+    centre = ((margin_px + high[0]) / 2, (margin_px + high[1]) / 2) if gaze is None else gaze
+    if not all(margin_px <= x <= limit for x, limit in zip(centre, high, strict=True)):
         raise ValueError(f"sampler: gaze {gaze} lies outside the image of {hw[0]}x{hw[1]} pixels (margin {margin_px})")
-    return centre, low, high
+    low = (margin_px, margin_px)
+    return (
+        torch.tensor(centre, dtype=torch.float64),
+        torch.tensor(low, dtype=torch.float64),
+        torch.tensor(high, dtype=torch.float64),
+    )
 
 
 def _polar(box: tuple[Tensor, Tensor, Tensor], angle: Tensor, radius: Tensor, inner_px: float) -> Tensor:
