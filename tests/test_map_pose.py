@@ -9,7 +9,7 @@ from dhtorch.codes import Gate, PoseCode
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import covariance, most_probable, near_far, se3
 from dhtorch.geometry.least_squares import robust, weight_slope
-from dhtorch.records import Camera, Pose, Samples, Tracks
+from dhtorch.records import Camera, Pose, PoseFit, Samples, Shutter, Tracks
 from dhtorch.stages.pose import _near_far, map_pose, pnp_ransac
 from dhtorch.stages.triangulate import two_view
 
@@ -185,6 +185,22 @@ def test_rows_that_turn_are_found_and_undone():
     assert error[0] < 0.7 * error[1]
     still = map_pose(*pairs(30, 80, 160)[0])
     assert (still.shutter.turn.abs() < 1e-9).double().mean() > 0.9  # 2 % of the cost is not taken away by chance
+
+
+def test_a_given_pose_brings_its_shutter_along():
+    """Depth under a known pose: exact where the turn of the rows is known too, as little sure as its covariance says."""
+    args, T, b, z = pairs(4, 10, 60, noise=0.0, depth=0.0, turn=0.005)
+    zero, batch = torch.zeros(4, dtype=D), torch.zeros(4, 6, 6, dtype=D)
+    known = PoseFit(T, batch, zero[:, None].expand(4, 70) > 1, zero.long(), zero, zero + 1, zero + 1e3, zero.int())
+    rows = known.replace(shutter=Shutter(b, torch.zeros(4, 9, 9, dtype=D)))
+    vague = known.replace(
+        shutter=Shutter(b, torch.diag_embed(torch.tensor([0.0] * 6 + [1e-4] * 3, dtype=D)).expand(4, 9, 9))
+    )
+    plain, exact, unsure = (two_view(*args[:2], fit, *args[2:4]) for fit in (known, rows, vague))
+    both = plain.keep & exact.keep
+    off = [((e.depth / z - 1).abs()[both]).median() for e in (plain, exact)]
+    assert both.sum() > 150 and off[1] < 0.02 * off[0]
+    assert (exact.sigma_shared[exact.keep] == 0).all() and (unsure.sigma_shared[unsure.keep] > 0).all()
 
 
 def test_a_turn_that_was_not_believed_is_not_known_to_be_none():
