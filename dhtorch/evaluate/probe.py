@@ -112,8 +112,8 @@ def columns(of: Moments, index: Tensor) -> Moments:
 class Stream:
     """Moments of shards that pass by, added in place: F² numbers are kept, however many samples there were.
 
-    Equal to :func:`moments` of all shards together up to rounding. With :func:`ridge` behind it, F = 10,000 takes
-    about 4 GB at the peak (five F × F matrices of float64), and a shard. No gradients.
+    Equal to :func:`moments` of all shards together up to rounding. With :func:`ridge` behind it the peak is four F × F
+    matrices of float64 and a few copies of a shard: 3.3 GB measured for F = 10,000 in shards of 1,000. No gradients.
     """
 
     def __init__(self, features: int, targets: int, device: torch.device | str = "cpu") -> None:
