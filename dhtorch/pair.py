@@ -68,7 +68,8 @@ def extend(
             ``estimate`` and ``ms`` (milliseconds by stage).
 
     Returns:
-        Estimate for the B × n samples of view 0, silent ones with their reason.
+        Estimate for the B × n samples of view 0, silent ones with their reason; in the dtype of the intrinsics, float32
+        where these are half precision. Images and depth may be of any floating dtype.
 
     Raises:
         ValueError: wrong shapes, or different batch sizes.
@@ -79,6 +80,7 @@ def extend(
     """
     check("extend", image_0=(frame_0.image, "B C H W"), f_0=(frame_0.camera.f, "B 2"), t=(frame_1.camera.f, "B 2"))
     check("extend", image_0=(frame_0.image, "B C H W"), image_1=(frame_1.image, "B c h w"))
+    frame_0, frame_1 = lifted(frame_0), lifted(frame_1)
     clock = _Clock(trace)
     like = frame_0.camera.f
     uv = clock("sample", sample(frame_0.hw, n, device=like.device, dtype=like.dtype))
@@ -146,6 +148,20 @@ def merge(samples: Samples, estimate: Estimate) -> Map:
         score=choose(samples.confidence, estimate.score),
         source=source.to(torch.int32),
     )
+
+
+def lifted(frame: Frame) -> Frame:
+    """The frame with intrinsics of at least single precision: half a pixel is lost on the eleven bits of a half.
+
+    Gradient: to the intrinsics.
+    """
+
+    def single(camera: Camera | None) -> Camera | None:
+        if camera is None or camera.f.dtype.itemsize >= 4:
+            return camera
+        return camera.map(lambda x: x.float())
+
+    return frame.replace(camera=single(frame.camera), depth_camera=single(frame.depth_camera))
 
 
 def undistort_tracks(tracks: Tracks, camera_0: Camera, camera_1: Camera) -> Tracks:

@@ -23,7 +23,7 @@ from dhtorch.codes import Gate, first_reason
 from dhtorch.geometry.pyramid import build_pyramid
 from dhtorch.geometry.shapes import check
 from dhtorch.geometry.steady import steady
-from dhtorch.pair import Trace, extend
+from dhtorch.pair import Trace, extend, lifted
 from dhtorch.records import Estimate, Frame, PoseFit, Samples, Tracks
 from dhtorch.stages import backproject as _backproject
 from dhtorch.stages import holes as _holes
@@ -180,6 +180,7 @@ def extend_window(
     if not others.image.shape[0]:
         raise ValueError("extend_window: found no other view, expected at least one")
     began, ms = time.perf_counter(), {}
+    anchor, others = lifted(anchor), lifted(others)
     uv = sample(anchor.hw, n, device=anchor.camera.f.device, dtype=anchor.camera.f.dtype)
     samples = classify(anchor, backproject(anchor, uv))
     ms["samples"] = 1e3 * (time.perf_counter() - began)

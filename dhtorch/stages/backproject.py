@@ -109,6 +109,7 @@ def _read_depth(frame: Frame, uv: Tensor, search_px: int, edge_rel: float) -> tu
     if search_px > 0:
         index, _ = nearest_index((h, w), _nearest_return(frame.depth, place, corner, size, search_px))
     value = frame.depth.flatten(1).gather(1, index)
+    value = value.to(torch.promote_types(value.dtype, uv.dtype))  # half precision stores, and computes nothing
     returned = inside & (value > 0) & (value < torch.inf)
     value = torch.where(returned, value, 0)
     edge = returned & (high > low * (1 + edge_rel))
