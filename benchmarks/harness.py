@@ -17,19 +17,53 @@ from typing import Any
 import cv2
 import torch
 
+#: Clocks by name: what a wall shows, or (on a busy machine) the time this process was really given.
+CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
 
-def in_turn(calls: Sequence[Callable[[], Any]], *, repeats: int = 15, warm_up: int = 3) -> list[list[float]]:
-    """Milliseconds of each call, ``repeats`` times, the calls taking turns so that noise hits all alike."""
-    for _ in range(warm_up):
-        for call in calls:
+
+def in_turn(
+    calls: Sequence[Callable[[], Any]],
+    *,
+    repeats: int = 15,
+    warm_up: int = 3,
+    clock: str = "wall",
+    device: str = "cpu",
+    least_ms: float = 0.0,
+) -> list[list[float]]:
+    """Milliseconds of each call, ``repeats`` times, the calls taking turns so that noise hits all alike.
+
+    Calls that take less than ``least_ms`` are repeated until they do not, and their mean counts as one time. On
+    another device than the CPU times are those between two events of it.
+    """
+    counts = []
+    for call in calls:
+        for _ in range(warm_up):
             call()
+        took = _time(call, 1, clock, device)
+        counts.append(max(1, round(least_ms / took)) if took > 0 else 1)
     times: list[list[float]] = [[] for _ in calls]
     for _ in range(repeats):
-        for call, record in zip(calls, times, strict=True):
-            start = time.perf_counter()
-            call()
-            record.append(1e3 * (time.perf_counter() - start))
+        for call, count, record in zip(calls, counts, times, strict=True):
+            record.append(_time(call, count, clock, device))
     return times
+
+
+def _time(call: Callable[[], Any], count: int, clock: str, device: str) -> float:
+    """Mean milliseconds of ``count`` calls."""
+    if device != "cpu":
+        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        torch.cuda.synchronize()
+        start.record()
+        for _ in range(count):
+            call()
+        end.record()
+        torch.cuda.synchronize()
+        return start.elapsed_time(end) / count
+    now = CLOCKS[clock]
+    begin = now()
+    for _ in range(count):
+        call()
+    return 1e3 * (now() - begin) / count
 
 
 def iqr(values: Sequence[float]) -> float:
@@ -62,10 +96,12 @@ def set_threads(threads: int) -> None:
 
 def arguments(description: str) -> argparse.ArgumentParser:
     """The options every script has."""
-    parser = argparse.ArgumentParser(description=description)
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, help="write the rows to this file")
     parser.add_argument("--full", action="store_true", help="the whole grid instead of the default few minutes")
     parser.add_argument("--repeats", type=int, default=15)
+    parser.add_argument("--clock", choices=[*CLOCKS], default="wall", help="cpu: on a machine that others use too")
+    parser.add_argument("--device", default="cpu", help="cpu, or cuda where the script knows how")
     return parser
 
 

@@ -1,8 +1,9 @@
-"""Time per pair, whole and by stage: ``method=paper`` against the same seats filled by OpenCV.
+"""Time per pair, whole and by stage: ``paper`` and ``map`` against the seats of ``paper`` filled by OpenCV.
 
     python benchmarks/pair.py --json benchmarks/results/pair.json
 
-Pairs of TUM fr1/desk (640×480, near limit 1 m, gap 4) where DHTORCH_DATA is set, else of the built-in room. Both sides
+``map`` does more than the peer (affine tracks, a pose from all tracks, a sigma), so its rows say what that costs.
+Pairs of TUM fr1/desk (640×480, near limit 1 m, gap 4) where DHTORCH_DATA is set, else of the built-in room. All sides
 take turns in one process; errors are medians of the relative depth error over the same candidates.
 """
 
@@ -10,6 +11,7 @@ from __future__ import annotations
 
 import os
 import statistics
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,11 +24,10 @@ from dhtorch.baselines import opencv
 from dhtorch.data.pairs import by_gap
 from dhtorch.data.synthetic import SyntheticRoom
 from dhtorch.evaluate import errors, holdout
-from dhtorch.pair import extend
+from dhtorch.pair import METHODS, extend
 from dhtorch.records import Frame
 from dhtorch.stages import triangulate
 
-OURS = extend
 PEER = partial(
     extend,
     track=opencv.lucas_kanade,
@@ -58,28 +59,30 @@ def median_error(method: Any, pair: tuple[str, Frame, Frame, Frame, float]) -> f
     return errors.measure(errors.select(estimate, truth))["median_rel"]
 
 
-def measure(batch: int, threads: int, repeats: int, n: int = 2048) -> list[dict[str, Any]]:
-    """Rows for one batch size and thread count: the whole pair, then each stage."""
+def measure(batch: int, threads: int, options: Any, n: int = 2048) -> list[dict[str, Any]]:
+    """Rows for one batch size and thread count: for each method the whole pair, then each stage."""
     harness.set_threads(threads)
     pair = load(batch)
-    traces: list[list[dict[str, float]]] = [[], []]
+    methods: dict[str, Callable[..., Any]] = {**METHODS, "opencv": PEER}
+    traces: dict[str, list[dict[str, float]]] = {name: [] for name in methods}
 
-    def call(side: int, method: Any) -> None:
+    def call(name: str) -> None:
         trace: dict[str, Any] = {}
         with torch.no_grad():
-            method(pair[1], pair[2], n=n, trace=trace)
-        traces[side].append(trace["ms"])
+            methods[name](pair[1], pair[2], n=n, trace=trace)
+        traces[name].append(trace["ms"])
 
-    ours, theirs = harness.in_turn([partial(call, 0, OURS), partial(call, 1, PEER)], repeats=repeats)
-    found = [median_error(m, pair) for m in (OURS, PEER)]
-    name, common = f"pair_paper_b{batch}", {"n": n, "batch": batch}
-    scale = [[t / batch for t in side] for side in (ours, theirs)]
-    rows = [
-        harness.row(name, scale[0], "opencv", scale[1], **common, ours_error=found[0], peer_error=found[1], bar=True)
-    ]
-    for stage in traces[0][0]:
-        a, b = ([t[stage] / batch for t in side[-repeats:]] for side in traces)
-        rows.append(harness.row(f"{name}.{stage}", a, "opencv", b, **common))
+    sides = harness.in_turn([partial(call, name) for name in methods], repeats=options.repeats, clock=options.clock)
+    times = {name: [t / batch for t in side] for name, side in zip(methods, sides, strict=True)}
+    found = {name: median_error(method, pair) for name, method in methods.items()}
+    rows = []
+    for method in METHODS:
+        name, common = f"pair_{method}_b{batch}", {"n": n, "batch": batch}
+        errors_of = {"ours_error": found[method], "peer_error": found["opencv"]}
+        rows.append(harness.row(name, times[method], "opencv", times["opencv"], **common, **errors_of, bar=True))
+        for stage in traces[method][0]:
+            a, b = ([t[stage] / batch for t in traces[k][-options.repeats :]] for k in (method, "opencv"))
+            rows.append(harness.row(f"{name}.{stage}", a, "opencv", b, **common))
     return rows
 
 
@@ -89,11 +92,12 @@ def main() -> None:
     rows = []
     for threads in (1, 2):
         for batch in (1, 8, 32) if options.full else (1, 8):
-            rows += measure(batch, threads, options.repeats)
+            rows += measure(batch, threads, options)
     print(f"{load(1)[0]}: milliseconds per pair, medians of {options.repeats}; errors are median relative depth errors")
     harness.report(rows, options.json)
-    whole = [r["ratio"] for r in rows if r["bar"]]
-    print(f"ours / opencv, whole pair: {min(whole):.2f} to {max(whole):.2f}, median {statistics.median(whole):.2f}")
+    for method in METHODS:
+        whole = [r["ratio"] for r in rows if r["bar"] and r["name"].startswith(f"pair_{method}_")]
+        print(f"{method} / opencv: {min(whole):.2f} to {max(whole):.2f}, median {statistics.median(whole):.2f}")
 
 
 if __name__ == "__main__":

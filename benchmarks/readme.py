@@ -102,7 +102,7 @@ def speed() -> str:
             mine = {
                 r["name"].partition(".")[2] or "whole pair": r
                 for r in rows
-                if (r["threads"], r["batch"]) == (threads, batch)
+                if (r["threads"], r["batch"]) == (threads, batch) and r["name"].startswith("pair_paper_")
             }
             for stage in ("whole pair", "track", "pose", "triangulate"):
                 r = mine[stage]

@@ -1,0 +1,86 @@
+"""The ten most expensive operations of a method or a stage, and how many there are.
+
+    python benchmarks/profile_ops.py                         method=paper, whole pair
+    python benchmarks/profile_ops.py map --stage pose        one seat of a method
+    python benchmarks/profile_ops.py paper --batch 8 --n 2048 --top 20
+
+Stages: sample, backproject, classify, track, pose, triangulate, score. One pair of TUM fr1/desk where DHTORCH_DATA is
+set, else of the built-in room.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import harness
+import pair as pairs
+import torch
+from torch.profiler import ProfilerActivity, profile
+
+from dhtorch.pair import METHODS, extend
+
+STAGES = ("sample", "backproject", "classify", "track", "pose", "triangulate", "score")
+
+
+def seat_call(method: Callable[..., Any], stage: str, frames: tuple[Any, Any], n: int) -> Callable[[], Any]:
+    """One seat of a method with the arguments that the method gives it."""
+    seen: dict[str, Callable[[], Any]] = {}
+    options: dict[str, Any] = {**(extend.__kwdefaults__ or {}), **getattr(method, "keywords", {})}
+    seat = options[stage]
+
+    def watched(*args: Any, **kwargs: Any) -> Any:
+        seen[stage] = partial(seat, *args, **kwargs)
+        return seat(*args, **kwargs)
+
+    method(*frames, n=n, **{stage: watched})
+    return seen[stage]
+
+
+def table(call: Callable[[], Any], repeats: int, top: int, device: str) -> str:
+    """Operations by the time they take themselves, per call."""
+    for _ in range(3):
+        call()
+    kinds = [ProfilerActivity.CPU] + ([ProfilerActivity.CUDA] if device != "cpu" else [])
+    with profile(activities=kinds) as found:
+        for _ in range(repeats):
+            call()
+    key = "self_cpu_time_total" if device == "cpu" else "self_device_time_total"
+    events = sorted(found.key_averages(), key=lambda e: -getattr(e, key))
+    whole = sum(getattr(e, key) for e in events)
+    lines = [f"{'operation':36} {'us per call':>12} {'share':>7} {'count':>7}"]
+    for e in events[:top]:
+        took = getattr(e, key)
+        lines.append(f"{e.key[:36]:36} {took / repeats:12.1f} {took / whole:7.1%} {e.count / repeats:7.0f}")
+    count = sum(e.count for e in events if e.key.startswith("aten::"))
+    return "\n".join([*lines, f"{'all':36} {whole / repeats:12.1f} {1:7.1%} {count / repeats:7.0f}"])
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("method", nargs="?", choices=[*METHODS], default="paper")
+    parser.add_argument("--stage", choices=STAGES, help="one seat instead of the whole pair")
+    parser.add_argument("--batch", type=int, default=1)
+    parser.add_argument("--n", type=int, default=2048)
+    parser.add_argument("--top", type=int, default=10)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--device", default="cpu")
+    options = parser.parse_args()
+    harness.set_threads(options.threads)
+    scene, near, other, *_ = pairs.load(options.batch)
+    frames = (near.to(options.device), other.to(options.device))
+    method = METHODS[options.method]
+    with torch.no_grad():
+        call: Callable[[], Any] = partial(method, *frames, n=options.n)
+        if options.stage:
+            call = seat_call(method, options.stage, frames, options.n)
+        print(f"{options.method}{'.' + options.stage if options.stage else ''} on {scene}, batch {options.batch}")
+        print(table(call, options.repeats, options.top, options.device))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,133 @@
+"""How time and memory grow with samples, pairs, hypotheses, pixels and views: nothing may grow faster than its input.
+
+    python benchmarks/scaling.py --json benchmarks/results/scaling.json
+
+Each series doubles one size, the others stay. Growth exponents are slopes of a line through (log size, log time or
+log memory): 1 is proportional, 0 constant. Sizes of pictures are in pixels. Peak memory is what a process of its own
+needs above its inputs. The last row is the largest batch that is promised to fit: 32 pairs with 4096 samples.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import harness
+import torch
+from torch.nn.functional import interpolate
+
+from dhtorch import tree
+from dhtorch.data.synthetic import SyntheticRoom
+from dhtorch.evaluate import holdout
+from dhtorch.experiments.memory import peak_mib
+from dhtorch.geometry import camera as cam
+from dhtorch.pair import METHODS
+from dhtorch.records import Frame
+from dhtorch.window import extend_window
+
+#: The largest exponent that counts as proportional.
+MOST = 1.05
+
+
+def views(count: int) -> list[Frame]:
+    """The anchor's near returns and ``count`` further views of the built-in room, 240x320."""
+    room = SyntheticRoom()
+    step = max(room.gap // count, 1)
+    frames = [holdout.range_split(room[k * step], room.near) for k in range(count + 1)]
+    return [resized(frame, (240, 320)) for frame in frames]
+
+
+def resized(frame: Frame, hw: tuple[int, int]) -> Frame:
+    """The frame with a picture of another size."""
+    image = frame.image / 255 if frame.image.dtype == torch.uint8 else frame.image
+    image = interpolate(image, hw, mode="bilinear", antialias=True, align_corners=False).clamp(0, 1)
+    camera = cam.resize(frame.camera, frame.hw, hw)
+    return frame.replace(image=(image * 255).round().to(torch.uint8), camera=camera)
+
+
+def repeated(frame: Frame, batch: int) -> Frame:
+    """``batch`` copies of a frame."""
+    return tree.collate([frame] * batch)
+
+
+def series(full: bool) -> dict[str, list[tuple[int, Callable[[], Any]]]]:
+    """Calls by name of what grows, each with its size."""
+    anchor, other = views(1)
+    doublings = range(5 if full else 4)
+    found: dict[str, list[tuple[int, Callable[[], Any]]]] = {}
+    for method in ("paper", "map"):
+        pair = partial(METHODS[method], anchor, other)
+        found[f"{method}.samples"] = [(512 << k, partial(pair, n=512 << k)) for k in doublings]
+        pairs = [partial(METHODS[method], repeated(anchor, 1 << k), repeated(other, 1 << k)) for k in doublings]
+        found[f"{method}.pairs"] = [(1 << k, partial(p, n=512)) for k, p in zip(doublings, pairs, strict=True)]
+        found[f"{method}.hypotheses"] = [(64 << k, partial(pair, n=512, hypotheses=64 << k)) for k in doublings]
+    sizes = [(120, 160), (240, 160), (240, 320), (480, 320), (480, 640)][-len(doublings) :]
+    shown = [(hw, partial(METHODS["paper"], resized(anchor, hw), resized(other, hw), n=512)) for hw in sizes]
+    found["paper.pixels"] = [(hw[0] * hw[1], call) for hw, call in shown]
+    counts = [1 << k for k in doublings]
+    windows = [partial(extend_window, anchor, tree.stack(views(v)[1:]), n=512, views=v) for v in counts]
+    found["window.views"] = [*zip(counts, windows, strict=True)]
+    return found
+
+
+def exponent(sizes: Sequence[float], values: Sequence[float]) -> float:
+    """Slope of the least-squares line through the logarithms."""
+    x, y = [math.log(s) for s in sizes], [math.log(max(v, 1e-9)) for v in values]
+    return statistics.linear_regression(x, y).slope
+
+
+def measure(name: str, calls: list[tuple[int, Callable[[], Any]]], options: Any) -> list[dict[str, Any]]:
+    """Rows of one series, each beside the size half as large."""
+    sizes = [size for size, _ in calls]
+    times = harness.in_turn(
+        [call for _, call in calls], repeats=options.repeats, warm_up=1, clock=options.clock, device=options.device
+    )
+    memory = [peak_mib(call) or math.nan for _, call in calls]
+    grows = [exponent(sizes, [statistics.median(t) for t in times]), exponent(sizes, memory)]
+    said = ", ".join(
+        f"{size}: {statistics.median(t):.1f} ms {m:.0f} MiB" for size, t, m in zip(sizes, times, memory, strict=True)
+    )
+    verdict = "" if max(grows) <= MOST else f"   above {MOST}!"
+    print(f"{name:18} time ^ {grows[0]:.2f}, memory ^ {grows[1]:.2f}   ({said}){verdict}")
+    rows = []
+    for k in range(1, len(sizes)):
+        more: dict[str, Any] = {"n": sizes[k], "bar": k == len(sizes) - 1, "peak_mib": memory[k]}
+        more |= {"time_exponent": grows[0], "memory_exponent": grows[1]}
+        rows.append(harness.row(f"scaling.{name}", times[k], "half_the_size", times[k - 1], **more))
+    return rows
+
+
+def largest(options: Any) -> list[dict[str, Any]]:
+    """Rows of both methods with 32 pairs and 4096 samples: 640x480, beside one pair after another."""
+    frames = [resized(frame, (480, 640)) for frame in views(1)]
+    rows = []
+    for method in ("paper", "map"):
+        whole = partial(METHODS[method], *(repeated(f, 32) for f in frames), n=4096)
+        single = partial(METHODS[method], *frames, n=4096)
+        together, alone = harness.in_turn([whole, single], repeats=2, warm_up=1, clock=options.clock)
+        memory = [peak_mib(call) or math.nan for call in (whole, single)]
+        print(f"{method}, B = 32, N = 4096: {memory[0]:.0f} MiB above the inputs; one pair {memory[1]:.0f} MiB")
+        more: dict[str, Any] = {"n": 4096, "batch": 32, "bar": True, "peak_mib": memory[0]}
+        times = [t / 32 for t in together]
+        rows.append(harness.row(f"scaling.{method}.largest", times, "pair_by_pair", alone, **more))
+    return rows
+
+
+def main() -> None:
+    """Print the exponents; write the rows with ``--json``."""
+    options = harness.arguments(__doc__ or "").parse_args()
+    options.repeats = min(options.repeats, 5)
+    harness.set_threads(1)
+    rows = []
+    with torch.no_grad():
+        for name, calls in series(options.full).items():
+            rows += measure(name, calls, options)
+        rows += largest(options)
+    harness.report(rows, options.json)
+
+
+if __name__ == "__main__":
+    main()
