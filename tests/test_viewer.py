@@ -13,7 +13,6 @@ import sys
 from dataclasses import replace
 from functools import partial
 
-import hydra
 import numpy as np
 import pytest
 from omegaconf import OmegaConf
@@ -415,14 +414,13 @@ def targets(node):
         yield from targets(value)
 
 
-def test_every_setting_that_ships_can_be_shown_again():
-    conf = run.config_dir()
-    for group in again.NAMED:
-        for file in (conf / group).glob("*.yaml"):
-            with hydra.initialize_config_dir(str(conf), version_base="1.3"):
-                cfg = OmegaConf.to_container(hydra.compose("run", [f"{group}={file.stem}"])[group])
-            for name in targets(cfg):
-                assert callable(again._function(name, group, group)), name
+@pytest.mark.parametrize(
+    ("group", "folder"), [("data", "data"), ("pairs", "pairs"), ("method", "method"), ("method", "seats")]
+)
+def test_every_setting_that_ships_can_be_shown_again(group, folder):
+    files = list((run.config_dir() / folder).glob("*.yaml"))
+    named = {name for file in files for name in targets(OmegaConf.to_container(OmegaConf.load(file)))}
+    assert named and all(callable(again._function(name, group, group)) for name in named)
 
 
 def test_null_stands_for_what_strict_json_cannot_hold(job):

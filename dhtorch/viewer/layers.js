@@ -34,8 +34,8 @@ const scales = {
   score: new Scale([], "score", { log: false, range: [0, 1] }),
   error: new Scale(everything("error"), "sure", { unit: "%", range: [0.003, 0.3] }),
 };
-const MODES = [["picture", "picture"], ["source", "source"], ["hole", "class of hole"], ["gate", "gate"], ["depth", "depth"], ["sigma", "sigma / depth"], ["score", "score"], ["error", "error against held-back returns"]]
-  .filter(([key]) => (key !== "error" || hasErrors) && (key !== "picture" || hasViews));
+const MODES = [["picture", "own colour"], ["source", "source"], ["hole", "class of hole"], ["gate", "gate"], ["depth", "depth"], ["sigma", "sigma / depth"], ["score", "score"], ["error", "error against held-back returns"]]
+  .filter(([key]) => key !== "error" || hasErrors);
 const state = { now: 0, all: false, mode: "source", threshold: 0, picked: null, playing: null };
 const show = Object.fromEntries([...document.querySelectorAll("[data-show]")].map((box) => [box.dataset.show, box.checked]));
 
@@ -156,8 +156,9 @@ function drawSpace() {
       space.points(l.sensor, { size: 1.3 * grain, smallest: l.seen ? 1.6 : 2.5 });
     }
     if (show.held) space.points(l.held, { size: grain, smallest: 1.4 });
-    if (show.recovered) {
-      space.points(l.recovered, { size: 2.8 * grain, smallest: 4, threshold, rim: dark ? [0.05, 0.05, 0.05] : [0.25, 0.2, 0.1], rimmed: 0.75 });
+    if (show.recovered && l.recovered) {
+      const large = 1 + 1.8 * Math.min(1, 3000 / l.recovered.n); // few points are drawn large, a dense cloud is not
+      space.points(l.recovered, { size: large * grain, smallest: 1.4 * large, threshold, rim: dark ? [0.05, 0.05, 0.05] : [0.25, 0.2, 0.1], rimmed: 0.75 });
       if (show.sigma) space.lines(l.bars, { threshold });
     }
     if (hasViews && show.tracks && show.recovered && n === state.now) space.lines(l.rays, { alpha: 0.1, threshold });

@@ -93,7 +93,7 @@ function tellColours() {
     const seen = (name, code, want) => shots.some((s) => s[name].some((v, k) => v === code && want(s.source[k])));
     const list = mode === "hole" ? [[DATA.colours.sensor, "sensor"], ...DATA.holes.filter((h) => seen("hole", h.code, (x) => x !== 1)).map((h) => [h.colour, h.name])]
       : mode === "gate" ? outcomes.filter((o) => shots.some((s) => s.counts[o.key])).map((o) => [o.colour, o.name])
-      : mode === "picture" ? [[DATA.colours.silent, "silent (on the pictures)"]]
+      : mode === "picture" ? []
       : [[DATA.colours.sensor, "sensor"], [DATA.colours.recovered, "recovered"], ...(hasViews ? [[DATA.colours.silent, "silent (on the pictures)"]] : [])];
     rows.push(element("ul", { class: "keys" }, ...list.map(([colour, name]) => key(colour, name))));
   }
@@ -247,6 +247,7 @@ function begin() {
   $("all-row").toggleAttribute("hidden", shots.length < 2 || !DATA.placed);
   $("pictures").toggleAttribute("hidden", !hasViews);
   $("time").toggleAttribute("hidden", !hasViews);
+  document.querySelector('[data-place="camera"]').toggleAttribute("hidden", !hasViews);
   $("no-gl").toggleAttribute("hidden", Boolean(space.gl));
   $("space").setAttribute("aria-label", `Points of ${DATA.title} in space: arrow keys turn, plus and minus zoom`);
   for (const [name, has] of [["held", shots.some((s) => s.held.n)], ["silent", hasViews], ["tracks", hasViews], ["depth", hasViews], ["frustums", hasViews]]) {

@@ -180,7 +180,7 @@ function drawRisk(svg, { scores, errors, candidates }, threshold) {
     if (n >= 9) points.push([(n + 1) / candidates, sum / (n + 1)]);
     if (kept === n + 1 && n >= 9) at = points[points.length - 1];
   });
-  const top = Math.max(0.05, ...points.map((p) => p[1])) * 1.15, X = (v) => 30 + 280 * v, Y = (v) => 78 - (68 * v) / top;
+  const top = points.reduce((most, p) => Math.max(most, p[1]), 0.05) * 1.15, X = (v) => 30 + 280 * v, Y = (v) => 78 - (68 * v) / top;
   const path = points.map((p, k) => `${k ? "L" : "M"}${X(p[0]).toFixed(1)} ${Y(p[1]).toFixed(1)}`).join("");
   const line = (x1, y1, x2, y2) => element("line", { x1, y1, x2, y2 });
   svg.replaceChildren(
