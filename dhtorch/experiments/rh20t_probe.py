@@ -165,8 +165,8 @@ def robot(
 def verdict(judged: Judged, real: bool, margin: float) -> tuple[bool | None, str]:
     """Equivalent over all samples and over those that move? Never decided without DINOv2's own weights."""
     n, own = len(judged.groups), judged.mean(OURS, ALL).value or 0.0
-    less = 1 - (judged.ratio(OURS, CONTEXT, ALL).value or 1.0)
-    text = f"error {own:.3f} of the targets' variance, {less:.1%} below the context alone ({n} tasks)"
+    times = judged.ratio(OURS, CONTEXT, ALL)
+    text = f"error {own:.3f} of the targets' variance, {_interval(times)} times that of the context alone ({n} tasks)"
     if (REFERENCE, ALL) not in judged.squares:
         return None, f"DINOv2 was left out; with depth features: {text}"
     found = {c: judged.ratio(OURS, REFERENCE, c, level=probe.EQUIVALENCE_LEVEL) for c in (ALL, MOVING)}
