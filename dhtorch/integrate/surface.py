@@ -12,12 +12,14 @@ from torch import Tensor
 
 from dhtorch.geometry import cells
 from dhtorch.integrate.volume import INSIDE, SIDE, SOURCES, Volume
-from dhtorch.tree import Record, record
+from dhtorch.tree import Record, collate, record
 
 #: Largest step of the distance across a surface, in truncations: a view's rim is a step of up to two.
 MAX_STEP = 1.5
 #: Blocks along the side of a brick that is meshed at a time.
 _BRICK = 8
+#: Points that are described at a time.
+_CHUNK = 1 << 18
 #: Fractions of a voxel below which a vertex of the mesh counts as lying on a voxel.
 _SNAP = 1e-4
 
@@ -116,7 +118,12 @@ def _welded(volume: Volume, vertices: Tensor, faces: Tensor) -> Surface:
 
 
 def _describe(volume: Volume, a: Tensor, b: Tensor, t: Tensor, xyz: Tensor) -> Surface:
-    """Points between voxels ``a`` and ``b`` (P, 3), with what the two know."""
+    """Points between voxels ``a`` and ``b`` (P, 3), with what the two know; some at a time, to bound the memory."""
+    parts = zip(*(x.split(_CHUNK) for x in (a, b, t, xyz)), strict=True)
+    return collate(_described(volume, *part) for part in parts)
+
+
+def _described(volume: Volume, a: Tensor, b: Tensor, t: Tensor, xyz: Tensor) -> Surface:
     t = t.to(volume.distance.dtype)[:, None]
     index, known = _slot(volume, torch.stack((a, b)))
     share = torch.stack((1 - t, t)) * known[..., None]
