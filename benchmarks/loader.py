@@ -2,18 +2,23 @@
 
     python benchmarks/loader.py --json benchmarks/results/loader.json
 
-The plain loader decodes a JPEG, resizes it to 224×224 and decodes the depth from PNG, for two views; beside it the same
-with ``ExtendDepth``, and with the same seats filled by OpenCV. ``ours_ms`` and ``peer_ms`` are milliseconds per sample
-in the steady state, workers included; their inverse times 1000 is printed as samples per second. Pairs of TUM fr1/desk
-where DHTORCH_DATA is set, else of the built-in room; every process uses one thread.
+The plain loader decodes a JPEG and a 16-bit PNG with the depth, resizes both where asked for, and resizes the picture
+to 224×224 for a network; only that leaves the worker. ``single`` is one view per sample, of which the transform's
+front end alone is asked; ``pair`` is two views, and beside the transform stands the same with OpenCV in its seats.
+``ours_ms`` and ``peer_ms`` are milliseconds per sample in the steady state, workers included. In ``scaling`` rows
+``peer_ms`` is what two workers would take per sample if the transform scaled from one worker to two as the plain
+loader does. In ``step`` rows the transform alone stands beside a forward pass of DINOv2 (random weights).
+
+Pairs of TUM fr1/desk where DHTORCH_DATA is set, else of the built-in room; every process uses one thread.
 """
 
 from __future__ import annotations
 
 import os
-import time
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import cv2
@@ -23,13 +28,19 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from dhtorch import data, extend
-from dhtorch.baselines import opencv
+from dhtorch.baselines import dinov2, opencv
 from dhtorch.data.synthetic import SyntheticRoom
 from dhtorch.geometry import camera as cam
 from dhtorch.stages import triangulate
-from dhtorch.transform import ExtendDepth, ExtendedDataset, one_thread
+from dhtorch.transform import ExtendDepth, one_thread
 
 SIDE = 224
+BATCH = 8
+STRETCH = 2  # batches that make one time
+ROUNDS = 3  # turns of each loader
+SIZES = {"224x224": (SIDE, SIDE), "640x480": (480, 640)}
+BARS = "640x480"
+NETWORKS = {"dinov2_l": {}, "dinov2_s": {"hidden": 384, "layers": 12, "heads": 6}}
 OPENCV = partial(
     extend,
     track=opencv.lucas_kanade,
@@ -39,27 +50,32 @@ OPENCV = partial(
 
 
 class Encoded(Dataset[Any]):
-    """Two views as JPEG and depth as 16-bit PNG, in memory, repeated; decoded and resized when asked for."""
+    """Views as JPEG and depth as 16-bit PNG, in memory, repeated; decoded, resized and transformed when asked for."""
 
-    def __init__(self, pairs: list[dict[str, Any]], hw: tuple[int, int], length: int) -> None:
-        self.pairs, self.hw, self.length = pairs, hw, length
+    def __init__(
+        self, pairs: list[dict[str, Any]], hw: tuple[int, int], keys: Sequence[str], length: int, transform: Any = None
+    ) -> None:
+        self.pairs, self.hw, self.keys, self.length, self.transform = pairs, hw, keys, length, transform
 
     def __len__(self) -> int:
         return self.length
 
     def __getitem__(self, i: int) -> dict[str, Any]:
-        if not 0 <= i < self.length:
-            raise IndexError(i)
+        out = self.decoded(i)
+        views = {key: out[key] for key in self.keys}
+        small = {f"{k}_{SIDE}": cv2.resize(v, (SIDE, SIDE), interpolation=cv2.INTER_AREA) for k, v in views.items()}
+        out = out if self.transform is None else self.transform(out)
+        return {**small, **{k: v for k, v in out.items() if k not in (*self.keys, "depth")}}
+
+    def decoded(self, i: int) -> dict[str, Any]:
+        """One sample as the transform reads it."""
         pair, wh = self.pairs[i % len(self.pairs)], (self.hw[1], self.hw[0])
+        views = {key: cv2.imdecode(pair[key], cv2.IMREAD_COLOR_RGB) for key in self.keys}
         depth = cv2.imdecode(pair["depth"], cv2.IMREAD_UNCHANGED)
-        out = {
-            key: cv2.resize(cv2.imdecode(pair[key], cv2.IMREAD_COLOR_RGB), wh, interpolation=cv2.INTER_AREA)
-            for key in ("image", "other")
-        }
-        small = {k: cv2.resize(v, (SIDE, SIDE), interpolation=cv2.INTER_AREA) for k, v in out.items()}
-        depth = cv2.resize(depth, wh, interpolation=cv2.INTER_NEAREST)
-        network = {f"{k}_{SIDE}": v for k, v in small.items()}
-        return {**out, **network, "depth": depth.astype(np.int32), "intrinsics": pair["intrinsics"], "index": i}
+        if depth.shape != self.hw:
+            views = {key: cv2.resize(v, wh, interpolation=cv2.INTER_AREA) for key, v in views.items()}
+            depth = cv2.resize(depth, wh, interpolation=cv2.INTER_NEAREST)
+        return {**views, "depth": depth, "intrinsics": pair["intrinsics"], "index": i}
 
 
 def encoded() -> tuple[str, tuple[int, int], list[dict[str, Any]]]:
@@ -83,62 +99,115 @@ def encoded() -> tuple[str, tuple[int, int], list[dict[str, Any]]]:
     return recording.name, recording[0].hw, pairs
 
 
-def per_sample(dataset: Any, workers: int, batch: int, repeats: int) -> list[float]:
-    """Milliseconds per sample, one number for each stretch of four batches, after one stretch to warm up."""
+def per_sample(dataset: Dataset[Any], workers: int, repeats: int, clock: str) -> Iterator[float]:
+    """Milliseconds per sample, one number for each stretch, after one to warm up; of workers always by the wall."""
+    now = harness.CLOCKS["wall" if workers else clock]
     options: dict[str, Any] = {"worker_init_fn": one_thread, "multiprocessing_context": "fork"} if workers else {}
-    loader = iter(DataLoader(dataset, batch, num_workers=workers, **options))
-    times = []
+    loader = iter(DataLoader(dataset, BATCH, num_workers=workers, **options))
     for k in range(repeats + 1):
-        start = time.perf_counter()
-        for _ in range(4):
+        start = now()
+        for _ in range(STRETCH):
             next(loader)
         if k:
-            times.append(1e3 * (time.perf_counter() - start) / (4 * batch))
-    del loader
-    return times
+            yield 1e3 * (now() - start) / (STRETCH * BATCH)
 
 
-def measure(
-    size: tuple[int, int], workers: int, repeats: int, n: int, batch: int, found: tuple[str, Any, Any]
-) -> list[dict[str, Any]]:
-    """Rows of one image size and number of workers: against the plain loader, and against OpenCV in the seats."""
-    _, native, pairs = found
-    dataset = Encoded(pairs, size, 4 * batch * (repeats + 1 + 2 * max(workers, 1)))
-    views = {"depth_unit": "mm", "other_image": "other", "intrinsics_hw": native, "tokens_hw": (SIDE, SIDE)}
-    sets = [
-        ExtendedDataset(dataset, ExtendDepth(**views, n=n)),
-        dataset,
-        ExtendedDataset(dataset, ExtendDepth(**views, n=n, method=OPENCV)),
-    ]
-    stretches: list[list[float]] = [[], [], []]
-    for _ in range(2):  # in turn, so that a busy minute hits all alike
-        for own, one in zip(stretches, sets, strict=True):
-            own.extend(per_sample(one, workers, batch, max(repeats // 2, 1)))
-    name = f"loader_{size[1]}x{size[0]}_workers{workers}"
-    rates = ", ".join(f"{1e3 / np.median(s):.1f}" for s in stretches)
-    print(f"{name}: samples/s {rates} (with the transform, plain, OpenCV seats)")
-    common = {"n": n, "batch": batch, "mode": "eager"}
-    return [
-        harness.row(name, stretches[0], "plain_loader", stretches[1], **common),
-        harness.row(name, stretches[0], "opencv_seats", stretches[2], **common, bar=True),
-    ]
+class Bench:
+    """One image size and one kind of sample: the loaders that are compared, and their rows."""
+
+    def __init__(self, size: str, mode: str, n: int, repeats: int, clock: str) -> None:
+        self.found, self.size, self.mode, self.n = encoded(), size, mode, n
+        self.repeats, self.clock = max(repeats // ROUNDS, 1), clock
+        self.keys = ("image",) if mode == "single" else ("image", "other")
+        self.transforms = {"transform": self.transform(), "plain_loader": None}
+        if mode == "pair":
+            self.transforms["opencv_seats"] = self.transform(method=OPENCV)
+        self.times: dict[tuple[str, int], list[float]] = {}
+
+    def transform(self, **options: Any) -> ExtendDepth:
+        """For the samples of this loader."""
+        other = {"other_image": "other"} if self.mode == "pair" else {}
+        return ExtendDepth(
+            depth_unit="mm", intrinsics_hw=self.found[1], tokens_hw=(SIDE, SIDE), n=self.n, **other, **options
+        )
+
+    def dataset(self, transform: ExtendDepth | None, workers: int) -> Encoded:
+        """Long enough for one turn."""
+        length = BATCH * (STRETCH * (self.repeats + 1) + 2 * workers)
+        return Encoded(self.found[2], SIZES[self.size], self.keys, length, transform)
+
+    def measure(self, workers: int) -> None:
+        """Loaders take turns, so that a busy minute hits all alike."""
+        for _ in range(ROUNDS):
+            for name, transform in self.transforms.items():
+                found = per_sample(self.dataset(transform, workers), workers, self.repeats, self.clock)
+                self.times.setdefault((name, workers), []).extend(found)
+        rates = {name: 1e3 / median(self.times[name, workers]) for name in self.transforms}
+        said = ", ".join(f"{name} {rate:.1f}" for name, rate in rates.items())
+        print(f"{self.mode} {self.size}, {workers} workers: samples/s {said}", flush=True)
+
+    def rows(self, workers: int) -> list[dict[str, Any]]:
+        """Against the plain loader and against OpenCV; the bars stand on the larger pictures."""
+        barred = {"single": "plain_loader", "pair": "opencv_seats"}[self.mode]
+        name, ours = f"loader_{self.mode}_{self.size}_workers{workers}", self.times["transform", workers]
+        return [
+            harness.row(name, ours, peer, self.times[peer, workers], **self.common(peer == barred))
+            for peer in self.transforms
+            if peer != "transform"
+        ]
+
+    def scaling(self) -> dict[str, Any]:
+        """Two workers, against the plain loader's gain from one to two."""
+        one, plain_one, plain_two = (
+            median(self.times[key]) for key in (("transform", 1), ("plain_loader", 1), ("plain_loader", 2))
+        )
+        expected = [one * plain_two / plain_one] * 2
+        name = f"loader_scaling_{self.mode}_{self.size}"
+        return harness.row(name, self.times["transform", 2], "plain_scaling", expected, **self.common(True))
+
+    def common(self, bar: bool) -> dict[str, Any]:
+        """Fields of a row."""
+        return {"n": self.n, "batch": BATCH, "bar": bar and self.size == BARS}
+
+
+def steps(benches: Sequence[Bench], repeats: int, clock: str) -> Iterator[dict[str, Any]]:
+    """The transform alone beside a forward pass of a network, and the share of both that it takes."""
+    picture = torch.zeros(1, 3, SIDE, SIDE)
+    for peer, sizes in NETWORKS.items():
+        try:
+            network = dinov2.load(**sizes)
+        except ImportError as error:
+            print(f"step rows skipped: {error}")
+            return
+        for bench in benches:
+            transform, sample = bench.transforms["transform"], bench.dataset(None, 0).decoded(0)
+            calls = [partial(transform, sample), partial(network, pixel_values=picture)]
+            with torch.no_grad():
+                ours, theirs = harness.in_turn(calls, repeats=repeats, warm_up=1, clock=clock)
+            found = harness.row(f"step_{bench.mode}_{bench.size}", ours, peer, theirs, n=bench.n)
+            share = found["ours_ms"] / (found["ours_ms"] + found["peer_ms"])
+            print(f"{bench.mode} {bench.size}: {100 * share:.2f} % of the transform and a {peer} forward", flush=True)
+            yield found
 
 
 def main() -> None:
     arguments = harness.arguments(str(__doc__).splitlines()[0])
     arguments.add_argument("--samples", type=int, default=512, help="points per image")
+    arguments.add_argument("--workers", type=int, nargs="+", help="instead of 0 1 2")
     options = arguments.parse_args()
     harness.set_threads(1)
-    found = encoded()
-    print(f"pairs of {found[0]}")
-    sizes = [(SIDE, SIDE), (480, 640)]
-    counts = (0, 1, 2, 4) if options.full else (0, 1, 2)
-    rows = [
-        row
-        for size in sizes
-        for workers in counts
-        for row in measure(size, workers, options.repeats, options.samples, 8, found)
-    ]
+    counts = options.workers or ([0, 1, 2, 4] if options.full else [0, 1, 2])
+    modes = [(size, mode) for size in SIZES for mode in ("single", "pair")]
+    benches = [Bench(*each, options.samples, options.repeats, options.clock) for each in modes]
+    print(f"pairs of {benches[0].found[0]}")
+    rows = []
+    for bench in benches:
+        for workers in counts:
+            bench.measure(workers)
+            rows += bench.rows(workers)
+        if {1, 2} <= set(counts):
+            rows.append(bench.scaling())
+    rows += steps(benches, max(options.repeats // 5, 3), options.clock)
     harness.report(rows, options.json)
 
 
