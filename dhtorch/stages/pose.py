@@ -242,7 +242,7 @@ def map_pose(
     isotropic: float = 0.1,
     turn_sigma: float = 0.01,
     turn_gain: float = 0.02,
-    translation_gain: float = 0.5,
+    translation_gain: float = 0.55,
     kernel: str | None = "geman_mcclure",
     bend: float = 2.0,
     near_steps: int = 4,
