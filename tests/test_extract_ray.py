@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -35,15 +36,30 @@ def cluster(monkeypatch):
     """A head that computes nothing and two raylets of one core each; ended by process id."""
     for name, value in quiet_environment().items():
         monkeypatch.setenv(name, value)
-    from ray.cluster_utils import Cluster  # noqa: PLC0415
-
-    head = {"num_cpus": 0, "object_store_memory": STORE, "include_dashboard": False}
-    started = Cluster(initialize_head=True, head_node_args=head)
+    started = patiently(head)
     try:
-        nodes = [started.add_node(num_cpus=1, object_store_memory=STORE) for _ in range(2)]
+        nodes = [patiently(partial(started.add_node, num_cpus=1, object_store_memory=STORE)) for _ in range(2)]
         yield started.address, [raylet(node) for node in nodes]
     finally:
         started.shutdown()
+
+
+def head():
+    from ray.cluster_utils import Cluster  # noqa: PLC0415
+
+    options = {"num_cpus": 0, "object_store_memory": STORE, "include_dashboard": False}
+    return Cluster(initialize_head=True, head_node_args=options)
+
+
+def patiently(make, tries=4):
+    """Ray gives a node 30 s to come up, which is not enough on a busy machine."""
+    for k in range(tries):
+        try:
+            return make()
+        except Exception:
+            if k + 1 == tries:
+                raise
+    return None
 
 
 def raylet(node):

@@ -68,7 +68,10 @@ def on_ray(rows: Rows, positions: Sequence[int], address: str | None) -> Iterato
     _reach(address)
     own = {} if address else {"include_dashboard": False, "object_store_memory": STORE_BYTES}
     logging.getLogger("ray.data").setLevel(logging.ERROR)
-    ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **own)
+    try:
+        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **own)
+    except Exception as error:  # Ray has no class of its own for a node that does not come up
+        raise ConnectionError(f"extract.engine=ray: {error}") from error
     try:
         context = data.DataContext.get_current()
         context.execution_options.preserve_order = True
