@@ -16,7 +16,6 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from dhtorch.geometry import se3
 from dhtorch.geometry.se3 import Pose
 from dhtorch.geometry.shapes import check
 
@@ -62,20 +61,23 @@ def linearise(
     """
     check("linearise", R=(T.R, "B 3 3"), f=(f, "B 2"), c=(c, "B 2"), xyz=(xyz, "B 3 N"), uv=(uv, "B 2 N"))
     # Multiply-adds instead of a matrix product: the rounding cannot depend on the batch.
-    x, y, z = _moved(T, xyz).unbind(1)
+    Y = _moved(T, xyz)
+    z = Y[:, 2]
     w = 1 / z.masked_fill(~(z > MIN_DEPTH), 1.0)
-    a, b = x * w, y * w
-    ab, zero, target = a * b, torch.zeros_like(a), (uv - c[..., None]) / f[..., None]
-    columns_u = (-ab, 1 + a * a, -b, w, zero, -a * w, a - target[:, 0])
-    columns_v = (-1 - b * b, ab, a, zero, w, -b * w, b - target[:, 1])
-    rows = torch.stack([plane for pair in zip(columns_u, columns_v, strict=True) for plane in pair], 1)
-    return rows.unflatten(1, (7, 2)) * f[:, None, :, None], z
+    f = f[..., None]
+    plane = Y[:, :2] * w[:, None]  # (a, b): where the point is seen at z = 1
+    minus, square = -plane, plane * plane
+    (a, b), (na, nb), (aw, bw) = plane.unbind(1), minus.unbind(1), (minus * w[:, None]).unbind(1)
+    aa, bb = square.unbind(1)
+    ra, rb = (plane - (uv - c[..., None]) / f).unbind(1)
+    zero = torch.zeros_like(a)
+    columns = (na * b, -1 - bb, 1 + aa, a * b, nb, a, w, zero, zero, w, aw, bw, ra, rb)  # u and v in turn
+    return torch.stack(columns, 1).unflatten(1, (7, 2)) * f[:, None], z
 
 
 def _moved(T: Pose, xyz: Tensor) -> Tensor:
-    x, y, z = xyz[:, None].unbind(2)
-    R = T.R[..., None]
-    return R[:, :, 0] * x + R[:, :, 1] * y + R[:, :, 2] * z + T.t[..., None]
+    (x, y, z), (r0, r1, r2) = xyz[:, None].unbind(2), T.R[..., None].unbind(2)
+    return r0 * x + r1 * y + r2 * z + T.t[..., None]
 
 
 def robust(square: Tensor, kernel: str | None, scale: float) -> tuple[Tensor, Tensor]:
@@ -212,11 +214,27 @@ def move(
     """
     check("move", R=(T.R, "B 3 3"), xi=(xi, "B 6"))
     omega, upsilon = xi[:, :3], xi[:, 3:]
-    W = se3.hat(omega)
     M = torch.cat((T.R, T.t[..., None]), -1)
-    WM = W @ M
-    M = M + (WM + 0.5 * (W @ WM)) / (1 + 0.25 * (omega * omega).sum(-1))[:, None, None]
+    axis = omega[..., None].expand_as(M)
+    once = torch.linalg.cross(axis, M, dim=1)
+    twice = torch.linalg.cross(axis, once, dim=1)
+    M = M + (once + 0.5 * twice) / (1 + 0.25 * (omega * omega).sum(-1))[:, None, None]
     return Pose(M[..., :3], M[..., 3] + upsilon)
+
+
+def trial_step(T: Pose, H: Tensor, g: Tensor) -> tuple[Pose, Tensor]:
+    """:func:`gauss_newton_step` in a few operations, for proposals that are judged afterwards by their cost.
+
+    The system is solved in float64 by elimination and not refined; a step that is no number is no step.
+
+    Gradient: none. Raises ValueError for wrong shapes.
+    """
+    check("trial_step", H=(H, "B 6 6"), g=(g, "B 6"))
+    with torch.no_grad():
+        xi, info = torch.linalg.solve_ex(H.double(), -g.double())
+        xi = xi.to(g.dtype)
+        ok = (info == 0) & (xi.abs().amax(-1) < torch.inf)
+        return move(T, xi.masked_fill(~ok[:, None], 0.0)), ok
 
 
 def minimise(

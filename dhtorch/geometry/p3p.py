@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.linalg import cross
 
 from dhtorch.geometry.shapes import check
 
@@ -83,7 +84,7 @@ def _ranges(m: Tensor, a: Tensor) -> Tensor:
     split = torch.where(far, D1 * weight + D2, D1 + D2 * weight)  # det(split) = 0
     other = torch.where(far, D1, D2)
     # The null vector is the steepest column of the adjugate; both planes contain it.
-    columns = (_cross(split[1], split[2]), _cross(split[2], split[0]), _cross(split[0], split[1]))
+    columns = (cross(split[1], split[2], dim=0), cross(split[2], split[0], dim=0), cross(split[0], split[1], dim=0))
     size = [(x * x).sum(0) for x in columns]
     p = torch.where(size[0] >= size[1], columns[0], columns[1])
     p = torch.where(torch.maximum(size[0], size[1]) >= size[2], p, columns[2])
@@ -99,21 +100,22 @@ def _ranges(m: Tensor, a: Tensor) -> Tensor:
 
 def _cones(m: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
     """Symmetric (3, 3, *) matrices of a_23 × (equation 12) − a_12 × (equation 23), and of the same with 13 for 12."""
-    zero = torch.zeros_like(m[0])
-    xy, xz, yz1, yz2 = -a[2] * m[0], -a[2] * m[1], a[0] * m[2], a[1] * m[2]
-    first = (a[2], xy, zero, xy, a[2] - a[0], yz1, zero, yz1, -a[0])
-    second = (a[2], zero, xz, zero, -a[1], yz2, xz, yz2, a[2] - a[1])
+    (m0, m1, m2), (a0, a1, a2) = m.unbind(0), a.unbind(0)
+    zero = torch.zeros_like(m0)
+    xy, xz, yz1, yz2 = -a2 * m0, -a2 * m1, a0 * m2, a1 * m2
+    first = (a2, xy, zero, xy, a2 - a0, yz1, zero, yz1, -a0)
+    second = (a2, zero, xz, zero, -a1, yz2, xz, yz2, a2 - a1)
     return torch.stack(first).unflatten(0, (3, 3)), torch.stack(second).unflatten(0, (3, 3))
 
 
 def _pencil(m: Tensor, a: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Coefficients, cubic first, of det(D1 + γ D2) / a_23 as a polynomial in γ."""
-    s = 1 - m * m
-    volume = 2 * a[2] * (1 - m[0] * m[1] * m[2])
-    k3 = a[1] * (a[1] * s[2] - a[2] * s[1])
-    k2 = a[1] * s[2] * (a[1] + 2 * a[0]) + a[2] * s[1] * (a[2] - a[0]) - a[1] * volume
-    k1 = a[0] * s[2] * (a[0] + 2 * a[1]) + a[2] * s[0] * (a[2] - a[1]) - a[0] * volume
-    k0 = a[0] * (a[0] * s[2] - a[2] * s[0])
+    (s0, s1, s2), (a0, a1, a2) = (1 - m * m).unbind(0), a.unbind(0)
+    volume = 2 * a2 * (1 - m[0] * m[1] * m[2])
+    k3 = a1 * (a1 * s2 - a2 * s1)
+    k2 = a1 * s2 * (a1 + 2 * a0) + a2 * s1 * (a2 - a0) - a1 * volume
+    k1 = a0 * s2 * (a0 + 2 * a1) + a2 * s0 * (a2 - a1) - a0 * volume
+    k0 = a0 * (a0 * s2 - a2 * s0)
     return k3, k2, k1, k0
 
 
@@ -169,12 +171,12 @@ def _null_directions(A: Tensor, u: Tensor, v: Tensor) -> Tensor:
 
 def _polish(d: Tensor, m: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
     """A Newton step on d_i² + d_k² − 2 d_i d_k m_ik = a_ik; ranges (3, 4, *) and the longest of the steps (4, *)."""
-    m, a = m[:, None], a[:, None]
+    (m0, m1, m2), (a0, a1, a2) = m[:, None].unbind(0), a[:, None].unbind(0)
     x, y, z = d.unbind(0)
-    xy, xz, yz = x - y * m[0], x - z * m[1], y - z * m[2]
-    yx, zx, zy = y - x * m[0], z - x * m[1], z - y * m[2]
+    xy, xz, yz = x - y * m0, x - z * m1, y - z * m2
+    yx, zx, zy = y - x * m0, z - x * m1, z - y * m2
     # Half the Jacobian has the rows (xy, yx, 0), (xz, 0, zx), (0, yz, zy).
-    r0, r1, r2 = x * xy + y * yx - a[0], x * xz + z * zx - a[1], y * yz + z * zy - a[2]
+    r0, r1, r2 = x * xy + y * yx - a0, x * xz + z * zx - a1, y * yz + z * zy - a2
     p, q = zx * yz, yx * xz
     det = -2 * (xy * p + q * zy)
     step_x = r2 * (yx * zx) - r0 * p - r1 * (yx * zy)
@@ -198,17 +200,6 @@ def _frame(P: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Orthonormal axes (coordinate, …) of triangles (point, coordinate, …)."""
     e0 = P[1] - P[0]
     e0 = e0 / (e0 * e0).sum(0).sqrt()
-    e2 = _cross(e0, P[2] - P[0])
+    e2 = cross(e0, P[2] - P[0], dim=0)
     e2 = e2 / (e2 * e2).sum(0).sqrt()
-    return e0, _cross(e2, e0), e2
-
-
-def _cross(a: Tensor, b: Tensor) -> Tensor:
-    """a × b along the first axis, whole planes at a time."""
-    turned = a * _turn(b) - _turn(a) * b  # component k of it is component k + 2 of the product
-    return _turn(turned)
-
-
-def _turn(a: Tensor) -> Tensor:
-    """Components (1, 2, 0)."""
-    return torch.cat((a[1:], a[:1]))
+    return e0, cross(e2, e0, dim=0), e2

@@ -22,6 +22,7 @@ from dhtorch.geometry.least_squares import (
     minimise,
     normal_equations,
     robust,
+    trial_step,
 )
 from dhtorch.geometry.most_probable import Options, most_probable
 from dhtorch.geometry.most_probable import covariance as m_covariance
@@ -185,12 +186,12 @@ def _robust_pose(
     fk, ck, near, seen, used = (x.repeat_interleave(keep, 0) for x in (f, c, near, seen, used))
     cost_of = _truncated(fk, ck, near, seen, used, options.threshold_px)
     flat = Pose(poses.R.flatten(0, 1), poses.t.flatten(0, 1))
-    flat, cost = minimise(cost_of, flat, options.local_optimisation)
+    flat, cost = minimise(cost_of, flat, options.local_optimisation, step=trial_step)
     best = cost.unflatten(0, (-1, keep)).argmin(1)[:, None]
     R = flat.R.unflatten(0, (-1, keep)).gather(1, best[..., None, None].expand(-1, 1, 3, 3))[:, 0]
     t = flat.t.unflatten(0, (-1, keep)).gather(1, best[..., None].expand(-1, 1, 3))[:, 0]
     cost_of = _truncated(f, c, xyz, uv, usable, options.threshold_px, options.kernel, options.kernel_px)
-    T, _ = minimise(cost_of, Pose(R, t), options.polish_steps)
+    T, _ = minimise(cost_of, Pose(R, t), options.polish_steps, step=trial_step)
     safe = found & T.R.isfinite().flatten(1).all(1) & T.t.isfinite().all(1)
     eye = se3.identity(len(f), T.R)
     R = torch.where(safe[:, None, None], T.R, eye.R).double()
