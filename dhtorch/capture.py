@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from dhtorch import data
+from dhtorch.console import EPILOG, progress
 from dhtorch.data import FormatError, files
 from dhtorch.data.survey import Survey, survey_pictures, survey_recording, survey_stacks
 
@@ -47,8 +48,11 @@ def main(argv: Sequence[str]) -> int:
 
     Raises:
         FormatError: nothing there, or nothing that could be shown.
+        KeyboardInterrupt: Ctrl-C; contact sheets that are written stay.
     """
-    parser = argparse.ArgumentParser(prog="dhtorch inspect", description="What a capture holds, and a contact sheet.")
+    parser = argparse.ArgumentParser(
+        prog="dhtorch inspect", description="What a capture holds, and a contact sheet.", epilog=EPILOG
+    )
     parser.add_argument("path", type=Path, help="a capture: a folder, up to two folders above it, or a file")
     parser.add_argument("--out", type=Path, help="folder of the contact sheet (default: outputs/<date>/<time>)")
     parser.add_argument("--format", default="auto", help="name of the format, where it is not to be recognised")
@@ -60,11 +64,17 @@ def main(argv: Sequence[str]) -> int:
     found = find(options.path) if options.format == "auto" else [_named(options.path, options.format)]
     now = datetime.now()
     out = options.out or Path("outputs") / f"{now:%Y-%m-%d}" / f"{now:%H-%M-%S}"
-    for capture in found:
-        for survey in surveys(capture, options.frames):
-            survey.name = _full_name(options.path, capture.path, survey.name)
-            print_survey(capture, survey)
-            print(f"wrote {write_sheet(survey, out)}\n")
+    sheets: list[Path] = []
+    try:
+        for capture in found:
+            for survey in surveys(capture, options.frames):
+                survey.name = _full_name(options.path, capture.path, survey.name)
+                print_survey(capture, survey)
+                sheets.append(write_sheet(survey, out))
+                print(f"wrote {sheets[-1]}\n")
+    except KeyboardInterrupt:
+        stay = f"{len(sheets)} contact sheet{'s' * (len(sheets) != 1)} in {out} stay; " if sheets else ""
+        raise KeyboardInterrupt(f"{stay}the same command looks again") from None
     return 0
 
 
@@ -142,7 +152,7 @@ def _recordings(capture: Found, frames: int) -> Iterator[Survey]:
     if len(recordings) > _MOST:
         warning.append(f"{len(recordings)} recordings in this capture: the first {_MOST} are shown")
     for recording in islice(recordings, _MOST):
-        survey = survey_recording(recording, frames)
+        survey = survey_recording(recording, frames, progress=progress)
         survey.warnings.extend(warning)
         yield survey
 

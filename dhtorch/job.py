@@ -5,6 +5,7 @@ The result is written last, after its pictures: a folder with a valid ``result.j
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,8 @@ from dhtorch import archive, figures, report
 from dhtorch.data import Recordings
 from dhtorch.data import files as data_files
 from dhtorch.experiments.protocol import MIN_CANDIDATES, Outcome, Settings
+
+_LOG = logging.getLogger(__name__)
 
 #: The settings groups; their names enter the key of a result.
 GROUPS = ("method", "data", "pairs", "holdout", "experiment")
@@ -58,12 +61,16 @@ def run(
     digest = archive.data_digest({**_files(recordings), **_named_files(settings)})
     key = archive.result_key({**settings, "choices": names}, digest)
     target = folder / "result.json"
+    for recording in recordings if _LOG.isEnabledFor(logging.DEBUG) else ():
+        _LOG.debug("data: %s, %d of %s", recording.name, len(recording), recording.format)
+    _LOG.debug("digest %s, key %s", digest, key)
     archive.clear(target)
     if settings["resume"] and archive.finished(target, key):
         print(f"{target}: finished and valid, left untouched")
         return Ended(str(folder), "untouched")
     methods = {names["method"]: parts["method"]}
     outcome = parts["experiment"](recordings, methods, parts["pairs"], _common(settings), progress=progress)
+    _LOG.debug("%d pairs answered", outcome.n_pairs)
     examples = outcome.examples if settings["figures"] else []
     drawn = [path for example in examples for path in figures.draw_example(folder / example.scene, example)]
     scenes = [r.name for r in recordings]

@@ -11,16 +11,18 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import importlib
+import logging
 import os
 import re
 import shlex
 import sys
 import traceback
-import warnings
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
+
+from dhtorch import console
 
 #: Sub-command → module with ``main(argv) -> int``.
 COMMANDS = {"inspect": "dhtorch.capture", "report": "dhtorch.report"}
@@ -32,14 +34,24 @@ CONFIGURED = {"extract": "dhtorch.extract", "integrate": "dhtorch.mapping", "vie
 #: Sub-command → the option that a first word without a name sets.
 FIRST_WORD = {"view": "result"}
 
+DONE, SOME_FAILED, FAILED, INTERRUPTED, UNHEARD = 0, 1, 2, 130, 141
+
 #: Exit codes, as ``dhtorch --help`` lists them.
-DONE, SOME_FAILED, FAILED, INTERRUPTED = 0, 1, 2, 130
+EXIT_CODES = {
+    DONE: "all done or left untouched",
+    SOME_FAILED: "some jobs of a sweep failed",
+    FAILED: "bad option, bad data or failed job",
+    INTERRUPTED: "interrupted",
+    UNHEARD: "nobody reads the output any more",
+}
+
+_LOG = logging.getLogger("dhtorch.run")
 
 #: What bad input raises: reported in one line, without a traceback.
 USER_ERRORS = (ValueError, OSError, KeyError, ImportError)
 
 #: Flags of Hydra that show something and run nothing.
-SHOW = {"-h", "--help", "--hydra-help", "--version", "-i", "--info", "-sc", "--shell-completion", "-c", "--cfg"}
+SHOW = {"-h", "--help", "--hydra-help", "-i", "--info", "-sc", "--shell-completion", "-c", "--cfg"}
 SWEEP = {"-m", "--multirun"}
 
 #: How a job may end, and in words.
@@ -48,6 +60,8 @@ STATES = {"finished": "finished", "untouched": "left untouched", "failed": "fail
 #: Where results lie that are to be resumed, when no ``output`` is given.
 RESUMED = Path("outputs/resumed")
 
+_SEPARATORS = "/\\"
+
 #: A longer folder name is cut and told apart by a hash.
 LONGEST_NAME = 120
 
@@ -55,19 +69,33 @@ LONGEST_NAME = 120
 def main(argv: list[str] | None = None) -> int:
     """Entry point of the console script; returns the exit code."""
     argv = sys.argv[1:] if argv is None else argv
-    with warnings.catch_warnings():
-        _hush()
+    flags, argv = [a for a in argv if a in console.FLAGS], [a for a in argv if a not in console.FLAGS]
+    with console.speaking(flags), console.hushed():
         try:
-            if argv and argv[0] in COMMANDS:
-                return int(importlib.import_module(COMMANDS[argv[0]]).main(argv[1:]) or 0)
-            if argv and argv[0] in CONFIGURED:
-                return _run_configured(argv[0], argv[1:])
-            return _run_hydra(argv)
+            code = _run(argv)
+            sys.stdout.flush()
+            return code
+        except BrokenPipeError:  # as of `dhtorch report … | head`
+            console.leave_the_pipe()
+            return UNHEARD
         except USER_ERRORS as error:
             return _fail(error, show="--traceback" in argv)
         except KeyboardInterrupt as stop:  # a sub-command may say how to go on
             print(": ".join(["dhtorch: interrupted", *map(str, stop.args)]), file=sys.stderr)
             return INTERRUPTED
+
+
+def _run(argv: list[str]) -> int:
+    if argv == ["--version"]:
+        from dhtorch import __version__  # noqa: PLC0415
+
+        print(f"dhtorch {__version__}")
+        return DONE
+    if argv and argv[0] in COMMANDS:
+        return int(importlib.import_module(COMMANDS[argv[0]]).main(argv[1:]) or 0)
+    if argv and argv[0] in CONFIGURED:
+        return _run_configured(argv[0], argv[1:])
+    return _run_hydra(argv)
 
 
 def config_dir() -> Path:
@@ -86,8 +114,8 @@ def job_name(overrides: str) -> str:
     keeps different jobs apart. Data below the environment variable DHTORCH_DATA is named relative to it.
     """
     base = os.environ.get("DHTORCH_DATA")
-    text = overrides.replace(base.rstrip("/") + "/", "") if base else overrides
-    plain = re.sub(r"[^\w.,=+~@-]", "", text.replace("/", "-"), flags=re.ASCII)
+    text = overrides.replace(base.rstrip(_SEPARATORS) + os.sep, "") if base else overrides
+    plain = re.sub(r"[^\w.,=+~@-]", "", re.sub(r"[/\\]", "-", text), flags=re.ASCII).rstrip(".")
     if plain == text and len(plain) <= LONGEST_NAME:
         return plain or "defaults"
     return f"{plain[: LONGEST_NAME - 9]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
@@ -120,8 +148,10 @@ def _run_configured(word: str, argv: list[str]) -> int:
     except (HydraException, OmegaConfBaseException) as error:
         return _fail(_cause(error), show="traceback=true" in argv)
     module = importlib.import_module(CONFIGURED[word])
+    _LOG.debug("%s: %s", word, ", ".join(f"{k}={v}" for k, v in groups.items()))
     try:
-        return int(module.run({**settings, "choices": groups}, parts, progress=_progress) or DONE)
+        with console.unsaid():
+            return int(module.run({**settings, "choices": groups}, parts, progress=console.progress) or DONE)
     except USER_ERRORS as error:
         return _fail(error, show=settings.get("traceback", False))
 
@@ -197,7 +227,8 @@ def _sweep(engine: Any, overrides: Sequence[str], again: str, show: bool) -> int
     jobs = [job for batch in batches for job in batch]
     counts = Counter(job.return_value.state for job in jobs)
     shares = ", ".join(f"{counts[state]} {words}" for state, words in STATES.items())
-    print(f"{len(jobs)} job{'s' * (len(jobs) != 1)}: {shares}", flush=True)
+    with console.unsaid():
+        print(f"{len(jobs)} job{'s' * (len(jobs) != 1)}: {shares}", flush=True)
     if not counts["failed"]:
         return DONE
     common = set.intersection(*(set(job.overrides) for job in jobs))
@@ -217,7 +248,8 @@ def _job(cfg: Any) -> Any:
     from omegaconf import OmegaConf  # noqa: PLC0415
     from omegaconf.errors import OmegaConfBaseException  # noqa: PLC0415
 
-    _hush()
+    console.hush()
+    console.listen()
     from dhtorch import job  # noqa: PLC0415
 
     runtime = HydraConfig.get().runtime
@@ -225,8 +257,13 @@ def _job(cfg: Any) -> Any:
     try:
         settings: Any = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
         parts = {k: instantiate(cfg[k], _convert_="all") for k in ("data", "method", "pairs", "experiment")}
-        progress = _progress if alone else lambda items, _text, _total: items
-        return job.run(settings, parts, dict(runtime.choices), Path(runtime.output_dir), progress=progress)
+        progress = console.progress if alone else lambda items, _text, _total: items
+        _LOG.debug("job in %s: %s", runtime.output_dir, HydraConfig.get().job.override_dirname or "defaults")
+        with console.unsaid():
+            ended = job.run(settings, parts, dict(runtime.choices), Path(runtime.output_dir), progress=progress)
+        if console.verbosity() == "quiet":
+            print(Path(ended.folder) / "result.json", flush=True)
+        return ended
     except Exception as error:
         cause = _cause(error)
         expected = isinstance(cause, (*USER_ERRORS, OmegaConfBaseException, InstantiationException))
@@ -254,27 +291,6 @@ def _again(argv: Iterable[str], folder: Path) -> str:
 def _quote(text: str) -> str:
     """A value as Hydra's grammar takes it."""
     return text if re.fullmatch(r"[\w./-]+", text) else "'" + text.replace("'", r"\'") + "'"
-
-
-def _progress(items: Iterable[Any], text: str, total: int) -> Iterator[Any]:
-    """A progress bar with rate and time left on a terminal, nothing elsewhere."""
-    from rich.console import Console  # noqa: PLC0415
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn  # noqa: PLC0415
-
-    columns = ("{task.description:24}", BarColumn(), MofNCompleteColumn(), "{task.fields[rate]}", TimeRemainingColumn())
-    hidden = not sys.stderr.isatty()
-    with Progress(*columns, console=Console(stderr=True), disable=hidden, transient=True) as bar:
-        task = bar.add_task(text, total=total, rate="")
-        for item in items:
-            yield item
-            speed = bar.tasks[task].speed
-            bar.update(task, advance=1, rate=f"{speed:.1f}/s" if speed else "")
-
-
-def _hush() -> None:
-    """Warnings that other libraries cause are not the user's business, unless Python's -W asks for them."""
-    if not sys.warnoptions:
-        warnings.filterwarnings("ignore", module=r"(?!dhtorch\b)")
 
 
 def _cause(error: BaseException) -> BaseException:

@@ -11,7 +11,7 @@ import dhtorch
 
 ROOT = Path(dhtorch.__file__).parent
 LEVELS = [
-    {"tree", "codes", "archive"},
+    {"tree", "codes", "archive", "console"},
     {"geometry"},
     {"records"},
     {"stages", "negative", "data", "evaluate", "baselines"},

@@ -7,7 +7,7 @@ frame that cannot be read, a missing pose or an empty depth map becomes a warnin
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -61,8 +61,13 @@ class Survey:
         self.warnings.append(text)
 
 
-def survey_recording(recording: Any, frames: int = 8) -> Survey:
-    """Facts of a recording (or what looks like one), from its tables and ``frames`` of its frames."""
+def survey_recording(
+    recording: Any, frames: int = 8, *, progress: Callable[..., Iterable[int]] = lambda items, _text, _total: items
+) -> Survey:
+    """Facts of a recording (or what looks like one), from its tables and ``frames`` of its frames.
+
+    ``progress`` wraps the loop that decodes them: (items, text, number of items) → items.
+    """
     out = Survey(recording.name, recording.format)
     n = len(recording)
     skipped = int(recording.number[-1] - recording.number[0]) + 1 - n
@@ -70,7 +75,7 @@ def survey_recording(recording: Any, frames: int = 8) -> Survey:
     _times(recording.times, recording.rate_hz, out)
     places = sorted({round(k * (n - 1) / max(frames - 1, 1)) for k in range(frames)})
     shots: dict[int, Frame] = {}
-    for i in places:
+    for i in progress(places, recording.name, len(places)):
         try:
             shots[i] = recording[i]
         except FormatError as error:

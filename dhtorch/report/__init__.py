@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from dhtorch import archive
+from dhtorch.console import EPILOG, progress
 from dhtorch.report import page, text
 from dhtorch.report.layouts import SHOWN, in_layout
 from dhtorch.report.reading import Result, describe
@@ -50,7 +51,9 @@ def main(argv: Sequence[str]) -> int:
     Raises:
         FileNotFoundError, ValueError: a result is missing or not valid, or the page cannot be written there.
     """
-    parser = argparse.ArgumentParser(prog="dhtorch report", description="Tables and a page from archived results.")
+    parser = argparse.ArgumentParser(
+        prog="dhtorch report", description="Tables and a page from archived results.", epilog=EPILOG
+    )
     parser.add_argument("result", nargs="+", type=Path, help="result.json, or a folder with one or many below it")
     form = parser.add_mutually_exclusive_group()
     form.add_argument("--markdown", action="store_true", help="Markdown instead of console tables")
@@ -58,7 +61,7 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--traceback", action="store_true", help="show where an error came from")
     options = parser.parse_args(argv)
     paths = list(_found(options.result))
-    results = [archive.read(path) for path in paths]
+    results = [archive.read(path) for path in progress(paths, "results", len(paths))]
     if options.html:
         print(f"wrote {page.write(options.html, results)}: {len(results)} result{'s' * (len(results) != 1)}")
         return 0

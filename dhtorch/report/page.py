@@ -6,6 +6,7 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
+from dhtorch import archive
 from dhtorch.codes import Source
 from dhtorch.figures import GATE_COLOURS, HOLE_COLOURS, RECOVERED, SENSOR
 from dhtorch.report import published
@@ -53,8 +54,9 @@ def write(path: Path, results: Sequence[Result]) -> Path:
         raise ValueError(f"{path}: found a folder, expected the name of an HTML file")
     if path.suffix.lower() not in (".html", ".htm"):
         raise ValueError(f"{path}: found {path.suffix or 'no ending'}, expected a name that ends in .html")
-    path.write_text(page(results), encoding="utf-8")
-    return path
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path}: found no folder {path.parent}, expected one")
+    return archive.replace_file(path, page(results).encode("utf-8"))
 
 
 def _colours() -> str:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from dhtorch import archive
 from dhtorch.codes import Gate, Hole, names, words
 from dhtorch.figures import GATE_COLOURS, HOLE_COLOURS, RECOVERED, SENSOR, SILENT
 from dhtorch.viewer.scene import Cloud, Scene, Shot, View
@@ -66,10 +67,7 @@ def write(path: Path, scene: Scene) -> Path:
         ValueError: nothing to show.
         OSError: the file cannot be written.
     """
-    text = page(scene)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8")
-    return path
+    return archive.replace_file(path, page(scene).encode("utf-8"))
 
 
 def _data(scene: Scene) -> dict[str, Any]:
