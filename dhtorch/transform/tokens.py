@@ -66,23 +66,25 @@ def patch_tokens(
     rows, columns = grid(hw, patch=patch, tokens_hw=tokens_hw)
     cell = _cells(found.uv, hw, patch, tokens_hw or hw, fit, rows, columns)
 
-    def total(x: Tensor) -> Tensor:
-        zero = torch.zeros(x.shape[0], rows * columns + 1, dtype=torch.float64, device=x.device)
-        return zero.scatter_add(1, cell, x.double())[:, :-1]
+    def total(x: Tensor) -> Tensor:  # (B, N, k) → (B, P, k)
+        zero = torch.zeros(x.shape[0], rows * columns + 1, x.shape[2], dtype=torch.float64, device=x.device)
+        return zero.scatter_add(1, cell[..., None].expand_as(x), x)[:, :-1]
 
     answered = (found.source != Source.NONE) & (found.depth > 0)
     inverse = torch.where(answered, 1 / torch.where(answered, found.depth, 1.0).double(), 0.0)
     noise = torch.where(answered, found.sigma.double() * inverse * inverse, 0.0)
-    n, n_answered = total(torch.ones_like(inverse)), total(answered)
+    classes = torch.tensor(list(names(Hole)), dtype=hole.dtype, device=hole.device)
+    known = torch.stack((torch.ones_like(inverse), answered.double(), inverse), -1)
+    sums = total(torch.cat((known, (hole[..., None] == classes).double()), -1))
+    n, n_answered, n_inverse = sums[..., :3].unbind(-1)
     per, per_answered = 1 / n.clamp_min(1), 1 / n_answered.clamp_min(1)
-    mean = total(inverse) * per_answered
+    mean = n_inverse * per_answered
     own = torch.cat((mean, torch.zeros_like(mean[:, :1])), 1).gather(1, cell)
     off = torch.where(answered, inverse - own, 0.0)
-    variance = total(noise * noise + off * off) * per_answered
+    variance = total((noise * noise + off * off)[..., None])[..., 0] * per_answered
     positive = variance > 0
     sigma = torch.where(positive, torch.where(positive, variance, 1.0).sqrt(), 0.0)
-    shares = [total(hole == code) * per for code in names(Hole)]
-    tokens = torch.stack((mean, sigma, n_answered * per, *shares), -1)
+    tokens = torch.cat((torch.stack((mean, sigma, n_answered * per), -1), sums[..., 3:] * per[..., None]), -1)
     return tokens.to(found.depth.dtype), n_answered > 0
 
 
