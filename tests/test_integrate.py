@@ -399,9 +399,10 @@ def test_device_poses_are_the_recordings_own_where_finite():
         recording.place(Trajectory(None), [], poses="gps")
 
 
-@pytest.mark.parametrize(
-    "pairs", [[(i, i + 20) for i in range(0, 20, 2)], [(i, i + 4) for i in range(5)], [(0, 1), (1, 2)]]
-)
+WIDTHS = ([(i, i + 20) for i in range(0, 20, 2)], [(i, i + 4) for i in range(5)], [(0, 1), (1, 2)], [(0, 3), (6, 9)])
+
+
+@pytest.mark.parametrize("pairs", WIDTHS)
 def test_links_of_another_width_join_all_frames(pairs):
     links = recording.chain(pairs)
     assert not set(links) & set(pairs)

@@ -31,7 +31,7 @@ def job(tmp_path_factory):
     folder = tmp_path_factory.mktemp("map")
     env = {k: v for k, v in os.environ.items() if k != "DHTORCH_DATA"}
     command = [sys.executable, "-m", "dhtorch", "integrate", *TINY, "cutoff=2.0", "output=here"]
-    done = subprocess.run(command, check=False, cwd=folder, env=env, capture_output=True, text=True, timeout=240)
+    done = subprocess.run(command, check=False, cwd=folder, env=env, capture_output=True, text=True, timeout=290)
     assert done.returncode == 0, done.stderr
     assert done.stderr == "", "neither warnings nor a progress bar"
     return folder / "here", done.stdout

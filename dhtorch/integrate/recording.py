@@ -148,7 +148,8 @@ def chain(pairs: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
     widths = sorted(place[j] - place[i] for i, j in pairs)
     wide = widths[len(widths) // 2] if widths else 1
     other = [w for w in range(1, wide) if math.gcd(w, wide) == 1 and w + wide - 1 <= len(frames)]
-    links = [(frames[n], frames[n + w]) for w in other[-1:] for n in range(len(frames) - w)]
+    step = other[-1] if other else 1
+    links = [(frames[n], frames[n + step]) for n in range(len(frames) - step)]
     return [link for link in links if link not in set(pairs)]
 
 
