@@ -13,7 +13,7 @@ Errors: median rotation error in degrees over a hundred pairs; that of the trans
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -35,11 +35,8 @@ from dhtorch.stages.pose import pnp_ransac
 HW, FOCAL, THRESHOLD_PX, HYPOTHESES = (480, 640), 525.0, 3.0, 64
 K = np.array([[FOCAL, 0, HW[1] / 2], [0, FOCAL, HW[0] / 2], [0, 0, 1]])
 Answer = tuple[np.ndarray, np.ndarray]
-
-try:
-    pycolmap: Any = importlib.import_module("pycolmap")
-except ImportError:
-    pycolmap = None
+#: pycolmap is optional, and its import takes a while: only where it is asked.
+HAS_COLMAP = importlib.util.find_spec("pycolmap") is not None
 
 
 def scene(batch: int, n: int, outliers: float, seed: int) -> tuple[Samples, Tracks, Camera, Pose]:
@@ -98,6 +95,8 @@ def pose_lib(xyz: np.ndarray, uv: np.ndarray) -> Answer:
 
 def colmap(xyz: np.ndarray, uv: np.ndarray) -> Answer:
     """COLMAP's robust absolute pose, refined."""
+    import pycolmap
+
     camera = pycolmap.Camera(model="PINHOLE", width=HW[1], height=HW[0], params=[FOCAL, FOCAL, HW[1] / 2, HW[0] / 2])
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error, options.ransac.min_num_trials, options.ransac.confidence = THRESHOLD_PX, 100, 0.999
@@ -107,7 +106,7 @@ def colmap(xyz: np.ndarray, uv: np.ndarray) -> Answer:
 
 
 PEERS: dict[str, Callable[[np.ndarray, np.ndarray], Answer]] = {"opencv_ap3p": ap3p, "opencv_magsac": magsac}
-PEERS |= {"poselib": pose_lib} | ({"pycolmap": colmap} if pycolmap is not None else {})
+PEERS |= {"poselib": pose_lib} | ({"pycolmap": colmap} if HAS_COLMAP else {})
 
 
 def arrays(samples: Samples, tracks: Tracks) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -168,7 +167,7 @@ def measure(batch: int, n: int, outliers: float, options: Any, compile_too: bool
 def main() -> None:
     """Print the tables; write the rows with ``--json``."""
     options = harness.arguments(__doc__ or "").parse_args()
-    if pycolmap is None:
+    if not HAS_COLMAP:
         print("pycolmap: skipped, not installed (pip install pycolmap)")
     rows = []
     with torch.no_grad():
