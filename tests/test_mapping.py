@@ -180,6 +180,6 @@ def test_a_real_desk_becomes_a_map(tmp_path, monkeypatch, capsys):
     ]
     assert main(["integrate", *options, "mesh=false"]) == 0
     (scene,) = [r for r in archive.read(tmp_path / "here")["rows"] if r["pair"] is None]
-    assert scene["n_frames"] == 3 and scene["n_voxels"] > 1000 and scene["largest_island"] > 0.5
+    assert scene["n_frames"] == 3 and scene["n_voxels"] > 1000 and scene["largest_island"] > 0.2
     assert torch.get_num_threads() == 1 and "tum_fr1_desk9: 3 of 3 frames" in capsys.readouterr().out
     shutil.rmtree(tmp_path / "here")
