@@ -68,6 +68,9 @@ def listen() -> None:
     logger, verbose = logging.getLogger("dhtorch"), verbosity() == "verbose"
     for handler in [h for h in logger.handlers if h.get_name() == VERBOSITY]:
         logger.removeHandler(handler)
+    for name, known in logging.root.manager.loggerDict.items():
+        if name.startswith("dhtorch") and isinstance(known, logging.Logger):
+            known.disabled = False  # Hydra's own set-up silences whatever logger is there before it
     logger.setLevel(logging.DEBUG if verbose else logging.NOTSET)
     logger.propagate = not verbose
     if verbose:

@@ -87,9 +87,9 @@ def main(argv: list[str] | None = None) -> int:
 
 def _run(argv: list[str]) -> int:
     if argv == ["--version"]:
-        from dhtorch import __version__  # noqa: PLC0415
+        import dhtorch  # noqa: PLC0415
 
-        print(f"dhtorch {__version__}")
+        print(f"dhtorch {dhtorch.__version__}")
         return DONE
     if argv and argv[0] in COMMANDS:
         return int(importlib.import_module(COMMANDS[argv[0]]).main(argv[1:]) or 0)
@@ -183,6 +183,8 @@ def _run_hydra(argv: list[str]) -> int:
         return _show("run", argv)
     _refuse_flags(argv, SWEEP | SHOW)
     overrides, sweep = [a for a in argv if a not in SWEEP], bool({*SWEEP, "hydra.mode=MULTIRUN"} & set(argv))
+    if console.verbosity() == "quiet":
+        overrides.append("hydra/hydra_logging=disabled")  # what a launcher says of its jobs
     try:
         with hydra.initialize_config_dir(str(config_dir()), version_base="1.3", job_name="dhtorch"):
             engine: Any = GlobalHydra.instance().hydra

@@ -1,10 +1,9 @@
-"""The command: a job end to end, clear errors, help, the installed wheel. Sweeps and resuming: test_resume.py."""
+"""The command: a job end to end, clear errors, help. Sweeps and resuming: test_resume.py; the wheel: test_packaging.py."""
 
 import os
 import re
 import subprocess
 import sys
-import venv
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +12,9 @@ import pytest
 from dhtorch import archive
 from dhtorch.data import writers
 from dhtorch.data.synthetic import SyntheticRoom
-from dhtorch.run import config_dir, main
+from dhtorch.run import main
 
 TINY = ["data.hw=[120,160]", "data.n_frames=3", "pairs.gap=2", "method.n=1024"]
-REPO = Path(__file__).resolve().parents[1]
 
 
 def dhtorch(folder, *args, data=None, timeout=240):
@@ -203,30 +201,3 @@ def test_batches_and_workers_give_the_same_rows(tmp_path):
         (path,) = results(folder)
         rows.append([{k: v for k, v in r.items() if k != "ms"} for r in archive.read(path)["rows"]])
     assert rows[0] == rows[1]
-
-
-@pytest.mark.slow
-def test_the_wheel_runs_from_an_empty_folder(tmp_path):
-    """Built, installed beside the present environment's libraries, run where no checkout is."""
-    subprocess.run(
-        [sys.executable, "-m", "build", "--wheel", "--no-isolation", "-o", str(tmp_path), str(REPO)],
-        check=True,
-        capture_output=True,
-    )
-    (wheel,) = tmp_path.glob("*.whl")
-    venv.create(tmp_path / "env", with_pip=True)
-    python = tmp_path / "env" / "bin" / "python"
-    subprocess.run([python, "-m", "pip", "install", "-q", "--no-deps", str(wheel)], check=True)
-    libraries = next(p for p in sys.path if p.endswith("site-packages"))
-    here = next((tmp_path / "env").rglob("site-packages"))
-    (here / "libraries.pth").write_text(libraries + "\n")
-    empty = tmp_path / "empty"
-    empty.mkdir()
-    code = "import dhtorch.run; print(dhtorch.run.config_dir())"
-    where = subprocess.run([python, "-P", "-c", code], cwd=empty, capture_output=True, text=True, check=True).stdout
-    assert Path(where.strip()) == here / "dhtorch" / "conf" != config_dir()
-    done = subprocess.run(
-        [tmp_path / "env/bin/dhtorch", *TINY, "figures=false"], check=False, cwd=empty, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    assert len(results(empty)) == 1

@@ -1,0 +1,311 @@
+"""What MkDocs calls while it builds: pages of the API, and marks in the others that are filled from the code.
+
+``<!-- make: name argument -->`` on a line of its own is replaced by what the function of that name in ``MAKERS``
+returns. So nothing is said twice: README's words come from README, an experiment's from its docstring, a help text from
+the command, figures from the result files.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import io
+import json
+import re
+import sys
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+REPO = Path(__file__).resolve().parents[1]
+PACKAGE = REPO / "dhtorch"
+sys.path += [str(REPO / "benchmarks"), str(REPO / "docs")]  # MkDocs forgets this after the import
+
+import licences as terms  # noqa: E402
+import readme as tables  # noqa: E402
+from docstrings import markdown as as_markdown  # noqa: E402
+
+import dhtorch  # noqa: E402
+from dhtorch import run  # noqa: E402
+
+#: Words of the command with a help text of their own.
+WORDS = ("", "inspect", "report", "extract", "integrate", "view")
+
+_MARK = re.compile(r"^<!-- make: (\w+) ?(.*?) -->$", re.M)
+_ASKED = re.compile(
+    r"Question: (?P<question>.*?\?)(?P<idea>.*?)(?P<when>Expectation[^:]*): (?P<expectation>.*)"
+    r"What would refute it: (?P<refutation>.*)",
+    re.S,
+)
+
+
+# ---------------------------------------------------------------------------------------------------- MkDocs' own calls
+
+
+def on_config(config: Any) -> Any:
+    """The API's pages join the navigation."""
+    pages = [{"dhtorch": "api/dhtorch.md"}, *({part: f"api/{part}.md"} for part in parts())]
+    config.nav.insert(len(config.nav) - 1, {"API": pages})
+    return config
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """The API's pages, and README's pictures."""
+    from mkdocs.structure.files import File  # noqa: PLC0415
+
+    for part in ("dhtorch", *parts()):
+        files.append(File.generated(config, f"api/{part}.md", content=api_page(part)))
+    for target in pictures():
+        files.append(File.generated(config, f"readme/{target}", abs_src_path=str(REPO / target)))
+    return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Fill the marks of a page."""
+    return filled(markdown)
+
+
+def filled(markdown: str) -> str:
+    """A page with its marks replaced.
+
+    Raises:
+        ValueError: a mark that nobody makes, or that asks for something which is not there.
+    """
+
+    def make(mark: re.Match[str]) -> str:
+        if mark[1] not in MAKERS:
+            raise ValueError(f"docs: found the mark {mark[1]!r}, expected one of {', '.join(MAKERS)}")
+        return MAKERS[mark[1]](*([mark[2]] if mark[2] else []))
+
+    return _MARK.sub(make, markdown)
+
+
+# ----------------------------------------------------------------------------------------------------------- the API
+
+
+def parts() -> list[str]:
+    """Modules and packages of dhtorch, by name."""
+    found = {p.stem for p in PACKAGE.glob("*.py")} | {p.parent.name for p in PACKAGE.glob("*/__init__.py")}
+    return sorted(found - {"__init__", "__main__"})
+
+
+def api_page(part: str) -> str:
+    """One page for a module, or for a package with all its modules."""
+    if part == "dhtorch":
+        head = ["| name | |", "| :-- | :-- |"]
+        names = [(name, getattr(dhtorch, name)) for name in dhtorch.__all__]
+        public = [f"| [`{n}`][{x.__module__}.{x.__qualname__}] | {_first(x.__doc__)} |" for n, x in names]
+        others = [f"| [`{p}`]({p}.md) | {_first(_doc(p))} |" for p in parts()]
+        return "\n".join(["# dhtorch", "", module("dhtorch"), "", *head, *public, "", *head, *others])
+    files = sorted((PACKAGE / part).rglob("*.py")) if (PACKAGE / part).is_dir() else [PACKAGE / f"{part}.py"]
+    return "\n\n".join([f"# {part}", *(_module(file) for file in files)])
+
+
+def _module(file: Path) -> str:
+    """mkdocstrings' block for a module: what is defined in it and is public, not what it imports."""
+    dotted = ".".join(file.relative_to(REPO).with_suffix("").parts).removesuffix(".__init__")
+    members = json.dumps(list(_public(_tree(file))))
+    return f"::: {dotted}\n    options:\n      members: {members}\n"
+
+
+def _public(tree: ast.Module) -> Iterator[str]:
+    for node in tree.body:
+        names: list[str] = []
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            names = [node.name]
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names = [t.id for t in targets if isinstance(t, ast.Name)]
+        yield from (name for name in names if not name.startswith("_"))
+
+
+@cache
+def _tree(file: Path) -> ast.Module:
+    return ast.parse(file.read_text(encoding="utf-8"))
+
+
+def _doc(part: str) -> str:
+    file = PACKAGE / part / "__init__.py"
+    return ast.get_docstring(_tree(file if file.is_file() else PACKAGE / f"{part}.py")) or ""
+
+
+def _first(docstring: str | None) -> str:
+    """The promise: the first paragraph of a docstring in one line, as Markdown."""
+    return " ".join(as_markdown((docstring or "").strip().split("\n\n")[0]).split()).replace("|", "\\|")
+
+
+# ------------------------------------------------------------------------------------------------------------- README
+
+
+@cache
+def readme() -> str:
+    """README; its tables are those of the result files (``benchmarks/readme.py``, held by a test)."""
+    return (REPO / "README.md").read_text(encoding="utf-8")
+
+
+def pictures() -> list[str]:
+    """Files of the repository that README shows."""
+    return sorted(set(re.findall(r"!\[[^\]]*\]\(((?!https?:)[^)#]+)\)", readme())))
+
+
+def section(title: str) -> str:
+    """A section of README with its heading, without the markers of its tables."""
+    found = re.search(rf"^## ({re.escape(title)}.*?)(?=^## |\Z)", readme(), re.M | re.S)
+    if not found:
+        known = ", ".join(re.findall(r"^## (.*)$", readme(), re.M))
+        raise ValueError(f"README.md: found no section {title!r}, expected one of {known}")
+    return _adopted(re.sub(r"^#(#+ )", r"\1", f"## {found[1]}", flags=re.M))
+
+
+def readme_head(end: str = "The stages") -> str:
+    """README from its beginning up to a section."""
+    head, found, _ = readme().partition(f"\n## {end}")
+    if not found:
+        raise ValueError(f"README.md: found no section {end!r}, expected one")
+    return _adopted(head)
+
+
+def readme_table(title: str) -> str:
+    """The first table of a section of README."""
+    table = re.search(r"(?:^\|.*\n)+", section(title) + "\n", re.M)
+    if not table:
+        raise ValueError(f"README.md: found no table in section {title!r}, expected one")
+    return table[0]
+
+
+def _adopted(markdown: str) -> str:
+    """README's text on a page of the site: pictures where the site has them, links to other files as text."""
+    for target in pictures():
+        markdown = markdown.replace(f"]({target})", f"](readme/{target})")
+    for label, target in re.findall(r"(?<!!)\[([^\]]+)\]\(([^)#:]+)\)", markdown):
+        if (REPO / target).exists():
+            markdown = markdown.replace(f"[{label}]({target})", label)
+    return re.sub(r"<!--.*?-->\n?", "", markdown)
+
+
+# --------------------------------------------------------------------------------------------------- what code says
+
+
+def module(dotted: str) -> str:
+    """The docstring of a module."""
+    file = REPO / Path(*dotted.split("."))
+    file = file / "__init__.py" if file.is_dir() else file.with_suffix(".py")
+    return as_markdown(ast.get_docstring(_tree(file)) or "")
+
+
+def reader(name: str) -> str:
+    """What a reader of ``dhtorch.data`` says of its format, and how its options are named."""
+    text = f"**`dhtorch.data.{name}`** — {module(f'dhtorch.data.{name}')}\n"
+    options = REPO / "conf" / "data" / f"{name}.yaml"
+    if not options.is_file():
+        return text
+    lines = options.read_text(encoding="utf-8").splitlines()
+    lines = [line for line in lines if line and not line.startswith(("#", "_"))]
+    return text + f"\nOptions, with their defaults (`data.NAME=VALUE`):\n\n```yaml\n{chr(10).join(lines)}\n```\n"
+
+
+def choices(group: str) -> str:
+    """The choices of a settings group, with the words on top of each file."""
+    rows = [f"| `{group}=` | |", "| :-- | :-- |"]
+    for file in sorted((REPO / "conf" / group).glob("*.yaml")):
+        lines = file.read_text(encoding="utf-8").splitlines()
+        words = [line[1:].strip() for line in lines[: next(i for i, x in enumerate(lines) if not x.startswith("#"))]]
+        rows.append(f"| `{file.stem}` | {' '.join(words)} |")
+    return "\n".join(rows)
+
+
+def codes() -> str:
+    """The code tables: number, name, meaning."""
+    source, shown = (PACKAGE / "codes.py").read_text(encoding="utf-8"), []
+    for node in _tree(PACKAGE / "codes.py").body:
+        if not isinstance(node, ast.ClassDef):
+            continue
+        body = "\n".join(source.splitlines()[node.lineno : node.end_lineno])
+        rows = re.findall(r"^ +([A-Z_]+): Final = (\d+)(?: +#: (.*))?$", body, re.M)
+        table = "\n".join(f"| {number} | `{name}` | {words} |" for name, number, words in rows)
+        shown.append(f"### {node.name}\n\n{_first(ast.get_docstring(node))}\n\n| | | |\n| --: | :-- | :-- |\n{table}")
+    return "\n\n".join(shown)
+
+
+def asked() -> dict[str, dict[str, str]]:
+    """Experiment → question, idea, expectation and refutation, as its docstring has them."""
+    found = {}
+    for file in sorted((PACKAGE / "experiments").glob("*.py")):
+        text = ast.get_docstring(_tree(file)) or ""
+        if text.startswith("Question:"):
+            said = _ASKED.fullmatch(text)
+            if not said:
+                raise ValueError(f"{file}: expected a question, an expectation and what would refute it")
+            found[file.stem] = {k: v.strip() for k, v in said.groupdict().items()}
+    return found
+
+
+def experiments() -> str:
+    """One row for every experiment, then each in its own words."""
+    answers: dict[str, list[str]] = {}
+    for name, result in archived().items():
+        answer = f"{result['verdict']} on {result['data']['name']} (`{name}`)"
+        answers.setdefault(result["experiment"], []).append(answer)
+    rows, texts = ["| experiment | question | archived answers |", "| :-- | :-- | :-- |"], []
+    for name, said in asked().items():
+        question = said["question"][0].upper() + " ".join(said["question"][1:].split())
+        answer = "; ".join(answers.get(name, ["none"]))
+        rows.append(f"| [`{name}`](#{name}) | {question} | {answer} |")
+        idea = f"{said['idea']}\n\n" if said["idea"] else ""
+        texts.append(
+            f"## {name}\n\n**{question}**\n\n{idea}**{said['when']}.** {said['expectation']}\n\n"
+            f"**What would refute it.** {said['refutation']}\n\nArchived answers: {answer}. "
+            f"Code: [`dhtorch.experiments.{name}`][dhtorch.experiments.{name}]."
+        )
+    return "\n".join(rows) + "\n\n" + as_markdown("\n\n".join(texts))
+
+
+@cache
+def archived() -> dict[str, dict[str, Any]]:
+    """Result files that answer a question: name → result."""
+    found = {}
+    for file in sorted((REPO / "benchmarks" / "results").glob("*.json")):
+        result = json.loads(file.read_text(encoding="utf-8"))
+        if isinstance(result, dict) and result.get("verdict"):
+            found[file.stem] = result
+    return found
+
+
+def verdicts() -> str:
+    """Every archived answer, through README's own function."""
+    return str(tables.verdicts(list(archived())))
+
+
+def helps() -> str:
+    """Every help text of the command, as a terminal shows it."""
+    names = {word: f"dhtorch {word}".strip() for word in WORDS}
+    return "\n\n".join(f"## {name}\n\n```text\n{help_of(word)}\n```" for word, name in names.items())
+
+
+def help_of(word: str) -> str:
+    """What ``dhtorch WORD --help`` prints."""
+    said, before = io.StringIO(), sys.argv
+    with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
+        try:
+            run.main([*([word] if word else []), "--help"])
+        finally:
+            sys.argv = before
+    return said.getvalue().strip("\n")
+
+
+def exit_codes() -> str:
+    """Exit codes of the command."""
+    return "\n".join(["| code | |", "| --: | :-- |", *(f"| {k} | {v} |" for k, v in run.EXIT_CODES.items())])
+
+
+def licences() -> str:
+    """Direct dependencies and their licences."""
+    return str(terms.table())
+
+
+MAKERS: dict[str, Callable[..., str]] = {
+    "readme": section,
+    **{f.__name__: f for f in (readme_head, readme_table, module, reader, choices, codes)},
+    **{f.__name__: f for f in (experiments, verdicts, helps, exit_codes, licences)},
+}

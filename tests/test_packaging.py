@@ -1,0 +1,142 @@
+"""What is handed out: the wheel and the source archive are whole, and the wheel works where no checkout is."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import tarfile
+import tomllib
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+REPO = Path(__file__).resolve().parents[1]
+PACKAGE = REPO / "dhtorch"
+TINY = ["data.hw=[60,80]", "data.n_frames=3", "data.supersample=1", "data.lidar=exact", "pairs.gap=2", "method.n=256"]
+
+#: Files beside the modules that the package reads when it runs.
+ASSETS = {p.relative_to(REPO).as_posix() for p in PACKAGE.rglob("*") if p.suffix in (".css", ".js", ".html", ".json")}
+
+
+def build(source, what, target):
+    """``wheel`` or ``sdist`` of a source tree, by the build backend alone: nothing is fetched."""
+    code = f"import hatchling.build as b, sys; print(b.build_{what}(sys.argv[1]))"
+    run = [sys.executable, "-c", code, str(target)]
+    done = subprocess.run(run, cwd=source, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return target / done.stdout.split()[-1]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    return build(REPO, "wheel", tmp_path_factory.mktemp("wheel"))
+
+
+def members(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        return set(archive.namelist())
+
+
+def tracked(*folders):
+    """Files of the repository below some folders; git's list, so that caches do not count."""
+    run = ["git", "ls-files", "--cached", "--others", "--exclude-standard", *folders]
+    done = subprocess.run(run, cwd=REPO, capture_output=True, text=True, check=False)
+    if done.returncode:
+        pytest.skip("not a git checkout")
+    return {name for name in done.stdout.split("\n") if name and (REPO / name).is_file()}
+
+
+def test_the_wheel_holds_the_package_its_settings_and_assets_and_no_more(wheel):
+    inside = {name for name in members(wheel) if not name.split("/")[0].endswith(".dist-info")}
+    assert ASSETS and inside >= ASSETS
+    assert "dhtorch/py.typed" in inside
+    assert inside == tracked("dhtorch") | {f"dhtorch/{name}" for name in tracked("conf")}
+
+
+def test_the_wheel_says_what_it_is(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        (facts,) = (archive.read(n).decode() for n in archive.namelist() if n.endswith(".dist-info/METADATA"))
+        (entry,) = (archive.read(n).decode() for n in archive.namelist() if n.endswith("entry_points.txt"))
+        assert any(n.endswith("licenses/LICENSE") for n in archive.namelist())
+    project = tomllib.loads((REPO / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert "License-Expression: Apache-2.0" in facts and "# dhtorch" in facts
+    assert set(re.findall(r"^Provides-Extra: (.*)$", facts, re.M)) == set(project["optional-dependencies"])
+    assert "dhtorch = dhtorch.run:main" in entry
+
+
+@pytest.mark.timeout(600)  # seconds of work, but a busy machine stretches them
+def test_the_wheel_works_where_no_checkout_is(wheel, tmp_path):
+    """In an environment of its own beside the present libraries: a job, an experiment and every word."""
+    environment, empty = tmp_path / "env", tmp_path / "empty"
+    venv.create(environment, with_pip=False, symlinks=os.name != "nt")
+    (here,) = {p.resolve() for p in environment.rglob("site-packages")}
+    scripts = environment / ("Scripts" if os.name == "nt" else "bin")
+    python = scripts / "python"
+    pip = [sys.executable, "-m", "pip", "--python", str(python), "install", "-q", "--no-deps", "--no-index", str(wheel)]
+    subprocess.run([*pip, "--disable-pip-version-check"], check=True, capture_output=True)
+    libraries = next(p for p in sys.path if p.endswith("site-packages"))
+    (here / "libraries.pth").write_text(libraries + "\n", encoding="utf-8")
+    empty.mkdir()
+    calls = [
+        [*TINY, "figures=false", "output=job"],
+        [*TINY, "figures=false", "output=census", "experiment=hole_census"],
+        ["report", "job", "--html", "page.html"],
+        ["view", "job", "html=view.html"],
+        ["inspect", "job", "--out", "sheets", "--format", "nothing"],
+    ]
+    code = (
+        "import json, sys, dhtorch; from dhtorch.run import config_dir, main;"
+        "print('\\x00' + json.dumps([[main(a) for a in json.loads(sys.argv[1])], dhtorch.__file__, str(config_dir())]))"
+    )
+    env = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "DHTORCH_DATA")}
+    run = [python, "-P", "-c", code, json.dumps(calls)]
+    done = subprocess.run(run, cwd=empty, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    codes, module, settings = json.loads(done.stdout.partition("\x00")[2])
+    assert codes == [0, 0, 0, 0, 2], done.stderr  # no format is called "nothing"
+    assert Path(module) == here / "dhtorch" / "__init__.py" and Path(settings) == here / "dhtorch" / "conf"
+    assert {"page.html", "view.html"} <= {p.name for p in empty.iterdir()} and "<style" in (
+        empty / "page.html"
+    ).read_text(encoding="utf-8")
+    version = subprocess.run(
+        [scripts / "dhtorch", "--version"], cwd=empty, env=env, capture_output=True, text=True, check=True
+    )
+    assert version.stdout.startswith("dhtorch ")
+
+
+def test_the_source_archive_makes_the_same_wheel(wheel, tmp_path):
+    archive = build(REPO, "sdist", tmp_path)
+    with tarfile.open(archive) as tar:
+        tar.extractall(tmp_path, filter="data")
+    (source,) = (p for p in tmp_path.iterdir() if p.is_dir())
+    for name in ("tests", "benchmarks", "notebooks", "docs", "conf"):
+        assert (source / name).is_dir(), name
+    for name in ("README.md", "LICENSE", "CITATION.cff", "Makefile", "constraints.txt", "mkdocs.yml", "pyproject.toml"):
+        assert (source / name).is_file(), name
+    again = build(source, "wheel", tmp_path)
+    assert again.name == wheel.name and members(again) == members(wheel)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("extra", ["data", "live", "learned", "view", "mesh", "scale", "ray-launcher", "docs", "dev"])
+def test_extras_can_be_resolved(wheel, extra):
+    """Dry run against the index, with the pinned torch."""
+    ask = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--retries", "0", "--timeout", "10"]
+    reachable = subprocess.run([*ask, "index", "versions", "rich"], capture_output=True, text=True, check=False)
+    if reachable.returncode:
+        pytest.skip("no package index can be reached")
+    wanted = [f"dhtorch[{extra}] @ {wheel.as_uri()}", "-c", str(REPO / "constraints.txt")]
+    force = ["--ignore-installed"] if extra == "ray-launcher" else []  # an environment of its own
+    done = subprocess.run([*ask, "install", "--dry-run", *force, *wanted], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert "Would install" in done.stdout
+
+
+def test_every_extra_is_tested():
+    project = tomllib.loads((REPO / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    (mark,) = [m for m in test_extras_can_be_resolved.pytestmark if m.name == "parametrize"]
+    assert set(mark.args[1]) == set(project["optional-dependencies"])
