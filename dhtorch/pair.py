@@ -171,14 +171,18 @@ def undistort_tracks(tracks: Tracks, camera_0: Camera, camera_1: Camera) -> Trac
     """
     if camera_0.distortion is None and camera_1.distortion is None:
         return tracks
-    uv_0, uv_1 = cam.undistort(camera_0, tracks.uv_0), cam.undistort(camera_1, tracks.uv_1)
-    fine = uv_0.isfinite().all(-1) & uv_1.isfinite().all(-1)
+    given = tracks.uv_0.isfinite().all(-1) & tracks.uv_1.isfinite().all(-1)
+    centre_0, centre_1 = (c.c.detach()[:, None] for c in (camera_0, camera_1))
+    uv_0 = cam.undistort(camera_0, torch.where(given[..., None], tracks.uv_0, centre_0))
+    uv_1 = cam.undistort(camera_1, torch.where(given[..., None], tracks.uv_1, centre_1))
+    fine = given & uv_0.isfinite().all(-1) & uv_1.isfinite().all(-1)
     uv_0 = torch.where(fine[..., None], uv_0, tracks.uv_0)
     uv_1 = torch.where(fine[..., None], uv_1, tracks.uv_1)
-    J = cam.undistort_jacobian(camera_1, uv_1)
+    J = cam.undistort_jacobian(camera_1, torch.where(fine[..., None], uv_1, centre_1))
     # Products of 2×2 matrices written as sums: rounding then does not depend on the batch.
-    half = (J[..., :, :, None] * tracks.cov[..., None, :, :]).sum(-2)
-    cov = (half[..., :, None, :] * J[..., None, :, :]).sum(-1)
+    known = tracks.cov.isfinite()
+    half = (J[..., :, :, None] * torch.where(known, tracks.cov, 0)[..., None, :, :]).sum(-2)
+    cov = torch.where(known, (half[..., :, None, :] * J[..., None, :, :]).sum(-1), tracks.cov)
     return tracks.replace(uv_0=uv_0, uv_1=uv_1, cov=cov, valid=tracks.valid & fine)
 
 

@@ -73,7 +73,8 @@ def backproject(
     returned = depth > 0
     unsure, beyond = returned & (level < min_conf), returned & (depth > near_limit)
     usable = returned & ~(unsure | beyond)
-    xyz = cam.unproject(frame.camera, uv, torch.where(usable, depth, 1))
+    seen = torch.where(usable[..., None], uv, torch.zeros_like(uv))  # a pixel that is no number has no gradient either
+    xyz = cam.unproject(frame.camera, seen, torch.where(usable, depth, 1))
     usable = usable & (xyz.detach().abs().amax(-1) < torch.inf)  # a pixel outside the lens model has no ray
     halvings = edge.int().add(shine).add(white)
     confidence = (level.to(depth.dtype) / 2).clamp(0, 1) * 0.5**halvings

@@ -78,6 +78,8 @@ def rank(
     """
     check("rank", gate=(estimate.gate, "B N"), uv=(samples.uv, "B N 2"), valid=(tracks.valid, "B N"))
     parallax, residual = estimate.parallax_deg, estimate.residual_px
+    stated = estimate.keep & parallax.isfinite() & residual.isfinite()
+    parallax, residual = (torch.where(stated, x, torch.zeros_like(x)) for x in (parallax, residual))
     score = parallax / (parallax + half_parallax_deg) * (1 - residual / residual_scale_px).clamp_min(0)
     return _silence(estimate, score, min_score)
 

@@ -87,6 +87,10 @@ def two_view(
     posed, still = fit.ok[:, None], fit.code == PoseCode.NO_BASELINE
     tracked = tracks.valid & tracks.uv_0.isfinite().all(-1) & tracks.uv_1.isfinite().all(-1)
     uv_0, uv_1 = _silence(tracks.uv_0, tracked), _silence(tracks.uv_1, tracked)
+    cov = _silence(tracks.cov.flatten(-2), tracked).unflatten(-1, (2, 2))
+    grey, round_trip, texture = (
+        torch.where(tracked, x, 0) for x in (tracks.photometric, tracks.error, samples.trackability)
+    )
     y = None
     if fit.shutter is not None:
         y = cam.rays(cam.ideal(camera_0), uv_0)[..., 1]
@@ -94,11 +98,11 @@ def two_view(
         uv_1 = straighten(uv_1.transpose(1, 2), camera_1.f, camera_1.c, y, turn).transpose(1, 2)
     geometry = solver(uv_0, uv_1, camera_0, camera_1, _stand_in(fit))
     parallax_deg = geometry.parallax * (180 / math.pi)
-    mismatch = tracks.photometric / samples.trackability.clamp_min(MIN_TRACKABILITY).sqrt()
-    cov = _fitted(tracks.cov, tracked, fit, isotropic) if fitted_noise else tracks.cov
+    mismatch = grey / texture.clamp_min(MIN_TRACKABILITY).sqrt()
+    cov = _fitted(cov, tracked, fit, isotropic) if fitted_noise else cov
     own, shared = _variance(geometry, cov, fit, y)
     own, shared = own * sigma_scale**2, shared * sigma_scale**2
-    own = own * _doubt((mismatch, mismatch_px), (geometry.residual_px, residual_px), (tracks.error, round_trip_px))
+    own = own * _doubt((mismatch, mismatch_px), (geometry.residual_px, residual_px), (round_trip, round_trip_px))
     if sensor_share > 0:
         shared = shared + (sensor_share * _relative_noise(samples, fit) * geometry.depth) ** 2
     behind = ~((geometry.depth > 0) & (geometry.depth_1 > 0))

@@ -1,0 +1,479 @@
+"""Gradients at work: what they recover, and that compiled graphs, vmap, forward and reverse mode agree about them."""
+
+import math
+import shutil
+from functools import partial
+
+import pytest
+import torch
+from contract import leaves, tensor_map
+from test_contract import shifted, tracked
+from torch.func import jacfwd, jacrev, vmap
+from torch.utils import _pytree as pytree
+
+from dhtorch import tree
+from dhtorch.data.synthetic import SyntheticRoom
+from dhtorch.evaluate import holdout
+from dhtorch.geometry.lookup import nearest
+from dhtorch.pair import METHODS, extend, merge, undistort_tracks, uniform_draws
+from dhtorch.records import Camera
+from dhtorch.stages import backproject, holes, pose, sample, score, track, triangulate
+from dhtorch.window import extend_window
+
+D = torch.float64
+N = 256
+
+
+def room(seed=2, **options):
+    return SyntheticRoom(
+        **{"seed": seed, "hw": (120, 160), "path": "orbit", "n_frames": 17, "lidar": "exact", **options}
+    )
+
+
+def views(recording, *numbers, near=2.0, dtype=D):
+    """Frames of a room with a short-range sensor and a picture that can carry a gradient."""
+    frames = [holdout.range_split(recording[k], near).to(dtype) for k in numbers]
+    return [f.replace(image=f.image.to(dtype) / 255) for f in frames]
+
+
+@pytest.fixture(scope="module")
+def pair():
+    return views(room(), 0, 16)
+
+
+@pytest.fixture(scope="module")
+def trace(pair):
+    trace = {}
+    METHODS["map"](*pair, n=N, trace=trace)
+    assert int(trace["estimate"].keep.sum()) > 100 and bool(trace["fit"].ok)
+    return trace
+
+
+@pytest.fixture(scope="module")
+def stages(pair, trace):
+    """Name → (function, arguments): every stage on what the stages before it found."""
+    frame, other = pair
+    samples, tracks, fit, estimate = (trace[k] for k in ("samples", "tracks_ideal", "fit", "estimate"))
+    posing = samples, tracks, frame.camera, other.camera, torch.rand(1, 50, 3, dtype=D)
+    geometry = samples, tracks, fit, frame.camera, other.camera
+    scorer = score.LearnedScore(seed=1)
+    torch.nn.init.normal_(scorer.last, std=0.1)
+    lens = torch.tensor([[0.05, -0.02, 0.001, -0.002, 0.01]], dtype=D)
+    bent = [f.camera.replace(distortion=lens) for f in pair]
+    return {
+        "backproject": (backproject.backproject, (frame, samples.uv)),
+        "classify": (holes.classify, (frame, samples)),
+        "lucas_kanade": (track.lucas_kanade, (frame.image, other.image, samples.uv)),
+        "lucas_kanade_affine": (track.lucas_kanade_affine, (frame.image, other.image, samples.uv)),
+        "undistort_tracks": (undistort_tracks, (tracks, *bent)),
+        "pnp_ransac": (pose.pnp_ransac, posing),
+        "map_pose": (pose.map_pose, posing),
+        "two_view": (triangulate.two_view, geometry),
+        "two_view of map": (METHODS["map"].keywords["triangulate"], geometry),
+        "rank": (score.rank, (estimate, samples, tracks, fit)),
+        "rank_by_error": (score.rank_by_error, (estimate, samples, tracks, fit)),
+        "learned_score": (scorer, (estimate, samples, tracks, fit)),
+        "merge": (merge, (samples, estimate)),
+        "extend": (partial(extend, n=N), tuple(pair)),
+        "map": (partial(METHODS["map"], n=N), tuple(pair)),
+    }
+
+
+def with_gradients(fn, args):
+    """What ``fn`` returns, and the gradients of a weighted sum of all its finite values to every floating input."""
+    flat, spec = pytree.tree_flatten(args)
+    floating = [isinstance(x, torch.Tensor) and x.is_floating_point() for x in flat]
+    flat = [x.detach().clone().requires_grad_() if f else x for x, f in zip(flat, floating, strict=True)]
+    out = fn(*pytree.tree_unflatten(flat, spec))
+    total = sum(
+        (torch.where(x.isfinite(), x, 0) * torch.linspace(0.5, 1.5, x.numel(), dtype=x.dtype).view(x.shape)).sum()
+        for x in leaves(out)
+        if x.requires_grad
+    )
+    inputs = [x for x, f in zip(flat, floating, strict=True) if f]
+    return out, torch.autograd.grad(total, inputs, allow_unused=True)
+
+
+# ------------------------------------------------------------------------------------------------ one graph
+
+
+CHEAP = ("backproject", "two_view of map", "learned_score", "merge")
+MORE = ("classify", "undistort_tracks", "two_view", "rank", "rank_by_error")
+LARGE = ("lucas_kanade", "lucas_kanade_affine", "pnp_ransac", "map_pose", "extend", "map")
+
+
+def agrees_when_compiled(fn, args, backend, atol=1e-12):
+    torch._dynamo.reset()
+    plain, gradients = with_gradients(fn, args)
+    compiled, again = with_gradients(torch.compile(fn, fullgraph=True, backend=backend), args)
+    for x, y in zip(leaves(plain), leaves(compiled), strict=True):
+        torch.testing.assert_close(x, y, rtol=1e-9, atol=atol, equal_nan=True)
+    assert any(g is not None for g in gradients)
+    for g, h in zip(gradients, again, strict=True):
+        assert (g is None) == (h is None)
+        if g is not None:
+            assert g.isfinite().all()
+            torch.testing.assert_close(g, h, rtol=1e-9, atol=atol * float(1 + g.abs().max()))
+
+
+@pytest.mark.parametrize("name", CHEAP)
+def test_a_compiled_stage_and_its_gradients_are_the_plain_ones(stages, name):
+    agrees_when_compiled(*stages[name], "aot_eager")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("name", [*MORE, *LARGE])
+def test_every_stage_and_whole_methods_compile_as_one_graph_with_equal_gradients(stages, name):
+    """(That their values capture is tested for every stage in ``test_contract.py``.)"""
+    agrees_when_compiled(*stages[name], "aot_eager")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.skipif(shutil.which("g++") is None, reason="inductor needs a C++ compiler")
+@pytest.mark.parametrize("name", ["backproject", "two_view of map", "rank_by_error", "learned_score"])
+def test_inductor_agrees(stages, name):
+    agrees_when_compiled(*stages[name], "inductor", atol=1e-9)
+
+
+def test_samplers_and_draws_are_part_of_the_graph():
+    def both(x):
+        return sample.spiral((48, 64), 20, dtype=x.dtype) * x, uniform_draws(3, 2, 5) * x
+
+    x = torch.ones((), dtype=D)
+    captured = torch.compile(both, fullgraph=True, backend="aot_eager")(x)
+    assert all(torch.equal(a, b) for a, b in zip(captured, both(x), strict=True))
+    draws = torch.rand(5, 3, generator=torch.Generator().manual_seed(3), dtype=D)
+    assert torch.equal(captured[1], draws.expand(2, 5, 3))
+    mapped = vmap(lambda y: y * uniform_draws(3, 1, 5)[0])(torch.ones(4, dtype=D))
+    assert torch.equal(mapped, draws.expand(4, 5, 3)), "the draws follow the seed: nothing is random to vmap"
+
+
+# ------------------------------------------------------------------------------- forward, reverse, differences
+
+
+def exact(batch, n=24):
+    """Samples, exact tracks, cameras and draws: the residuals are zero, so the pose's derivative is exact."""
+    samples, tracks, _, camera_0, camera_1 = tracked(batch, n, D, noise=0.0)
+    return samples, tracks, camera_0, camera_1, torch.rand(1, 8, 3, dtype=D).expand(batch, 8, 3)
+
+
+DIRECTIONS = torch.randn(3 * 24 + 8, 5, generator=torch.Generator().manual_seed(5), dtype=D)
+
+
+def moved(q, samples, tracks, camera_0, camera_1, draws):
+    """Near points, tracks and intrinsics of both views, moved along five fixed random directions by q (5,)."""
+    n, shift = samples.depth.shape[1], DIRECTIONS @ q
+    pixels, share, lens = shift[: 2 * n].view(n, 2), shift[2 * n : 3 * n, None], shift[3 * n :]
+    first = Camera(camera_0.f + lens[:2], camera_0.c + lens[2:4])
+    second = Camera(camera_1.f + lens[4:6], camera_1.c + lens[6:])
+    return (
+        samples.replace(xyz=samples.xyz * (1 + share)),
+        tracks.replace(uv_1=tracks.uv_1 + pixels),
+        first,
+        second,
+        draws,
+    )
+
+
+def posed(fn):
+    def of(*args):
+        fit = fn(*moved(*args))
+        return torch.cat((fit.T_1_from_0.R.flatten(1), fit.T_1_from_0.t), 1)
+
+    return of
+
+
+def recovered(*args):
+    """Everything behind the tracker: the recovered part of the map."""
+    samples, tracks, first, second, draws = moved(*args)
+    fit = pose.pnp_ransac(samples, tracks, first, second, draws)
+    estimate = triangulate.two_view(samples, tracks, fit, first, second, min_parallax_deg=None)
+    return merge(samples.replace(xyz=samples.xyz * torch.nan), estimate).depth
+
+
+WHOLE = {
+    "pnp_ransac": posed(pose.pnp_ransac),
+    "map_pose": posed(partial(pose.map_pose, turn_sigma=0.0, isotropic=1.0)),
+    "pose, two_view, merge": recovered,
+}
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_forward_reverse_and_finite_differences_agree(name):
+    """With respect to near points, tracks and intrinsics of both views at once, for a batch of pairs under vmap."""
+    arguments = exact(2)
+
+    def one(q, args):
+        return WHOLE[name](q, *tensor_map(lambda v: v[None], args))[0]
+
+    zero = torch.zeros(5, dtype=D)
+    found = one(zero, tensor_map(lambda v: v[0], arguments))
+    assert found.isfinite().all() and (found != 0).sum() >= 10
+    reverse = vmap(jacrev(one), in_dims=(None, 0))(zero, arguments)
+    forward = vmap(jacfwd(one), in_dims=(None, 0))(zero, arguments)
+    torch.testing.assert_close(reverse, forward, rtol=1e-6, atol=1e-8)
+    h = 1e-6
+    for b in range(2):
+        args = tensor_map(lambda v, b=b: v[b], arguments)
+        numeric = torch.stack([(one(h * e, args) - one(-h * e, args)) / (2 * h) for e in torch.eye(5, dtype=D)], -1)
+        assert numeric.abs().max() > 1e-3
+        torch.testing.assert_close(reverse[b], numeric, rtol=1e-3, atol=1e-4 * float(numeric.abs().max()))
+
+
+def test_the_tracker_in_forward_and_reverse_mode():
+    """Forward mode differentiates the search, reverse mode its last step, whose Hessian is an approximation."""
+    image_0, image_1, uv = shifted(2, 6, D)
+    ramp = torch.linspace(0, 1, image_1.shape[-1], dtype=D)
+
+    fine = partial(track.lucas_kanade, epsilon_px=1e-9, iterations=60)
+
+    def of(light, first, second, at):
+        return fine(first[None], (second * (1 + light * ramp))[None], at[None]).uv_1[0]
+
+    zero, h = torch.zeros((), dtype=D), 1e-5
+    reverse = vmap(jacrev(of), in_dims=(None, 0, 0, 0))(zero, image_0, image_1, uv)
+    forward = vmap(jacfwd(of), in_dims=(None, 0, 0, 0))(zero, image_0, image_1, uv)
+    ahead, back = (fine(image_0, image_1 * (1 + light * ramp), uv).uv_1 for light in (h, -h))
+    numeric = (ahead - back) / (2 * h)
+    assert float(numeric.abs().max()) > 0.01
+    torch.testing.assert_close(forward, numeric, rtol=1e-2, atol=1e-3)
+    cosine = torch.nn.functional.cosine_similarity(reverse.flatten(), numeric.flatten(), dim=0)
+    assert float(cosine) > 0.9
+
+
+def test_derivatives_of_the_whole_pair_to_intrinsics_in_both_modes(pair, trace):
+    """The map method from its images on, three parameters of one camera shared by both views."""
+    frame, other = pair
+
+    def of(p):
+        camera = Camera(frame.camera.f * p[:1].exp(), frame.camera.c + p[1:] * frame.camera.f)
+        seen = [f.replace(camera=camera, depth_camera=None) for f in (frame, other)]
+        return METHODS["map"](*seen, n=N, track=lambda *_, **__: trace["tracks"]).depth.nan_to_num()
+
+    zero = torch.zeros(3, dtype=D)
+    forward, reverse = jacfwd(of)(zero), jacrev(of, chunk_size=64)(zero)
+    assert forward.isfinite().all() and forward.abs().max() > 1
+    # Forward mode sees through no_grad into the searches, reverse mode their last step: equal but for small terms.
+    assert float((forward - reverse).norm() / reverse.norm()) < 0.05
+
+
+# ------------------------------------------------------------------------------------------ where gradients go
+
+
+@pytest.mark.parametrize("name", ["extend", "map"])
+def test_gradients_reach_everything_a_pair_is_made_of(pair, name):
+    parts = {
+        "image 0": pair[0].image,
+        "image 1": pair[1].image,
+        "near depth": pair[0].depth,
+        "f 0": pair[0].camera.f,
+        "c 0": pair[0].camera.c,
+        "f 1": pair[1].camera.f,
+        "c 1": pair[1].camera.c,
+        "depth f": pair[0].camera.f,
+        "depth c": pair[0].camera.c,
+    }
+    given = {k: v.detach().clone().requires_grad_() for k, v in parts.items()}
+    image_0, image_1, depth, f_0, c_0, f_1, c_1, *own = given.values()
+    first = pair[0].replace(image=image_0, depth=depth, camera=Camera(f_0, c_0), depth_camera=Camera(*own))
+    estimate = METHODS["map" if name == "map" else "paper"](
+        first, pair[1].replace(image=image_1, camera=Camera(f_1, c_1)), n=N
+    )
+    far = estimate.keep & (estimate.depth > 2)
+    torch.where(far, estimate.depth, 0).sum().backward()
+    for k, v in given.items():
+        if k.startswith("depth "):  # they only choose the pixel that is read
+            assert v.grad is None or not v.grad.any(), k
+        else:
+            assert v.grad is not None and v.grad.isfinite().all() and v.grad.abs().max() > 0, k
+
+
+@pytest.mark.parametrize("name", [*CHEAP, *MORE, *LARGE])
+def test_silent_points_pass_no_nan(stages, name):
+    """Half of the points are spoilt (no number, no track, no return): gradients stay finite everywhere."""
+    fn, args = stages[name]
+
+    def spoil(x):
+        if not (isinstance(x, torch.Tensor) and x.dim() > 1 and x.shape[1] == N):
+            return x
+        odd = (torch.arange(N) % 2 == 1).view(1, N, *[1] * (x.dim() - 2))
+        if x.dtype == torch.bool:
+            return x & ~odd
+        return torch.where(odd, torch.nan, x) if x.is_floating_point() else x
+
+    spoilt = pytree.tree_map(spoil, args)
+    if name in ("extend", "map"):
+        hollow = args[0].depth.clone()
+        hollow[..., ::2] = 0
+        spoilt = (args[0].replace(depth=hollow), args[1])
+    _, gradients = with_gradients(fn, spoilt)
+    some = [g for g in gradients if g is not None]
+    assert some and all(g.isfinite().all() for g in some) and any(g.any() for g in some)
+
+
+@pytest.mark.parametrize("name", ["paper", "map"])
+def test_a_pair_without_any_answer_has_finite_gradients(pair, name):
+    """No return, no pose: silence is no NaN to whoever learns from many pairs at once."""
+    depth = torch.zeros_like(pair[0].depth).requires_grad_()
+    image = pair[0].image.clone().requires_grad_()
+    estimate = METHODS[name](pair[0].replace(depth=depth, image=image), pair[1], n=64)
+    assert not estimate.keep.any()
+    total = sum(torch.where(x.isfinite(), x, 0).sum() for x in leaves(estimate) if x.requires_grad)
+    for x in torch.autograd.grad(total, (depth, image), allow_unused=True):
+        assert x is None or x.isfinite().all()
+
+
+# ------------------------------------------------------------------------------------------------ half precision
+
+
+@pytest.fixture(scope="module")
+def single():
+    """Frames in single precision and what each method says about them."""
+    frames = [f.to(torch.float32) for f in views(room(), 0, 16)]
+    return frames, {name: METHODS[name](*frames, n=N) for name in ("paper", "map")}
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+@pytest.mark.parametrize(
+    ("name", "what"), [("map", "image"), ("map", "depth"), ("map", "camera"), ("map", "all"), ("paper", "all")]
+)
+def test_half_precision_is_lifted_where_it_is_read(single, name, what, dtype):
+    change = {
+        "image": lambda f: f.replace(image=f.image.to(dtype)),
+        "depth": lambda f: f.replace(depth=f.depth.to(dtype)),
+        "camera": lambda f: f.replace(camera=f.camera.to(dtype), depth_camera=f.depth_camera.to(dtype)),
+        "all": lambda f: f.to(dtype),
+    }[what]
+    frames, known = single
+    trace = {}
+    half = METHODS[name](*map(change, frames), n=N, trace=trace)
+    for record in (half, trace["samples"], trace["tracks"], trace["fit"]):
+        assert all(x.dtype == torch.float32 for x in leaves(record) if x.is_floating_point())
+    both = half.keep & known[name].keep
+    assert int(both.sum()) > 0.95 * int(known[name].keep.sum()) and half.depth[half.keep].isfinite().all()
+    error = ((half.depth - known[name].depth).abs() / known[name].depth)[both]
+    assert float(error.median()) < (0.004 if dtype == torch.bfloat16 else 0.002)
+
+
+def test_a_window_of_half_precision():
+    anchor, *others = (f.to(torch.bfloat16) for f in views(room(), 0, 8, 16))
+    estimate = extend_window(anchor, tree.stack(others), n=N)
+    assert estimate.depth.dtype == torch.float32 and int(estimate.keep.sum()) > 20
+    assert estimate.depth[estimate.keep].isfinite().all()
+
+
+# --------------------------------------------------------------------------------------------- what they recover
+
+
+class Task:
+    """Far depth of a few pairs against held-back truth; tracks do not depend on what is looked for, so they stay."""
+
+    def __init__(self, n=512):
+        pairs = [views(room(seed, hw=(180, 240)), 0, 16, dtype=torch.float32) for seed in (2, 3)]
+        whole = tree.collate([room(seed, hw=(180, 240))[0] for seed in (2, 3)])
+        self.near, self.other = (tree.collate(frames) for frames in zip(*pairs, strict=True))
+        self.method = partial(METHODS["map"], n=n, pose=partial(pose.map_pose, turn_sigma=0.0))  # a global shutter
+        trace = {}
+        self.method(self.near, self.other, trace=trace)
+        self.tracks, self.samples = trace["tracks"], trace["samples"]
+        truth = holdout.truth_at(whole, self.samples.uv)
+        self.far = holdout.candidates(self.samples, truth, 2.0).ok
+        self.here = holdout.candidates(self.samples, truth, 0.0).ok & ~self.far
+        self.truth = torch.where(self.far, truth.depth, 1.0)
+        assert int(self.far.sum()) > 100
+
+    def ask(self, camera, depth):
+        near = self.near.replace(camera=camera, depth=depth, depth_camera=None)
+        return self.method(near, self.other.replace(camera=camera), track=lambda *_, **__: self.tracks)
+
+
+def fit(residual, start, *, scale=0.03, prior=0.0, steps=25):
+    """Levenberg–Marquardt on a robust cost (Geman–McClure); residual(p) → (residuals, (who counts, residuals))."""
+
+    def cost(p):
+        r, (counts, _) = residual(p)
+        return float(torch.where(counts, r * r / (r * r + scale * scale), 1.0).sum() + prior * p.square().sum())
+
+    p, damping, least = start, 1e-2, cost(start)
+    for _ in range(steps):
+        J, (counts, r) = jacfwd(residual, has_aux=True)(p)
+        w = counts / (1 + (r / scale) ** 2) ** 2 / scale**2
+        H = (J.T * w) @ J + prior * torch.eye(len(p), dtype=p.dtype)
+        g = (J.T * w) @ r + prior * p
+        for _ in range(6):
+            proposal = p - torch.linalg.solve(H + damping * torch.diag(H.diagonal()), g)
+            found = cost(proposal)
+            if found < least:
+                break
+            damping *= 10
+        else:
+            return p
+        converged = least - found < 1e-6 * least
+        p, least, damping = proposal, found, damping / 10
+        if converged:
+            return p
+    return p
+
+
+@pytest.fixture(scope="module")
+def task():
+    return Task()
+
+
+def relative(estimate, truth, counts):
+    """Logarithm of answered over true depth, 0 where it does not count; with who counts."""
+    counts = estimate.keep.detach() & counts
+    r = torch.where(counts, estimate.depth, truth).log() - truth.log()
+    return r.flatten(), (counts.flatten(), r.detach().flatten())
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_intrinsics_five_per_cent_wrong_are_recovered_from_far_depth(task, sign):
+    f, c = task.near.camera.f, task.near.camera.c
+
+    def camera(p):
+        return Camera(f * p[:1].exp(), c + p[1:] * f)
+
+    def residual(p):
+        return relative(task.ask(camera(p), task.near.depth), task.truth, task.far)
+
+    off = 0.05 * c[0] / f[0]
+    start = torch.stack((torch.tensor(math.log(1 + sign * 0.05)), sign * off[0], -off[1]))
+    before = residual(start)[1]
+    p = fit(residual, start)
+    after = residual(p)[1]
+    assert abs(float(p[0].exp() - 1)) < 0.01, "focal length within a fifth of its error"
+    assert float((p[1:] * f[0]).abs().max()) < 2.5, "principal point within 2.5 px, from 6 and 4.5"
+    median = [float(r[counts].abs().median()) for counts, r in (before, after)]
+    assert median[1] < 0.2 * median[0] and median[1] < 0.01
+
+
+def test_a_wrong_scale_of_near_depth_is_recovered_pixel_by_pixel(task):
+    """The sensor lies by a smooth field, 1 % to 11 %; far truth fixes its mean, near triangulation its shape."""
+    hw = task.near.depth.shape[-2:]
+
+    def field(theta):
+        coarse = theta.view(1, 1, 3, 4)
+        return torch.nn.functional.interpolate(coarse, size=hw, mode="bilinear", align_corners=True)[:, 0]
+
+    true = torch.linspace(0.01, 0.11, 12)
+    lying = task.near.depth * field(true).exp()
+
+    def residual(theta):
+        depth = lying * (-field(theta)).exp()
+        estimate = task.ask(task.near.camera, depth)
+        told, _ = nearest(depth, task.samples.uv)
+        return relative(
+            estimate, torch.where(task.far, task.truth, torch.where(task.here, told, 1.0)), task.far | task.here
+        )
+
+    def left(theta):
+        wrong, _ = nearest((field(true) - field(theta)).expand(len(lying), -1, -1), task.samples.uv)
+        return float(wrong[task.here].abs().median())
+
+    start = torch.zeros(12)
+    theta = fit(residual, start, prior=1.0)
+    assert left(start) > 0.04
+    assert left(theta) < 0.015
