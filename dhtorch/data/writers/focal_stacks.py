@@ -22,7 +22,8 @@ def write_fod500(root: Path, stacks: Mapping[int, FocalStack]) -> None:
         for k, image in enumerate(stack.images[0]):
             write(root / f"{index:06d}_{k:02d}All.tif", rgb_tiff(image.permute(1, 2, 0).numpy()))
         if stack.depth is not None:
-            plane, picture = stack.depth[0].numpy().astype(np.float16), io.BytesIO()
+            # The library takes memory as it lies, whatever the strides say.
+            plane, picture = np.ascontiguousarray(stack.depth[0].numpy(), np.float16), io.BytesIO()
             header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
             exr.File(header, dict.fromkeys("RGB", plane)).write(picture)
             write(root / f"{index:06d}Dpt.exr", picture.getvalue())
@@ -57,7 +58,7 @@ def write_light_field(
 ) -> None:
     """``LightField/<scene>/LF_<n>.npy`` and ``DepthRegistered/<scene>/DEPTH_<n>.png`` (16 bits, mm)."""
     content = io.BytesIO()
-    np.save(content, light_field.numpy())
+    np.save(content, light_field.contiguous().numpy())
     write(root / "LightField" / scene / f"LF_{number:04d}.npy", content.getvalue())
     if depth is not None:
         write(root / "DepthRegistered" / scene / f"DEPTH_{number:04d}.png", png(depth_codes(depth, 1000.0)))

@@ -105,7 +105,8 @@ def write_npz_pair(root: Path, left: Frame, right: Frame, *, name: str = "scene"
     baseline, doffs = _rectification(left, right)
     write(root / f"{name}_left.png", png(pixels(left)))
     write(root / f"{name}_right.png", png(pixels(right)))
-    np.savez_compressed(root / f"{name}_disp.npz", _disparity(left, baseline, doffs).astype(np.float32))
+    disparity = np.ascontiguousarray(_disparity(left, baseline, doffs), np.float32)
+    np.savez_compressed(root / f"{name}_disp.npz", disparity)
     meta = {"K_left": K_matrix(left.camera).tolist(), "K_right": K_matrix(right.camera).tolist()}
     write(root / "meta.json", json.dumps(meta | {"baseline_m": baseline, "doffs": doffs}))
 

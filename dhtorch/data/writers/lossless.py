@@ -12,9 +12,8 @@ import numpy as np
 from dhtorch.data.files import need
 
 _H264 = {"qp": "0", "preset": "ultrafast"}
-_HEVC = {"preset": "ultrafast", "x265-params": "lossless=1:log-level=none:pools=none:frame-threads=1"}
-#: On a busy machine the muxer has once refused a packet of the 12-bit encoder that it takes the next time.
-_ATTEMPTS = 3
+# No B-frames: with them the muxer refuses films of two pictures, at some sizes always and at others now and then.
+_HEVC = {"preset": "ultrafast", "x265-params": "lossless=1:bframes=0:log-level=none:pools=none:frame-threads=1"}
 
 #: Pixel format → encoder and options that lose nothing.
 _LOSSLESS: dict[str, tuple[str, dict[str, str]]] = {
@@ -42,21 +41,8 @@ def write_lossless(
     encoder, lossless = _LOSSLESS[pixels]
     chosen = dict(lossless if options is None else options)
     file.parent.mkdir(parents=True, exist_ok=True)
-    for attempt in range(_ATTEMPTS):
-        try:
-            _encode(file, pictures, pixels, rate, encoder, chosen)
-            return
-        except av.error.PatchWelcomeError:
-            if attempt == _ATTEMPTS - 1:
-                raise
-
-
-def _encode(
-    file: Path, pictures: Sequence[np.ndarray], pixels: str, rate: Fraction, encoder: str, options: dict[str, str]
-) -> None:
-    av = need("av")
     with av.open(str(file), "w", format="mp4") as container:
-        stream = container.add_stream(encoder, rate=rate, options=options)
+        stream = container.add_stream(encoder, rate=rate, options=chosen)
         stream.pix_fmt = pixels
         stream.height, stream.width = pictures[0].shape[:2]
         stream.codec_context.thread_count = 1

@@ -25,8 +25,9 @@ def pixels(frame: Frame) -> np.ndarray:
 
 
 def depth_codes(depth: Tensor, units_per_metre: float) -> np.ndarray:
-    """(h, w) uint16."""
-    return (depth[0].double() * units_per_metre).round().clamp(0, 65534).numpy().astype(np.uint16)
+    """(h, w) uint16, row after row in memory."""
+    codes = (depth[0].double() * units_per_metre).round().clamp(0, 65534)
+    return np.ascontiguousarray(codes.numpy(), np.uint16)
 
 
 def png(picture: np.ndarray) -> bytes:
@@ -34,7 +35,7 @@ def png(picture: np.ndarray) -> bytes:
     h, w = picture.shape[:2]
     bits = 8 * picture.dtype.itemsize
     colour = 2 if picture.ndim == 3 and picture.shape[2] == 3 else 0
-    rows = picture.astype(picture.dtype.newbyteorder(">")).reshape(h, -1).view(np.uint8)
+    rows = picture.astype(picture.dtype.newbyteorder(">"), order="C").reshape(h, -1).view(np.uint8)
     raw = np.concatenate((np.zeros((h, 1), np.uint8), rows), 1).tobytes()
     chunks = (b"IHDR" + struct.pack(">IIBBBBB", w, h, bits, colour, 0, 0, 0), b"IDAT" + zlib.compress(raw, 1), b"IEND")
     framed = (struct.pack(">I", len(c) - 4) + c + struct.pack(">I", zlib.crc32(c)) for c in chunks)

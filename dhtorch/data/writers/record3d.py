@@ -75,7 +75,8 @@ def write_record3d_exr(
         write(folder / "rgb" / f"{i}.jpg", _jpeg(pixels(frame)))
         header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
         picture = io.BytesIO()
-        exr.File(header, {channel: frame.depth[0].numpy().astype(dtype)}).write(picture)
+        # The library takes memory as it lies, whatever the strides say.
+        exr.File(header, {channel: np.ascontiguousarray(frame.depth[0].numpy(), dtype)}).write(picture)
         write(folder / "depth" / f"{i}.exr", picture.getvalue())
     meta = _metadata(frames, fps, None)
     del meta["perFrameIntrinsicCoeffs"]
