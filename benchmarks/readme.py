@@ -93,22 +93,37 @@ def truths() -> str:
     return table(["truth test", "candidates", "coverage", "median error", "p90"], rows)
 
 
+def timings(file: str) -> list[dict[str, Any]]:
+    """Rows of a benchmark's result file."""
+    rows: list[dict[str, Any]] = json.loads((RESULTS / f"{file}.json").read_text())
+    return rows
+
+
+def bars() -> str:
+    """Each speed that has a bar, one thread, beside that bar."""
+    rows = []
+    for file, name, mode, bar, words in SPEED_BARS:
+        found = [r for r in timings(file) if (r["name"], r["mode"], r["threads"], r["bar"]) == (name, mode, 1, True)]
+        (r,) = found
+        errors = " / ".join("–" if r[k] is None else f"{r[k]:.3g}" for k in ("ours_error", "peer_error"))
+        cells = [words if mode == "eager" else f"{words}, {mode}", f"{r['ours_ms']:.2f}", f"{r['peer_ms']:.2f}"]
+        rows.append([*cells, f"{r['ratio']:.2f}", f"≤ {bar:g}", errors])
+    return table(["", "ours, ms", "peer, ms", "ratio", "bar", "errors, ours / peer"], rows)
+
+
 def speed() -> str:
-    """Milliseconds per pair by stage."""
-    rows = json.loads((RESULTS / "pair.json").read_text())
+    """Milliseconds per pair by stage, one thread."""
     shown = []
-    for threads in (1, 2):
-        for batch in (1, 8):
-            mine = {
-                r["name"].partition(".")[2] or "whole pair": r
-                for r in rows
-                if (r["threads"], r["batch"]) == (threads, batch) and r["name"].startswith("pair_paper_")
-            }
-            for stage in ("whole pair", "track", "pose", "triangulate"):
-                r = mine[stage]
-                cells = [f"{threads} thread{'s' * (threads > 1)}, B = {batch}, {stage}"]
-                shown.append([*cells, f"{r['ours_ms']:.1f}", f"{r['peer_ms']:.1f}", f"{r['ratio']:.2f}"])
-    return table(["", "`paper`, ms", "`opencv`, ms", "ratio"], shown)
+    for batch in (1, 8):
+        for stage in ("", ".track", ".pose", ".triangulate"):
+            cells = [f"B = {batch}, {stage[1:] or 'whole pair'}"]
+            for method in ("paper", "map"):
+                (r,) = (
+                    r for r in timings("pair") if (r["name"], r["threads"]) == (f"pair_{method}_b{batch}{stage}", 1)
+                )
+                cells += [f"{r['ours_ms']:.1f}", f"{r['ratio']:.2f}"]
+            shown.append([*cells, f"{r['peer_ms']:.1f}"])
+    return table(["one thread", "`paper`, ms", "ratio", "`map`, ms", "ratio", "`opencv`, ms"], shown)
 
 
 def comparison() -> str:
@@ -135,6 +150,21 @@ def by_scene() -> str:
         ]
         rows.append([*cells, " / ".join(map(number, ratios))])
     head = ["scene", "candidates", "coverage", "median error", "ratio at equal coverage, `map` / `window`"]
+    return table(head, rows)
+
+
+def stress() -> str:
+    """Coverage and median error in rooms with one thing wrong, and the ratio at equal coverage."""
+    rows = []
+    for scene, methods in scenes("stress", "full").items():
+        cells = [scene, str(methods["paper"]["n_candidates"])]
+        for key in ("coverage", "median_rel"):
+            cells.append(" / ".join(percent(methods[m].get(key)) for m in ("paper", "map", "window")))
+        ratios = [
+            methods[m].get("against_paper", {}).get("median_rel_ratio_at_equal_coverage") for m in ("map", "window")
+        ]
+        rows.append([*cells, " / ".join(map(number, ratios))])
+    head = ["room", "candidates", "coverage, `paper` / `map` / `window`", "median error", "ratio at equal coverage"]
     return table(head, rows)
 
 
@@ -189,7 +219,24 @@ def picture(path: Path) -> None:
     figure.savefig(path, dpi=80, bbox_inches="tight")
 
 
-TABLES = {"room": room, "shared": shared, "truths": truths, "speed": speed, "comparison": comparison}
+#: File, row, mode and bar of every speed that has one, in words.
+SPEED_BARS = (
+    ("frontend", "frontend_224", "eager", 1.1, "front end, 224×224, n = 1024"),
+    ("frontend", "frontend_224", "compiled", 0.35, "front end, 224×224, n = 1024"),
+    ("frontend", "frontend_1440", "eager", 0.08, "front end, 1440×1920"),
+    ("lk", "lk_w21_n2048", "eager", 1.1, "search there, n = 2048"),
+    ("lk", "lk_w21_n512_b8", "eager", 1.5, "search there, n = 512, B = 8"),
+    ("lk", "lk_w21_n512_b8", "cached", 1.1, "search there, n = 512, B = 8"),
+    ("lk", "lk_fb_w21_n2048", "eager", 0.7, "search there and back, n = 2048"),
+    ("pnp", "pnp_n500_b16", "eager", 1.0, "pose, 500 points, B = 16"),
+    ("pnp", "pnp_n500_b1", "eager", 4.0, "pose, 500 points, B = 1"),
+    ("pnp", "pnp_n500_b1", "compiled", 2.5, "pose, 500 points, B = 1"),
+    ("triangulate", "triangulate_100k", "eager", 0.03, "triangulation, 100,000 points"),
+    ("pair", "pair_paper_b8", "eager", 1.0, "`paper`, whole pair, B = 8"),
+    ("pair", "pair_map_b8", "eager", 1.6, "`map`, whole pair, B = 8"),
+)
+
+TABLES = {"room": room, "shared": shared, "truths": truths, "speed": speed, "comparison": comparison, "bars": bars}
 TABLES |= {"comparison scenes": by_scene}
 
 #: Numbers of the method comparison in words, and on which side of its bar each belongs.
@@ -211,8 +258,11 @@ ASKED = (
     *("hole_census", "device_pose", "motion", "ablation", "latency"),
     *("room_range_split", "room_gate_ablation", "room_device_pose", "room_real_holes", "paths_motion"),
 )
+PIPELINES = ("rh20t_probe", "vo_probe", "learned_score")
 NEGATIVE = ("helix_correlation", "defocus", "focus_stack", "defocus_fusion", "icp", "hole_attention")
 TABLES |= {"verdicts": partial(verdicts, ASKED), "negative": partial(verdicts, NEGATIVE)}
+TABLES |= {"pipelines": partial(verdicts, PIPELINES), "stress": stress}
+TABLES |= {"map": partial(verdicts, ("global_map",))}
 
 
 def in_layout(name: str) -> str:
