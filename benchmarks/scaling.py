@@ -2,9 +2,10 @@
 
     python benchmarks/scaling.py --json benchmarks/results/scaling.json
 
-Each series doubles one size, the others stay. Growth exponents are slopes of a line through (log size, log time or
-log memory): 1 is proportional, 0 constant. Sizes of pictures are in pixels. Peak memory is what a process of its own
-needs above its inputs. The last row is the largest batch that is promised to fit: 32 pairs with 4096 samples.
+Each series doubles one size, the others stay; hypotheses are those of seat 5 alone, 16 pairs at once. Growth exponents
+are slopes of a line through (log size, log time or log memory): 1 is proportional, 0 constant. Sizes of pictures are in
+pixels. Peak memory is what a process of its own needs above its inputs. The last rows are the largest batch that is
+promised to fit: 32 pairs with 4096 samples.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from functools import partial
 from typing import Any
 
 import harness
+import pnp
 import torch
 from torch.nn.functional import interpolate
 
@@ -24,8 +26,9 @@ from dhtorch.data.synthetic import SyntheticRoom
 from dhtorch.evaluate import holdout
 from dhtorch.experiments.memory import peak_mib
 from dhtorch.geometry import camera as cam
-from dhtorch.pair import METHODS
+from dhtorch.pair import METHODS, uniform_draws
 from dhtorch.records import Frame
+from dhtorch.stages.pose import pnp_ransac
 from dhtorch.window import extend_window
 
 #: The largest exponent that counts as proportional.
@@ -63,7 +66,9 @@ def series(full: bool) -> dict[str, list[tuple[int, Callable[[], Any]]]]:
         found[f"{method}.samples"] = [(512 << k, partial(pair, n=512 << k)) for k in doublings]
         pairs = [partial(METHODS[method], repeated(anchor, 1 << k), repeated(other, 1 << k)) for k in doublings]
         found[f"{method}.pairs"] = [(1 << k, partial(p, n=512)) for k, p in zip(doublings, pairs, strict=True)]
-        found[f"{method}.hypotheses"] = [(64 << k, partial(pair, n=512, hypotheses=64 << k)) for k in doublings]
+    samples, tracks, camera, _ = pnp.scene(16, 500, 0.3, seed=1)
+    seat = partial(pnp_ransac, samples, tracks, camera, camera)
+    found["pose.hypotheses"] = [(128 << k, partial(seat, uniform_draws(0, 16, 128 << k))) for k in doublings]
     sizes = [(120, 160), (240, 160), (240, 320), (480, 320), (480, 640)][-len(doublings) :]
     shown = [(hw, partial(METHODS["paper"], resized(anchor, hw), resized(other, hw), n=512)) for hw in sizes]
     found["paper.pixels"] = [(hw[0] * hw[1], call) for hw, call in shown]
@@ -85,16 +90,18 @@ def measure(name: str, calls: list[tuple[int, Callable[[], Any]]], options: Any)
     times = harness.in_turn(
         [call for _, call in calls], repeats=options.repeats, warm_up=1, clock=options.clock, device=options.device
     )
-    memory = [peak_mib(call) or math.nan for _, call in calls]
-    grows = [exponent(sizes, [statistics.median(t) for t in times]), exponent(sizes, memory)]
-    said = ", ".join(
-        f"{size}: {statistics.median(t):.1f} ms {m:.0f} MiB" for size, t, m in zip(sizes, times, memory, strict=True)
-    )
+    # Of the smallest and the largest size: each costs a process that imports everything anew.
+    memory = [peak_mib(calls[k][1]) or math.nan for k in (0, -1)]
+    middles = [statistics.median(t) for t in times]
+    grows = [exponent(sizes, middles), exponent([sizes[0], sizes[-1]], memory)]
+    said = ", ".join(f"{size}: {ms:.1f} ms" for size, ms in zip(sizes, middles, strict=True))
     verdict = "" if max(grows) <= MOST else f"   above {MOST}!"
-    print(f"{name:18} time ^ {grows[0]:.2f}, memory ^ {grows[1]:.2f}   ({said}){verdict}")
+    print(f"{name:18} time ^ {grows[0]:.2f}, memory ^ {grows[1]:.2f}{verdict}", flush=True)
+    print(f"{'':18} {said}; {memory[0]:.0f} to {memory[1]:.0f} MiB", flush=True)
     rows = []
     for k in range(1, len(sizes)):
-        more: dict[str, Any] = {"n": sizes[k], "bar": k == len(sizes) - 1, "peak_mib": memory[k]}
+        last = k == len(sizes) - 1
+        more: dict[str, Any] = {"n": sizes[k], "bar": last, "peak_mib": memory[1] if last else None}
         more |= {"time_exponent": grows[0], "memory_exponent": grows[1]}
         rows.append(harness.row(f"scaling.{name}", times[k], "half_the_size", times[k - 1], **more))
     return rows
