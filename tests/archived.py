@@ -251,6 +251,48 @@ def ablation():
     return result("ablation", rows_of(variants))
 
 
+def screened(experiment, variants, metrics, extra=None):
+    """One item a scene, as experiments write them whose estimator is no method."""
+    rng, rows = random.Random(0), []
+    for scene in SCENES:
+        for variant in variants:
+            base = {"scene": scene, "method": variant, "truth": "full", "n_candidates": 3000}
+            found = {m: rng.uniform(-0.2, 0.9) for m in metrics}
+            rows += [{**base, **found, "pair": [0, 0]}, {**base, **found, "pair": None, "role": ROLES.get(scene)}]
+    return result(experiment, rows, summarise(rows, variants, ["full"]) | (extra or {}))
+
+
+def icp():
+    return screened("icp", ("good", "good + icp points", "none"), ("n_voxels", "drift_deg", "drift_rel"))
+
+
+def hole_attention():
+    return screened("hole_attention", ("centre", "attention", "random"), ("hole_rate", "rise", "cluster_share"))
+
+
+def helix_correlation():
+    return screened("helix_correlation", ("own_arm", "flow"), ("corr", "rank_corr", "coverage"))
+
+
+def defocus():
+    variants = ("oracle_side", "by_height", "all_beyond", "height_alone", "natural")
+    walls = {"blank_wall.soft_paint_px": 2.4, "two_sides.near_px": 1.66, "two_sides.true_px": 1.69}
+    extra = {name: {"value": v, "low": None, "high": None, "n": 1, "unit": "1"} for name, v in walls.items()}
+    return screened("defocus", variants, ("rho_abs", "corr", "rank_corr", "side_right"), extra)
+
+
+def focus_stack():
+    variants = [c + m for c in ("clean", "noisy", "light_field", "no_focus") for m in ("", ", variance")]
+    return screened(
+        "focus_stack", variants, ("rank_corr", "corr", "gated_corr", "abs_corr", "gated_abs_corr", "flip_share")
+    )
+
+
+def defocus_fusion():
+    variants = ("bilinear", "guided_filter", "defocus_guided")
+    return screened("defocus_fusion", variants, ("corr", "mean_rel", "mean_rel_ratio", "edge_mean_rel", "rmse_m"))
+
+
 def unknown():
     return result("tomorrow", rows_of({"a": (0.06, 0.6), "b": (0.07, 0.5), "c": (0.05, 0.4)}))
 
@@ -270,6 +312,12 @@ ALL = (
     motion,
     latency,
     learned,
+    helix_correlation,
+    icp,
+    hole_attention,
+    defocus,
+    focus_stack,
+    defocus_fusion,
     ablation,
     unknown,
     pair,

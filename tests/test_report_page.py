@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from dhtorch import archive, report
 from dhtorch.codes import Gate, Source
-from dhtorch.report import curves, layouts, page, plots, published, svg, text
+from dhtorch.report import cells, curves, layouts, page, plots, published, svg, text
 from dhtorch.report.markup import Markup, escape, tag
 from dhtorch.report.reading import flatten, scene_rows
 from dhtorch.report.tables import COLUMNS, every_number
@@ -200,6 +200,12 @@ SOURCES = {
     "motion": (published.MOTION,),
     "latency": (published.LATENCY,),
     "learned": (published.LEARNED,),
+    "helix_correlation": (published.HELIX,),
+    "icp": (published.ICP,),
+    "hole_attention": (published.ATTENTION,),
+    "defocus": (published.DEFOCUS,),
+    "focus_stack": (published.FOCUS_STACK,),
+    "defocus_fusion": (published.FUSION,),
 }
 
 
@@ -239,6 +245,48 @@ def test_ours_stands_beside_the_papers_line():
         "parallax gate off",
         "reprojection gate off",
     ]
+
+
+def test_negative_results_stand_beside_the_papers_figure():
+    """Ours from the committed files, not copied here: the cell beside the paper's is the summary's number."""
+
+    def beside(name, label, heading, metric):
+        result = archive.read(REPO / f"benchmarks/results/{name}.json")
+        table = layouts.in_layout(result)[0]
+        (row,) = [row for row in table.rows if row[0] == label]
+        at = table.flat_head().index(f"{heading}, ours")
+        assert table.flat_head()[at + 1] == f"{heading}, published"
+        assert row[at] == cells.show(result["summary"][metric]["value"], metric)
+        return row[at + 1]
+
+    oracle = "side from an oracle"
+    assert beside("defocus", oracle, "corr", "oracle_side.corr") == "0.66"
+    assert beside("defocus", oracle, "|ρ| of blur", "oracle_side.rho_abs") == "0.22"
+    assert beside("defocus", "side by height in the picture", "corr", "by_height.corr") == "0.06"
+    assert beside("focus_stack", "clean", "Spearman", "clean.rank_corr") == "0.69"
+    field = "optics of a light field"
+    assert beside("focus_stack", field, "sign flipped", "light_field.flip_share") == "∼1/5"
+    assert beside("focus_stack", field, "|corr|, surest quarter", "light_field.gated_abs_corr") == "0.21"
+    assert beside("defocus_fusion", "bilinear", "corr", "bilinear.corr") == "0.82–0.99"
+
+
+def test_a_stack_of_one_measure_and_a_sweep_have_the_tables_that_they_can_have():
+    first, other = layouts.in_layout(archived.focus_stack())
+    assert [row[0] for row in first.rows] == ["clean", "noisy", "optics of a light field", "nothing blurred"]
+    assert {row[0].split(", ")[1] for row in other.rows} == {"variance"} and not other.quoted
+    (swept,) = layouts.in_layout(archived.screened("focus_stack", ("given",), ("order_corr", "halves_corr")))
+    assert "Sweeps" in swept.title and len(swept.rows) == 1 and not swept.note
+    (given_,) = layouts.in_layout(archived.screened("focus_stack", ("given",), ("rank_corr", "gated_corr")))
+    assert [row[0] for row in given_.rows] == [
+        "given",
+        "published: clean synthetic",
+        "published: real light fields",
+    ]
+
+
+def test_what_one_picture_cannot_tell_apart_has_a_table_of_its_own():
+    rows = {row[0]: row[1:] for row in layouts.in_layout(archived.defocus())[1].rows}
+    assert rows["in focus, soft paint"] == ["2.40", "0.00"] and rows["nearer than the focus"] == ["1.66", "1.69"]
 
 
 def test_what_was_not_measured_says_why():

@@ -56,10 +56,25 @@ HEADS = {
     "peak_mib": "peak memory",
     "scale": "scale from",
     "metric": "metric?",
+    "rho_abs": "|ρ| of blur",
+    "rank_corr": "Spearman",
+    "abs_corr": "|corr|",
+    "gated_corr": "corr, surest quarter",
+    "gated_abs_corr": "|corr|, surest quarter",
+    "flip_share": "sign flipped",
+    "order_corr": "order of pictures",
+    "halves_corr": "odd against even pictures",
+    "mean_rel": "mean",
+    "mean_rel_ratio": "mean error ratio",
+    "edge_mean_rel": "mean at edges",
+    "rmse_m": "RMSE m",
+    "changed_rel": "changed",
 }
 #: Metric → style, where its name does not give it away (see :func:`style`).
 STYLES = {"coverage": "percent", "pnp_success": "percent", "within_sigma": "percent", "within_2sigma": "percent"}
-STYLES |= {"corr": "ratio", "ece": "fine", "ece_equal_mass": "fine", "ece_pooled": "fine", "monotonicity": "fine"}
+STYLES |= dict.fromkeys(("rho_abs", "corr", "rank_corr", "abs_corr", "gated_corr", "gated_abs_corr"), "ratio")
+STYLES |= {"order_corr": "ratio", "halves_corr": "ratio", "side_right": "percent", "mean_rel_ratio": "fine"}
+STYLES |= {"ece": "fine", "ece_equal_mass": "fine", "ece_pooled": "fine", "monotonicity": "fine"}
 STYLES |= {"parameters": "large", "weight_bytes": "bytes", "peak_mib": "mebibytes"}
 DECIMALS = {"count": 0, "number": 1, "ratio": 2, "fine": 3}
 _LARGE = ((1e9, "B"), (1e6, "M"), (1e3, "k"))

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
-from dhtorch.report import probes, published, timings
+from dhtorch.report import negatives, probes, published, timings
 from dhtorch.report.cells import NOTHING, head, show
 from dhtorch.report.reading import Result, cohorts, entry, last_cohort, variants
-from dhtorch.report.tables import DERIVED, OURS, PUBLISHED, Line, Table, by_scene, by_variant, source
-
-#: (pattern of our variant, its label or None = its own name, the paper's line)
-Known = Sequence[tuple[str, str | None, str | None]]
+from dhtorch.report.tables import DERIVED, OURS, PUBLISHED, Known, Line, Table, by_scene, by_variant, lines, source
 
 CUTOFF = r"(?:gated,? )?cutoff .*"
 RANGE_SPLIT: Known = (
@@ -39,20 +36,6 @@ LEARNED: Known = (
     (r"dust3r(?:_oracle)?", None, "DUSt3R"),
     (r"vggt(?:_oracle)?", None, "VGGT-1B"),
 )
-HELIX: Known = (
-    ("own_arm", "own arm in time", "dual-helix correlation"),
-    ("between_arms", "between the arms", None),
-    ("best_arm", "the better of both", None),
-    ("flow", "plain flow", "plain 2-D optical flow"),
-    ("flow_along_arm", "plain flow along the arm", None),
-)
-ICP: Known = (("good", None, "device pose (VIO) alone"), (r"good \+ icp points", None, "ICP over it"))
-ATTENTION: Known = (
-    ("centre", "gaze at the centre", "before"),
-    ("attention", "gaze on the largest hole cluster", "gaze on the largest hole cluster"),
-    ("random", "gaze anywhere", None),
-    ("even", "even samples", None),
-)
 
 
 def in_layout(result: Result) -> list[Table]:
@@ -65,22 +48,6 @@ def in_layout(result: Result) -> list[Table]:
     if len(variants(result)) < 3 or not measured:
         return []
     return [by_variant(result, "Medians over scenes", ("n_scenes", *measured))]
-
-
-def lines(result: Result, known: Known, without: str = r"(?!)") -> list[Line]:
-    """The paper's lines in its order, each with our variant of that kind, then what else we ran."""
-    names = [v for v in variants(result) if not re.fullmatch(without, v)]
-    found, used = [], set()
-    for pattern, label, paper in known:
-        matching = [v for v in names if v not in used and re.fullmatch(pattern, v)]
-        used.update(matching)
-        for v in matching:
-            alike = paper is None or paper.lower().startswith(v.lower())
-            shown = label or (v if alike else f"{v} ({PUBLISHED}: {paper})")
-            found.append(Line(shown, v, paper))
-        if not matching:
-            found.append(Line(label or paper or pattern, None, paper))
-    return found + [Line(v, v) for v in names if v not in used]
 
 
 def _range_split(result: Result) -> list[Table]:
@@ -224,27 +191,6 @@ def _learned_score(result: Result) -> list[Table]:
     return [by_variant(result, "The same answers in the order of each score, over scenes", columns)]
 
 
-def _helix(result: Result) -> list[Table]:
-    columns = ("n_scenes", "corr", "rank_corr", "corr_answered", "coverage", "flow_share", "along_share")
-    title = "Shift as a depth cue: correlation with the sensor's inverse depth, medians over scenes"
-    return [by_variant(result, title, columns, lines(result, HELIX), published.HELIX)]
-
-
-def _icp(result: Result) -> list[Table]:
-    columns: tuple[str, ...] = ("n_scenes", "n_voxels", "voxels_vs_pose", "right_share", "confident_share")
-    columns += ("rotation_deg", "drift_deg", "drift_rel")
-    title = "ICP over poses from elsewhere, medians over scenes; voxels added up"
-    return [by_variant(result, title, columns, lines(result, ICP), published.ICP)]
-
-
-def _attention(result: Result) -> list[Table]:
-    columns = ("n_scenes", "hole_rate", "rise", "cluster_share", "cluster_returns")
-    routes = ("n_scenes", *(f"route_share.{r}" for r in ("triangulate", "change_exposure", "get_closer", "turn_head")))
-    title = "Looking at the holes, medians over scenes"
-    found = by_variant(result, title, columns, lines(result, ATTENTION), published.ATTENTION)
-    return [found, by_variant(result, "What the holes ask for", routes)]
-
-
 LAYOUTS: dict[str, Callable[[Result], list[Table]]] = {
     "range_split": _range_split,
     "real_holes": _real_holes,
@@ -260,9 +206,12 @@ LAYOUTS: dict[str, Callable[[Result], list[Table]]] = {
     "method_comparison": _comparison,
     "learned_score": _learned_score,
     "part_ablation": _part_ablation,
-    "helix_correlation": _helix,
-    "icp": _icp,
-    "hole_attention": _attention,
+    "helix_correlation": negatives.helix,
+    "icp": negatives.icp,
+    "hole_attention": negatives.attention,
+    "defocus": negatives.defocus,
+    "focus_stack": negatives.focus_stack,
+    "defocus_fusion": negatives.fusion,
     "rh20t_probe": probes.future_motion,
     "vo_probe": probes.visual_odometry,
 }

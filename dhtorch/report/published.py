@@ -212,9 +212,12 @@ DEFOCUS = Published(
     "captures of its own, mostly",
     _table(
         "rho_abs corr",
-        {"unsigned": "0.22 | –", "side from an oracle": "– | 0.66", "side has to be produced": "– | 0.06"},
+        {"unsigned": "0.22 | –", "side from an oracle": "0.22 | 0.66", "side has to be produced": "– | 0.06"},
     ),
-    ("Two ambiguities: texture (a blank wall looks defocused), and near against far of the focus.",),
+    (
+        "|ρ| asks for no side: the one figure stands in two lines.",
+        "Two ambiguities: texture (a blank wall looks defocused), and near against far of the focus.",
+    ),
 )
 
 FOCUS_STACK = Published(

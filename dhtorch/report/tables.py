@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -22,6 +23,9 @@ from dhtorch.report.reading import (
     value,
     variants,
 )
+
+#: (pattern of our variant, its label or None = its own name, the paper's line)
+Known = Sequence[tuple[str, str | None, str | None]]
 
 #: First cell of the row with the intervals over scenes.
 INTERVAL = "95 % interval"
@@ -161,6 +165,22 @@ def by_variant(
     over = (("", 1), *((head(m), 2) if m in double else ("", 1) for m in columns))
     heads = ["", *(h for m in columns for h in ((OURS, PUBLISHED) if m in double else (head(m),)))]
     return Table(title, heads, body + cited, quoted=len(cited), over=over, note=note)
+
+
+def lines(result: Result, known: Known, without: str = r"(?!)") -> list[Line]:
+    """The paper's lines in its order, each with our variant of that kind, then what else we ran."""
+    names = [v for v in variants(result) if not re.fullmatch(without, v)]
+    found, used = [], set()
+    for pattern, label, paper in known:
+        matching = [v for v in names if v not in used and re.fullmatch(pattern, v)]
+        used.update(matching)
+        for v in matching:
+            alike = paper is None or paper.lower().startswith(v.lower())
+            shown = label or (v if alike else f"{v} ({PUBLISHED}: {paper})")
+            found.append(Line(shown, v, paper))
+        if not matching:
+            found.append(Line(label or paper or pattern, None, paper))
+    return found + [Line(v, v) for v in names if v not in used]
 
 
 def every_number(result: Result) -> list[Table]:
