@@ -82,7 +82,22 @@ def test_rows_of_benchmarks_are_strict_json(tmp_path, capsys):
     row = harness.row("x", [1.0, 2.0, 3.0, 4.0], "peer", [4.0, 5.0, 6.0, 7.0], **more)
     harness.report([row], tmp_path / "x.json")
     read = json.loads((tmp_path / "x.json").read_text())[0]
-    keys = "name mode n batch threads device ours_ms ours_iqr peer peer_ms ratio ours_error peer_error bar".split()
+    keys = [
+        "name",
+        "mode",
+        "n",
+        "batch",
+        "threads",
+        "device",
+        "ours_ms",
+        "ours_iqr",
+        "peer",
+        "peer_ms",
+        "ratio",
+        "ours_error",
+        "peer_error",
+        "bar",
+    ]
     assert set(read) == set(keys) and read["ratio"] == pytest.approx(2.5 / 5.5) and read["bar"] is False
     assert "ratio" in capsys.readouterr().out
 
