@@ -234,6 +234,9 @@ SPEED_BARS = (
     ("triangulate", "triangulate_100k", "eager", 0.03, "triangulation, 100,000 points"),
     ("pair", "pair_paper_b8", "eager", 1.0, "`paper`, whole pair, B = 8"),
     ("pair", "pair_map_b8", "eager", 1.6, "`map`, whole pair, B = 8"),
+    ("loader", "loader_single_640x480_workers0", "eager", 1.1, "loader with one view, 640×480"),
+    ("loader", "loader_pair_640x480_workers0", "eager", 1.0, "loader with two views, 640×480"),
+    ("loader", "loader_scaling_pair_640x480", "eager", 1.05, "the same, what two workers gain"),
 )
 
 TABLES = {"room": room, "shared": shared, "truths": truths, "speed": speed, "comparison": comparison, "bars": bars}
