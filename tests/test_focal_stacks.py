@@ -231,6 +231,26 @@ def test_ddff12_raw_light_fields_are_sharpest_at_their_depth(tmp_path: Path) -> 
         assert float(got.focus_m[0, best]) == pytest.approx(focus, abs=1e-3)
 
 
+def test_ddff12_stacks_of_one_room_are_one_scene(tmp_path: Path) -> None:
+    lf = light_field(torch.tensor(0.1), (12, 16), 3)
+    for scene, number in (("train/kitchen", 0), ("train/kitchen", 4), ("test/library", 4), ("train/studentlab", 0)):
+        writers.write_light_field(tmp_path / "raw", scene, number, lf)
+    raw = data.open_stacks(tmp_path / "raw")
+    assert raw.by_scene() == {"test/library": [0], "train/kitchen": [1, 2], "train/studentlab": [3]}
+    assert data.open_stacks(tmp_path / "raw", split="test").by_scene() == {"test/library": [0]}
+
+    file = tmp_path / "a.h5"
+    writers.write_ddff12(file, {"train": [stack(i, 10) for i in range(5)], "val": [stack(9, 10)]})
+    assert data.open_stacks(file).by_scene() == {"train": [0, 1, 2, 3, 4], "val": [5]}, "which rooms is not said"
+    known = data.open_stacks(file, per_scene=2, split="train").by_scene()
+    assert known == {"train/scene_00": [0, 1], "train/scene_01": [2, 3], "train/scene_02": [4]}
+    fails("option per_scene: found 0, expected at least 1", file, per_scene=0)
+    writers.write_fod500(tmp_path / "fod", {0: stack(0), 7: stack(7)})
+    assert data.open_stacks(tmp_path / "fod").by_scene() == {"000000": [0], "000007": [1]}, "each a scene of its own"
+    with pytest.raises(ValueError, match="found 1 scenes of 2 stacks, expected one for each"):
+        Stacks("x", "images", raw.load, ("a", "b"), scenes=("room",))
+
+
 def test_ddff12_raw_without_its_depth_is_left_out(tmp_path: Path) -> None:
     lf, depth = light_field(torch.tensor(0.1), (12, 16), 3), torch.ones(1, 12, 16)
     for number in range(3):

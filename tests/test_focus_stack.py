@@ -137,6 +137,40 @@ def test_stacks_in_the_formats_of_the_data_sets(tmp_path: Path):
     assert row["rank_corr"] > 0.9 and row["gated_corr"] > 0.9
 
 
+def room(near, seed, invert=False):
+    """A stack of ten pictures as a light-field camera would refocus them; read back to front where inverted."""
+    ten = 1 / torch.linspace(2.0, 1 / 7, 10)[None]
+    depth = slope(48, 64, near=near, far=6.0)
+    shot = photograph(paint(48, 64, seed), depth, lens_of(64.0, f_number=0.2), ten)[0].expand(-1, 3, -1, -1)
+    images = (255 * shot).round().to(torch.uint8)[None]
+    return FocalStack(images.flip(1) if invert else images, depth=depth)
+
+
+def test_intervals_resample_rooms_and_not_stacks_of_one_room(tmp_path: Path):
+    """Three stacks of one room, two of another: two scenes, whichever room has more stacks."""
+    made = [room(0.6, 0), room(0.7, 1), room(0.8, 2, invert=True), room(0.6, 3, invert=True), room(0.9, 4, invert=True)]
+    writers.write_ddff12(tmp_path / "d.h5", {"train": made})
+    asked = {"stride_px": 1, "window_px": 3.0, "measures": ("modified_laplacian",)}
+
+    def run(**options):
+        return experiment.run([data.open_stacks(tmp_path / "d.h5", **options)], {}, None, Settings(), **asked)
+
+    rooms, unknown = run(per_scene=3), run()
+    assert set(given(rooms)) == {"d/train/scene_00", "d/train/scene_01"} and rooms.n_pairs == 5
+    assert [row["n_pairs"] for row in given(rooms).values()] == [3, 2]
+    assert [row["flip_share"] for row in given(rooms).values()] == [pytest.approx(1 / 3), 1.0]
+    summary = rooms.summary["given.rank_corr"]
+    said = [row["rank_corr"] for row in given(rooms).values()]
+    assert summary["n"] == 2 and summary["value"] == pytest.approx(sum(said) / 2)
+    assert rooms.summary["given.flip_share"]["value"] == pytest.approx(2 / 3) and said[0] > 0 > said[1]
+    stacks = [r for r in rooms.rows if r["pair"] is not None and r["method"] == "given"]
+    assert [r["pair"] for r in stacks] == [[i, i] for i in range(5)] and all(
+        r["n_candidates"] == 48 * 64 for r in stacks
+    )
+    assert list(given(unknown)) == ["d/train"] and unknown.summary["given.rank_corr"]["n"] == 1
+    assert unknown.summary["given.rank_corr"]["low"] is None, "one room has no interval"
+
+
 def test_the_order_of_a_sweep_without_truth(tmp_path: Path):
     steps = torch.linspace(1 / 0.5, 1 / 4.0, 8)
     measured = sharpness(swept(steps))

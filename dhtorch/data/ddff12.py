@@ -53,6 +53,7 @@ def read(
     focus_m: Sequence[float] | None = None,
     depth_disparity: float = _DEPTH_DISPARITY,
     depth_folder: str = "DepthRegistered",
+    per_scene: int | None = None,
 ) -> Stacks:
     """Open DDFF-12.
 
@@ -63,25 +64,31 @@ def read(
             light fields are refocused at these.
         depth_disparity: m px, depth times disparity: focal length times distance of two neighbouring sub-apertures.
         depth_folder: of the raw depth maps (16-bit PNG, mm).
+        per_scene: stacks of one room, where those of an HDF5 file are known to follow one another. None = not known: as
+            the file does not say which stacks share a room, all of a split count as one scene.
 
     Returns:
-        Stacks in the order of the file: near focus first. The published HDF5 mixes the rooms of train and val. Depth is
-        None where a split has no labels. The camera is the calibrated one where the size is 552×383.
+        Stacks in the order of the file, near focus first; light fields of one folder are one scene. The published HDF5
+        mixes the rooms of train and val. Depth is None where a split has no labels. The camera is the calibrated one
+        where the size is 552×383.
 
     Raises:
-        FormatError: no stack, a stack and its labels that disagree, or a damaged file.
+        FormatError: no stack, a stack and its labels that disagree, a damaged file, or an option that cannot be.
     """
     root = Path(root)
     constant = files.to_positive(depth_disparity, root, "option depth_disparity")
     steps = torch.linspace(*_DISPARITIES, _SLICES, dtype=torch.float64)
     focus = (constant / steps).float() if focus_m is None else focus_distances(focus_m, root)
+    if per_scene is not None and per_scene < 1:
+        raise FormatError(root, "option per_scene", per_scene, "at least 1")
     raw = (root / "LightField").is_dir()
-    shots, report = _light_fields(root, depth_folder) if raw else _hdf5_stacks(root)
+    shots, report = _light_fields(root, depth_folder) if raw else _hdf5_stacks(root, per_scene)
     shots = [shot for shot in shots if split in (None, shot.split)]
     if not shots:
         raise FormatError(root, "stacks", f"none of split {split or 'any'}", "stack_<split> or LightField/<split>/")
     load = _Load(tuple(shots), focus, constant)
-    return Stacks(root.resolve().stem, "ddff12", load, tuple(shot.name for shot in shots), root, tuple(report))
+    names, scenes = (tuple(found) for found in zip(*((s.name, s.scene) for s in shots), strict=True))
+    return Stacks(root.resolve().stem, "ddff12", load, names, root, tuple(report), scenes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +97,7 @@ class _Shot:
 
     name: str
     split: str
+    scene: str
     stack: Hdf5Array | Path
     truth: Hdf5Array | Path | None
     row: int = 0
@@ -126,7 +134,7 @@ class _Load:
         return FocalStack(images[None], self.focus[None], depth, camera)
 
 
-def _hdf5_stacks(root: Path) -> tuple[list[_Shot], list[str]]:
+def _hdf5_stacks(root: Path, per_scene: int | None) -> tuple[list[_Shot], list[str]]:
     sources = [root] if root.is_file() else sorted(root.glob("*.h5"))
     shots = []
     for file in sources:
@@ -142,7 +150,8 @@ def _hdf5_stacks(root: Path) -> tuple[list[_Shot], list[str]]:
             if truth is not None and truth.shape != (n, *hw):
                 raise FormatError(file, truth.key, f"shape {truth.shape}", f"{(n, *hw)}, as {key}")
             prefix = f"{file.stem}/{match[1]}" if len(sources) > 1 else match[1]
-            shots += [_Shot(f"{prefix}/{i:04d}", match[1], stack, truth, i) for i in range(n)]
+            rooms = [prefix if per_scene is None else f"{prefix}/scene_{i // per_scene:02d}" for i in range(n)]
+            shots += [_Shot(f"{prefix}/{i:04d}", match[1], rooms[i], stack, truth, i) for i in range(n)]
     return shots, []
 
 
@@ -156,7 +165,8 @@ def _light_fields(root: Path, depth_folder: str) -> tuple[list[_Shot], list[str]
             report.append(f"{scene}/{number}: no {truth.name}: left out")
         else:
             label = truth if folder.is_dir() else None
-            shots.append(_Shot(f"{scene.as_posix()}/{number}", scene.parts[0], file, label))
+            room = scene.as_posix()
+            shots.append(_Shot(f"{room}/{number}", scene.parts[0], room, file, label))
     return shots, report
 
 

@@ -42,7 +42,7 @@ class Stacks(Sequence[FocalStack]):
     """A lazy sequence of focal stacks (B = 1): nothing is decoded before a stack is asked for, and it pickles.
 
     Raises:
-        ValueError: no stack.
+        ValueError: no stack, or not one scene for each.
     """
 
     name: str  # of the collection, for tables and figures
@@ -51,10 +51,21 @@ class Stacks(Sequence[FocalStack]):
     names: tuple[str, ...]  # one for each stack
     root: Path | None = None  # folder or file that was opened
     report: tuple[str, ...] = ()  # what was left out, and why
+    scenes: tuple[str, ...] | None = None  # the scene that each stack shows; None = each its own
 
     def __post_init__(self) -> None:
         if not self.names:
             raise ValueError(f"stacks {self.name}: found none, expected at least one")
+        if self.scenes is not None and len(self.scenes) != len(self.names):
+            found = f"{len(self.scenes)} scenes of {len(self.names)} stacks"
+            raise ValueError(f"stacks {self.name}: found {found}, expected one for each")
+
+    def by_scene(self) -> dict[str, list[int]]:
+        """Scene → positions of its stacks. What is said of many scenes resamples these, never stacks of one room."""
+        found: dict[str, list[int]] = {}
+        for i, scene in enumerate(self.names if self.scenes is None else self.scenes):
+            found.setdefault(scene, []).append(i)
+        return found
 
     def __len__(self) -> int:
         return len(self.names)

@@ -30,8 +30,8 @@ from dhtorch.evaluate import bootstrap
 from dhtorch.evaluate.correlation import pearson, spearman
 from dhtorch.experiments.defocus import is_exact
 from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
-from dhtorch.experiments.rows import Row
-from dhtorch.experiments.screening import screen
+from dhtorch.experiments.rows import Row, mean
+from dhtorch.experiments.screening import Item, screen
 from dhtorch.geometry.lookup import luma
 from dhtorch.negative.focus_stack import align, depth_at, sharpest, sharpness
 from dhtorch.records import Frame
@@ -57,11 +57,11 @@ KEPT = 0.25
 
 @dataclass(frozen=True, eq=False)
 class _Scene:
-    """One stack of a data set as a scene."""
+    """A scene of a data set: one stack, or all that show the same room."""
 
     name: str
     stacks: Stacks
-    index: int
+    indices: tuple[int, ...]
     role: None = None
 
 
@@ -84,8 +84,8 @@ def run(
 
     Rows, per scene: over the pixels of a grid with depth, ``rank_corr`` (Spearman) and ``corr`` (Pearson) of claimed
     and true inverse depth, ``gated_corr`` over the most confident quarter, ``abs_corr`` and ``gated_abs_corr`` their
-    sizes, ``flip_share`` 1 where Spearman is negative (the summary has its mean), ``median_rel`` of depth. Without
-    depth: ``order_corr``, ``halves_corr``, ``motion_px``, see :func:`without_truth`.
+    sizes, ``flip_share`` 1 where Spearman is negative (a scene and the summary have its mean), ``median_rel`` of
+    depth. Without depth: ``order_corr``, ``halves_corr``, ``motion_px``, see :func:`without_truth`.
 
     Args:
         recordings, settings, progress: as :func:`dhtorch.experiments.protocol.run`; recordings with exact depth
@@ -96,7 +96,7 @@ def run(
         slices: pictures of a rendered stack.
         focal_length_m, f_number: of the lens, as in :func:`dhtorch.experiments.defocus.run`.
         stride_px: of the grid.
-        max_stacks: of each data set, evenly spread.
+        max_stacks: of each data set, evenly spread. Stacks of one room are one scene.
 
     Raises:
         ValueError: a recording with neither; fewer than two slices.
@@ -107,9 +107,9 @@ def run(
         raise ValueError(f"experiment.slices: found {slices}, expected at least 2")
     ask_maps = partial(_numbers, measures=measures, window_px=window_px, stride=stride_px)
 
-    def ask(scene: Any, _item: Any) -> dict[str, Row]:
+    def ask(scene: Any, item: Item) -> dict[str, Row]:
         if isinstance(scene, _Scene):
-            stack = _sorted(scene.stacks[scene.index].to(settings.dtype).to(settings.device))
+            stack = _sorted(scene.stacks[item[0]].to(settings.dtype).to(settings.device))
             if stack.depth is None or stack.focus_m is None:
                 return without_truth(stack, measures[0], window_px)
             taken = {"given": stack.images, "given_aligned": align(stack.images)[0]}
@@ -123,7 +123,7 @@ def run(
     scenes = [scene for recording in recordings for scene in _scenes(recording, max_stacks)]
     names = [c if m == measures[0] else f"{c}, {m}" for c in (*RENDERED, *GIVEN) for m in measures]
     wanted = _wanted(scenes, names)
-    outcome = screen(scenes, lambda _s: [(0, 0)], ask, wanted, truth="full", progress=progress)
+    outcome = screen(scenes, _items, ask, wanted, truth="full", whole=_flips, progress=progress)
     for name in wanted:
         flips = [row.get("flip_share") for row in outcome.scenes(name).values()]
         entry = bootstrap.interval(flips, statistic="mean")._asdict() | {"unit": "1"}
@@ -271,13 +271,28 @@ def _numbers(
     }
 
 
+def _items(scene: Any) -> list[Item]:
+    """The stacks of a scene; the first frame of a recording."""
+    return [(i, i) for i in scene.indices] if isinstance(scene, _Scene) else [(0, 0)]
+
+
+def _flips(_scene: Any, found: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
+    """Variant → share of a scene's stacks whose sign is flipped; the median of yes and no would not say it."""
+    said: dict[str, list[float]] = {}
+    for answer in found:
+        for variant, row in answer.items():
+            said.setdefault(variant, []).extend([row["flip_share"]] if row.get("flip_share") is not None else [])
+    return {variant: {"flip_share": mean(shares)} for variant, shares in said.items() if shares}
+
+
 def _scenes(recording: Any, most: int) -> list[Any]:
-    """A recording with exact depth, or every stack of a data set."""
+    """A recording with exact depth, or every scene of a data set with those of its stacks that were chosen."""
     if isinstance(recording, Stacks):
-        chosen = torch.linspace(0, len(recording) - 1, min(most, len(recording))).round().int().tolist()
+        chosen = set(torch.linspace(0, len(recording) - 1, min(most, len(recording))).round().int().tolist())
+        rooms = {s: tuple(i for i in all_ if i in chosen) for s, all_ in recording.by_scene().items()}
         single = len(recording) == 1
         label = recording.name if recording.root is None or not single else _folder(recording)
-        return [_Scene(label if single else f"{label}/{recording.names[i]}", recording, i) for i in chosen]
+        return [_Scene(label if single else f"{label}/{s}", recording, stacks) for s, stacks in rooms.items() if stacks]
     if not is_exact(recording):
         raise ValueError(f"focus_stack: {recording.name} expected focal stacks, or a recording with exact depth")
     return [recording]
