@@ -331,6 +331,7 @@ ROWS = [
     Row(least_squares.linearise, planes, "dtype batch vmap capture gradcheck empty raises", grad=(0, 1, 2, 3, 4), bad=lambda a: (*a[:4], a[4][..., 1:])),
     Row(least_squares.robust, lambda b, n, d: (uniform(b, n, dtype=d), "cauchy", 0.5), "dtype batch vmap capture gradcheck empty shuffle padding nan", (0,), (0,)),
     Row(least_squares.gauss_newton_step, lambda b, n, d: (poses(b, d), positive(b, n, d), uniform(b, 6, dtype=d)), "dtype batch vmap capture"),
+    Row(least_squares.trial_step, lambda b, n, d: (poses(b, d), positive(b, n, d), uniform(b, 6, dtype=d)), "dtype batch capture raises", bad=wrong_last_axis(2)),
     Row(least_squares.solve_spd, lambda b, n, d: (positive(b, n, d), uniform(b, 6, 1, dtype=d)), "dtype batch vmap capture"),
     Row(least_squares.normal_equations, lambda b, n, d: (uniform(b, 7, 2, n - n % 16 + 16, dtype=d), uniform(b, n - n % 16 + 16, dtype=d)), "dtype batch vmap capture gradcheck", grad=(0, 1)),
     Row(least_squares.move, lambda b, n, d: (poses(b, d), uniform(b, 6, dtype=d, low=-0.2, high=0.2)), POINTLESS + " raises", grad=(0, 1), bad=wrong_last_axis(1)),
