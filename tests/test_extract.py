@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -199,7 +200,9 @@ def start(folder, *args):
     """The command in a process group of its own, as a shell starts it."""
     with (folder / "out").open("w") as out, (folder / "err").open("w") as err:
         full = [sys.executable, "-m", "dhtorch", "extract", *args]
-        return subprocess.Popen(full, cwd=folder, stdout=out, stderr=err, start_new_session=True)
+        # Whoever started the tests in the background may have had SIGINT ignored; a shell's foreground job hears it.
+        heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+        return subprocess.Popen(full, cwd=folder, stdout=out, stderr=err, start_new_session=True, preexec_fn=heard)
 
 
 def stop(process, folder, how, n=1):

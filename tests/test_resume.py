@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from dhtorch import archive, job, run
+from dhtorch import archive, console, job, run
 from dhtorch.run import config_dir, job_name, main
 
 ROOM = ["data.hw=[60,80]", "data.n_frames=3", "data.supersample=1", "data.lidar=exact"]
@@ -268,7 +268,7 @@ def test_data_and_weights_count_by_content_not_by_place(tmp_path):
 def test_only_our_own_warnings_are_seen():
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        run._hush()
+        console.hush()
         for module in ("torch.nn", "hydra.main", "dhtorchy", "dhtorch.pair"):
             warnings.warn_explicit("careful", UserWarning, f"{module}.py", 1, module=module)
     assert [Path(w.filename).stem for w in caught] == ([] if sys.warnoptions else ["dhtorch.pair"]) or sys.warnoptions
