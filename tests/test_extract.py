@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -201,8 +200,11 @@ def start(folder, *args):
     with (folder / "out").open("w") as out, (folder / "err").open("w") as err:
         full = [sys.executable, "-m", "dhtorch", "extract", *args]
         # Whoever started the tests in the background may have had SIGINT ignored; a shell's foreground job hears it.
-        heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-        return subprocess.Popen(full, cwd=folder, stdout=out, stderr=err, start_new_session=True, preexec_fn=heard)
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
+        try:
+            return subprocess.Popen(full, cwd=folder, stdout=out, stderr=err, start_new_session=True)
+        finally:
+            signal.signal(signal.SIGINT, before)
 
 
 def stop(process, folder, how, n=1):
