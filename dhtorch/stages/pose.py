@@ -122,12 +122,13 @@ def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, f: Tensor, c
     xyz, uv, usable = _planes(xyz, uv, valid)
     with torch.no_grad():
         start, found = _robust_pose(xyz, uv, usable, f, c, draws, options)
+    start = start.detach()  # forward mode looks through no_grad, into a search that may stand beside a singular triple
     # The last step, in float64 and with the graph on.
     rows, depth = linearise(start, f.double(), c.double(), xyz.double(), uv.double())
     with torch.no_grad():
         square = (rows[:, 6] * rows[:, 6]).sum(1)
         inlier = usable & found[:, None] & (depth > MIN_DEPTH) & (square < options.threshold_px**2)
-        weight = robust(square, options.kernel, options.kernel_px)[1] * inlier
+        weight = (robust(square, options.kernel, options.kernel_px)[1] * inlier).detach()
     H, g = normal_equations(rows, weight)
     T, solved = gauss_newton_step(start, H, g)
     with torch.no_grad():
