@@ -5,9 +5,8 @@ import json
 import os
 import pickle
 import signal
-import subprocess
 import sys
-import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +19,7 @@ pytest.importorskip("av")
 import pyarrow
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
+from processes import start, stop
 from pyarrow import parquet
 
 from dhtorch import data, extract
@@ -54,14 +54,12 @@ def command(tmp_path, monkeypatch, capsys):
     """``dhtorch extract`` in this process, from an empty folder."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("DHTORCH_DATA", raising=False)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def call(*args):
         code = main(["extract", *args])
         return (code, *capsys.readouterr())
 
-    yield call
-    signal.signal(signal.SIGINT, before)
+    return call
 
 
 def asked(root, *more, out="features", gap=GAP):
@@ -195,40 +193,16 @@ def test_workers_make_the_same_files(robot, command, workers):
     assert contents("features") == contents("other") and len(files("other")) == 3
 
 
-def start(folder, *args):
-    """The command in a process group of its own, as a shell starts it."""
-    with (folder / "out").open("w") as out, (folder / "err").open("w") as err:
-        full = [sys.executable, "-m", "dhtorch", "extract", *args]
-        # Whoever started the tests in the background may have had SIGINT ignored; a shell's foreground job hears it.
-        before = signal.signal(signal.SIGINT, signal.default_int_handler)
-        try:
-            return subprocess.Popen(full, cwd=folder, stdout=out, stderr=err, start_new_session=True)
-        finally:
-            signal.signal(signal.SIGINT, before)
-
-
-def stop(process, folder, how, n=1):
-    """A signal to the whole group as soon as ``n`` shards are there; returns the exit code."""
-    try:
-        end = time.monotonic() + 150
-        while len(files(folder)) < n and process.poll() is None and time.monotonic() < end:
-            time.sleep(0.002)
-        os.killpg(process.pid, how)
-        return process.wait(60)
-    finally:
-        if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
-
-
 MANY = ["data.hw=[60,80]", "data.n_frames=60", "data.supersample=1", "out=features", "extract.shard_rows=4"]
 
 
 def test_kill_9_in_the_middle_loses_and_doubles_nothing(tmp_path, command):
     """With workers, in the middle of a shard; then the same command again."""
     args = [*MANY, *PAPER, "workers=1"]
-    process = start(tmp_path, *args)
-    assert stop(process, tmp_path / "features", signal.SIGKILL, 3) == -signal.SIGKILL, (tmp_path / "err").read_text()
+    process = start(tmp_path, "extract", *args)
+    assert stop(process, partial(files, tmp_path / "features"), 3, signal.SIGKILL) == -signal.SIGKILL, (
+        tmp_path / "err"
+    ).read_text()
     before = seen(files("features"))
     assert 3 <= len(before) < 15
     assert all(parquet.read_table(Path("features") / name).num_rows == 4 for name in before)
@@ -269,8 +243,8 @@ def test_ctrl_c_leaves_whole_shards_and_says_how_to_go_on(robot, command, monkey
 
 
 def test_ctrl_c_from_a_terminal_ends_the_workers_quietly(tmp_path):
-    process = start(tmp_path, *MANY, *PAPER, "workers=2")
-    code = stop(process, tmp_path / "features", signal.SIGINT, 2)
+    process = start(tmp_path, "extract", *MANY, *PAPER, "workers=2")
+    code = stop(process, partial(files, tmp_path / "features"), 2, signal.SIGINT)
     err = (tmp_path / "err").read_text()
     assert code == 130 and "Traceback" not in err and len(err.strip().splitlines()) == 1, err
     assert "whole and stay" in err

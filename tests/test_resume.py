@@ -2,14 +2,12 @@
 
 import importlib.util
 import json
-import os
 import re
 import shlex
 import signal
-import subprocess
 import sys
-import time
 import warnings
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,6 +16,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
+from processes import start, stop
 
 from dhtorch import archive, console, job, run
 from dhtorch.run import config_dir, job_name, main
@@ -32,27 +31,6 @@ LAUNCHERS = {
     "submitit_slurm": "hydra_submitit_launcher",
     "ray": "hydra_ray_launcher",
 }
-
-
-def start(folder, *args):
-    """The command in a process group of its own, as a shell starts it."""
-    with (folder / "out").open("w") as out, (folder / "err").open("w") as err:
-        command = [sys.executable, "-m", "dhtorch", *args]
-        return subprocess.Popen(command, cwd=folder, stdout=out, stderr=err, start_new_session=True)
-
-
-def stop(process, folder, n, how):
-    """Send a signal to the whole group as soon as ``n`` results are there; returns the exit code."""
-    try:
-        end = time.monotonic() + 150  # on a busy machine a start alone takes long
-        while len(results(folder)) < n and process.poll() is None and time.monotonic() < end:
-            time.sleep(0.005)
-        os.killpg(process.pid, how)
-        return process.wait(60)
-    finally:
-        if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
 
 
 def results(folder):
@@ -73,20 +51,17 @@ def asked(path):
 def command(tmp_path, monkeypatch, capsys):
     """The command in this process, from an empty folder."""
     monkeypatch.chdir(tmp_path)
-    # A test run in the background of a shell inherits an ignored SIGINT.
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def call(*args):
         code = main(list(args))
         return (code, *capsys.readouterr())
 
-    yield call
-    signal.signal(signal.SIGINT, before)
+    return call
 
 
 def test_kill_9_in_the_middle_of_a_sweep_loses_and_doubles_nothing(tmp_path):
     sweep = ["-m", "resume=true", "output=sweep", *SIX]
-    code = stop(start(tmp_path, *sweep), tmp_path, 2, signal.SIGKILL)
+    code = stop(start(tmp_path, *sweep), partial(results, tmp_path), 2, signal.SIGKILL)
     assert code == -signal.SIGKILL
     before = seen(results(tmp_path))
     assert 2 <= len(before) < 6
