@@ -126,11 +126,12 @@ def luma(rgb: Tensor, dim: int) -> Tensor:
 
     The channel dimension is kept with size 1. Floating images keep their dtype, uint8 becomes float32.
     """
+    # Divided first, so that the bytes and the floats of one picture have the same grey, bit for bit.
+    rgb = rgb / 255.0 if rgb.dtype == torch.uint8 else rgb
     if rgb.shape[dim] == 1:
-        return rgb / 255.0 if rgb.dtype == torch.uint8 else rgb
+        return rgb
     r, g, b = rgb.split(1, dim)
-    grey = torch.add(torch.add(LUMA[0] * r, g, alpha=LUMA[1]), b, alpha=LUMA[2])
-    return grey / 255.0 if rgb.dtype == torch.uint8 else grey
+    return torch.add(torch.add(LUMA[0] * r, g, alpha=LUMA[1]), b, alpha=LUMA[2])
 
 
 def nearest(grid: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
