@@ -4,8 +4,8 @@
 
 Each series doubles one size, the others stay; hypotheses are those of seat 5 alone, 16 pairs at once. Growth exponents
 are slopes of a line through (log size, log time or log memory): 1 is proportional, 0 constant. Sizes of pictures are in
-pixels. Peak memory is what a process of its own needs above its inputs. The last rows are the largest batch that is
-promised to fit: 32 pairs with 4096 samples.
+pixels. Peak memory is what a process of its own needs above its inputs, after one small call of each method has loaded
+the libraries. The last rows are the largest batch that is promised to fit: 32 pairs with 4096 samples.
 """
 
 from __future__ import annotations
@@ -78,6 +78,15 @@ def series(full: bool) -> dict[str, list[tuple[int, Callable[[], Any]]]]:
     return found
 
 
+def small_calls() -> None:
+    """One small call of everything that is measured: libraries are loaded at first use, and belong to no size."""
+    frame = Frame(torch.rand(1, 3, 120, 160), torch.ones(1, 120, 160), cam.Camera(*torch.full((2, 1, 2), 80.0)))
+    anchor, other = frame, frame.replace(image=frame.image.roll(2, -1))
+    for method in METHODS.values():
+        method(anchor, other, n=64)
+    extend_window(anchor, tree.stack([other]), n=64, views=1)
+
+
 def exponent(sizes: Sequence[float], values: Sequence[float]) -> float:
     """Slope of the least-squares line through the logarithms."""
     x, y = [math.log(s) for s in sizes], [math.log(max(v, 1e-9)) for v in values]
@@ -91,7 +100,7 @@ def measure(name: str, calls: list[tuple[int, Callable[[], Any]]], options: Any)
         [call for _, call in calls], repeats=options.repeats, warm_up=1, clock=options.clock, device=options.device
     )
     # Of the smallest and the largest size: each costs a process that imports everything anew.
-    memory = [peak_mib(calls[k][1]) or math.nan for k in (0, -1)]
+    memory = [peak_mib(calls[k][1], small_calls) or math.nan for k in (0, -1)]
     middles = [statistics.median(t) for t in times]
     grows = [exponent(sizes, middles), exponent([sizes[0], sizes[-1]], memory)]
     said = ", ".join(f"{size}: {ms:.1f} ms" for size, ms in zip(sizes, middles, strict=True))
@@ -115,7 +124,7 @@ def largest(options: Any) -> list[dict[str, Any]]:
         whole = partial(METHODS[method], *(repeated(f, 32) for f in frames), n=4096)
         single = partial(METHODS[method], *frames, n=4096)
         together, alone = harness.in_turn([whole, single], repeats=2, warm_up=1, clock=options.clock)
-        memory = [peak_mib(call) or math.nan for call in (whole, single)]
+        memory = [peak_mib(call, small_calls) or math.nan for call in (whole, single)]
         print(f"{method}, B = 32, N = 4096: {memory[0]:.0f} MiB above the inputs; one pair {memory[1]:.0f} MiB")
         more: dict[str, Any] = {"n": 4096, "batch": 32, "bar": True, "peak_mib": memory[0]}
         times = [t / 32 for t in together]

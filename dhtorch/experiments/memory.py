@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import gc
 import sys
 from collections.abc import Callable
@@ -37,7 +38,7 @@ def peak_mib(call: Callable[[], Any], before: Callable[[], Any] | None = None) -
 
     Args:
         call: a picklable partial; its arguments are inputs and are copied before anything is measured.
-        before: called first, uncounted: imports.
+        before: called first, uncounted: what is loaded at first use.
 
     Returns:
         MiB; None where the system does not tell.
@@ -54,6 +55,7 @@ def _peak(call: Callable[[], Any], before: Callable[[], Any] | None, threads: in
         before()
     call = _own(call)
     gc.collect()
+    _give_back()
     _forget_peak()
     start = _resident()
     with torch.no_grad():
@@ -87,6 +89,12 @@ def _highest() -> int | None:
     """Bytes resident at most so far. The kernel's own high-water mark of this address space comes first:
     ``ru_maxrss`` of a new process starts at the size of the one that made it."""
     return _status("VmHWM") or _rusage()
+
+
+def _give_back() -> None:
+    """Hand free memory back to the system, where the C library can: what is kept would be used again, uncounted."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _forget_peak() -> None:
