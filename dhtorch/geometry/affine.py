@@ -1,12 +1,16 @@
 """Registration of small windows under affine motion, gain and bias: what is left to correct after a track was found.
 
-Alphabet: ``p`` an offset in the window, px; the window of image 0 stands on the whole pixel q nearest to ``uv_0`` and
-holds T and its gradient; the warp p → x + A p says where its pixels lie in image 1, J reads there; ``gain`` g and
-``bias`` b: J ≈ g T + b. M points of all pairs travel in one row: x (2, M), A (2, 2, M).
+Alphabet: ``p`` an offset in the window, px, and u, v the same from -1 to 1; the window of image 0 stands on the whole
+pixel q nearest to ``uv_0`` and holds T and its gradient; the ``warp`` W (3, 2, M), px, says where its pixels lie in
+image 1: the middle at W_0, (u, v) at W_0 + u W_1 + v W_2, which is W_0 + A p. J reads there; ``gain`` g and ``bias`` b:
+J ≈ g T + b. M points of all pairs travel in one row, last.
 
 Inverse composition (Baker and Matthews 2004) puts the small change δ, D of a step on the side of T, whose derivatives
-never change: J ≈ g (T + ∇T · (δ + D p)) + b is linear regression of J on eight fixed pictures, ∇T, ∇T p, T and 1, so
-gain and bias need no iteration of their own. T is never read between pixels, which keeps its noise white.
+never change: J ≈ g (T + ∇T · (δ + D p)) + b is linear regression of J on eight fixed pictures, ∇T, u ∇T, v ∇T, T and 1,
+so gain and bias need no iteration of their own. T is never read between pixels, which keeps its noise white.
+
+Such steps shrink by a factor that is nearly constant and, where the noise in T's gradient passes for texture, not
+small. Two of them tell it, and the third takes at once what would follow (Anderson 1965, with a memory of one step).
 """
 
 from __future__ import annotations
@@ -19,7 +23,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dhtorch.geometry.least_squares import solve_spd
+from dhtorch.geometry.least_squares import MIN_PIVOT, solve_spd
 from dhtorch.geometry.lookup import round_half_up
 from dhtorch.geometry.pyramid import GRAD_X, GRAD_Y, GREY, REACH, Pyramid
 from dhtorch.geometry.shapes import check
@@ -27,8 +31,14 @@ from dhtorch.geometry.shapes import check
 #: Points treated at once: few enough for their windows to stay in the cache.
 CHUNK = 256
 
-#: Steps that all points take, before those that still move are picked out.
-STEPS_TOGETHER = 4
+#: Rows of points are filled up to multiples of this, so that a point's rounding does not depend on how many there are.
+LANES = 16
+
+#: Steps are taken so much longer than regression says, which noise in T's gradient makes too short.
+LONGER = 1.4
+
+#: Of what would follow a step, at most so many times that step is taken at once.
+AHEAD = 4.0
 
 #: Added to the normal equations' affine part: what 2 / 255 of noise would say of a corner that moves by 2 px. It only
 #: matters where the window determines no affine motion (a single edge).
@@ -52,9 +62,6 @@ MOST_NOISE = 0.9
 #: A search that ends with this much more residual noise than it began with has diverged.
 WORSE = 1.2
 
-#: Which of the moments 1, u, v, uu, uv, vv is the product of two of 1, u, v.
-_PRODUCT = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
-
 
 class Registration(NamedTuple):
     """What :func:`register` finds for B × N points."""
@@ -67,14 +74,21 @@ class Registration(NamedTuple):
     ok: Tensor  # (B, N) bool; where not, uv_1 is the start and linear the identity
 
 
+class _Options(NamedTuple):
+    """How to search; see :func:`register`."""
+
+    window: int
+    steps: int
+    epsilon_px: float
+    max_shift_px: float
+
+
 class _State(NamedTuple):
-    x: Tensor  # (2, M) px
-    A: Tensor  # (2, 2, M)
+    warp: Tensor  # (3, 2, M) px
     textured: Tensor  # (M,) the normal equations have a solution
-    moving: Tensor  # (M,) not yet converged
     fit: Tensor  # (3, M) see _quality
     first: Tensor  # (3, M) the same where this search began
-    inverse: Tensor  # (8, 8, M) of the normal equations
+    inverse: Tensor  # (2, 8, M) rows of the inverse normal equations, for the motion of the point in the window
 
 
 def register(
@@ -85,7 +99,7 @@ def register(
     *,
     wanted: Tensor | None = None,  # (B, N) bool
     window: int = 21,
-    iterations: int = 10,
+    iterations: int = 7,
     epsilon_px: float = 0.01,
     max_shift_px: float = 2.0,
 ) -> Registration:
@@ -123,39 +137,15 @@ def register(
         here, there, batch, usable = _rows(source, target, uv_0, uv_1)
         if wanted is not None:
             usable = usable & wanted.reshape(-1)
-        q = round_half_up(here)
-        d = here - q
-        still = torch.eye(2, dtype=d.dtype, device=d.device)[..., None].expand(2, 2, B * N)
-        search = partial(_search, source, target, epsilon_px=epsilon_px, window=window)
-        together = min(STEPS_TOGETHER, iterations)
-        state = _resume(usable, _nothing(there - d, still), partial(search, level=0, steps=together), q, batch)
-        start = state._replace(x=there - d, A=still, fit=state.first)
-        if iterations > together:
-            on = partial(search, level=0, steps=iterations - together)
-            state = _resume(usable & state.moving, state, on, q, batch)
-        if len(target.levels) > 1:
-            on = partial(search, level=1, steps=iterations)
-            state = _resume(usable & (_determinant(state.A) > HALVE**2), state, on, q, batch)
-        shift = (state.x + _apply(state.A, d) - there).square().sum(0).sqrt()
-        shift = torch.where(shift.isfinite(), shift, torch.full_like(shift, max_shift_px))
-        ok = usable & _accept(state, start, target, shift, max_shift_px)
-        state = _State(*(torch.where(ok, new, old) for new, old in zip(state, start, strict=True)))
-        cov = _covariance(state, d, window)
+        o = _Options(window, iterations, epsilon_px, max_shift_px)
+        answer = _for_some(usable, _nothing(there), partial(_register, source, target, o), (here, there, batch))
 
     def grid(y: Tensor) -> Tensor:  # (..., M) -> (B, N, ...)
         y = y.unflatten(-1, (B, N)).movedim((-2, -1), (0, 1))
         return y.to(uv_0.dtype) if y.is_floating_point() else y
 
-    rms = state.fit[1].sqrt() / state.fit[0].clamp(*GAIN)
-    found = torch.where(ok, state.x + _apply(state.A, d), there)
-    return Registration(
-        uv_1=torch.where(grid(ok)[..., None], grid(found), uv_1.detach()),
-        linear=grid(state.A),
-        rms=grid(rms),
-        cov=grid(cov),
-        shift_px=grid(shift),
-        ok=grid(ok),
-    )
+    found, linear, rms, cov, shift_px, ok = (grid(y) for y in answer)
+    return Registration(torch.where(ok[..., None], found, uv_1.detach()), linear, rms, cov, shift_px, ok)
 
 
 def step(
@@ -180,16 +170,16 @@ def step(
     B, N = (check("step", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), linear=(linear, "B N 2 2"))[k] for k in "BN")
     here, there, batch, usable = _rows(source, target, uv_0, uv_1)
     q = round_half_up(here)
-    A = linear.detach().to(here.dtype).permute(2, 3, 0, 1).reshape(2, 2, B * N)
+    place = _place(here - q, window)
+    A = linear.detach().to(here.dtype).permute(3, 2, 0, 1).reshape(2, 2, B * N)
     usable = usable & A.isfinite().all(0).all(0)
-    A = torch.where(usable, A, torch.eye(2, dtype=A.dtype, device=A.device)[..., None])
-    x = there - _apply(A, (here - q).detach())
-    G = _template(source, q, batch, window)
-    patch, corner = _patch(target, 0, x, batch, window)
-    J = _read(patch, x - corner, A, window)
-    solution, solved = solve_spd(_normal(G), _right_side(G, J)[..., None])
-    x, A_new, _ = _compose(x, A, solution[..., 0].T.to(x.dtype), window)
-    found = torch.where(usable & solved, x + _apply(A_new, here - q), there)
+    warp = _start(there, place.detach(), torch.where(usable, A, _still(A)), window)
+    Q = _pictures(source, q, batch, window)
+    patch, corner = _patch(target, 0, warp[0], batch, window)
+    J = _read(patch, _from(corner, warp), window)
+    solution, solved = solve_spd(_normal(Q), (Q * J[:, None]).sum(-1)[..., None])
+    warp = _compose(warp, _change(solution[..., 0]), window)
+    found = torch.where(usable & solved, (warp * place[:, None]).sum(0), there)
     return found.T.reshape(B, N, 2).to(uv_0.dtype)
 
 
@@ -203,90 +193,128 @@ def _rows(source: Pyramid, target: Pyramid, uv_0: Tensor, uv_1: Tensor):
     return here, there, batch, usable
 
 
+def _register(
+    source: Pyramid,
+    target: Pyramid,
+    o: _Options,
+    here: Tensor,  # (2, M) px
+    there: Tensor,  # (2, M) px
+    batch: Tensor,  # (M,)
+) -> tuple[Tensor, ...]:
+    """The fields of a :class:`Registration`, points last."""
+    q = round_half_up(here)
+    place = _place(here - q, o.window)
+    warp = _start(there, place, _still(there), o.window)
+    search = partial(_search, source, target, o)
+    state = search(0, q, place, warp, batch)
+    best = state._replace(warp=warp, fit=state.first)
+    if len(target.levels) > 1:
+        big = _determinant(_linear(state.warp, o.window)) > HALVE**2
+        state = _State(*_for_some(big, state, partial(search, 1), (q, place, state.warp, batch)))
+    shift = ((state.warp * place[:, None]).sum(0) - there).square().sum(0).sqrt()
+    shift = torch.where(shift.isfinite(), shift, torch.full_like(shift, o.max_shift_px))
+    ok = _accept(state, best.fit, target, o.window) & (shift <= o.max_shift_px)
+    best = _State(*(torch.where(ok, new, old) for new, old in zip(state, best, strict=True)))
+    rms = best.fit[1].sqrt() / best.fit[0].clamp(*GAIN)
+    A = _linear(best.warp, o.window).transpose(0, 1)
+    return (best.warp * place[:, None]).sum(0), A, rms, _covariance(best, place, o.window), shift, ok
+
+
 def _search(
     source: Pyramid,
     target: Pyramid,
-    points: tuple[Tensor, ...],  # q (2, M), x (2, M), A (2, 2, M), batch (M,)
-    *,
+    o: _Options,
     level: int,
-    steps: int,
-    window: int,
-    epsilon_px: float,
+    q: Tensor,  # (2, M) px
+    place: Tensor,  # (3, M)
+    warp: Tensor,  # (3, 2, M) px
+    batch: Tensor,  # (M,)
 ) -> _State:
     """Steps of all points, a chunk at a time, reading image 1 from one level."""
     zoom = 0.5**level
+    fine = o._replace(epsilon_px=o.epsilon_px * zoom)
+    memory = None if _static(warp) else warp.new_empty(2, min(CHUNK, len(batch)), 8, o.window * o.window)
     parts = []
-    for q, x, A, batch in zip(*(y.split(CHUNK, -1) for y in points), strict=True):
-        G = _template(source, q, batch, window)
-        state = _descend(G, target, level, steps, epsilon_px * zoom, (x * zoom, A * zoom, batch))
-        parts.append(state._replace(x=state.x / zoom, A=state.A / zoom))
+    for q_, place_, warp_, batch_ in zip(*(y.split(CHUNK, -1) for y in (q, place, warp * zoom, batch)), strict=True):
+        patch, corner = _patch(target, level, warp_[0], batch_, o.window)
+        Q = _pictures(source, q_, batch_, o.window, None if memory is None else memory[0, : len(batch_)])
+        products = None if memory is None else memory[1, : len(batch_)]
+        state = _descend(Q, patch, _from(corner, warp_), fine, products)
+        inverse = (state.inverse[:6].unflatten(0, (3, 2)) * place_[:, None, None]).sum(0)
+        parts.append(state._replace(warp=_from(-corner, state.warp) / zoom, inverse=inverse))
     return _State(*(torch.cat(field, -1) for field in zip(*parts, strict=True)))
 
 
 def _descend(
-    G: Tensor, target: Pyramid, level: int, steps: int, epsilon_px: float, points: tuple[Tensor, ...]
+    Q: Tensor,  # (M, 8, w²)
+    patch: Tensor,  # (M, 1, s, s)
+    warp: Tensor,  # (3, 2, M) px of the patch
+    o: _Options,
+    products: Tensor | None,  # (M, 8, w²), to be overwritten
 ) -> _State:
-    """Steps of one chunk, everything in pixels of the level read."""
-    x, A, batch = points
-    window = G.shape[-1]
-    patch, corner = _patch(target, level, x, batch, window)
-    H = _normal(G)
-    eye = torch.eye(8, dtype=H.dtype, device=H.device)
-    inverse, textured = solve_spd(H, eye.expand_as(H))
-    J = _read(patch, x - corner, A, window)
-    fit = first = _quality(G[2], J, x, A)
-    moving = textured
-    for _ in range(steps):
-        solution = (inverse * _right_side(G, J)[:, None]).sum(-1).T
-        x_new, A_new, moved = _compose(x, A, solution, window)
-        x, A = torch.where(moving, x_new, x), torch.where(moving, A_new, A)
-        J = _read(patch, x - corner, A, window)
-        moving = moving & (moved > epsilon_px)
-        if not _static(x) and not moving.any():
+    """Steps of one chunk, from warp to warp in pixels of the patch; the whole inverse (8, 8, M)."""
+    inverse, textured = _invert(_normal(Q))
+    J = _read(patch, warp, o.window)
+    fit = first = _quality(Q[:, 6], J, _share(warp[0, ..., None].clone()))
+    moving, taken, before = textured, None, None
+    for _ in range(o.steps):
+        sums = torch.mul(Q, J[:, None], out=products).sum(-1)
+        change = _change((inverse * sums[:, None]).sum(-1))
+        taken, before = _further(change * LONGER, taken, before), change * LONGER
+        warp = torch.where(moving, _compose(warp, taken, o.window), warp)
+        J = _read(patch, warp, o.window)
+        moving = moving & (change.abs().sum(0).amax(0) > o.epsilon_px)
+        if not _static(warp) and not moving.any():
             break
-    if steps:
-        fit = _quality(G[2], J, x, A)
-    inverse = torch.where(textured[:, None, None], inverse, eye / DAMPING).permute(1, 2, 0)
-    return _State(x, A, textured, moving, fit, first, inverse)
+    if o.steps:
+        fit = _quality(Q[:, 6], J, _share(_places(warp, o.window).flatten(2)))
+    return _State(warp, textured, fit, first, inverse.permute(1, 2, 0))
 
 
-def _nothing(x: Tensor, A: Tensor) -> _State:
-    """The state of points that are not registered."""
-    none, fit = torch.zeros_like(x[0], dtype=torch.bool), x.new_zeros(3, x.shape[1])
-    eye = torch.eye(8, dtype=x.dtype, device=x.device)[..., None]
-    return _State(x, A, none, none, fit, fit, (eye / DAMPING).expand(8, 8, x.shape[1]))
+def _further(change: Tensor, taken: Tensor | None, before: Tensor | None) -> Tensor:
+    """The step to take where regression says ``change`` (3, 2, M), having said ``before`` when ``taken`` was taken."""
+    if taken is None or before is None:
+        return change
+    bend = change - before
+    share = (change * bend).sum((0, 1)) / (bend * bend).sum((0, 1)).clamp_min(1e-20)
+    return change - share.clamp(-AHEAD, AHEAD / (1 + AHEAD)) * (taken + bend)
 
 
-def _resume(wanted: Tensor, state: _State, search: Callable[..., _State], q: Tensor, batch: Tensor) -> _State:
-    """The state, replaced where ``wanted`` (M,) by that of a further search from there."""
-    points = (q, state.x, state.A, batch)
+def _nothing(there: Tensor) -> tuple[Tensor, ...]:
+    """The fields of a :class:`Registration` for points (2, M) that are not registered."""
+    none, zero = torch.zeros_like(there[0], dtype=torch.bool), torch.zeros_like(there[0])
+    return there, _still(there), zero, _still(there), zero, none
+
+
+def _for_some(wanted: Tensor, values, fn: Callable[..., tuple[Tensor, ...]], columns: tuple[Tensor, ...]):
+    """``values`` (each (..., M)), replaced where ``wanted`` (M,) by what ``fn(*columns)`` returns."""
     if _static(wanted):
-        return _State(*(torch.where(wanted, new, old) for new, old in zip(search(points), state, strict=True)))
+        return tuple(torch.where(wanted, new, old) for new, old in zip(fn(*columns), values, strict=True))
     some = wanted.nonzero()[:, 0]
     if not len(some):
-        return state
-    new = search(tuple(y.index_select(-1, some) for y in points))
-    return _State(*(old.index_copy(-1, some, n) for old, n in zip(state, new, strict=True)))
+        return values
+    some = torch.cat([some, some[:1].expand(-len(some) % LANES)])  # filled up by copies of the first
+    new = fn(*(y.index_select(-1, some) for y in columns))
+    return tuple(old.index_copy(-1, some, n) for old, n in zip(values, new, strict=True))
 
 
-def _accept(state: _State, start: _State, target: Pyramid, shift: Tensor, max_shift_px: float) -> Tensor:
+def _accept(state: _State, first: Tensor, target: Pyramid, window: int) -> Tensor:
     """Which searches are believed (M,)."""
-    size, gain = _determinant(state.A), state.fit[0]
+    size, gain = _determinant(_linear(state.warp, window)), state.fit[0]
     sane = (size > SCALE[0] ** 2) & (size < SCALE[1] ** 2) & (gain > GAIN[0]) & (gain < GAIN[1])
-    better = _noise(state.fit) <= WORSE * _noise(start.fit)
-    return state.textured & sane & better & (shift <= max_shift_px) & _inside(state.x, target)
+    better = _noise(state.fit) <= WORSE * _noise(first)
+    return state.textured & sane & better & _inside(state.warp[0], target)
 
 
-def _covariance(state: _State, d: Tensor, window: int) -> Tensor:
-    """Covariance (2, 2, M) of where the offset ``d`` (2, M) of the window goes.
+def _covariance(state: _State, place: Tensor, window: int) -> Tensor:
+    """Covariance (2, 2, M) of where the ``place`` (3, M) in the window goes.
 
-    With R the rows of the inverse normal equations that move d and C = S⁻¹ their part for d itself, white noise of
-    variance s² moves d by s² (1 + 1/g²) C. But S holds the noise of T and its gradient as if it were texture: noise of
-    energy E adds S (R E Rᵀ) S to it. With that taken out S is S' and the spread S'⁻¹ S S'⁻¹.
+    With R = ``inverse`` and C = S⁻¹ its part for that place, white noise of variance s² moves it by s² (1 + 1/g²) C.
+    But S holds the noise of T and its gradient as if it were texture: noise of energy E adds S (R E Rᵀ) S to it. With
+    that taken out S is S' and the spread S'⁻¹ S S'⁻¹.
     """
-    weight = torch.stack((torch.ones_like(d[0]), d[0] / (window // 2), d[1] / (window // 2))).double()
-    R = (state.inverse[:6].unflatten(0, (3, 2)).double() * weight[:, None, None]).sum(0)  # (2, 8, M)
-    C = (R[:, :6].unflatten(1, (3, 2)) * weight[:, None]).sum(1)
+    R = state.inverse.double()
+    C = (R[:, :6].unflatten(1, (3, 2)) * place.double()[:, None]).sum(1)
     square, n = state.fit[0].clamp(*GAIN).double().square(), window * window
     variance = _noise(state.fit).double().clamp_min(QUANTISATION) * (n / (n - 8))
     u2 = (window // 2 + 1) / (window // 2) / 3  # mean over the window
@@ -299,16 +327,45 @@ def _covariance(state: _State, d: Tensor, window: int) -> Tensor:
     most = trace + (trace * trace - _determinant(ratio)).clamp_min(0).sqrt()
     true = _inverse(S - false * (MOST_NOISE / most.clamp_min(MOST_NOISE)))
     spread = _product(_product(true, S), true) * (variance * (1 + square) / square)
-    A = state.A.double()
-    return _product(_product(A, spread), A.transpose(0, 1)).to(state.x.dtype)
+    A = _linear(state.warp, window).double()
+    return _product(_product(A.transpose(0, 1), spread), A).to(state.warp.dtype)
 
 
-def _template(source: Pyramid, q: Tensor, batch: Tensor, window: int) -> Tensor:
-    """Windows (3, M, w, w) of the gradient and of T without its mean, around whole pixels ``q`` (2, M)."""
+def _place(d: Tensor, window: int) -> Tensor:
+    """Where an offset ``d`` (2, M), px, lies in the window: (1, u, v)."""
+    return torch.cat((torch.ones_like(d[:1]), d / (window // 2)))
+
+
+def _still(like: Tensor) -> Tensor:
+    """Identities (2, 2, M)."""
+    return torch.eye(2, dtype=like.dtype, device=like.device)[..., None].expand(2, 2, like.shape[-1])
+
+
+def _start(there: Tensor, place: Tensor, A: Tensor, window: int) -> Tensor:
+    """The warp with linear part ``A``, transposed, that sends ``place`` (3, M) ``there`` (2, M)."""
+    sides = A * (window // 2)
+    return torch.cat(((there - (sides * place[1:, None]).sum(0))[None], sides))
+
+
+def _linear(warp: Tensor, window: int) -> Tensor:
+    """Aᵀ (2, 2, M)."""
+    return warp[1:] / (window // 2)
+
+
+def _from(corner: Tensor, warp: Tensor) -> Tensor:
+    """A warp seen from ``corner`` (2, M)."""
+    return torch.cat(((warp[0] - corner)[None], warp[1:]))
+
+
+def _pictures(source: Pyramid, q: Tensor, batch: Tensor, window: int, out: Tensor | None = None) -> Tensor:
+    """The eight pictures (M, 8, w²) of windows around whole pixels ``q`` (2, M): ∇T, u ∇T, v ∇T, T without its mean
+    and 1; u and v run from -1 to 1."""
     first, _ = source.locate(0, q, batch, window // 2, (GRAD_X, GRAD_Y, GREY))
-    G = source.read(0, first, window)
-    T = G[2:] - G[2:].mean(-1, keepdim=True)
-    return torch.cat([G[:2], T]).unflatten(-1, (window, window))
+    G = source.read(0, first, window).transpose(0, 1)
+    s = torch.linspace(-1, 1, window, dtype=q.dtype, device=q.device)
+    one, u, v = torch.ones_like(G[:, :1]), s.repeat(window), s.repeat_interleave(window)
+    g, T = G[:, :2], G[:, 2:]
+    return torch.cat((g, g * u, g * v, T - T.mean(-1, keepdim=True), one), 1, out=out)
 
 
 def _patch(target: Pyramid, level: int, x: Tensor, batch: Tensor, window: int) -> tuple[Tensor, Tensor]:
@@ -321,32 +378,36 @@ def _patch(target: Pyramid, level: int, x: Tensor, batch: Tensor, window: int) -
     return target.read(level, first, side)[0].unflatten(-1, (side, side))[:, None], middle - reach
 
 
-def _places(x: Tensor, A: Tensor, window: int) -> Tensor:
-    """Where the window's pixels lie: the planes (2, M, w, w) of x + A p."""
-    half = window // 2
-    p = torch.arange(-half, half + 1, dtype=x.dtype, device=x.device)
-    return (x[..., None, None] + A[:, 1, :, None, None] * p[:, None]) + A[:, 0, :, None, None] * p
+def _places(warp: Tensor, window: int) -> Tensor:
+    """Where the window's pixels lie: planes (2, M, w, w)."""
+    s = torch.linspace(-1, 1, window, dtype=warp.dtype, device=warp.device)
+    middle, right, down = warp[..., None]
+    return (middle + down * s)[..., None] + (right * s)[..., None, :]
 
 
-def _read(patch: Tensor, x: Tensor, A: Tensor, window: int) -> Tensor:
-    """J (M, w, w) at x + A p, x (2, M) px of the patch; beyond its border the border's value."""
-    scale = 2 / (patch.shape[-1] - 1)
-    grid = _places(x * scale - 1, A * scale, window).permute(1, 2, 3, 0)
-    return F.grid_sample(patch, grid, padding_mode="border", align_corners=True)[:, 0]
+def _read(patch: Tensor, warp: Tensor, window: int) -> Tensor:
+    """J (M, w²) in a patch, the warp in its pixels; beyond its border the border's value."""
+    middle = (patch.shape[-1] - 1) / 2
+    grid = _places(_from(torch.full_like(warp[0], middle), warp) / middle, window).permute(1, 2, 3, 0)
+    return F.grid_sample(patch, grid, padding_mode="border", align_corners=True).flatten(1)
 
 
-def _quality(T: Tensor, J: Tensor, x: Tensor, A: Tensor) -> Tensor:
-    """How well windows agree (3, M): gain of J over T; mean square of what gain and bias leave; and which share of the
-    variance of white noise reading between pixels has left in J (which would make half a pixel look a better fit)."""
-    J = J - J.mean((-2, -1), keepdim=True)
-    energy = (T * T).sum((-2, -1))
-    gain = (T * J).sum((-2, -1)) / torch.where(energy > 0, energy, torch.ones_like(energy))
-    variance = (J - gain[:, None, None] * T).square().mean((-2, -1))
-    f = _places(x, A, T.shape[-1])
-    f = f - f.floor()
-    share = 1 - 2 * f * (1 - f)
-    share = (share[0] * share[1]).mean((-2, -1))
+def _quality(T: Tensor, J: Tensor, share: Tensor) -> Tensor:
+    """How well windows agree (3, M): gain of J over T; mean square of what gain and bias leave; and ``share``."""
+    energy = (T * T).sum(-1)
+    gain = (T * J).sum(-1) / torch.where(energy > 0, energy, torch.ones_like(energy))
+    rest = J - gain[:, None] * T
+    variance = (rest - rest.mean(-1, keepdim=True)).square().mean(-1)
     return torch.stack((gain, variance, share))
+
+
+def _share(places: Tensor) -> Tensor:
+    """Which share (M,) of the variance of white noise is left, on average, by reading at places (2, M, k), overwritten.
+
+    It would make half a pixel look a better fit.
+    """
+    u, v = places.frac_().abs_().sub_(0.5).square_().mul_(2).add_(0.5)
+    return u.mul_(v).mean(-1)
 
 
 def _noise(fit: Tensor) -> Tensor:
@@ -355,45 +416,33 @@ def _noise(fit: Tensor) -> Tensor:
     return variance / (share + gain.clamp(*GAIN).square())
 
 
-def _moments(Q: Tensor) -> Tensor:
-    """Sums (M, 3, k) of pictures (k, M, w, w) times 1, u and v; u and v run from -1 to 1."""
-    s = torch.linspace(-1, 1, Q.shape[-1], dtype=Q.dtype, device=Q.device)
-    rows, columns = Q.sum(-1), Q.sum(-2)
-    return torch.stack((rows.sum(-1), (columns * s).sum(-1), (rows * s).sum(-1))).permute(2, 0, 1)
+def _normal(Q: Tensor) -> Tensor:
+    """Normal equations (M, 8, 8) of the eight pictures."""
+    damping = torch.tensor([0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0], dtype=Q.dtype, device=Q.device) * DAMPING
+    return torch.bmm(Q, Q.transpose(1, 2)) + torch.diag(damping)
 
 
-def _right_side(G: Tensor, J: Tensor) -> Tensor:
-    """Sums (M, 8) of J times the eight pictures."""
-    ends = torch.stack(((G[2] * J).sum((-2, -1)), J.sum((-2, -1))), 1)
-    return torch.cat((_moments(G[:2] * J).flatten(1), ends), 1)
+def _invert(H: Tensor) -> tuple[Tensor, Tensor]:
+    """Inverse (M, 8, 8) of normal equations, and whether there is one."""
+    diagonal = H.diagonal(dim1=1, dim2=2).double()
+    s = diagonal.masked_fill(~(diagonal > 0), 1.0).rsqrt()
+    s = s[:, :, None] * s[:, None]
+    L, info = torch.linalg.cholesky_ex(H * s)
+    textured = (info == 0) & (L.diagonal(dim1=1, dim2=2).amin(-1) > MIN_PIVOT)
+    L = torch.where(textured[:, None, None], L, torch.eye(8, dtype=L.dtype, device=L.device) * DAMPING**0.5)
+    return (torch.cholesky_inverse(L) * s).to(H.dtype), textured
 
 
-def _normal(G: Tensor) -> Tensor:
-    """Normal equations (M, 8, 8) of the eight pictures: ∇T, u ∇T, v ∇T, T and 1."""
-    g, T = G[:2], G[2]
-    Q = torch.stack((g[0] * g[0], g[0] * g[1], g[1] * g[1]))
-    s = torch.linspace(-1, 1, Q.shape[-1], dtype=Q.dtype, device=Q.device)
-    rows, columns, mixed = Q.sum(-1), Q.sum(-2), (Q * s).sum(-1)
-    sums = torch.stack((rows, columns * s, rows * s, columns * s * s, mixed * s, rows * s * s)).sum(-1)  # (6, 3, M)
-    product, pair = (torch.tensor(t, device=Q.device) for t in (_PRODUCT, ((0, 1), (1, 2))))
-    H = sums[product][:, :, pair].permute(4, 0, 2, 1, 3).reshape(-1, 6, 6)
-    damping = torch.tensor([0.0, 0.0, 1.0, 1.0, 1.0, 1.0], dtype=H.dtype, device=H.device) * DAMPING
-    H = H + torch.diag(damping)
-    side = torch.stack((_moments(g * T).flatten(1), _moments(g).flatten(1)), -1)  # (M, 6, 2)
-    energy, zero = (T * T).sum((-2, -1)), torch.zeros_like(T[:, 0, 0])
-    corner = torch.stack((energy, zero, zero, zero + T.shape[-2] * T.shape[-1]), -1).unflatten(-1, (2, 2))
-    return torch.cat((torch.cat((H, side), 2), torch.cat((side.transpose(1, 2), corner), 2)), 1)
+def _change(solution: Tensor) -> Tensor:
+    """The change (3, 2, M) that a solution (M, 8) says: δ, and what it adds at u = 1 and v = 1, px."""
+    return (solution[:, :6].T / solution[:, 6].clamp(*GAIN)).unflatten(0, (3, 2))
 
 
-def _compose(x: Tensor, A: Tensor, solution: Tensor, window: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The warp after a step on the template's side, and how far it moves the window's corners, px."""
+def _compose(warp: Tensor, change: Tensor, window: int) -> Tensor:
+    """The warp after a change on the template's side: A becomes A (1 + D)⁻¹, and with that W_0 becomes W_0 - A δ."""
     half = window // 2
-    c = solution[:6] / solution[6].clamp(*GAIN)
-    D = torch.stack((torch.stack((c[2], c[4])), torch.stack((c[3], c[5])))) / half
-    eye = torch.eye(2, dtype=x.dtype, device=x.device)[..., None]
-    A_new = _product(A, _inverse(eye + D))
-    moved = (c[:2].abs() + half * D.abs().sum(1)).amax(0)
-    return x - _apply(A_new, c[:2]), A_new, moved
+    sides = _product(_inverse(_still(change) + change[1:] / half), warp[1:])
+    return torch.cat(((warp[0] - (sides * change[0, :, None]).sum(0) / half)[None], sides))
 
 
 def _inside(x: Tensor, pyramid: Pyramid) -> Tensor:
@@ -415,10 +464,6 @@ def _inverse(A: Tensor) -> Tensor:
 def _product(A: Tensor, B: Tensor) -> Tensor:
     """(2, 2, M) times (2, 2, M), as sums: rounding then does not depend on the batch."""
     return (A[:, :, None] * B[None]).sum(1)
-
-
-def _apply(A: Tensor, d: Tensor) -> Tensor:
-    return A[:, 0] * d[0] + A[:, 1] * d[1]
 
 
 def _static(x: Tensor) -> bool:

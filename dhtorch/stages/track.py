@@ -194,7 +194,7 @@ def lucas_kanade_affine(
     track: Callable[..., Tracks] = lucas_kanade,
     window: int = 21,
     levels: int = 4,
-    iterations: int = 10,
+    iterations: int = 7,
     epsilon_px: float = 0.01,
     max_shift_px: float = 2.0,
 ) -> Tracks:
