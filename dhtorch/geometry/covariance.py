@@ -80,7 +80,5 @@ def median(
     check("median", x=(x, "B N"), used=(used, "B N"))
     if x.shape[-1] == 0:
         return x.new_ones((*x.shape[:-1], 1))
-    ordered = x.masked_fill(~used, torch.inf).sort(-1).values
-    count = used.sum(-1, keepdim=True)
-    middle = ordered.gather(-1, ((count - 1) // 2).clamp_min(0))
-    return torch.where(count > 0, middle, torch.ones_like(middle))
+    middle = x.masked_fill(~used, torch.nan).nanmedian(-1, keepdim=True).values
+    return torch.where(middle.isnan(), torch.ones_like(middle), middle)

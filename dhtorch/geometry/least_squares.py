@@ -60,10 +60,9 @@ def linearise(
     Gradient: to pose, f, c, xyz and uv. The Jacobian is checked against autograd.
     """
     check("linearise", R=(T.R, "B 3 3"), f=(f, "B 2"), c=(c, "B 2"), xyz=(xyz, "B 3 N"), uv=(uv, "B 2 N"))
-    # Multiply-adds instead of a matrix product: the rounding cannot depend on the batch.
-    Y = _moved(T, xyz)
+    Y = torch.baddbmm(T.t[..., None], T.R, xyz)
     z = Y[:, 2]
-    w = 1 / z.masked_fill(~(z > MIN_DEPTH), 1.0)
+    w = 1 / z.clamp_min(MIN_DEPTH)
     f = f[..., None]
     plane = Y[:, :2] * w[:, None]  # (a, b): where the point is seen at z = 1
     minus, square = -plane, plane * plane
@@ -73,11 +72,6 @@ def linearise(
     zero = torch.zeros_like(a)
     columns = (na * b, -1 - bb, 1 + aa, a * b, nb, a, w, zero, zero, w, aw, bw, ra, rb)  # u and v in turn
     return torch.stack(columns, 1).unflatten(1, (7, 2)) * f[:, None], z
-
-
-def _moved(T: Pose, xyz: Tensor) -> Tensor:
-    (x, y, z), (r0, r1, r2) = xyz[:, None].unbind(2), T.R[..., None].unbind(2)
-    return r0 * x + r1 * y + r2 * z + T.t[..., None]
 
 
 def robust(square: Tensor, kernel: str | None, scale: float) -> tuple[Tensor, Tensor]:
@@ -213,13 +207,12 @@ def move(
     Gradient: to T and xi. Raises ValueError for wrong shapes.
     """
     check("move", R=(T.R, "B 3 3"), xi=(xi, "B 6"))
-    omega, upsilon = xi[:, :3], xi[:, 3:]
+    omega = xi[:, :3, None]
     M = torch.cat((T.R, T.t[..., None]), -1)
-    axis = omega[..., None].expand_as(M)
-    once = torch.linalg.cross(axis, M, dim=1)
-    twice = torch.linalg.cross(axis, once, dim=1)
-    M = M + (once + 0.5 * twice) / (1 + 0.25 * (omega * omega).sum(-1))[:, None, None]
-    return Pose(M[..., :3], M[..., 3] + upsilon)
+    once = torch.linalg.cross(omega, M, dim=1)
+    twice = torch.linalg.cross(omega, once, dim=1)
+    M = M + (once + 0.5 * twice) / (1 + 0.25 * (omega * omega).sum(1, keepdim=True))
+    return Pose(M[..., :3], M[..., 3] + xi[:, 3:])
 
 
 def trial_step(T: Pose, H: Tensor, g: Tensor) -> tuple[Pose, Tensor]:
@@ -231,9 +224,8 @@ def trial_step(T: Pose, H: Tensor, g: Tensor) -> tuple[Pose, Tensor]:
     """
     check("trial_step", H=(H, "B 6 6"), g=(g, "B 6"))
     with torch.no_grad():
-        xi, info = torch.linalg.solve_ex(H.double(), -g.double())
-        xi = xi.to(g.dtype)
-        ok = (info == 0) & (xi.abs().amax(-1) < torch.inf)
+        xi = torch.linalg.solve_ex(H.double(), -g.double()).result.to(g.dtype)
+        ok = xi.abs().amax(-1) < torch.inf  # without a solution it is not
         return move(T, xi.masked_fill(~ok[:, None], 0.0)), ok
 
 
@@ -266,7 +258,7 @@ def minimise(
         proposal, ok = step(T, best.H + factor[:, None, None] * diagonal, best.g)
         found = evaluate(proposal)
         better = ok & (found.cost < best.cost)
-        T, best = choose(better, proposal, T), choose(better, found, best)
+        T, best = choose(better, (proposal, found), (T, best))
         factor = torch.where(better, factor * 0.1, factor * 10)
     return T, best.cost
 

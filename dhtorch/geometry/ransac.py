@@ -22,6 +22,9 @@ MIN_SPREAD = 1e-3
 #: points of a room, would look like a line.
 FAR_OFF = 100.0
 
+#: Residuals of hypotheses that are looked at together: three planes of them stay in cache.
+RESIDUALS = 1 << 15
+
 
 def usable_first(
     usable: Tensor,  # (B, N) bool
@@ -37,11 +40,10 @@ def usable_first(
     N = check("usable_first", usable=(usable, "B N"))["N"]
     if N == 0:
         raise ValueError("usable_first: usable has no points, expected N > 0")
-    number = usable.sum(-1, keepdim=True)
-    rank = torch.where(usable, usable.cumsum(-1) - 1, torch.full_like(number, N))
-    position = torch.arange(N, device=usable.device).expand_as(rank)
-    order = torch.zeros_like(rank[:, :1]).expand(-1, N + 1).scatter(1, rank, position)
-    return order.gather(1, even_slots(number[:, 0], size)), number[:, 0].clamp(max=size)
+    found = usable.cumsum(-1)
+    number = found[:, -1]
+    index = torch.searchsorted(found, even_slots(number, size) + 1)
+    return index.clamp(max=N - 1), number.clamp(max=size)
 
 
 def even_slots(count: Tensor, size: int) -> Tensor:
@@ -89,20 +91,21 @@ def msac_cost(
 
     Source: P. Torr, A. Zisserman, "MLESAC" (CVIU 2000), the truncated score.
     """
-    K = check("msac_cost", R=(T.R, "B K 3 3"), t=(T.t, "B K 3"), xyz=(xyz, "B 3 M"), uv=(uv, "B 2 M"))["K"]
-    limit = threshold_px * threshold_px
+    sizes = check("msac_cost", R=(T.R, "B K 3 3"), t=(T.t, "B K 3"), xyz=(xyz, "B 3 M"), uv=(uv, "B 2 M"))
+    limits = (used * (threshold_px * threshold_px))[:, None]
     scale = torch.cat((f, torch.ones_like(f[:, :1])), 1)[:, :, None, None]
-    P = torch.cat((T.R, T.t[..., None]), -1).transpose(1, 2) * scale  # (B, 3, K, 4)
+    P = (torch.cat((T.R, T.t[..., None]), -1).transpose(1, 2) * scale).flatten(1, 2)  # (B, 3 K, 4)
     points = torch.cat((xyz, torch.ones_like(xyz[:, :1])), 1)
-    limits = used.to(xyz.dtype) * limit
+    pairs = max(RESIDUALS // (sizes["K"] * max(sizes["M"], 1)), 1)
     costs = []
-    for b in range(T.R.shape[0]):  # one product per pair keeps the temporaries in cache
-        x, y, z = (P[b].flatten(0, 1) @ points[b]).unflatten(0, (3, K))
+    for b in range(0, len(f), pairs):  # few pairs at a time keep the temporaries in cache
+        part = slice(b, b + pairs)
+        x, y, z = torch.bmm(P[part], points[part]).unflatten(1, (3, -1)).unbind(1)
         w = z.clamp_min_(MIN_DEPTH).reciprocal_()  # points behind the camera land far outside the image
-        x = x.mul_(w).sub_(uv[b, 0])
-        y = y.mul_(w).sub_(uv[b, 1])
-        costs.append(torch.minimum(x.mul_(x).add_(y.mul_(y)), limits[b]).sum(-1))
-    return torch.stack(costs)
+        x = x.mul_(w).sub_(uv[part, :1])
+        y = y.mul_(w).sub_(uv[part, 1:])
+        costs.append(torch.minimum(x.mul_(x).add_(y.mul_(y)), limits[part]).sum(-1))
+    return torch.cat(costs)
 
 
 @torch.no_grad()
@@ -136,7 +139,8 @@ def search(
     uv = uv - c[..., None]
     rays = torch.cat((uv / f[..., None], torch.ones_like(uv[:, :1])), 1)
     triples = distinct_triples(draws, count)
-    R, t, valid = p3p(_pick(rays, triples), _pick(xyz, triples))
+    picked = _take(torch.cat((rays, xyz), 1), triples.flatten(1)).unflatten(2, triples.shape[1:]).permute(0, 2, 3, 1)
+    R, t, valid = p3p(picked[..., :3], picked[..., 3:])
     poses = Pose(R.flatten(1, 2), t.flatten(1, 2))
     few = even_slots(count, preview)
     used = torch.arange(preview, device=count.device) < count[:, None]
@@ -162,20 +166,13 @@ def collinear(
     """
     check("collinear", xyz=(xyz, "B 3 M"), used=(used, "B M"))
     reach = xyz.detach().abs().amax(1)
-    used = used & (reach <= FAR_OFF * median(reach, used))
-    weight = used.double()[:, None]
-    x = torch.where(used[:, None], xyz.double(), torch.zeros_like(xyz, dtype=torch.float64))
-    x = (x - x.sum(-1, keepdim=True) / weight.sum(-1, keepdim=True).clamp_min(1)) * weight
+    used = (used & (reach <= FAR_OFF * median(reach, used)))[:, None]
+    x = xyz.masked_fill(~used, 0.0).double()
+    x = (x - x.sum(-1, keepdim=True) / used.sum(-1, keepdim=True).clamp_min(1)) * used
     scatter = torch.bmm(x, x.transpose(1, 2))
     trace = scatter.diagonal(dim1=-2, dim2=-1).sum(-1)
     minors = 0.5 * (trace * trace - (scatter * scatter).sum((-2, -1)))  # ≈ product of the two largest eigenvalues
     return minors <= (MIN_SPREAD * trace) ** 2
-
-
-def _pick(planes: Tensor, triples: Tensor) -> Tensor:
-    """(B, 3, M) at (B, H, 3) slots → (B, H, 3, 3) point, coordinate."""
-    picked = _take(planes, triples.flatten(1))
-    return picked.unflatten(2, triples.shape[1:]).permute(0, 2, 3, 1)
 
 
 def _take(planes: Tensor, slots: Tensor) -> Tensor:

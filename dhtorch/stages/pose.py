@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from dhtorch.codes import PoseCode
+from dhtorch.codes import PoseCode, first_reason
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import covariance, near_far, ransac, se3
 from dhtorch.geometry.least_squares import (
@@ -17,11 +17,12 @@ from dhtorch.geometry.least_squares import (
     MIN_DEPTH,
     Normal,
     choose,
-    gauss_newton_step,
     linearise,
     minimise,
+    move,
     normal_equations,
     robust,
+    solve_spd,
     trial_step,
 )
 from dhtorch.geometry.most_probable import Options, most_probable
@@ -130,30 +131,38 @@ def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, f: Tensor, c
         inlier = usable & found[:, None] & (depth > MIN_DEPTH) & (square < options.threshold_px**2)
         weight = (robust(square, options.kernel, options.kernel_px)[1] * inlier).detach()
     H, g = normal_equations(rows, weight)
-    T, solved = gauss_newton_step(start, H, g)
+    eye = torch.eye(6, dtype=H.dtype, device=H.device).expand_as(H)
+    x, solved = solve_spd(H, torch.cat((-g[..., None], eye), -1))
+    T, inverse = move(start, x[..., 0]), x[..., 1:].detach()
     with torch.no_grad():
         n_inlier = inlier.sum(-1)
         enough = n_inlier >= options.min_inlier
         line = ransac.collinear(xyz, torch.where(enough[:, None], inlier, usable))
-        finite = T.R.isfinite().flatten(1).all(1) & T.t.isfinite().all(1)
-        code = torch.where(solved & finite, PoseCode.OK, PoseCode.DEGENERATE)
-        code = torch.where(enough, code, PoseCode.TOO_FEW)
-        code = torch.where(line, PoseCode.DEGENERATE, code)
-        code = torch.where(usable.sum(-1) >= options.min_inlier, code, PoseCode.TOO_FEW).to(torch.int32)
-        ok = code == PoseCode.OK
+        finite = (T.R.sum((1, 2)) + T.t.sum(1)).isfinite()
+        code = first_reason(
+            (usable.sum(-1) < options.min_inlier, PoseCode.TOO_FEW),
+            (line, PoseCode.DEGENERATE),
+            (~enough, PoseCode.TOO_FEW),
+            (~(solved & finite), PoseCode.DEGENERATE),
+            otherwise=PoseCode.OK,
+        )
+        failed = code != PoseCode.OK
         total = (square * inlier).sum(-1)
         rms_px = (total / n_inlier.clamp_min(1)).sqrt()
         sigma_px = (total / (2 * n_inlier - 6).clamp_min(1)).sqrt().clamp_min(MIN_SIGMA_PX)
-        cov, _ = covariance.from_normal(H, sigma_px)
-        t_snr = covariance.mahalanobis(T.t, cov[:, 3:, 3:])
+        cov = (inverse + inverse.transpose(1, 2)) * (0.5 * sigma_px * sigma_px)[:, None, None]
+        # With H = L Lᵀ, the lower end of L is the factor of the translation's information, the rotation eliminated.
+        lower = torch.linalg.cholesky_ex(H).L[:, 3:, 3:]
+        root = (lower * T.t[..., None]).sum(1)
+        t_snr = (root * root).sum(-1).sqrt() / sigma_px
 
     def answer(x: Tensor) -> Tensor:
-        return torch.where(ok.view(-1, *[1] * (x.ndim - 1)), x, torch.nan).to(uv.dtype)
+        return x.masked_fill(failed.view(-1, *[1] * (x.ndim - 1)), torch.nan).to(uv.dtype)
 
     return PoseFit(
         T_1_from_0=Pose(answer(T.R), answer(T.t)),
         cov=answer(cov),
-        inlier=(inlier & ok[:, None])[:, :N],
+        inlier=(inlier & ~failed[:, None])[:, :N],
         n_inlier=n_inlier,
         rms_px=answer(rms_px),
         sigma_px=answer(sigma_px),
@@ -163,15 +172,13 @@ def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, f: Tensor, c
 
 
 def _planes(xyz: Tensor, uv: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Planes (B, 3, N'), (B, 2, N') and usable (B, N'), N' > 0 a multiple of LANES; unusable points at a safe place."""
-    usable = valid & xyz.isfinite().all(-1) & uv.isfinite().all(-1)
-    safe = torch.tensor([0.0, 0.0, 1.0], dtype=xyz.dtype, device=xyz.device)
-    xyz = torch.where(usable[..., None], xyz, safe)
-    uv = torch.where(usable[..., None], uv, torch.zeros_like(uv))
+    """Planes (B, 3, N'), (B, 2, N') and usable (B, N'), N' > 0 a multiple of LANES; unusable points at zero."""
+    both = torch.cat((xyz, uv), -1)
+    usable = valid & both.isfinite().all(-1)
     N = usable.shape[1]
-    padding = max(N + -N % LANES, LANES) - N
-    xyz, uv = (torch.nn.functional.pad(x.transpose(1, 2), (0, padding)) for x in (xyz, uv))
-    return xyz, uv, torch.nn.functional.pad(usable, (0, padding))
+    padding = (0, max(N + -N % LANES, LANES) - N)
+    both = torch.nn.functional.pad(both.masked_fill(~usable[..., None], 0.0).transpose(1, 2), padding).contiguous()
+    return both[:, :3], both[:, 3:], torch.nn.functional.pad(usable, padding)
 
 
 def _robust_pose(
@@ -211,23 +218,23 @@ def _truncated(
 ) -> Callable[[Pose], Normal]:
     """The cost that search and refinement share: Σ rho(min(r², threshold²)), points behind the camera in full."""
     limit = threshold_px * threshold_px
+    limits = usable * limit
 
     def evaluate(T: Pose) -> Normal:
         rows, depth = linearise(T, f, c, xyz, uv)
         square = (rows[:, 6] * rows[:, 6]).sum(1)
-        square = square.masked_fill(depth <= MIN_DEPTH, limit).clamp(max=limit)
+        square = torch.minimum(square.masked_fill(depth <= MIN_DEPTH, limit), limits)
         rho, weight = robust(square, kernel, kernel_px)
-        H, g = normal_equations(rows, weight * (usable & (square < limit)))
-        return Normal((rho * usable).sum(-1), H, g)
+        return Normal(rho.sum(-1), *normal_equations(rows, weight * (square < limits)))
 
     return evaluate
 
 
 def _orthonormal(R: Tensor) -> Tensor:
     """The rotation nearest along Gram–Schmidt to one that has drifted by rounding."""
-    x = R[:, 0] / R[:, 0].norm(dim=-1, keepdim=True)
+    x = R[:, 0] / (R[:, 0] * R[:, 0]).sum(-1, keepdim=True).sqrt()
     z = torch.linalg.cross(x, R[:, 1])
-    z = z / z.norm(dim=-1, keepdim=True)
+    z = z / (z * z).sum(-1, keepdim=True).sqrt()
     return torch.stack((x, torch.linalg.cross(z, x), z), 1)
 
 
