@@ -67,8 +67,8 @@ def forward(image_0: Tensor, image_1: Tensor, uv: Tensor, window: int, pyramid_0
     o = lk.Options(window, 30, 0.01, track.MIN_EIGENVALUE, "none")
     with torch.no_grad():
         source = build_pyramid(image_0, LEVELS, window) if pyramid_0 is None else pyramid_0
-        target = build_pyramid(image_1, LEVELS, window)
-        x = uv.permute(2, 0, 1).reshape(2, B * N)
+        target = build_pyramid(image_1, LEVELS, window, gradients=False)
+        x = uv.permute(2, 0, 1).reshape(2, B * N).contiguous()
         batch = torch.arange(B).repeat_interleave(N)
         known = lk.within(x, *source.bounds())
         d, found, _ = lk.search(source, target, o, True, x, torch.zeros_like(x), batch, known)

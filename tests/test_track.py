@@ -76,6 +76,12 @@ def test_pyramid_stops_before_levels_that_no_window_fits_and_refuses_small_image
             build_pyramid(torch.rand(1, 1, 40, 40), **bad)
 
 
+def test_a_pyramid_without_gradients_has_the_same_grey_values():
+    image = torch.rand(2, 3, 97, 131)
+    for level, grey in zip(build_pyramid(image, 3)[0], build_pyramid(image, 3, gradients=False)[0], strict=True):
+        assert torch.equal(level[:, GREY : GREY + 1], grey)
+
+
 def test_pyramid_gradcheck():
     image = torch.rand(1, 1, 16, 17, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda x: build_pyramid(x, 1, 3).levels, image, fast_mode=True)
@@ -240,6 +246,7 @@ def test_wrong_shapes_and_options_raise():
         lambda: lucas_kanade(image, image, uv, window=51),
         lambda: lucas_kanade(image, image, uv, pyramid_0=build_pyramid(image[..., :-1])),
         lambda: lucas_kanade(image, image, uv, pyramid_0=build_pyramid(image, window=11)),
+        lambda: lucas_kanade(image, image, uv, pyramid_0=build_pyramid(image, gradients=False)),
         lambda: refine(image, image, uv, uv[:, :3]),
         lambda: refine(image, image, uv, uv, normalise="both"),
     ]

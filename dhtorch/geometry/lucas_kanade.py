@@ -35,6 +35,10 @@ LANES = 64
 #: there the points of a cell share one search. Cells are nested, so that they share its start as well.
 CELL, CELL_LEVEL = 4, 2
 
+#: On the finest level the sixth step on a map leaps to where the steps seem to lead; ratios of successive steps beyond
+#: these limits are not believed.
+LEAP, RATIO = 6, (-0.9, 0.9)
+
 #: On coarse levels a step has converged at so many times ``epsilon_px``.
 COARSE_EPSILON = 4.0
 
@@ -47,7 +51,7 @@ class Plan(NamedTuple):
 
 
 #: At the top nothing is known yet and few cells are to be searched.
-TOP, BETWEEN, FINEST = Plan((2, 2, 2, 2), 10), Plan((1, 2, 2), 8), Plan((1, 2, 2, 2), 8)
+TOP, BETWEEN, FINEST = Plan((2, 2, 2, 2), 10), Plan((1, 2, 2), 8), Plan((1, 2, 2), 8)
 
 #: A ratio of contrasts beyond these limits is not believed.
 GAIN = (0.2, 5.0)
@@ -79,13 +83,14 @@ class _Pair(NamedTuple):
 
 def search(
     source: Pyramid, target: Pyramid, o: Options, alike: bool, x: Tensor, d: Tensor, batch: Tensor, known: Tensor
-):
+) -> tuple[Tensor, Tensor, Tensor]:
     """Coarse to fine from ``d`` for the points that are ``known`` (M,), M a multiple of ``LANES``.
 
     ``alike``: all ``d`` are equal, so that the points of a cell may share a search.
 
     Returns the displacement (2, M), whether it was found (M,), and A (3, M) of the finest level.
     """
+    x, d = x.contiguous(), d.contiguous()
     top = min(len(source.levels), len(target.levels)) - 1
     rough = o._replace(epsilon_px=o.epsilon_px * COARSE_EPSILON)
 
@@ -93,22 +98,19 @@ def search(
         """Where the search on ``level`` starts: the displacement found on the level above."""
         if level == top:
             return d * 0.5**top
-        if not alike or level + 1 < CELL_LEVEL:
-            return coarse(level + 1, x, d, batch)[0] * 2
-        size = CELL * 2.0 ** (level + 1)
-        cell = ((x + 0.5) / size).floor()
-        middle = torch.minimum((cell + 0.5) * size, source.bounds(0)[1] - 0.5)
-        return _once_each(torch.cat([cell, batch[None]]).long(), partial(coarse, level + 1), (middle, d, batch))[0] * 2
+        if alike and level + 1 >= CELL_LEVEL:
+            return _by_cell(source, level + 1, partial(coarse, level + 1), x, d, batch) * 2
+        return coarse(level + 1, x, d, batch) * 2
 
-    def coarse(level: int, x: Tensor, d: Tensor, batch: Tensor) -> tuple[Tensor]:
+    def coarse(level: int, x: Tensor, d: Tensor, batch: Tensor) -> Tensor:
         pair, plan = _Pair(source, target, level, *target.bounds(level)), TOP if level == top else BETWEEN
         pixel = source.corner(level, x * 0.5**level + 0.5)  # read between pixels only where it decides the answer
         every = torch.ones_like(batch, dtype=torch.bool)
-        return (_descend(pair, rough, plan, pixel, start(level, x, d, batch), batch, every)[0],)
+        return _descend(pair, rough, plan, pixel, start(level, x, d, batch), batch, every)[0]
 
     pair = _Pair(source, target, 0, *target.bounds(0))
-    d, textured, A = _descend(pair, o, FINEST if top else TOP, x, start(0, x, d, batch), batch, known)
-    return d, known & textured & within(x + d, pair.low, pair.high), A
+    d, held, textured, A = _descend(pair, o, FINEST if top else TOP, x, start(0, x, d, batch), batch, known)
+    return d, known & textured & held & within(x + d, pair.low, pair.high), A
 
 
 def step(source: Pyramid, target: Pyramid, o: Options, x: Tensor, x_1: Tensor, batch: Tensor) -> tuple[Tensor, Tensor]:
@@ -162,22 +164,34 @@ def for_some(wanted: Tensor, fn: Callable, values: tuple[Tensor, ...], columns: 
     return tuple(old.index_copy(-1, some, n) for old, n in zip(values, new, strict=True))
 
 
-def _once_each(key: Tensor, fn: Callable, columns: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-    """``fn(*columns)`` for columns (..., M) that are equal where the columns of ``key`` (K, M) are, computed once."""
-    if _static(key) or not key.shape[1]:
-        return fn(*columns)
-    size = key.amax(1).tolist()
-    flat = (key[2] * (size[1] + 1) + key[1]) * (size[0] + 1) + key[0]
-    distinct, place = flat.unique(return_inverse=True)
-    some = torch.empty_like(distinct).scatter_(0, place, torch.arange(len(flat), device=flat.device))
-    some = torch.cat([some, some[:1].expand(-len(some) % LANES)])
-    return tuple(y.index_select(-1, place) for y in fn(*(column.index_select(-1, some) for column in columns)))
+def _by_cell(pyramid: Pyramid, level: int, fn: Callable, x: Tensor, d: Tensor, batch: Tensor) -> Tensor:
+    """``fn(x, d, batch)`` (2, M) in the middle of the cell that each ``x`` (2, M) lies in; all ``d`` are equal.
+
+    All cells of all images are computed or, where points are fewer, each point's own: with the same result.
+    """
+    size = CELL * 2**level
+    H, W = pyramid.hw()
+    columns, rows = -(-W // size), -(-H // size)
+    count = len(pyramid.levels[0]) * rows * columns
+    lowest, highest = pyramid.bounds()
+
+    def middle(column: Tensor, row: Tensor) -> Tensor:
+        return torch.minimum((torch.stack([column, row]) + 0.5) * size, highest - 0.5)
+
+    column, row = ((x - lowest) / size).long().clamp_min(0)
+    column, row = column.clamp_max(columns - 1), row.clamp_max(rows - 1)
+    if count >= x.shape[1]:
+        return fn(middle(column, row).to(x), d, batch)
+    cell = torch.arange(count + -count % LANES, device=x.device).clamp_max(count - 1)
+    places = middle(cell % columns, cell // columns % rows).to(x)
+    found = fn(places, d[:, :1].expand_as(places).contiguous(), cell // (rows * columns))
+    return found.index_select(-1, (batch * rows + row) * columns + column)
 
 
 def _descend(pair: _Pair, o: Options, plan: Plan, x: Tensor, d: Tensor, batch: Tensor, known: Tensor):
     """One level: all points on a first map, then those that need it on further ones.
 
-    Returns the displacement, whether the window is textured (M,), and A (3, M).
+    Returns the displacement; who stayed on the last map, and whose window is textured (both (M,)); and A (3, M).
     """
     corner = pair.target.corner(pair.level, x + d) - plan.radii[0]
     C, moments = _map(pair, o, plan.radii[0], x, corner, batch)
@@ -189,10 +203,11 @@ def _descend(pair: _Pair, o: Options, plan: Plan, x: Tensor, d: Tensor, batch: T
         if steps > 0:
             columns = (x, *state, batch, moments, A_inv)
             state = for_some(state[1], partial(_on_new_map, pair, o, radius, steps), state, columns)
-    return state[0], textured, moments[2:5]
+    d, _, held = state
+    return d, held, textured, moments[2:5]
 
 
-def _on_new_map(pair: _Pair, o: Options, radius: int, steps: int, x, d, live, batch, moments, A_inv):  # noqa: PLR0917
+def _on_new_map(pair: _Pair, o: Options, radius: int, steps: int, x, d, live, held, batch, moments, A_inv):  # noqa: PLR0917
     """:func:`_on_map` with a map around where the points are, of windows whose moments are known."""
     corner = pair.target.corner(pair.level, x + d) - radius
     C, _ = _map(pair, o, radius, x, corner, batch, moments)
@@ -208,23 +223,33 @@ def _on_map(
     x: Tensor,  # (2, M)
     d: Tensor,  # (2, M)
     live: Tensor,  # (M,) wants to move
-) -> tuple[Tensor, Tensor]:
-    """The displacement after ``steps`` Gauss-Newton steps on one map, and who wants to go on from there on another.
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The displacement after ``steps`` Gauss-Newton steps on one map, who wants to go on from there on another, and who
+    is still on this one.
 
     Beyond a map's border its field fades to zero, so that a point that leaves is held near it.
     """
     start = p = x + d - corner
     node = torch.arange(field.shape[1], dtype=p.dtype, device=p.device)[:, None]
     step = torch.zeros_like(p)
-    for _ in range(steps):
+    for k in range(1, steps + 1):
         hat = (1 - (p[:, None] - node).abs()).clamp_min(0)  # (2, n, M) bilinear weights
-        step = ((field * hat[0]).sum(2) * hat[1]).sum(1)
+        last, step = step, ((field * hat[0]).sum(2) * hat[1]).sum(1)
         if len(field) == 3:
             step = step[:2] / step[2].clamp(*GAIN)
+        if k == LEAP and k < steps and pair.level == 0:
+            step = _leap(last, step, o.epsilon_px)
         p = p - step
     p = torch.where(live & p.isfinite().all(0), p, start)
-    restless = (p != p.clamp(0, field.shape[1] - 1.0)).any(0) | ((step * step).sum(0) > o.epsilon_px**2)
-    return p + corner - x, live & restless & within(p, pair.low - corner, pair.high - corner)
+    held = (p == p.clamp(0, field.shape[1] - 1.0)).all(0)
+    restless = ~held | ((step * step).sum(0) > o.epsilon_px**2)
+    return p + corner - x, live & restless & within(p, pair.low - corner, pair.high - corner), held
+
+
+def _leap(last: Tensor, step: Tensor, epsilon_px: float) -> Tensor:
+    """The sum of all steps to come, as shrinking by one ratio as from the ``last`` to this ``step`` (Aitken)."""
+    ratio = (step * last).sum(0) / (last * last).sum(0).clamp_min(epsilon_px**2)
+    return torch.where((step * step).sum(0) > epsilon_px**2, step / (1 - ratio.clamp(*RATIO)), step)
 
 
 def _steps(C: Tensor, moments: Tensor, A_inv: Tensor) -> Tensor:
@@ -249,10 +274,9 @@ def _map(pair: _Pair, o: Options, radius: int, x: Tensor, corner: Tensor, batch:
         G = _project(pair.source.read(pair.level, i, w, None if pair.level else f), o.normalise)
         if moments is None:
             sums.append(_moments(G, o.normalise))
-        kernel = _kernels(G, o.normalise)
-        m = kernel.shape[1]
-        J = pair.target.read(pair.level, j, side).view(1, m, side, side)
-        maps.append(torch.cat([F.conv2d(J, k.reshape(m, 1, w, w), groups=m) for k in kernel]))
+        kernel = _kernels(G, o.normalise).reshape(-1, 1, w, w)
+        J = pair.target.read(pair.level, j.repeat(1, len(kernel) // len(f[0])), side).view(1, len(kernel), side, side)
+        maps.append(F.conv2d(J, kernel, groups=len(kernel)).unflatten(1, (-1, len(f[0])))[0])
     C = torch.cat(maps, 1).permute(0, 2, 3, 1).contiguous()
     return C, torch.cat(sums, -1) if moments is None else moments
 

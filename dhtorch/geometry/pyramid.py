@@ -1,7 +1,8 @@
-"""Image pyramids ready for window searches: padded levels with their gradients beside them.
+"""Image pyramids ready for window searches: padded levels, with their gradients beside them.
 
-Alphabet: ``image`` (B, C, H, W); ``level`` (B, 3, H_l + 2 pad, W_l + 2 pad), whose planes are the gradient along x, the
-gradient along y and the grey value. Pixel i of a level lies at pixel 2 i of the level below it.
+Alphabet: ``image`` (B, C, H, W); ``level`` (B, P, H_l + 2 pad, W_l + 2 pad), whose planes are the grey value and, where
+windows are to be searched for and not only searched in, its gradients along x and y. Pixel i of a level lies at pixel
+2 i of the level below it.
 """
 
 from __future__ import annotations
@@ -20,17 +21,17 @@ REACH = 8
 #: How far outside the image the middle of a window may lie, px of the level.
 MARGIN = 4
 
-#: Rows whose gradients are computed at once.
-BAND = 64
+#: Pixels that are worked on at once: few enough to stay in the cache, and to need no fresh memory.
+BAND = 1 << 17
 
 #: Planes of a level.
-GRAD_X, GRAD_Y, GREY = 0, 1, 2
+GREY, GRAD_X, GRAD_Y = 0, 1, 2
 
 
 class Pyramid(NamedTuple):
     """Padded levels of a batch of images, finest first. A plain pytree: it may be kept, moved and compiled."""
 
-    levels: tuple[Tensor, ...]  # each (B, 3, H_l + 2 pad, W_l + 2 pad)
+    levels: tuple[Tensor, ...]  # each (B, 3 or 1, H_l + 2 pad, W_l + 2 pad)
     pad: int
 
     def hw(self, level: int = 0) -> tuple[int, int]:
@@ -58,10 +59,10 @@ class Pyramid(NamedTuple):
 
         ``x`` (2, M) px of the level, ``batch`` (M,); returns flat indices (P, M), one row per plane, and (2, M).
         """
-        rows, width = self.levels[level].shape[-2:]
+        count, rows, width = self.levels[level].shape[1:]
         whole = self.corner(level, x)
         u, v = whole.long() + (self.pad - before)
-        plane = 3 * batch + torch.tensor(planes, device=x.device)[:, None]
+        plane = count * batch + torch.tensor(planes, device=x.device)[:, None]
         return (plane * rows + v) * width + u, x - whole
 
     def read(self, level: int, first: Tensor, size: int, fraction: Tensor | None = None) -> Tensor:
@@ -85,6 +86,8 @@ def build_pyramid(
     image: Tensor,  # (B, C, H, W) C 1 or 3; float in [0, 1] or uint8
     levels: int = 4,
     window: int = 21,
+    *,
+    gradients: bool = True,
 ) -> Pyramid:
     """Grey pyramid with gradients, padded for searches with windows of ``window`` pixels.
 
@@ -92,6 +95,9 @@ def build_pyramid(
     are Scharr's, per pixel. Outside the image the grey value is mirrored about the border pixel and the gradient is
     zero (a mirrored gradient would hold a window back at the border). As in ``cv2.buildOpticalFlowPyramid``, a level
     that would be no larger than the window is not made.
+
+    Args:
+        gradients: without them the pyramid takes a third of the memory; windows can be searched in it, not for it.
 
     Returns:
         1 to ``levels`` levels (full resolution included) in the image's dtype, float32 for narrower ones.
@@ -110,22 +116,39 @@ def build_pyramid(
     smallest = max(window, pad)
     if min(sizes["H"], sizes["W"]) <= smallest:
         raise ValueError(f"build_pyramid: image of {sizes['H']}x{sizes['W']} pixels is too small for window {window}")
-    grey = luma(image, dim=1)
-    grey = grey.to(torch.promote_types(grey.dtype, torch.float32))
+    dtype = torch.promote_types(image.dtype, torch.float32)
     chain: list[Tensor] = []
-    while len(chain) < levels and min(grey.shape[-2:]) > smallest:
-        chain.append(_with_gradients(grey, pad))
-        grey = _half(chain[-1][:, GREY:], pad)
+    h, w = image.shape[-2:]
+    while len(chain) < levels and min(h, w) > smallest:
+        level = image.new_empty(len(image), 3 if gradients else 1, h + 2 * pad, w + 2 * pad, dtype=dtype)
+        grey = level[:, GREY : GREY + 1]
+        inside = grey[..., pad:-pad, pad:-pad]
+        for part in _bands(image, (h, w)):
+            inside[..., part, :] = _half(chain[-1], pad, part) if chain else luma(image[..., part, :], dim=1)
+        _mirror(grey, pad)
+        if gradients:
+            _add_gradients(level, pad, image)
+        chain.append(level)
+        h, w = (h + 1) // 2, (w + 1) // 2
     return Pyramid(tuple(chain), pad)
 
 
-def _half(padded: Tensor, pad: int) -> Tensor:
-    """Half-size image of a padded one (B, 1, rows, width), as ``cv2.pyrDown`` (kornia's samples at other places).
+def _bands(image: Tensor, hw: tuple[int, ...]) -> list[slice]:
+    """Rows of a level to be worked on at once; all of them where a graph or a compiler would have to carry each."""
+    h, w = hw
+    whole = torch.compiler.is_compiling() or (image.requires_grad and torch.is_grad_enabled())
+    rows = h if whole else max(BAND // (len(image) * w), 1)
+    return [slice(top, min(top + rows, h)) for top in range(0, h, rows)]
+
+
+def _half(level: Tensor, pad: int, part: slice) -> Tensor:
+    """Rows ``part`` of the half-size image of a padded one, as ``cv2.pyrDown`` (kornia's samples at other places).
 
     Rows first, because their slices are contiguous; then even and odd columns are taken apart once.
     """
-    h, w = ((size - 2 * pad + 1) // 2 for size in padded.shape[-2:])
-    rows = [padded[..., pad + k : pad + k + 2 * h - 1 : 2, pad - 2 : pad + 2 * w + 1] for k in (-2, -1, 0, 1, 2)]
+    w = (level.shape[-1] - 2 * pad + 1) // 2
+    top, bottom = (pad + 2 * row for row in (part.start, part.stop))
+    rows = [level[:, GREY : GREY + 1, top + k : bottom + k : 2, pad - 2 : pad + 2 * w + 1] for k in (-2, -1, 0, 1, 2)]
     smooth = _binomial(*rows)
     even, odd = smooth[..., ::2].contiguous(), smooth[..., 1::2].contiguous()
     return _binomial(even[..., :w], odd[..., :w], even[..., 1 : w + 1], odd[..., 1:], even[..., 2:])
@@ -135,32 +158,26 @@ def _binomial(a: Tensor, b: Tensor, c: Tensor, d: Tensor, e: Tensor) -> Tensor:
     return torch.add(torch.add(a + e, b + d, alpha=4), c, alpha=6) * (1 / 16)
 
 
-def _with_gradients(grey: Tensor, pad: int) -> Tensor:
-    """A level (B, 3, rows, width) from its pixels (B, 1, h, w): Scharr's filter (3 10 3) x (-1 0 1) / 32 beside them.
+def _mirror(grey: Tensor, pad: int) -> None:
+    """Fill the padding of (B, 1, rows, width) with the image mirrored about its border pixels."""
+    middle = grey[..., pad:-pad, :]
+    middle[..., :pad] = middle[..., pad + 1 : 2 * pad + 1].flip(-1)
+    middle[..., -pad:] = middle[..., -2 * pad - 1 : -pad - 1].flip(-1)
+    grey[..., :pad, :] = grey[..., pad + 1 : 2 * pad + 1, :].flip(-2)
+    grey[..., -pad:, :] = grey[..., -2 * pad - 1 : -pad - 1, :].flip(-2)
 
-    Written into one new buffer, a band of rows at a time: fresh memory costs more than the arithmetic.
-    """
-    B, _, h, w = grey.shape
-    level = grey.new_empty(B, 3, h + 2 * pad, w + 2 * pad)
-    gradients, padded, columns = level[:, :GREY], level[:, GREY:], slice(pad, pad + w)
-    padded[..., pad : pad + h, columns] = grey
-    padded[..., pad : pad + h, :pad] = grey[..., 1 : pad + 1].flip(-1)
-    padded[..., pad : pad + h, pad + w :] = grey[..., w - pad - 1 : w - 1].flip(-1)
-    padded[..., :pad, :] = padded[..., pad + 1 : 2 * pad + 1, :].flip(-2)
-    padded[..., pad + h :, :] = padded[..., h - 1 : pad + h - 1, :].flip(-2)
-    for border in (
-        gradients[..., :pad, :],
-        gradients[..., pad + h :, :],
-        gradients[..., :pad],
-        gradients[..., pad + w :],
-    ):
+
+def _add_gradients(level: Tensor, pad: int, image: Tensor) -> None:
+    """Fill the planes beside the grey one: Scharr's filter (3 10 3) x (-1 0 1) / 32, and zero in the padding."""
+    planes, grey = level[:, GRAD_X:], level[:, GREY : GREY + 1]
+    for border in (planes[..., :pad, :], planes[..., -pad:, :], planes[..., :pad], planes[..., -pad:]):
         border.zero_()
-    for top in range(pad, pad + h, BAND):
-        bottom = min(top + BAND, pad + h)
-        above, here, below = (padded[..., top + k : bottom + k, pad - 1 : pad + w + 1] for k in (-1, 0, 1))
+    rows, width = grey.shape[-2:]
+    for part in _bands(image, (rows - 2 * pad, width)):
+        top, bottom = part.start + pad, part.stop + pad
+        above, here, below = (grey[..., top + k : bottom + k, pad - 1 : width - pad + 1] for k in (-1, 0, 1))
         across = torch.add(here * (10 / 32), above + below, alpha=3 / 32)
         slope = below - above
         down = torch.add(slope[..., 1:-1] * (10 / 32), slope[..., :-2] + slope[..., 2:], alpha=3 / 32)
-        level[:, GRAD_X : GRAD_X + 1, top:bottom, columns] = across[..., 2:] - across[..., :-2]
-        level[:, GRAD_Y : GRAD_Y + 1, top:bottom, columns] = down
-    return level
+        planes[:, :1, top:bottom, pad:-pad] = across[..., 2:] - across[..., :-2]
+        planes[:, 1:, top:bottom, pad:-pad] = down

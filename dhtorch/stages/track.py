@@ -43,7 +43,8 @@ def lucas_kanade(
 
     From coarse to fine, every window takes Gauss-Newton steps towards the smallest squared grey difference to its
     template. The way back starts from the point found as if nothing were known of the way there (with ``uv_1_init``:
-    from the opposite displacement), so that it is a test.
+    from the opposite displacement), so that it is a test. A window that still runs away at the end of the way there is
+    lost and not tested.
 
     Args:
         uv_1_init: where to start in image 1; at ``uv_0`` by default and where it is not finite.
@@ -61,9 +62,9 @@ def lucas_kanade(
         ``photometric`` the rms grey difference of the windows, in grey values of image 0, after normalisation; ``cov``
         is s² A⁻¹ with s² the residual variance, not below that of 8-bit rounding, and the small eigenvalue of A kept
         from vanishing: always finite, large without texture. It understates white noise, which reading between pixels
-        smooths out of the residual. ``valid``: inside image 1 on the finest level from start to end, textured, round
-        trip below its limit. Not valid: ``uv_1`` is the last position; for a ``uv_0`` outside the image the start of
-        the search, with 0 for what is not finite.
+        smooths out of the residual. ``valid``: inside image 1 on the finest level from start to end, not running away
+        at either end, textured, round trip below its limit. Not valid: ``uv_1`` is the last position; for a ``uv_0``
+        outside the image the start of the search, with 0 for what is not finite.
 
     Raises:
         ValueError: wrong shapes or options, an image no larger than the window, a pyramid of another image or window.
@@ -113,7 +114,7 @@ def refine(
     check("refine", image_0=(image_0, "B C H W"), uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"))
     check("refine", image_1=(image_1, "B C H W"), uv_0=(uv_0, "B N 2"))
     _check_options(1, normalise)
-    source, target = build_pyramid(image_0, 1, window), build_pyramid(image_1, 1, window)
+    source, target = build_pyramid(image_0, 1, window), build_pyramid(image_1, 1, window, gradients=False)
     B, N, _ = uv_0.shape
     x, x_1 = (uv.to(source.levels[0].dtype).permute(2, 0, 1).reshape(2, B * N) for uv in (uv_0, uv_1.detach()))
     usable = lk.within(x, *source.bounds(0)) & lk.within(x_1, *target.bounds(0))
@@ -177,10 +178,10 @@ def _check_options(iterations: int, normalise: str) -> None:
 
 def _check_pyramid(pyramid: Pyramid, image: Tensor, window: int) -> None:
     found, expected = (len(pyramid.levels[0]), *pyramid.hw()), (image.shape[0], *image.shape[-2:])
-    if found != expected or pyramid.pad != window // 2 + REACH:
+    if found != expected or pyramid.pad != window // 2 + REACH or pyramid.levels[0].shape[1] == 1:
         raise ValueError(
             f"lucas_kanade: pyramid_0 is of (B, H, W) {found} with padding {pyramid.pad}, "
-            f"expected {expected} with {window // 2 + REACH}"
+            f"expected {expected} with {window // 2 + REACH}, and gradients"
         )
 
 
@@ -223,7 +224,7 @@ def lucas_kanade_affine(
     with torch.no_grad():
         source = build_pyramid(image_0, levels, window) if pyramid_0 is None else pyramid_0
         tracks = track(image_0, image_1, uv_0, uv_1_init=uv_1_init, pyramid_0=source, window=window, levels=levels)
-        target = build_pyramid(image_1, 2, window)
+        target = build_pyramid(image_1, 2, window, gradients=False)
         found = affine.register(
             source,
             target,
