@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from torch.utils._pytree import tree_leaves
 
 from dhtorch.codes import Gate, PoseCode
 from dhtorch.geometry import camera as cam
@@ -117,11 +118,11 @@ def test_sigma_is_the_spread_of_far_depths():
 
 def test_elimination_is_the_schur_complement_of_the_whole_problem():
     """Normal equations with every inverse depth as an unknown of its own, reduced by hand."""
-    args, T, _, _ = pairs(1, 16, 16, noise=0.02, depth=0.0)
+    args, T, _, _ = pairs(1, 32, 32, noise=0.02, depth=0.0)
     samples, tracks, camera_0, camera_1, _ = args
     problem = _near_far(samples, tracks, camera_0, camera_1, 0.2)
     at = near_far.Unknowns(T, torch.zeros(1, 3, dtype=D))
-    noise = torch.full((1, 32), 0.09, dtype=D)
+    noise = torch.full((1, 64), 0.09, dtype=D)
     one = torch.ones(1, dtype=D)
     cost, H, g = near_far.normal(problem, at, noise, one, 0 * one, None, 1.0)
     ray = problem.ray[0].T
@@ -152,7 +153,7 @@ def test_elimination_is_the_schur_complement_of_the_whole_problem():
     right = b[:9] - A[:9, 9:] @ torch.linalg.solve(A[9:, 9:], b[9:])
     torch.testing.assert_close(H[0], reduced, rtol=2e-3, atol=1e-6 * float(reduced.abs().max()))
     torch.testing.assert_close(g[0], right, rtol=2e-2, atol=1e-3 * float(right.abs().max()))
-    assert linear.front.all() and cost > 0 and a.shape[0] == 32 and t.isfinite().all()
+    assert linear.front.all() and cost > 0 and a.shape[0] == 64 and t.isfinite().all()
 
 
 def near_far_shape(problem):
@@ -264,6 +265,24 @@ def test_mistracks_and_values_that_cannot_be_used_do_not_matter():
     hidden = map_pose(*put(args, valid=args[1].valid & ~wrong, cov=cov))
     spoilt = map_pose(*put(args, uv_1=uv_1, cov=cov))
     torch.testing.assert_close(hidden.T_1_from_0.t, spoilt.T_1_from_0.t, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, D])
+def test_a_pair_with_few_tracks_beside_one_with_many_is_answered_as_alone(dtype):
+    """Bit for bit: a pair is solved on as many tracks as the fullest of its company has."""
+    args, *_ = pairs(3, 400, 1400)
+    share = torch.tensor([1.0, 0.3, 0.05])[:, None]
+    used = torch.rand(3, 1800, generator=torch.Generator().manual_seed(4)) < share
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    samples, tracks, *rest = (x.to(dtype) for x in put(args, valid=used))
+    together = map_pose(samples, tracks, *rest)
+    alone = [map_pose(samples[b : b + 1], tracks[b : b + 1], *(x[b : b + 1] for x in rest)) for b in range(3)]
+    torch.set_num_threads(threads)
+    assert together.ok.all()
+    for b, fit in enumerate(alone):
+        for one, all_ in zip(tree_leaves(fit), tree_leaves(together), strict=True):
+            assert torch.equal(one[0], all_[b])
 
 
 # ------------------------------------------------------------------------------------------------------ gradients

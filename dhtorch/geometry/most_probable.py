@@ -21,7 +21,17 @@ from dhtorch.geometry.least_squares import (
     solve_spd,
     weight_slope,
 )
-from dhtorch.geometry.near_far import Problem, Unknowns, linearise_tracks, normal, prior, residuals, squares, step
+from dhtorch.geometry.near_far import (
+    LANES,
+    Problem,
+    Unknowns,
+    linearise_tracks,
+    normal,
+    prior,
+    residuals,
+    squares,
+    step,
+)
 from dhtorch.geometry.se3 import Pose
 
 #: Standard deviations of a residual coordinate, px, that are believed.
@@ -79,20 +89,24 @@ def most_probable(problem: Problem, start: Pose, o: Options) -> Solution:
     Raises:
         ValueError: wrong shapes, an unknown kernel.
 
-    Cost: ``near_steps`` + 3.5 ``steps`` evaluations of the problem. Fixed: nothing depends on values.
+    Cost: ``near_steps`` + 3.5 ``steps`` evaluations of the tracks that are used. Their number apart, nothing depends on
+    values.
     """
+    whole, (problem, close) = problem, _used_first(problem)
     at = Unknowns(start, torch.zeros_like(start.t))
     none, far, rigid = (torch.full_like(start.t[:, 0], x) for x in (0.0, o.far_weight, RIGID))
 
-    def solve(at: Unknowns, noise: Tensor, far: Tensor, precision: Tensor, steps: int) -> tuple[Unknowns, Tensor]:
+    def solve(
+        at: Unknowns, noise: Tensor, far: Tensor, precision: Tensor, steps: int, problem: Problem = problem
+    ) -> tuple[Unknowns, Tensor]:
         def evaluate(at: Unknowns) -> Normal:
             return normal(problem, at, noise, far, precision, o.kernel, o.bend)
 
         return minimise(evaluate, at, steps, step=step)
 
     half = o.near_steps // 2
-    near, _ = solve(at, noise_scale(problem, at), none, rigid, half)
-    near, _ = solve(near, noise_scale(problem, near), none, rigid, o.near_steps - half)
+    near, _ = solve(at, noise_scale(close, at), none, rigid, half, close)
+    near, _ = solve(near, noise_scale(close, near), none, rigid, o.near_steps - half, close)
     both, cost = solve(near, noise_scale(problem, near), far, rigid, o.steps)
     noise, precision = noise_scale(problem, both), rigid
     if o.turn_sigma > 0:
@@ -101,11 +115,35 @@ def most_probable(problem: Problem, start: Pose, o: Options) -> Solution:
         turned, lower = solve(both, noise, far, loose, o.steps)
         worth = cost - lower > o.turn_gain * cost + SLACK
         both, precision = choose(worth, turned, both), torch.where(worth, loose, rigid)
-    cost_near, cost_both = (_near_cost(problem, x, noise, o) for x in (near, both))
+    scales = noise[:, : close.near.shape[1]]
+    cost_near, cost_both = (_near_cost(close, x, scales, o) for x in (near, both))
     believed = cost_both <= cost_near * (1 + o.max_rise) + SLACK
     at, precision = choose(believed, both, near), torch.where(believed, precision, rigid)
     far, noise = torch.where(believed, far, none), noise_scale(problem, at)
-    return Solution(at, noise, far, precision, _translates(problem, at, noise, far, precision, o))
+    translates = _translates(problem, at, noise, far, precision, o)
+    of_near, of_far = ((noise * kind).amax(-1, keepdim=True) for kind in (~problem.far, problem.far))
+    noise = torch.where(whole.far, of_far, of_near.clamp_min(MIN_NOISE_PX**2))
+    return Solution(at, noise, far, precision, translates)
+
+
+def _used_first(problem: Problem) -> tuple[Problem, Problem]:
+    """The used tracks and the near tracks, each problem as wide as its fullest pair needs; near tracks come first."""
+    if _static(problem.near):
+        return problem, problem
+    used = problem.near | problem.far
+    order = (used.to(torch.uint8) + problem.near.to(torch.uint8)).argsort(dim=1, descending=True, stable=True)
+
+    def some(wanted: Tensor) -> Problem:
+        most = int(wanted.sum(1).max())
+        index = order[:, : max(most + -most % LANES, LANES)]
+
+        def pick(x: Tensor) -> Tensor:
+            return x.gather(-1, index.view(len(x), *[1] * (x.ndim - 2), -1).expand(*x.shape[:-1], -1))
+
+        planes = {k: pick(getattr(problem, k)) for k in ("ray", "uv", "inverse", "variance", "shape", "near", "far")}
+        return problem.replace(**planes)
+
+    return some(used), some(problem.near)
 
 
 def _translates(problem: Problem, at: Unknowns, noise: Tensor, far: Tensor, precision: Tensor, o: Options) -> Tensor:
@@ -198,3 +236,8 @@ def _rise_and_scatter(square: Tensor, weight: Tensor, used: Tensor, size: int, o
     rise = mean / (total(weight) / count).clamp_min(1e-9)
     scatter = total(weight * weight * square) / size / total(weight * weight).clamp_min(1e-9)
     return rise.clamp_min(MIN_RISE) / few, scatter * spent * spent
+
+
+def _static(x: Tensor) -> bool:
+    """Whether shapes must not depend on values."""
+    return torch.compiler.is_compiling() or torch._C._functorch.is_functorch_wrapped_tensor(x)

@@ -28,6 +28,9 @@ from dhtorch.geometry.se3 import Pose
 from dhtorch.geometry.shapes import check
 from dhtorch.tree import Record, record
 
+#: Sums and products over whole blocks of so many tracks round alike in any company, however many empty ones follow.
+LANES = 64
+
 #: A far track is not closer to the anchor than the nearest point of the sensor by more than this factor.
 MAX_NEARER = 2.0
 
@@ -37,7 +40,7 @@ BEHIND = 1e4
 
 @record
 class Problem(Record):
-    """Tracks of B pairs as planes, N a multiple of ``least_squares.LANES``; unused ones at any finite place."""
+    """Tracks of B pairs as planes, N a multiple of :data:`LANES`; unused ones at any finite place."""
 
     f: Tensor  # (B, 2) px, camera 1
     c: Tensor  # (B, 2) px, camera 1
@@ -159,8 +162,7 @@ def squares(
     check("squares", u=(linear.u, "B 7 N"), noise=(noise, "B N"))
     (m00, m01), (m10, m11) = _whitener(linear.slope, problem.shape * noise[:, None], linear.precision)
     r, s = linear.u[:, 6], linear.v[:, 6]
-    along, across = m00 * r + m01 * s, m10 * r + m11 * s
-    return torch.where(linear.front, along * along + across * across, torch.full_like(r, BEHIND))
+    return _square(linear, torch.stack((m00 * r + m01 * s, m10 * r + m11 * s), 1))
 
 
 def normal(
@@ -183,13 +185,19 @@ def normal(
     Gradient: as :func:`residuals`. Raises ValueError for wrong shapes or an unknown kernel.
     """
     linear = linearise_tracks(problem, at)
-    rho, weight = robust(squares(problem, linear, noise), kernel, bend)
+    rows = residuals(problem, linear, noise)
+    rho, weight = robust(_square(linear, rows[:, -1]), kernel, bend)
     share = problem.near + far_weight[:, None] * problem.far
-    H, g = normal_equations(residuals(problem, linear, noise), weight * share * linear.front)
+    H, g = normal_equations(rows, weight * share * linear.front)
     known = prior(turn_precision.to(g.dtype))
     turn = torch.cat((torch.zeros_like(g[:, :6]), at.turn), -1)
     cost = (rho * share).sum(-1) + turn_precision * (at.turn * at.turn).sum(-1)
     return Normal(cost, H + torch.diag_embed(known), g + known * turn)
+
+
+def _square(linear: Linear, r: Tensor) -> Tensor:
+    """Squared length (B, N) of whitened residuals (B, 2, N)."""
+    return torch.where(linear.front, (r * r).sum(1), BEHIND)
 
 
 def prior(turn_precision: Tensor) -> Tensor:

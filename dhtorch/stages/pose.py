@@ -36,7 +36,7 @@ from dhtorch.tree import collate
 PAIRS = 16
 
 #: Pairs whose near and far tracks are solved together: a track has ten columns there.
-MAP_PAIRS = 4
+MAP_PAIRS = 8
 
 #: Points the search looks at; a pair with more is thinned evenly. The last steps see all points.
 SEARCH_POINTS = 256
@@ -348,7 +348,7 @@ def _fit_all(o: Options, threshold_px: float, first: PoseFit, problem: Problem, 
 
 
 def _near_far(samples: Samples, tracks: Tracks, camera_0: Camera, camera_1: Camera, isotropic: float) -> Problem:
-    """The tracks as planes, N' > 0 a multiple of LANES; unused ones at a safe place."""
+    """The tracks as planes, N' > 0 a multiple of ``near_far.LANES``; unused ones at a safe place."""
     usable = tracks.valid & tracks.uv_1.isfinite().all(-1) & tracks.uv_0.isfinite().all(-1)
     xyz, sigma = samples.xyz, samples.sigma.detach()
     near = usable & xyz.isfinite().all(-1) & (xyz[..., 2] > 0) & (sigma > 0) & sigma.isfinite()
@@ -360,7 +360,7 @@ def _near_far(samples: Samples, tracks: Tracks, camera_0: Camera, camera_1: Came
     spread = torch.where(near, sigma, torch.ones_like(sigma)) / (z * z).detach()
     uv = torch.where(usable[..., None], tracks.uv_1, torch.zeros_like(tracks.uv_1))
     N = usable.shape[1]
-    padding = max(N + -N % LANES, LANES) - N
+    padding = max(N + -N % near_far.LANES, near_far.LANES) - N
 
     def plane(x: Tensor, value: float = 0.0) -> Tensor:
         x = x.transpose(1, 2) if x.ndim == 3 else x
