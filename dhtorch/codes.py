@@ -116,5 +116,5 @@ def first_reason(*reasons: tuple[Tensor, int], otherwise: int = 0) -> Tensor:
     """
     code = torch.full_like(reasons[0][0], otherwise, dtype=torch.int32)
     for mask, reason in reversed(reasons):
-        code = code.masked_fill(mask, reason)
+        code.masked_fill_(mask, reason)
     return code

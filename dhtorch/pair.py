@@ -133,7 +133,7 @@ def merge(samples: Samples, estimate: Estimate) -> Map:
 
     Gradient: to both sources.
     """
-    sensed = samples.xyz.isfinite().all(-1)
+    sensed = samples.usable
     recovered = estimate.keep & ~sensed
     zero = torch.zeros_like(samples.depth)
 

@@ -49,6 +49,11 @@ class Samples(Record):
     trackability: Tensor  # (B, N) smaller eigenvalue of the local gradient matrix, image in [0, 1]
     hole: Tensor  # (B, N) int32, codes.Hole
 
+    @property
+    def usable(self) -> Tensor:
+        """(B, N) bool: there is a point."""
+        return ~self.xyz[..., 2].isnan()
+
 
 @record
 class Tracks(Record):

@@ -200,14 +200,26 @@ def test_trackability_is_opencvs_minimum_eigenvalue(block):
 def test_summaries_are_those_of_the_patches_for_planar_and_interleaved_pictures(monkeypatch, colour, dtype):
     monkeypatch.setattr(lookup, "NUMBERS", 5 * 5 * colour * 64)  # several pieces
     image = torch.randint(0, 255, (2, colour, *HW), generator=torch.Generator().manual_seed(0)).to(dtype)
-    corner = torch.randint(-9, 140, (2, 300, 2), generator=torch.Generator().manual_seed(1))
-    expected = patches(image, corner, 5).float()
+    pixel = torch.randint(-9, 140, (2, 300, 2), dtype=torch.int32, generator=torch.Generator().manual_seed(1))
+    expected = patches(image, pixel - 2, 5).float()
     for picture in (image, image.contiguous(memory_format=torch.channels_last), image.repeat(1, 1, 1, 2)[..., : HW[1]]):
-        first, total = lookup.summarise(picture, corner, 5, lambda p: (p[-1, 1, 0], p.float().sum((0, 1, 2))))
+        first, total = lookup.summarise(picture, pixel, 5, lambda p: (p[-1, 1, 0], p.float().sum((0, 1, 2))))
         assert torch.equal(first.float(), expected[:, :, -1, 1, 0])
         torch.testing.assert_close(total, expected.sum((2, 3, 4)))
     with pytest.raises(ValueError, match="smaller than a patch"):
-        lookup.summarise(image[..., :4], corner, 5, lambda p: (p[0, 0, 0],))
+        lookup.summarise(image[..., :4], pixel, 5, lambda p: (p[0, 0, 0],))
+
+
+def test_grey_of_interleaved_bytes_is_exact_whoever_else_is_asked_for():
+    image = torch.randint(0, 256, (3, 3, *HW), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    image = image.contiguous(memory_format=torch.channels_last)
+    uv = spiral(HW, 777).expand(3, -1, -1)
+    found = min_eigenvalue(image, uv)
+    assert torch.equal(found[1:2, 5:105], min_eigenvalue(image[1:2], uv[1:2, 5:105]))
+    expected = min_eigenvalue(image.double() / 255, uv)
+    torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=1e-8)
+    with torch.autocast("cpu", dtype=torch.bfloat16):  # which takes bits off products, not off pixels
+        torch.testing.assert_close(min_eigenvalue(image, uv).double(), expected, rtol=1e-5, atol=1e-8)
 
 
 def test_a_spiral_asked_for_twice_is_the_same_and_each_is_its_own():

@@ -61,10 +61,7 @@ def project(
     check("camera.project", f=(camera.f, "B 2"), xyz=(xyz, "B N 3"))
     z = xyz[..., 2:]
     z = torch.where(z.abs() < 1e-9, torch.full_like(z, 1e-9), z)
-    xy = xyz[..., :2] / z
-    if camera.distortion is not None:
-        xy = _distort(camera.distortion, xy)[0]
-    return xy * camera.f[:, None] + camera.c[:, None]
+    return _seen(camera, xyz[..., :2] / z)
 
 
 def unproject(
@@ -74,7 +71,8 @@ def unproject(
 ) -> Tensor:
     """Points (B, N, 3) at z-depth ``depth`` seen at (distorted) pixels ``uv``."""
     check("camera.unproject", f=(camera.f, "B 2"), uv=(uv, "B N 2"), depth=(depth, "B N"))
-    return rays(camera, uv) * depth[..., None]
+    z = depth[..., None]
+    return torch.cat((_normalised(camera, undistort(camera, uv)) * z, z), -1)
 
 
 def rays(camera: Camera, uv: Tensor) -> Tensor:
@@ -89,7 +87,7 @@ def distort(camera: Camera, uv: Tensor) -> Tensor:
     check("camera.distort", f=(camera.f, "B 2"), uv=(uv, "B N 2"))
     if camera.distortion is None:
         return uv
-    return _distort(camera.distortion, _normalised(camera, uv))[0] * camera.f[:, None] + camera.c[:, None]
+    return _seen(camera, _normalised(camera, uv))
 
 
 def undistort(camera: Camera, uv: Tensor, *, iterations: int = 12) -> Tensor:
@@ -131,7 +129,7 @@ def depth_pixels(
     image of size ``hw`` and the exact scaling rule of :func:`resize` applies.
     """
     if depth_camera is not None:
-        return project(depth_camera, rays(camera, uv))
+        return _seen(depth_camera, _normalised(camera, undistort(camera, uv)))
     if depth_hw == hw:
         return uv
     s = torch.as_tensor([depth_hw[1] / hw[1], depth_hw[0] / hw[0]]).to(uv)
@@ -151,6 +149,13 @@ def undistort_jacobian(camera: Camera, uv_ideal: Tensor) -> Tensor:
 
 def _normalised(camera: Camera, uv: Tensor) -> Tensor:
     return (uv - camera.c[:, None]) / camera.f[:, None]
+
+
+def _seen(camera: Camera, xy: Tensor) -> Tensor:
+    """Pixels of the distorted image at ideal image-plane coordinates."""
+    if camera.distortion is not None:
+        xy = _distort(camera.distortion, xy)[0]
+    return xy * camera.f[:, None] + camera.c[:, None]
 
 
 def _newton_step(distortion: Tensor, xy: Tensor, target: Tensor) -> Tensor:

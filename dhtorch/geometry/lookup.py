@@ -1,11 +1,14 @@
 """Reading pixels of a batch of images at a batch of places, without touching the rest of the image.
 
-Alphabet: ``image`` (B, C, H, W); ``corner`` (B, N, 2) integer (u, v) of a patch's top-left pixel; ``uv`` (B, N, 2) px.
+Alphabet: ``image`` (B, C, H, W); ``uv`` (B, N, 2) px; ``pixel`` (B, N, 2) int32, the (u, v) that it lies
+in; ``corner`` (B, N, 2) integer (u, v) of a patch's top-left pixel.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,9 +17,10 @@ from dhtorch.geometry.shapes import check
 
 #: ITU-R BT.601 luma, the weights of ``cv2.cvtColor`` and ``kornia.color.rgb_to_grayscale``.
 LUMA = (0.299, 0.587, 0.114)
+_THOUSANDTHS = (299.0, 587.0, 114.0)
 
 #: Numbers of patches that are summarised together: few enough to stay in cache, and to need no fresh memory pages.
-NUMBERS = 1 << 17
+NUMBERS = 1 << 18
 
 #: Rows of this many points leave no tail to vector loops, which may round differently there.
 LANES = 64
@@ -24,50 +28,97 @@ LANES = 64
 
 def summarise(
     image: Tensor,  # (B, C, H, W), planar or interleaved in memory
-    corner: Tensor,  # (B, N, 2) integer
+    pixel: Tensor,  # (B, N, 2) int32, of :func:`pixels`
     size: int,
     reduce: Callable[[Tensor], tuple[Tensor, ...]],
+    *,
+    grey: bool = False,
 ) -> tuple[Tensor, ...]:
-    """A few numbers (B, N) about each patch whose top-left pixel is ``corner``, without keeping the patches.
+    """A few numbers (B, N) about the patch around each pixel, without keeping the patches.
 
-    ``reduce`` sees some points at a time and turns their pixels (C, size, size, P), points last, into tensors (P,).
-    Whatever it does pixel by pixel then runs along contiguous points. It must treat every point alike and may not
-    count on P, which is a multiple of LANES: the last ones are there to fill up. A patch that would leave the image
-    is shifted back inside.
+    ``reduce`` sees some points at a time and turns their pixels (C, size, size, P), points last, into tensors (P,);
+    with ``grey`` their grey values (size, size, P). Whatever it does pixel by pixel then runs along contiguous points.
+    It must treat every point alike and may not count on P, which is a multiple of LANES: the last ones are there to
+    fill up. A patch that would leave the image is moved back inside.
 
     Raises:
         ValueError: wrong shapes, or an image smaller than a patch.
 
     Gradient: to the image, through ``reduce``.
     """
-    sizes = check("lookup.summarise", image=(image, "B C H W"), corner=(corner, "B N 2"))
+    sizes = check("lookup.summarise", image=(image, "B C H W"), pixel=(pixel, "B N 2"))
     B, N, C, H, W = (sizes[k] for k in "BNCHW")
     _fits("summarise", size, H, W)
     flat, (b, c, v, u) = _flat(image)
-    whole = torch.int32 if image.numel() < 1 << 31 else torch.int64
-    left, top = corner.unbind(-1)
-    first = torch.add(top.clamp(0, H - size) * v, left.clamp(0, W - size), alpha=u)
+    x, y = _moved_inside(pixel if image.numel() < 1 << 31 else pixel.long(), (H, W), size)
+    middle = torch.add(x if u == 1 else x * u, y, alpha=v)
+    whole: Any = {"device": image.device, "dtype": middle.dtype}
     if B > 1:
-        first = first + torch.arange(B, device=image.device)[:, None] * b
-    first = torch.nn.functional.pad(first.to(whole).flatten(), (0, -(B * N) % LANES))
-    down, right = (torch.arange(0, size * k, k, device=image.device, dtype=whole) for k in (v, u))
-    steps = down[:, None, None] + right[:, None]
+        middle = middle + torch.arange(0, B * b, b, **whole)[:, None]
+    middle, fill = middle.flatten(), -(B * N) % LANES
+    if fill:
+        middle = torch.nn.functional.pad(middle, (0, fill), value=(size // 2) * (u + v))
+    down, right = (torch.arange(-(size // 2) * k, (size - size // 2) * k, k, **whole) for k in (v, u))
     at_once = max(NUMBERS // (C * size * size * LANES), 1) * LANES
-    if torch.compiler.is_compiling():
-        # A view by strides needs memory: made so, the index is computed once per point and not again for every pixel.
-        first, at_once = first.as_strided(first.shape, (1,)), len(first)
-    parts = (first,) if len(first) <= at_once else first.split(at_once)
-    found = [reduce(_take(flat, steps + points, C, c)) for points in parts]
+    read = partial(_read, flat, (C, c))
+    compiling = torch.compiler.is_compiling()
+    if compiling:
+        middle, at_once = _in_memory(middle), len(middle)  # computed once per point and not again for every pixel
+    if u == C == 3 and image.dtype == torch.uint8 and (compiling or (grey and _product_is_exact(image))):
+        read, grey = partial(_read_rows, flat, grey), False
+    parts = (middle,) if len(middle) <= at_once else middle.split(at_once)
+    seen = (read(down, right, part) for part in parts)
+    found = [reduce(luma(pixels, 0)[0] if grey else pixels) for pixels in seen]
     joined = found[0] if len(parts) == 1 else [torch.cat(x) for x in zip(*found, strict=True)]
-    return tuple(x[: B * N].view(B, N) for x in joined)
+    return tuple((x[: B * N] if fill else x).view(B, N) for x in joined)
 
 
-def _take(flat: Tensor, index: Tensor, C: int, c: int) -> Tensor:
-    """Numbers (C, *index.shape) at an index and at C - 1 further steps ``c`` from it."""
+def _read(flat: Tensor, channels: tuple[int, int], down: Tensor, right: Tensor, middle: Tensor) -> Tensor:
+    """Pixels (C, size, size, P) of patches, by flat index of their middle; how many channels, and the steps there."""
+    index = (down[:, None] + right)[..., None] + middle
+    C, c = channels
     if torch.compiler.is_compiling():
         return torch.stack([flat[index + k * c] for k in range(C)])
     row = index.flatten()
-    return torch.stack([flat[k * c :].index_select(0, row) for k in range(C)]).view(C, *index.shape)
+    rows = [flat[k * c :].index_select(0, row) for k in range(C)]
+    return (rows[0] if C == 1 else torch.stack(rows)).view(C, *index.shape)
+
+
+def _read_rows(flat: Tensor, grey: bool, down: Tensor, right: Tensor, middle: Tensor) -> Tensor:
+    """Pixels (3, size, size, P) of patches of an interleaved uint8 picture, or their ``grey`` values.
+
+    Rows of pixels are read as blocks of memory. Grey values come out of one matrix product, whose sums of whole
+    numbers below 2²⁴ are exact in whatever order they are taken.
+    """
+    size = len(right)
+    blocks = flat.as_strided((max(flat.numel() - 3 * size + 1, 0), 3 * size), (1, 1))
+    first = (down - 3 * (size // 2))[:, None] + middle
+    if torch.compiler.is_compiling():
+        pixels = blocks[first].unflatten(-1, (size, 3)).permute(3, 0, 2, 1)
+        return _in_memory(luma(pixels, 0)[0] if grey else pixels)
+    rows = blocks.index_select(0, first.flatten()).float()
+    weight = torch.eye(size, device=flat.device)[..., None] * torch.tensor(_THOUSANDTHS, device=flat.device)
+    values = (weight.flatten(1) @ rows.t()).div_(255 * 1000)
+    return values.view(size, size, -1).transpose(0, 1)
+
+
+def _in_memory(x: Tensor) -> Tensor:
+    """The same numbers, which a compiler then computes once: a view by strides needs memory."""
+    x = x.contiguous()
+    return x.as_strided(x.shape, x.stride())
+
+
+def _moved_inside(pixel: Tensor, hw: tuple[int, int], size: int) -> tuple[Tensor, Tensor]:
+    """Columns and rows (B, N) of the pixels nearest to those given whose patches lie in the image."""
+    u, v = pixel.unbind(-1)
+    before, after = size // 2, size - size // 2
+    return u.clamp(before, hw[1] - after), v.clamp(before, hw[0] - after)
+
+
+def fits(pixel: Tensor, hw: tuple[int, int], size: int) -> Tensor:
+    """Whether the patch around each pixel (B, N, 2) lies in an image of size ``hw``, (B, N)."""
+    x, y = _moved_inside(pixel, hw, size)
+    return (x == pixel[..., 0]) & (y == pixel[..., 1])
 
 
 def _flat(image: Tensor) -> tuple[Tensor, tuple[int, int, int, int]]:
@@ -127,7 +178,7 @@ def luma(rgb: Tensor, dim: int) -> Tensor:
     The channel dimension is kept with size 1. Floating images keep their dtype, uint8 becomes float32.
     """
     # Divided first, so that the bytes and the floats of one picture have the same grey, bit for bit.
-    rgb = rgb / 255.0 if rgb.dtype == torch.uint8 else rgb
+    rgb = rgb.float().div_(255) if rgb.dtype == torch.uint8 else rgb
     if rgb.shape[dim] == 1:
         return rgb
     r, g, b = rgb.split(1, dim)
@@ -140,24 +191,33 @@ def nearest(grid: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
     Outside the grid, and for non-finite ``uv``, the value is that of some border pixel and ``inside`` is false.
     """
     sizes = check("lookup.nearest", grid=(grid, "B h w"), uv=(uv, "B N 2"))
-    index, inside = nearest_index((sizes["h"], sizes["w"]), uv)
+    index, inside = nearest_index((sizes["h"], sizes["w"]), pixels(uv))
     return grid.flatten(1).gather(1, index), inside
 
 
-def nearest_index(hw: tuple[int, int], uv: Tensor) -> tuple[Tensor, Tensor]:
-    """Flat index (B, N) of the nearest pixel of ``uv`` (B, N, 2) in a grid of size ``hw``, and whether it exists.
+def nearest_index(hw: tuple[int, int], pixel: Tensor) -> tuple[Tensor, Tensor]:
+    """Flat index (B, N) of a pixel (B, N, 2) of :func:`pixels` in a grid of size ``hw``, and whether it exists.
 
-    Where it does not, and for non-finite ``uv``, the index is 0.
+    Where it does not, the index is that of some border pixel.
     """
-    u, v = round_half_up(uv).unbind(-1)
-    inside = (u >= 0) & (v >= 0) & (u < hw[1]) & (v < hw[0])
-    u, v = torch.where(inside, u, 0), torch.where(inside, v, 0)
-    return torch.add(u.long(), v.long(), alpha=hw[1]), inside
+    x, y = _moved_inside(pixel, hw, 1)
+    return torch.add(x, y, alpha=hw[1]).long(), (x == pixel[..., 0]) & (y == pixel[..., 1])
+
+
+def pixels(uv: Tensor) -> Tensor:
+    """The pixel that each ``uv`` lies in, int32; one outside of any image where it is no place at all."""
+    return round_half_up(uv.nan_to_num(-1.0)).int()
 
 
 def round_half_up(uv: Tensor) -> Tensor:
     """Nearest integers, halves upwards (``Tensor.round`` sends them to the even side, which depends on the place)."""
     return torch.floor(uv.detach() + 0.5)
+
+
+def _product_is_exact(image: Tensor) -> bool:
+    """Whether a matrix product has 24 bits here, and the overlapping view of rows that goes with it may be used."""
+    reduced = torch.is_autocast_enabled(image.device.type) or torch.get_float32_matmul_precision() != "highest"
+    return _view_is_safe(image) and not reduced
 
 
 def _view_is_safe(image: Tensor) -> bool:

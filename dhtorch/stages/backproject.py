@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dhtorch.codes import Flag, Hole
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry.lookup import luma, nearest_index, patches, round_half_up, summarise
+from dhtorch.geometry.lookup import fits, luma, nearest_index, patches, pixels, summarise
 from dhtorch.geometry.shapes import check
 from dhtorch.records import Frame, Samples
 
@@ -71,19 +71,18 @@ def backproject(
     depth, level, edge = _read_depth(frame, uv, search_px, edge_rel)
     border, dim, white, shine = _appearance(frame.image, uv, dark, saturated, highlight)
     returned = depth > 0
-    unsure, beyond = returned & (level < min_conf), returned & (depth > near_limit)
+    unsure, beyond = returned & (level < min_conf), depth > near_limit
+    xyz = cam.unproject(frame.camera, uv.nan_to_num(0.0, 0.0, 0.0), depth)  # no gradient to what is no number
     usable = returned & ~(unsure | beyond)
-    seen = torch.where(usable[..., None], uv, torch.zeros_like(uv))  # a pixel that is no number has no gradient either
-    xyz = cam.unproject(frame.camera, seen, torch.where(usable, depth, 1))
     usable = usable & (xyz.detach().abs().amax(-1) < torch.inf)  # a pixel outside the lens model has no ray
-    halvings = edge.int().add(shine).add(white)
+    halvings = edge.int().add_(shine).add_(white)
     confidence = (level.to(depth.dtype) / 2).clamp(0, 1) * 0.5**halvings
     return Samples(
         uv=uv,
         depth=depth,
         sigma=(sigma_m**2 + (sigma_rel * depth) ** 2).sqrt() if sigma_m > 0 else sigma_rel * depth,
         xyz=torch.where(usable[..., None], xyz, torch.nan),
-        confidence=torch.where(usable, confidence, 0),
+        confidence=torch.where(usable, confidence, 0.0),
         flag=_bits(
             (~returned, Flag.NO_DEPTH),
             (unsure, Flag.LOW_CONF),
@@ -104,35 +103,35 @@ def _read_depth(frame: Frame, uv: Tensor, search_px: int, edge_rel: float) -> tu
     h, w = frame.depth.shape[-2:]
     place = cam.depth_pixels(frame.camera, frame.hw, frame.depth_camera, (h, w), uv)
     size = min(max(NEIGHBOURHOOD, 2 * search_px + 1), h, w)
-    corner = _pixel(place) - size // 2
-    low, high = summarise(frame.depth[:, None], corner, size, _extremes)
-    index, inside = nearest_index((h, w), place)
+    pixel = pixels(place)
+    low, high = summarise(frame.depth[:, None], pixel, size, _extremes)
     if search_px > 0:
-        index, _ = nearest_index((h, w), _nearest_return(frame.depth, place, corner, size, search_px))
+        pixel = pixels(_nearest_return(frame.depth, place, size, search_px))
+    index, inside = nearest_index((h, w), pixel)
     value = frame.depth.flatten(1).gather(1, index)
     value = value.to(torch.promote_types(value.dtype, uv.dtype))  # half precision stores, and computes nothing
-    returned = inside & (value > 0) & (value < torch.inf)
-    value = torch.where(returned, value, 0)
-    edge = returned & (high > low * (1 + edge_rel))
+    value = torch.where(inside, value.nan_to_num(0.0, 0.0, 0.0).relu(), 0.0)
+    edge = (value > 0) & (high > low * (1 + edge_rel))
     level = torch.full_like(value, 2) if frame.conf is None else frame.conf.flatten(1).gather(1, index)
     return value, level, edge
 
 
 def _extremes(window: Tensor) -> tuple[Tensor, Tensor]:
     """Smallest and largest return of windows (1, size, size, P): infinity and 0 where there is none."""
-    window = window.detach().nan_to_num(0, 0, 0)
+    window = window.detach().flatten(0, 2).nan_to_num(0, 0, 0)
     none = torch.nn.functional.threshold(window, 0.0, torch.inf)
-    return none.amin((0, 1, 2)), window.amax((0, 1, 2)).clamp_min(0)
+    return none.amin(0), window.amax(0)
 
 
-def _nearest_return(depth: Tensor, place: Tensor, corner: Tensor, size: int, search_px: int) -> Tensor:
+def _nearest_return(depth: Tensor, place: Tensor, size: int, search_px: int) -> Tensor:
     """The pixel (B, N, 2) with a return nearest to each ``place``, ``place`` itself where none is within reach."""
     h, w = depth.shape[-2:]
-    window = patches(depth.detach()[:, None], corner, size).flatten(2)  # (B, N, size²), moved inside at the border
+    pixel = pixels(place).clamp(-1, max(h, w))
+    window = patches(depth.detach()[:, None], pixel - size // 2, size).flatten(2)  # moved inside at the border
     last = torch.tensor([w - size, h - size], device=depth.device)
-    first = torch.minimum(corner.clamp_min(0), last)
+    first = torch.minimum((pixel - size // 2).clamp_min(0), last)
     steps = torch.arange(size, device=depth.device)
-    du, dv = ((first - _pixel(place))[..., k, None] + steps for k in (0, 1))
+    du, dv = ((first - pixel)[..., k, None] + steps for k in (0, 1))
     du, dv = du[..., None, :], dv[..., :, None]
     reachable = (torch.maximum(du.abs(), dv.abs()) <= search_px).flatten(-2) & (window > 0) & (window < torch.inf)
     distance = (du * du + dv * dv).flatten(-2)
@@ -141,28 +140,20 @@ def _nearest_return(depth: Tensor, place: Tensor, corner: Tensor, size: int, sea
     return torch.where(reachable.gather(-1, pick), found.to(place.dtype), place)
 
 
-def _pixel(uv: Tensor) -> Tensor:
-    """The pixel that ``uv`` lies in, as integers; somewhere far outside where it is no place at all."""
-    return round_half_up(uv.nan_to_num(-1e6)).clamp(-1e6, 1e6).long()
-
-
 def _appearance(image: Tensor, uv: Tensor, dark: float, saturated: float, highlight: float) -> tuple[Tensor, ...]:
     """What the picture alone decides, (B, N) each: at the border, too dark, clipped at white, a highlight."""
-    H, W = image.shape[-2:]
-    size = min(NEIGHBOURHOOD, H, W)
-    corner = _pixel(uv) - size // 2
-    mean, centre, top, bottom = summarise(image.detach(), corner, size, _brightness)
-    u, v = corner.unbind(-1)
-    border = (u < 0) | (v < 0) | (u > W - size) | (v > H - size)
+    hw = (image.shape[-2], image.shape[-1])
+    pixel, size = pixels(uv), min(NEIGHBOURHOOD, *hw)
+    mean, centre, top, bottom = summarise(image.detach(), pixel, size, _brightness)
     shine = (top - bottom <= 0.15 * top) & (centre >= highlight) & (centre - mean >= 0.1)
-    return border, mean <= dark, mean >= saturated, shine
+    return ~fits(pixel, hw, size), mean <= dark, mean >= saturated, shine
 
 
-def _brightness(pixels: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _brightness(patch: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Mean grey, and of the pixel in the middle grey, largest and smallest channel; of (C, size, size, P)."""
-    half = pixels.shape[1] // 2
-    values, white = (pixels, 1) if pixels.is_floating_point() else (pixels.float(), 255)
-    colour = torch.stack((values.mean((1, 2)), values[:, half, half]), 1) / white
+    half = patch.shape[1] // 2
+    values, white = (patch, 1) if patch.is_floating_point() else (patch.float(), 255)
+    colour = torch.stack((values.flatten(1, 2).mean(1), values[:, half, half]), 1) / white
     mean, centre = luma(colour, 0)[0]
     return mean, centre, colour[:, 1].amax(0), colour[:, 1].amin(0)
 
@@ -171,5 +162,5 @@ def _bits(*masks: tuple[Tensor, int]) -> Tensor:
     """One int32 bit set of (mask, bit) pairs."""
     flag = torch.zeros_like(masks[0][0], dtype=torch.int32)
     for mask, bit in masks:
-        flag = torch.add(flag, mask, alpha=bit)
+        flag.add_(mask, alpha=bit)
     return flag

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.codes import ROUTE_OF_HOLE, Flag, Hole, first_reason
-from dhtorch.geometry.lookup import luma, round_half_up, summarise
+from dhtorch.geometry.lookup import pixels, summarise
 from dhtorch.geometry.shapes import check
 from dhtorch.records import Frame, Samples
 
@@ -47,11 +47,11 @@ def classify(
     check("classify", image=(frame.image, "B C H W"), uv=(samples.uv, "B N 2"), flag=(samples.flag, "B N"))
     trackability = min_eigenvalue(frame.image, samples.uv, block=block)
     hole = first_reason(
-        (samples.xyz.isfinite().all(-1), Hole.NONE),
-        ((samples.flag & Flag.BORDER) != 0, Hole.AT_BORDER),
-        ((samples.flag & Flag.UNDEREXPOSED) != 0, Hole.TOO_DARK),
-        ((samples.flag & Flag.SATURATED) != 0, Hole.TOO_BRIGHT),
-        ((samples.flag & Flag.SPECULAR) != 0, Hole.HIGHLIGHT),
+        (samples.usable, Hole.NONE),
+        ((samples.flag & Flag.BORDER).bool(), Hole.AT_BORDER),
+        ((samples.flag & Flag.UNDEREXPOSED).bool(), Hole.TOO_DARK),
+        ((samples.flag & Flag.SATURATED).bool(), Hole.TOO_BRIGHT),
+        ((samples.flag & Flag.SPECULAR).bool(), Hole.HIGHLIGHT),
         (trackability.detach() < min_trackability, Hole.LOW_TEXTURE),
         otherwise=Hole.TRACKABLE_NO_LIDAR,
     )
@@ -73,17 +73,20 @@ def min_eigenvalue(
     Gradient: to the image; at equal eigenvalues the subgradient without the split is taken.
     """
     check("min_eigenvalue", image=(image, "B C H W"), uv=(uv, "B N 2"))
-    corner = round_half_up(uv.nan_to_num(-1e6)).clamp(-1e6, 1e6).long() - (block + 2) // 2
-    a, b, c = (x / (16 * block * block) for x in summarise(image, corner, block + 2, _gradient_sums))
-    split2 = (a - c) ** 2 / 4 + b * b
-    positive = split2 > 0
-    split = torch.where(positive, torch.where(positive, split2, torch.ones_like(split2)).sqrt(), split2)
-    return (a + c) / 2 - split
+    a, b, c = summarise(image, pixels(uv), block + 2, _gradient_sums, grey=True)
+    half = (a - c) / 2
+    split2 = half * half + b * b
+    if split2.requires_grad:
+        positive = split2 > 0
+        split = torch.where(positive, torch.where(positive, split2, 1.0).sqrt(), split2)
+    else:
+        split = split2.sqrt()
+    return ((a + c) / 2 - split) / (16 * block * block)
 
 
-def _gradient_sums(pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Σ gx², Σ gx gy and Σ gy² of the Sobel filters over all but the outermost pixels (C, size, size, P)."""
-    gx, gy = _sobel(luma(pixels, 0)[0])
+def _gradient_sums(grey: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Σ gx², Σ gx gy and Σ gy² of the Sobel filters over all but the outermost pixels (size, size, P)."""
+    gx, gy = _sobel(grey)
     return (gx * gx).sum((0, 1)), (gx * gy).sum((0, 1)), (gy * gy).sum((0, 1))
 
 

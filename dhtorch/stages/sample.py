@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -53,10 +54,15 @@ def spiral(
     """
     if foveation <= 0:
         raise ValueError(f"spiral: foveation is {foveation}, expected > 0")
-    make = _arms.__wrapped__ if torch.compiler.is_compiling() else _arms
     centre = None if gaze is None else (gaze[0], gaze[1])
-    uv = make((hw[0], hw[1]), n, turns, foveation, centre, inner_px, margin_px)
+    uv = _kept((hw[0], hw[1]), n, turns, foveation, centre, inner_px, margin_px)
     return uv.to(device=device, dtype=dtype, copy=True)
+
+
+@torch.compiler.assume_constant_result
+def _kept(*args: Any) -> Tensor:
+    """:func:`_arms`, which torch.compile takes as it is and does not look into."""
+    return _arms(*args)
 
 
 @lru_cache(maxsize=16)

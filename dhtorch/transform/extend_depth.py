@@ -155,9 +155,8 @@ class ExtendDepth(torch.nn.Module):
             found, samples.hole, frame.hw, patch=self.patch, tokens_hw=self.tokens_hw, fit=self.fit
         )
         valid = found.source != Source.NONE
-        xyz = cam.unproject(frame.camera, found.uv, torch.where(valid, found.depth, 1.0))
-        zero = torch.zeros_like(paired, dtype=torch.int32)
-        problem = torch.where(paired, zero, Problem.NO_SECOND_VIEW)
+        xyz = cam.unproject(frame.camera, found.uv, found.depth)
+        problem = (~paired).int() * Problem.NO_SECOND_VIEW
         problem = torch.where(frame.depth.flatten(1).amax(1) > 0, problem, Problem.NO_DEPTH)
         added = {
             "uv": found.uv,
@@ -174,8 +173,10 @@ class ExtendDepth(torch.nn.Module):
             "tokens": tokens,
             "tokens_valid": known,
         }
-        out = {key: torch.where(bad.view(-1, *[1] * (x.ndim - 1)), torch.zeros_like(x), x) for key, x in added.items()}
-        return {**out, "problem": torch.where(bad, zero + Problem.UNREADABLE, problem)}
+        if bool(bad.any()):
+            added = {key: torch.where(bad.view(-1, *[1] * (x.ndim - 1)), 0, x) for key, x in added.items()}
+            problem = torch.where(bad, Problem.UNREADABLE, problem)
+        return {**added, "problem": problem}
 
     def _front_end(self, frame: Frame) -> Samples:
         like = frame.camera.f

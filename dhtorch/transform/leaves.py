@@ -43,19 +43,19 @@ def find(sample: Mapping[str, Any], key: str) -> Any:
     return value
 
 
-def to_tensor(value: Any, key: str) -> Tensor:
-    """A plain tensor of an array, a picture, numbers or a tensor of any class.
+def to_tensor(value: Any, key: str, *, signed: bool = True) -> Tensor:
+    """A plain tensor of an array, a picture, numbers or a tensor of any class; unsigned words made ``signed``.
 
     Raises:
         SampleError: it holds no numbers.
     """
     if isinstance(value, Tensor):
         x = value.as_subclass(Tensor)
-        return x.to(_SIGNED[x.dtype]) if x.dtype in _SIGNED else x
+        return x.to(_SIGNED[x.dtype]) if signed and x.dtype in _SIGNED else x
     array = np.asarray(value)
     if array.dtype.kind not in "buif":
         raise SampleError(f"{key}: found {type(value).__name__} of {array.dtype}, expected an array of numbers")
-    if array.dtype.kind == "u" and array.dtype.itemsize in (2, 4):
+    if signed and array.dtype.kind == "u" and array.dtype.itemsize in (2, 4):
         array = array.astype(np.int32 if array.dtype.itemsize == 2 else np.int64)
     array = array.astype(array.dtype.newbyteorder("="), copy=not array.flags.writeable)
     return torch.from_numpy(np.ascontiguousarray(array))
@@ -68,9 +68,9 @@ class Leaves:
         self.sample, self.batched, self.dtype = sample, batched, dtype
         self.like: Tensor | None = None  # the anchor's images: everything follows their device and number
 
-    def get(self, key: str) -> Tensor:
+    def get(self, key: str, *, signed: bool = True) -> Tensor:
         """(B, …) on the device of the first one asked for."""
-        x = to_tensor(find(self.sample, key), key)
+        x = to_tensor(find(self.sample, key), key, signed=signed)
         x = x if self.batched else x[None]
         if self.like is None:
             self.like = x
@@ -97,9 +97,9 @@ class Leaves:
         x = x.movedim(-1, 2) if hwc else x
         return x if x.dtype == torch.uint8 else x.to(self.dtype)
 
-    def planes(self, key: str, T: int) -> Tensor:
+    def planes(self, key: str, T: int, *, signed: bool = True) -> Tensor:
         """(B, T or 1, h, w), floating if it was, else whole."""
-        x = self.get(key)
+        x = self.get(key, signed=signed)
         shape = tuple(x.shape[1:])
         if x.ndim == 3:
             x = x[:, None]

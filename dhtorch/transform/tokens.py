@@ -5,6 +5,8 @@ Alphabet: B pictures, N samples, P = rows × columns of patches, row by row, as 
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -94,12 +96,12 @@ def _cells(
     """(B, N) index of the patch each sample lies in; rows · columns where it lies in none."""
     if fit not in FITS:
         raise ValueError(f"tokens: fit is {fit!r}, expected one of {', '.join(FITS)}")
-    scale = torch.tensor([tokens_hw[1] / hw[1], tokens_hw[0] / hw[0]], dtype=torch.float64)
+    scale = [tokens_hw[1] / hw[1], tokens_hw[0] / hw[0]]
     if fit != "stretch":
-        scale = (scale.amin() if fit == "pad" else scale.amax()).expand(2)
-    size, wanted = (torch.tensor([x[1], x[0]], dtype=torch.float64) for x in (hw, tokens_hw))
-    margin = (wanted - size * scale) / 2
-    place = (uv.detach().double() + 0.5) * scale.to(uv.device) + margin.to(uv.device)
+        scale = [min(scale) if fit == "pad" else max(scale)] * 2
+    margin = [(tokens_hw[k] - hw[k] * s) / 2 for k, s in zip((1, 0), scale, strict=True)]
+    options: Any = {"dtype": torch.float64, "device": uv.device}
+    place = (uv.detach().double() + 0.5) * torch.tensor(scale, **options) + torch.tensor(margin, **options)
     column, row = (place / patch).floor().unbind(-1)
     inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
     return torch.where(inside, row * columns + column, rows * columns).long()

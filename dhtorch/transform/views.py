@@ -25,7 +25,7 @@ from dhtorch.tree import stack
 UNITS = {"m": 1.0, "mm": 1000.0}
 
 #: Pixels at most by which the median depth of a frame is judged.
-PROBES = 4096
+PROBES = 1024
 
 #: The shapes of the image and the depth map may differ by this share; a transposed map differs by far more.
 MAX_ASPECT = 0.1
@@ -98,7 +98,7 @@ class Views:
         T, hw = images.shape[1], (images.shape[-2], images.shape[-1])
         at = _place(self.at, T, self.image)
         checks = [_in_unit_range(images[:, at], self.image)]
-        depths = self._metres(leaves.planes(self.depth, T))
+        depths = self._metres(leaves.planes(self.depth, T, signed=False))
         depth = depths[:, at if depths.shape[1] > 1 else 0].contiguous()
         checks += self._depth_checks(depth)
         conf = None if self.confidence is None else leaves.planes(self.confidence, T)
@@ -135,6 +135,8 @@ class Views:
         wanted = [self.other_at] if isinstance(self.other_at, int) else self.other_at
         places = [_place(p, images.shape[1], key) for p in wanted]
         pad = leaves.pad(key, images.shape[1])
+        if self.other_image is None and set(places) == {at}:
+            return None, torch.zeros_like(pad[:, at])
         frames, own = [], []
         for p in places:
             own.append(~pad[:, p] if self.other_image is not None or p != at else torch.zeros_like(pad[:, p]))
@@ -149,20 +151,20 @@ class Views:
             count, when = (T, at) if shared else (images.shape[1], p)
             camera = self._camera(leaves, numbers, hw, count, when, checks)
             frames.append(Frame(image, depth, camera, anchor.depth_camera))
-        paired = torch.stack(own).any(0)
-        if self.other_image is None and set(places) == {at}:
-            return None, paired
-        return (frames[0] if isinstance(self.other_at, int) else stack(frames)), paired
+        return (frames[0] if isinstance(self.other_at, int) else stack(frames)), torch.stack(own).any(0)
 
     def _metres(self, x: Tensor) -> Tensor:
         """Depth in metres, 0 = no return."""
         if self.depth_unit == "m" and not x.is_floating_point():
             raise SampleError(f"{self.depth}: found whole numbers ({x.dtype}), expected metres; is the unit mm?")
-        per_metre = UNITS.get(self.depth_unit) if isinstance(self.depth_unit, str) else None
         # Every pass over a whole map costs as much as the front end: no more of them than the numbers ask for.
-        x = x.nan_to_num(0.0, 0.0, 0.0) if x.is_floating_point() else x
-        x = x.clamp_min(0)
-        z = x if per_metre == 1.0 else x / per_metre if per_metre is not None else x * float(self.depth_unit)
+        x = x.nan_to_num(0.0, 0.0, 0.0).relu() if x.is_floating_point() else x.float().relu_()
+        if not isinstance(self.depth_unit, str):
+            z = x * float(self.depth_unit)
+        elif self.depth_unit == "m":
+            z = x
+        else:
+            z = x / UNITS[self.depth_unit] if x.requires_grad else x.div_(UNITS[self.depth_unit])
         low, high = self.depth_range
         return z if low <= 0 and high == float("inf") else torch.where((z > low) & (z <= high), z, 0.0)
 
@@ -180,7 +182,7 @@ class Views:
         self, leaves: Leaves, numbers: Numbers, hw: tuple[int, int], T: int, at: int, checks: list[Any]
     ) -> Camera:
         camera = leaves.camera(numbers, T, at, leaves.numbers(self.distortion, T, at))
-        if self.intrinsics_hw is not None:
+        if self.intrinsics_hw is not None and self.intrinsics_hw != hw:
             camera = cam.resize(camera, self.intrinsics_hw, hw)
         name = numbers if isinstance(numbers, str) else "intrinsics"
         size = torch.tensor([hw[1], hw[0]], dtype=camera.c.dtype, device=camera.c.device)
