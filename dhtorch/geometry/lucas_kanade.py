@@ -167,25 +167,26 @@ def for_some(wanted: Tensor, fn: Callable, values: tuple[Tensor, ...], columns: 
 def _by_cell(pyramid: Pyramid, level: int, fn: Callable, x: Tensor, d: Tensor, batch: Tensor) -> Tensor:
     """``fn(x, d, batch)`` (2, M) in the middle of the cell that each ``x`` (2, M) lies in; all ``d`` are equal.
 
-    All cells of all images are computed or, where points are fewer, each point's own: with the same result.
+    Where shapes may depend on values it is computed once per cell.
     """
     size = CELL * 2**level
     H, W = pyramid.hw()
     columns, rows = -(-W // size), -(-H // size)
-    count = len(pyramid.levels[0]) * rows * columns
     lowest, highest = pyramid.bounds()
 
-    def middle(column: Tensor, row: Tensor) -> Tensor:
-        return torch.minimum((torch.stack([column, row]) + 0.5) * size, highest - 0.5)
+    def search(cell: Tensor) -> Tensor:
+        place = torch.stack([cell % columns, cell // columns % rows]).to(x)
+        place = torch.minimum((place + 0.5) * size, highest - 0.5)
+        return fn(place, d[:, :1].expand_as(place).contiguous(), cell // (rows * columns))
 
     column, row = ((x - lowest) / size).long().clamp_min(0)
-    column, row = column.clamp_max(columns - 1), row.clamp_max(rows - 1)
-    if count >= x.shape[1]:
-        return fn(middle(column, row).to(x), d, batch)
-    cell = torch.arange(count + -count % LANES, device=x.device).clamp_max(count - 1)
-    places = middle(cell % columns, cell // columns % rows).to(x)
-    found = fn(places, d[:, :1].expand_as(places).contiguous(), cell // (rows * columns))
-    return found.index_select(-1, (batch * rows + row) * columns + column)
+    own = (batch * rows + row.clamp_max(rows - 1)) * columns + column.clamp_max(columns - 1)
+    if _static(x):
+        return search(own)
+    wanted = own.new_zeros(len(pyramid.levels[0]) * rows * columns).index_fill_(0, own, 1)
+    cells = wanted.nonzero()[:, 0]
+    cells = torch.cat([cells, cells[:1].expand(-len(cells) % LANES)])
+    return search(cells).index_select(-1, (wanted.cumsum(0) - 1)[own])
 
 
 def _descend(pair: _Pair, o: Options, plan: Plan, x: Tensor, d: Tensor, batch: Tensor, known: Tensor):
