@@ -218,15 +218,15 @@ def move(
 def trial_step(T: Pose, H: Tensor, g: Tensor) -> tuple[Pose, Tensor]:
     """:func:`gauss_newton_step` in a few operations, for proposals that are judged afterwards by their cost.
 
-    The system is solved in float64 by elimination and not refined; a step that is no number is no step.
+    The system is solved in float64 by elimination and not refined. Where it has no solution, or one that is no number,
+    the pose is no number either, and no cost of it is below another.
 
     Gradient: none. Raises ValueError for wrong shapes.
     """
     check("trial_step", H=(H, "B 6 6"), g=(g, "B 6"))
     with torch.no_grad():
-        xi = torch.linalg.solve_ex(H.double(), -g.double()).result.to(g.dtype)
-        ok = xi.abs().amax(-1) < torch.inf  # without a solution it is not
-        return move(T, xi.masked_fill(~ok[:, None], 0.0)), ok
+        xi, info = torch.linalg.solve_ex(H.double(), -g.double())
+        return move(T, xi.to(g.dtype)), info == 0
 
 
 def minimise(
@@ -252,13 +252,15 @@ def minimise(
     Gradient: none is meant to flow here; take :func:`gauss_newton_step` from the detached result.
     """
     best = evaluate(T)
+    kept, shape = pytree.tree_flatten((T, best))
     factor = torch.full_like(best.cost, damping)
     for _ in range(steps):
         diagonal = torch.diag_embed(best.H.diagonal(dim1=-2, dim2=-1))
         proposal, ok = step(T, best.H + factor[:, None, None] * diagonal, best.g)
         found = evaluate(proposal)
         better = ok & (found.cost < best.cost)
-        T, best = choose(better, (proposal, found), (T, best))
+        kept = [_where(better, a, b) for a, b in zip(pytree.tree_leaves((proposal, found)), kept, strict=True)]
+        T, best = pytree.tree_unflatten(kept, shape)
         factor = torch.where(better, factor * 0.1, factor * 10)
     return T, best.cost
 
@@ -268,4 +270,8 @@ def choose(mask: Tensor, new: S, old: S) -> S:
 
     Gradient: to the chosen ones.
     """
-    return pytree.tree_map(lambda a, b: torch.where(mask.view(-1, *[1] * (a.ndim - 1)), a, b), new, old)
+    return pytree.tree_map(lambda a, b: _where(mask, a, b), new, old)
+
+
+def _where(mask: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    return torch.where(mask.view(-1, *[1] * (a.ndim - 1)), a, b)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dhtorch.geometry.covariance import median
 from dhtorch.geometry.least_squares import MIN_DEPTH
 from dhtorch.geometry.p3p import p3p
 from dhtorch.geometry.se3 import Pose
@@ -48,9 +47,8 @@ def usable_first(
 
 def even_slots(count: Tensor, size: int) -> Tensor:
     """(B, size) slots below ``count`` (B,): 0, 1, 2, … while they last; evenly thinned where there are more."""
-    slot = torch.arange(size, device=count.device)
-    count = count[:, None]
-    return torch.where(count > size, slot * count // size, torch.minimum(slot, (count - 1).clamp_min(0)))
+    slot, count = torch.arange(size, device=count.device), count[:, None]
+    return torch.minimum(slot * count.clamp_min(size) // size, (count - 1).clamp_min(0))
 
 
 def distinct_triples(
@@ -77,41 +75,34 @@ def distinct_triples(
 
 @torch.no_grad()
 def msac_cost(
-    T: Pose,  # R (B, K, 3, 3), t (B, K, 3)
-    f: Tensor,  # (B, 2) px
-    xyz: Tensor,  # (B, 3, M) m
-    uv: Tensor,  # (B, 2, M) px relative to the principal point
-    used: Tensor,  # (B, M) bool
-    threshold_px: float,
+    poses: Tensor,  # (B, 4, 3 K): columns of (R | t), rows times (fx, fy, 1); all first rows, all second, all third
+    points: Tensor,  # (B, 6, M): u, v (px, from the principal point), x, y, z (m), 1
+    limits: Tensor,  # (B, M) px²: largest squared error, 0 for points that are not used
 ) -> Tensor:
-    """Truncated squared reprojection errors, summed over the used points: (B, K) px².
+    """Truncated squared reprojection errors, summed over points: (B, K) px².
 
     Points behind the camera count in full, save one exactly on its axis: refinement, not this ranking, decides on
     inliers.
 
     Source: P. Torr, A. Zisserman, "MLESAC" (CVIU 2000), the truncated score.
     """
-    sizes = check("msac_cost", R=(T.R, "B K 3 3"), t=(T.t, "B K 3"), xyz=(xyz, "B 3 M"), uv=(uv, "B 2 M"))
-    limits = (used * (threshold_px * threshold_px))[:, None]
-    scale = torch.cat((f, torch.ones_like(f[:, :1])), 1)[:, :, None, None]
-    P = (torch.cat((T.R, T.t[..., None]), -1).transpose(1, 2) * scale).flatten(1, 2)  # (B, 3 K, 4)
-    points = torch.cat((xyz, torch.ones_like(xyz[:, :1])), 1)
-    pairs = max(RESIDUALS // (sizes["K"] * max(sizes["M"], 1)), 1)
+    sizes = check("msac_cost", poses=(poses, "B 4 P"), points=(points, "B 6 M"), limits=(limits, "B M"))
+    uv, xyz = points.split((2, 4), 1)
+    pairs = max(RESIDUALS // max(sizes["P"] * sizes["M"], 1), 1)
     costs = []
-    for b in range(0, len(f), pairs):  # few pairs at a time keep the temporaries in cache
+    for b in range(0, len(points), pairs):  # few pairs at a time keep the temporaries in cache
         part = slice(b, b + pairs)
-        x, y, z = torch.bmm(P[part], points[part]).unflatten(1, (3, -1)).unbind(1)
+        x, y, z = torch.bmm(poses[part].transpose(1, 2), xyz[part]).unflatten(1, (3, -1)).unbind(1)
         w = z.clamp_min_(MIN_DEPTH).reciprocal_()  # points behind the camera land far outside the image
         x = x.mul_(w).sub_(uv[part, :1])
         y = y.mul_(w).sub_(uv[part, 1:])
-        costs.append(torch.minimum(x.mul_(x).add_(y.mul_(y)), limits[part]).sum(-1))
+        costs.append(torch.minimum(x.mul_(x).add_(y.mul_(y)), limits[part, None]).sum(-1))
     return torch.cat(costs)
 
 
 @torch.no_grad()
 def search(
-    xyz: Tensor,  # (B, 3, M) m
-    uv: Tensor,  # (B, 2, M) px
+    points: Tensor,  # (B, 5, M): x, y, z (m) and where they were seen, u, v (px)
     count: Tensor,  # (B,) usable slots
     f: Tensor,  # (B, 2) px
     c: Tensor,  # (B, 2) px
@@ -133,23 +124,29 @@ def search(
     Raises:
         ValueError: wrong shapes, fewer hypotheses (4 H) than ``keep``.
     """
-    sizes = check("search", xyz=(xyz, "B 3 M"), uv=(uv, "B 2 M"), f=(f, "B 2"), c=(c, "B 2"), draws=(draws, "B H 3"))
-    if 4 * sizes["H"] < keep:
+    sizes = check("search", points=(points, "B 5 M"), f=(f, "B 2"), c=(c, "B 2"), draws=(draws, "B H 3"))
+    M, K = sizes["M"], 4 * sizes["H"]
+    if keep > K:
         raise ValueError(f"search: draws has shape {tuple(draws.shape)}, expected at least {keep} solutions")
-    uv = uv - c[..., None]
-    rays = torch.cat((uv / f[..., None], torch.ones_like(uv[:, :1])), 1)
+    xyz, uv = points.split((3, 2), 1)
+    uv, one = uv - c[..., None], torch.ones_like(uv[:, :1])
     triples = distinct_triples(draws, count)
-    picked = _take(torch.cat((rays, xyz), 1), triples.flatten(1)).unflatten(2, triples.shape[1:]).permute(0, 2, 3, 1)
+    picked = _take(torch.cat((uv / f[..., None], one, xyz), 1), triples.flatten(1)[:, None])
+    picked = picked.unflatten(2, triples.shape[1:]).permute(0, 2, 3, 1)  # (B, H, point, ray and coordinates)
     R, t, valid = p3p(picked[..., :3], picked[..., 3:])
-    poses = Pose(R.flatten(1, 2), t.flatten(1, 2))
-    few = even_slots(count, preview)
-    used = torch.arange(preview, device=count.device) < count[:, None]
-    cost = msac_cost(poses, f, _take(xyz, few), _take(uv, few), used, threshold_px)
-    cost = cost.masked_fill(~valid.flatten(1), torch.inf)
-    poses, cost = _best(poses, cost, min(max(shortlist, keep), 4 * sizes["H"]))
-    used = torch.arange(sizes["M"], device=count.device) < count[:, None]
-    full = msac_cost(poses, f, xyz, uv, used, threshold_px)
-    return _best(poses, full.masked_fill(cost == torch.inf, torch.inf), keep)
+    poses = torch.cat((R, t[..., None]), -1).permute(0, 4, 3, 2, 1).flatten(3)  # (B, column, row, K)
+    lenses = poses * torch.cat((f, one[:, 0, :1]), 1)[:, None, :, None]
+    points = torch.cat((uv, xyz, one), 1)
+    limits = (torch.arange(M, device=count.device) < count[:, None]) * threshold_px**2
+    some = min(preview, M)
+    seen = _take(points, even_slots(count, some)[:, None])
+    cost = msac_cost(lenses.flatten(2), seen, limits[:, :some]).masked_fill(~valid.mT.flatten(1), torch.inf)
+    cost, index = cost.topk(min(max(shortlist, keep), K), largest=False)
+    full = msac_cost(_take(lenses, index[:, None, None]).flatten(2), points, limits)
+    # The preview is part of the whole, so the greater cost is the whole one, save that infinity stays.
+    cost, best = torch.maximum(cost, full).topk(keep, largest=False)
+    poses = _take(poses, index.gather(1, best)[:, None, None]).permute(0, 3, 2, 1)
+    return Pose(poses[..., :3], poses[..., 3]), cost
 
 
 def collinear(
@@ -166,7 +163,8 @@ def collinear(
     """
     check("collinear", xyz=(xyz, "B 3 M"), used=(used, "B M"))
     reach = xyz.detach().abs().amax(1)
-    used = (used & (reach <= FAR_OFF * median(reach, used)))[:, None]
+    middle = torch.where(used, reach, torch.nan).nanmedian(-1, keepdim=True).values
+    used = (used & (reach <= FAR_OFF * middle))[:, None]
     x = xyz.masked_fill(~used, 0.0).double()
     x = (x - x.sum(-1, keepdim=True) / used.sum(-1, keepdim=True).clamp_min(1)) * used
     scatter = torch.bmm(x, x.transpose(1, 2))
@@ -175,12 +173,6 @@ def collinear(
     return minors <= (MIN_SPREAD * trace) ** 2
 
 
-def _take(planes: Tensor, slots: Tensor) -> Tensor:
-    """(B, C, M) at (B, S) slots → (B, C, S)."""
-    return planes.gather(2, slots[:, None].expand(-1, planes.shape[1], -1))
-
-
-def _best(poses: Pose, cost: Tensor, keep: int) -> tuple[Pose, Tensor]:
-    cost, index = cost.topk(keep, dim=1, largest=False)
-    R = poses.R.gather(1, index[..., None, None].expand(-1, -1, 3, 3))
-    return Pose(R, poses.t.gather(1, index[..., None].expand(-1, -1, 3))), cost
+def _take(x: Tensor, index: Tensor) -> Tensor:
+    """Planes (B, …, M) at (B, 1, …, S) slots → (B, …, S)."""
+    return x.gather(-1, index.expand(*x.shape[:-1], -1))

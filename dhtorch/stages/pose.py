@@ -55,7 +55,7 @@ def pnp_ransac(
     threshold_px: float = 3.0,
     min_inlier: int = 8,
     local_optimisation: int = 2,
-    polish_steps: int = 2,
+    polish_steps: int = 1,
     kernel: str | None = None,
     kernel_px: float = 1.0,
 ) -> PoseFit:
@@ -120,12 +120,13 @@ class _Options:
 
 def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, f: Tensor, c: Tensor, draws: Tensor) -> PoseFit:
     N = xyz.shape[1]
-    xyz, uv, usable = _planes(xyz, uv, valid)
+    points, usable = _planes(xyz, uv, valid)
     with torch.no_grad():
-        start, found = _robust_pose(xyz, uv, usable, f, c, draws, options)
+        start, found = _robust_pose(points, usable, f, c, draws, options)
     start = start.detach()  # forward mode looks through no_grad, into a search that may stand beside a singular triple
     # The last step, in float64 and with the graph on.
-    rows, depth = linearise(start, f.double(), c.double(), xyz.double(), uv.double())
+    xyz, uv = points.double().split((3, 2), 1)
+    rows, depth = linearise(start, f.double(), c.double(), xyz, uv)
     with torch.no_grad():
         square = (rows[:, 6] * rows[:, 6]).sum(1)
         inlier = usable & found[:, None] & (depth > MIN_DEPTH) & (square < options.threshold_px**2)
@@ -146,7 +147,7 @@ def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, f: Tensor, c
             (~(solved & finite), PoseCode.DEGENERATE),
             otherwise=PoseCode.OK,
         )
-        failed = code != PoseCode.OK
+        ok, nan = code == PoseCode.OK, torch.full((), torch.nan, dtype=points.dtype, device=points.device)
         total = (square * inlier).sum(-1)
         rms_px = (total / n_inlier.clamp_min(1)).sqrt()
         sigma_px = (total / (2 * n_inlier - 6).clamp_min(1)).sqrt().clamp_min(MIN_SIGMA_PX)
@@ -157,12 +158,12 @@ def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, f: Tensor, c
         t_snr = (root * root).sum(-1).sqrt() / sigma_px
 
     def answer(x: Tensor) -> Tensor:
-        return x.masked_fill(failed.view(-1, *[1] * (x.ndim - 1)), torch.nan).to(uv.dtype)
+        return torch.where(ok.view(-1, *[1] * (x.ndim - 1)), x.to(nan.dtype), nan)
 
     return PoseFit(
         T_1_from_0=Pose(answer(T.R), answer(T.t)),
         cov=answer(cov),
-        inlier=(inlier & ~failed[:, None])[:, :N],
+        inlier=(inlier & ok[:, None])[:, :N],
         n_inlier=n_inlier,
         rms_px=answer(rms_px),
         sigma_px=answer(sigma_px),
@@ -171,35 +172,32 @@ def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, f: Tensor, c
     )
 
 
-def _planes(xyz: Tensor, uv: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Planes (B, 3, N'), (B, 2, N') and usable (B, N'), N' > 0 a multiple of LANES; unusable points at zero."""
-    both = torch.cat((xyz, uv), -1)
-    usable = valid & both.isfinite().all(-1)
+def _planes(xyz: Tensor, uv: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+    """x, y, z, u, v (B, 5, N') and usable (B, N'), N' > 0 a multiple of LANES; unusable points at zero."""
+    points = torch.cat((xyz, uv), -1)
+    usable = valid & points.isfinite().all(-1)
+    points = points.masked_fill(~usable[..., None], 0.0).transpose(1, 2)
     N = usable.shape[1]
-    padding = (0, max(N + -N % LANES, LANES) - N)
-    both = torch.nn.functional.pad(both.masked_fill(~usable[..., None], 0.0).transpose(1, 2), padding).contiguous()
-    return both[:, :3], both[:, 3:], torch.nn.functional.pad(usable, padding)
+    more = (0, max(N + -N % LANES, LANES) - N)
+    return torch.nn.functional.pad(points, more).contiguous(), torch.nn.functional.pad(usable, more)
 
 
 def _robust_pose(
-    xyz: Tensor, uv: Tensor, usable: Tensor, f: Tensor, c: Tensor, draws: Tensor, options: _Options
+    points: Tensor, usable: Tensor, f: Tensor, c: Tensor, draws: Tensor, options: _Options
 ) -> tuple[Pose, Tensor]:
     """Search, refine the best two, polish the better: a float64 pose (exactly a rotation) and whether there is one."""
     index, count = ransac.usable_first(usable, min(SEARCH_POINTS, usable.shape[1]))
-    near, seen = (x.gather(2, index[:, None].expand(-1, x.shape[1], -1)) for x in (xyz, uv))
-    poses, cost = ransac.search(near, seen, count, f, c, draws, threshold_px=options.threshold_px)
-    found = cost[:, 0].isfinite()
-    keep = cost.shape[1]
+    near = points.gather(2, index[:, None].expand(-1, 5, -1))
+    poses, cost = ransac.search(near, count, f, c, draws, threshold_px=options.threshold_px)
+    found, keep = cost[:, 0].isfinite(), cost.shape[1]
     used = torch.arange(index.shape[1], device=index.device) < count[:, None]
-    fk, ck, near, seen, used = (x.repeat_interleave(keep, 0) for x in (f, c, near, seen, used))
-    cost_of = _truncated(fk, ck, near, seen, used, options.threshold_px)
+    near, used, fk, ck = (x.repeat_interleave(keep, 0) for x in (near, used, f, c))
+    cost_of = _truncated(near, used, fk, ck, options.threshold_px)
     flat = Pose(poses.R.flatten(0, 1), poses.t.flatten(0, 1))
     flat, cost = minimise(cost_of, flat, options.local_optimisation, step=trial_step)
-    best = cost.unflatten(0, (-1, keep)).argmin(1)[:, None]
-    R = flat.R.unflatten(0, (-1, keep)).gather(1, best[..., None, None].expand(-1, 1, 3, 3))[:, 0]
-    t = flat.t.unflatten(0, (-1, keep)).gather(1, best[..., None].expand(-1, 1, 3))[:, 0]
-    cost_of = _truncated(f, c, xyz, uv, usable, options.threshold_px, options.kernel, options.kernel_px)
-    T, _ = minimise(cost_of, Pose(R, t), options.polish_steps, step=trial_step)
+    best = cost.view(-1, keep).argmin(1) + keep * torch.arange(len(f), device=f.device)
+    cost_of = _truncated(points, usable, f, c, options.threshold_px, options.kernel, options.kernel_px)
+    T, _ = minimise(cost_of, flat[best], options.polish_steps, step=trial_step)
     safe = found & T.R.isfinite().flatten(1).all(1) & T.t.isfinite().all(1)
     eye = se3.identity(len(f), T.R)
     R = torch.where(safe[:, None, None], T.R, eye.R).double()
@@ -207,23 +205,22 @@ def _robust_pose(
 
 
 def _truncated(
+    points: Tensor,
+    usable: Tensor,
     f: Tensor,
     c: Tensor,
-    xyz: Tensor,
-    uv: Tensor,
-    usable: Tensor,
     threshold_px: float,
     kernel: str | None = None,
     kernel_px: float = 1.0,
 ) -> Callable[[Pose], Normal]:
     """The cost that search and refinement share: Σ rho(min(r², threshold²)), points behind the camera in full."""
-    limit = threshold_px * threshold_px
-    limits = usable * limit
+    limits = usable * (threshold_px * threshold_px)
+    xyz, uv = points.split((3, 2), 1)
 
     def evaluate(T: Pose) -> Normal:
         rows, depth = linearise(T, f, c, xyz, uv)
         square = (rows[:, 6] * rows[:, 6]).sum(1)
-        square = torch.minimum(square.masked_fill(depth <= MIN_DEPTH, limit), limits)
+        square = torch.where(depth > MIN_DEPTH, torch.minimum(square, limits), limits)
         rho, weight = robust(square, kernel, kernel_px)
         return Normal(rho.sum(-1), *normal_equations(rows, weight * (square < limits)))
 
