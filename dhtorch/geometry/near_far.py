@@ -82,21 +82,25 @@ def straighten(
     Gradient: to all. Raises ValueError for wrong shapes.
     """
     check("straighten", uv=(uv, "B 2 N"), f=(f, "B 2"), c=(c, "B 2"), y=(y, "B N"), turn=(turn, "B 3"))
-    u, v = ((uv - c[..., None]) / f[..., None]).unbind(1)
-    b0, b1, b2 = (turn[:, k, None] * y for k in range(3))
-    z = 1 - (b0 * v - b1 * u)
-    z = torch.where(z.abs() < 0.1, torch.full_like(z, 0.1), z)  # beyond any shutter: stays finite
-    turned = torch.stack(((u - (b1 - b2 * v)) / z, (v - (b2 * u - b0)) / z), 1)
-    return turned * f[..., None] + c[..., None]
+    f, c = f[..., None], c[..., None]
+    return _straight((uv - c) / f, y, turn) * f + c
+
+
+def _straight(seen: Tensor, y: Tensor, turn: Tensor) -> Tensor:
+    """:func:`straighten` at z = 1: where (u, v, 1) - y · turn x (u, v, 1) passes it."""
+    ray = torch.cat((seen, torch.ones_like(seen[:, :1])), 1)
+    ray = ray - torch.linalg.cross(turn[..., None] * y[:, None], ray, dim=1)
+    z = ray[:, 2:]
+    return ray[:, :2] / torch.where(z.abs() < 0.1, 0.1, z)  # beyond any shutter: stays finite
 
 
 class Linear(NamedTuple):
-    """The tracks of a problem, linearised: two equations each, before their inverse depth is eliminated."""
+    """The tracks of a problem, linearised at z = 1: two equations each, before their inverse depth is eliminated."""
 
-    u: Tensor  # (B, 7, N) px, along u: six columns of the pose, then the residual
-    v: Tensor  # (B, 7, N) px, along v
-    slope: Tensor  # (B, 2, N) px m, d r / d q
-    precision: Tensor  # (B, N) m², of q before this track is read: 0 for far tracks, infinite for one at infinity
+    u: Tensor  # (B, 7, N), along u: six columns of the pose, then the residual
+    v: Tensor  # (B, 7, N), along v
+    slope: Tensor  # (B, 2, N) m, d r / d q
+    variance: Tensor  # (B, N) 1/m², of q before this track is read: infinite for far tracks, 0 for one at infinity
     front: Tensor  # (B, N) bool, in front of camera 1 and not at the epipole; others are finite and have no meaning
 
 
@@ -107,26 +111,25 @@ def linearise_tracks(problem: Problem, at: Unknowns) -> Linear:
     no first-order effect. Raises ValueError for wrong shapes.
     """
     check("linearise_tracks", ray=(problem.ray, "B 3 N"), uv=(problem.uv, "B 2 N"), turn=(at.turn, "B 3"))
-    f, c = problem.f, problem.c
-    uv = straighten(problem.uv, f, c, _height(problem), at.turn)
+    seen = _straight((problem.uv - problem.c[..., None]) / problem.f[..., None], _height(problem), at.turn)
     a, t = _turned(at.T.R, problem.ray), at.T.t[..., None]
     with torch.no_grad():
-        free = _inverse_depth(a, t, uv, f, c, problem.shape)
-        infinite = free < 0  # a point cannot lie beyond infinity: there q is known, and nothing is eliminated
+        free = _inverse_depth(a, t, seen, _noise_shape(problem))
+        # A point cannot lie beyond infinity: there q is known, and nothing is eliminated.
+        variance = torch.where(free < 0, 0.0, torch.inf).to(free.dtype)
     q = torch.where(problem.near, problem.inverse, free.clamp_min(0))
-    precision = torch.where(problem.near, 1 / problem.variance, torch.where(infinite, torch.inf, 0.0))
+    variance = torch.where(problem.near, problem.variance, variance)
     Y = a + q[:, None] * t
     # At the epipole a track fits any pose if only its point is near enough, and then holds it as if it were a vice.
-    nearest = torch.where(problem.near, problem.inverse, torch.zeros_like(q)).amax(-1, keepdim=True).detach()
+    nearest = torch.where(problem.near, problem.inverse, 0.0).amax(-1, keepdim=True).detach()
     front = (Y[:, 2] > MIN_DEPTH) & (problem.near | (q < MAX_NEARER * nearest))
-    w = 1 / torch.where(front, Y[:, 2], torch.ones_like(q))
-    x, y, k = Y[:, 0] * w, Y[:, 1] * w, q * w
-    seen = (uv - c[..., None]) / f[..., None]
+    w = 1 / torch.where(front, Y[:, 2], 1.0)
+    plane, k = Y[:, :2] * w[:, None], q * w
+    (x, y), (x_r, y_r) = plane.unbind(1), (plane - seen).unbind(1)
+    (xx, yy), (xk, yk) = (1 + plane * plane).unbind(1), (plane * -k[:, None]).unbind(1)
     xy, zero = x * y, torch.zeros_like(x)
-    u = torch.stack((-xy, 1 + x * x, -y, k, zero, -x * k, x - seen[:, 0]), 1) * f[:, :1, None]
-    v = torch.stack((-1 - y * y, xy, x, zero, k, -y * k, y - seen[:, 1]), 1) * f[:, 1:, None]
-    slope = torch.stack(((t[:, 0] - x * t[:, 2]) * w, (t[:, 1] - y * t[:, 2]) * w), 1) * f[..., None]
-    return Linear(u, v, slope, precision, front)
+    u, v = torch.stack((-xy, xx, -y, k, zero, xk, x_r), 1), torch.stack((-yy, xy, x, zero, k, yk, y_r), 1)
+    return Linear(u, v, (t[:, :2] - plane * t[:, 2:]) * w[:, None], variance, front)
 
 
 def residuals(
@@ -140,12 +143,11 @@ def residuals(
         problem, linear: tracks and :func:`linearise_tracks` of them.
         noise: scale of the tracks' ``shape``.
 
-    Gradient: to ``linear``, precision excepted, and noise. Raises ValueError for wrong shapes.
+    Gradient: to ``linear``, variance excepted, and noise. Raises ValueError for wrong shapes.
     """
     check("residuals", u=(linear.u, "B 7 N"), noise=(noise, "B N"))
-    m = _whitener(linear.slope, problem.shape * noise[:, None], linear.precision)
-    (m00, m01), (m10, m11) = ([x[:, None] for x in row] for row in m)
-    rows = torch.stack((m00 * linear.u + m01 * linear.v, m10 * linear.u + m11 * linear.v), 2)
+    m0, m1 = (m[:, None] for m in _whitener(problem, linear, noise))
+    rows = m0 * linear.u[:, :, None] + m1 * linear.v[:, :, None]
     turn = rows[:, :3] * _height(problem)[:, None, None]
     return torch.cat((rows[:, :6], turn, rows[:, 6:]), 1)
 
@@ -160,9 +162,8 @@ def squares(
     Gradient: as :func:`residuals`. Raises ValueError for wrong shapes.
     """
     check("squares", u=(linear.u, "B 7 N"), noise=(noise, "B N"))
-    (m00, m01), (m10, m11) = _whitener(linear.slope, problem.shape * noise[:, None], linear.precision)
-    r, s = linear.u[:, 6], linear.v[:, 6]
-    return _square(linear, torch.stack((m00 * r + m01 * s, m10 * r + m11 * s), 1))
+    m0, m1 = _whitener(problem, linear, noise)
+    return _square(linear, m0 * linear.u[:, 6:] + m1 * linear.v[:, 6:])
 
 
 def normal(
@@ -212,44 +213,48 @@ def _turned(R: Tensor, ray: Tensor) -> Tensor:
     return R[:, :, 0] * x + R[:, :, 1] * y + R[:, :, 2] * z
 
 
-def _inverse_depth(a: Tensor, t: Tensor, uv: Tensor, f: Tensor, c: Tensor, shape: Tensor) -> Tensor:
+def _noise_shape(problem: Problem) -> Tensor:
+    """The noise's covariance (B, 3, N) at z = 1, up to scale."""
+    f0, f1 = problem.f[:, :1], problem.f[:, 1:]
+    return problem.shape / torch.cat((f0 * f0, f0 * f1, f1 * f1), 1)[..., None]
+
+
+def _inverse_depth(a: Tensor, t: Tensor, seen: Tensor, shape: Tensor) -> Tensor:
     """Maximum-likelihood q (B, N) of a track without depth: its pixel, moved onto the epipolar line along the noise.
 
     ``a`` (B, 3, N) is the anchor's ray turned into camera 1. Negative where the rays part; 0 without baseline.
     """
-    u, v = ((uv - c[..., None]) / f[..., None]).unbind(1)
-    line = (t[:, 1] * a[:, 2] - t[:, 2] * a[:, 1], t[:, 2] * a[:, 0] - t[:, 0] * a[:, 2])
-    last = t[:, 0] * a[:, 1] - t[:, 1] * a[:, 0]
-    n0, n1 = line[0] / f[:, :1], line[1] / f[:, 1:]
-    m0, m1 = shape[:, 0] * n0 + shape[:, 1] * n1, shape[:, 1] * n0 + shape[:, 2] * n1
-    lift = (line[0] * u + line[1] * v + last) / (n0 * m0 + n1 * m1).clamp_min(1e-24)
-    u, v = u - lift * m0 / f[:, :1], v - lift * m1 / f[:, 1:]
-    p0, p1 = a[:, 0] - a[:, 2] * u, a[:, 1] - a[:, 2] * v
-    d0, d1 = t[:, 0] - t[:, 2] * u, t[:, 1] - t[:, 2] * v
-    return -(p0 * d0 + p1 * d1) / (d0 * d0 + d1 * d1).clamp_min(1e-24)
+    line = torch.linalg.cross(t.expand_as(a), a, dim=1)
+    n, last = line[:, :2], line[:, 2]
+    m = shape[:, :2] * n[:, :1] + shape[:, 1:] * n[:, 1:]
+    lift = ((n * seen).sum(1) + last) / (n * m).sum(1).clamp_min(1e-30)
+    seen = seen - lift[:, None] * m
+    p, d = a[:, :2] - a[:, 2:] * seen, t[:, :2] - t[:, 2:] * seen
+    return -(p * d).sum(1) / (d * d).sum(1).clamp_min(1e-24)
 
 
-def _whitener(slope: Tensor, cov: Tensor, precision: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-    """A matrix M (2×2 planes) with MᵀM = (S + s sᵀ / precision)⁻¹, singular where the precision is 0.
+def _whitener(problem: Problem, linear: Linear, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """The columns (B, 2, N) of a matrix M with MᵀM = (S + variance s sᵀ)⁻¹, singular where the variance is infinite.
 
     With S = L Lᵀ the whitened slope e = L⁻¹ s is a vector of the plane. Only the residual along it depends on q: of its
-    weight, precision / (|e|² + precision) is left. M turns e to the first axis and scales that.
+    weight, 1 / (1 + |e|² variance) is left. M turns e to the first axis and scales that.
     """
-    xx, xy, yy = cov.unbind(1)
-    a = 1 / xx.sqrt()
+    xx, xy, yy = (_noise_shape(problem) * noise[:, None]).unbind(1)
+    s0, s1 = linear.slope.unbind(1)
     b = xy / xx
-    d = 1 / (yy - b * xy).sqrt()  # L⁻¹ = [[a, 0], [−b d, d]]
-    e0, e1 = a * slope[:, 0], d * (slope[:, 1] - b * slope[:, 0])
+    a, d = xx.rsqrt(), (yy - b * xy).rsqrt()  # L⁻¹ = [[a, 0], [−b d, d]]
+    e0, e1 = a * s0, d * (s1 - b * s0)
     square = e0 * e0 + e1 * e1
     flat = square < 1e-12  # the pixel does not depend on q
-    length = torch.where(flat, torch.ones_like(square), square).sqrt()
-    e0 = torch.where(flat, torch.ones_like(e0), e0 / length)
-    e1 = torch.where(flat, torch.zeros_like(e1), e1 / length)
-    whole = flat | precision.isinf()
-    some = ~whole & (precision > 0)
-    safe = torch.where(some, precision, torch.ones_like(precision))
-    left = torch.where(some, (safe / (square + safe)).sqrt(), whole.to(square.dtype))
-    return (left * (e0 * a - e1 * b * d), left * e1 * d), (-e1 * a - e0 * b * d, e0 * d)
+    unit = torch.where(flat, 1.0, square).rsqrt()
+    e0, e1 = torch.where(flat, 1.0, e0 * unit), torch.where(flat, 0.0, e1 * unit)
+    free = linear.variance.isinf()
+    left = (1 + square * linear.variance.masked_fill(free, 0.0)).rsqrt().masked_fill(free & ~flat, 0.0)
+    left0, left1, bd = left * e0, left * e1, b * d
+    return (
+        torch.stack((left0 * a - left1 * bd, -e1 * a - e0 * bd), 1),
+        torch.stack((left1 * d, e0 * d), 1),
+    )
 
 
 def _height(problem: Problem) -> Tensor:
