@@ -43,15 +43,12 @@ LEAP, RATIO = 6, (-0.9, 0.9)
 COARSE_EPSILON = 4.0
 
 
-class Plan(NamedTuple):
-    """What a level is worth."""
+#: Gauss-Newton steps on one map.
+STEPS = 8
 
-    radii: tuple[int, ...]  # of a point's successive maps; one of radius r covers the offsets from -r to r + 1
-    steps: int  # on one map
-
-
-#: At the top nothing is known yet and few cells are to be searched.
-TOP, BETWEEN, FINEST = Plan((2, 2, 2, 2), 10), Plan((1, 2, 2), 8), Plan((1, 2, 2), 8)
+#: Radii of a point's successive maps at the top, where nothing is known yet and few cells are to be searched, and below
+#: the top. A map of radius r covers the offsets from -r to r + 1.
+TOP, BELOW = (3, 2, 2), (1, 2, 2)
 
 #: A ratio of contrasts beyond these limits is not believed.
 GAIN = (0.2, 5.0)
@@ -103,13 +100,13 @@ def search(
         return coarse(level + 1, x, d, batch) * 2
 
     def coarse(level: int, x: Tensor, d: Tensor, batch: Tensor) -> Tensor:
-        pair, plan = _Pair(source, target, level, *target.bounds(level)), TOP if level == top else BETWEEN
+        pair, radii = _Pair(source, target, level, *target.bounds(level)), TOP if level == top else BELOW
         pixel = source.corner(level, x * 0.5**level + 0.5)  # read between pixels only where it decides the answer
         every = torch.ones_like(batch, dtype=torch.bool)
-        return _descend(pair, rough, plan, pixel, start(level, x, d, batch), batch, every)[0]
+        return _descend(pair, rough, radii, pixel, start(level, x, d, batch), batch, every)[0]
 
     pair = _Pair(source, target, 0, *target.bounds(0))
-    d, held, textured, A = _descend(pair, o, FINEST if top else TOP, x, start(0, x, d, batch), batch, known)
+    d, held, textured, A = _descend(pair, o, BELOW if top else TOP, x, start(0, x, d, batch), batch, known)
     return d, known & textured & held & within(x + d, pair.low, pair.high), A
 
 
@@ -189,18 +186,18 @@ def _by_cell(pyramid: Pyramid, level: int, fn: Callable, x: Tensor, d: Tensor, b
     return search(cells).index_select(-1, (wanted.cumsum(0) - 1)[own])
 
 
-def _descend(pair: _Pair, o: Options, plan: Plan, x: Tensor, d: Tensor, batch: Tensor, known: Tensor):
+def _descend(pair: _Pair, o: Options, radii: tuple[int, ...], x: Tensor, d: Tensor, batch: Tensor, known: Tensor):
     """One level: all points on a first map, then those that need it on further ones.
 
     Returns the displacement; who stayed on the last map, and whose window is textured (both (M,)); and A (3, M).
     """
-    corner = pair.target.corner(pair.level, x + d) - plan.radii[0]
-    C, moments = _map(pair, o, plan.radii[0], x, corner, batch)
+    corner = pair.target.corner(pair.level, x + d) - radii[0]
+    C, moments = _map(pair, o, radii[0], x, corner, batch)
     A_inv, textured = _inverse(moments[2:5], o.min_eigenvalue * o.window**2)
     live = known & textured & within(x + d, pair.low, pair.high)
-    first, *further = (min(plan.steps, o.iterations - k * plan.steps) for k in range(len(plan.radii)))
+    first, *further = (min(STEPS, o.iterations - k * STEPS) for k in range(len(radii)))
     state = _on_map(pair, o, first, _steps(C, moments, A_inv), corner, x, d, live)
-    for radius, steps in zip(plan.radii[1:], further, strict=True):
+    for radius, steps in zip(radii[1:], further, strict=True):
         if steps > 0:
             columns = (x, *state, batch, moments, A_inv)
             state = for_some(state[1], partial(_on_new_map, pair, o, radius, steps), state, columns)

@@ -51,8 +51,8 @@ def lucas_kanade(
         pyramid_0: ``build_pyramid(image_0, levels, window)``, made once for an anchor tracked into many views.
         window: width in pixels, odd.
         levels: pyramid levels, full resolution included; fewer where a level would be no larger than the window.
-        iterations: most Gauss-Newton steps per level. A point that is not at rest after eight goes on only as far as a
-            few maps reach (``lucas_kanade.Plan``).
+        iterations: most Gauss-Newton steps per level. A point that is not at rest after eight goes on only as far as
+            three maps reach (``dhtorch.geometry.lucas_kanade``).
         epsilon_px: a shorter step has converged; on coarse levels, which only provide a start, four times that.
         normalise: ``none``; ``bias`` removes the means of both windows; ``gain_bias`` also their ratio of contrast.
         min_eigenvalue: of A / window² (grey values in [0, 1]); a window with less has too little texture.
