@@ -21,7 +21,7 @@ from dhtorch.geometry.shapes import check
 from dhtorch.geometry.steady import steady
 
 #: Points of all pairs that :func:`depths` works on at once.
-POINTS = 1 << 15
+POINTS = 1 << 17
 
 
 class TwoView(NamedTuple):
@@ -45,7 +45,7 @@ def triangulate(
     """One-sided optimal triangulation: the anchor's pixel is exact, the other is moved onto its epipolar line.
 
     ``uv_1`` drops perpendicularly (in pixels) onto the epipolar line of ``uv_0``, which is the maximum-likelihood
-    correction for isotropic noise in view 1; the two rays then meet and depth is a quotient of 2-vectors.
+    correction for isotropic noise in view 1; the two rays then meet, and depth is a quotient of lengths along the line.
 
     Returns:
         :class:`TwoView`. Without a baseline, or where the rays are parallel, depth is 0 and the slope 0.
@@ -87,9 +87,9 @@ def depths(
 
 def _directions(uv_0: Tensor, camera_0: Camera, T_1_from_0: Pose) -> tuple[Tensor, Tensor, Tensor]:
     """The anchor's rays turned into camera 1, R x, as three planes (B, N)."""
-    u, v = uv_0.unbind(-1)
-    (fx, fy), (cx, cy), R = camera_0.f.split(1, 1), camera_0.c.split(1, 1), T_1_from_0.R[..., None]
-    x, y = (u - cx) / fx, (v - cy) / fy
+    (u, v), (cx, cy) = uv_0.unbind(-1), camera_0.c.split(1, 1)
+    x, y = u - cx, v - cy
+    R = torch.cat((T_1_from_0.R[..., :2] / camera_0.f[:, None], T_1_from_0.R[..., 2:]), -1)[..., None]
     a0, a1, a2 = (x * R[:, k, 0] + y * R[:, k, 1] + R[:, k, 2] for k in range(3))
     return a0, a1, a2
 
@@ -100,15 +100,13 @@ def _meet(direction: tuple[Tensor, Tensor, Tensor], uv_1: Tensor, camera_1: Came
     u, v = uv_1.unbind(-1)
     (fx, fy), (cx, cy) = camera_1.f.split(1, 1), camera_1.c.split(1, 1)
     y0, y1 = (u - cx) / fx, (v - cy) / fy
-    # Epipolar line l = t × R x in normalised coordinates; in pixels its normal is (l0 / fx, l1 / fy).
-    l0, l1, l2 = t1 * a2 - t2 * a1, t2 * a0 - t0 * a2, t0 * a1 - t1 * a0
-    n0, n1 = l0 / fx, l1 / fy
-    lift = (l0 * y0 + l1 * y1 + l2) / _guard(n0 * n0 + n1 * n1)
-    y0, y1 = y0 - lift * n0 / fx, y1 - lift * n1 / fy
-    # (R x − (R x)₃ y) depth = t₃ y − t on the first two rows.
-    p0, p1 = a0 - a2 * y0, a1 - a2 * y1
-    q0, q1 = t2 * y0 - t0, t2 * y1 - t1
-    return (p0 * q0 + p1 * q1) / _guard(p0 * p0 + p1 * p1)
+    # (a − a₃ y) depth = t₃ y − t on the first two rows, for y on the epipolar line. Its direction is g = t₃ a − a₃ t;
+    # along it a point does not move when it drops onto the line perpendicularly in pixels.
+    stretch = fy / fx
+    g0, g1 = t2 * a0 - t0 * a2, (t2 * a1 - t1 * a2) * (stretch * stretch)
+    near = g0 * (t2 * y0 - t0) + g1 * (t2 * y1 - t1)
+    far = g0 * (a0 - a2 * y0) + g1 * (a1 - a2 * y1)
+    return near * far / (far * far).clamp_min(1e-20)
 
 
 def describe(
@@ -179,11 +177,6 @@ def depth_variance(
     shared = (carried * row).sum(-1)
     infinite = torch.full_like(own, torch.inf)
     return torch.where(defined, own, infinite), torch.where(defined, shared.clamp_min(0), infinite)
-
-
-def _guard(x: Tensor) -> Tensor:
-    """A non-negative denominator kept away from zero."""
-    return x.clamp_min(1e-18)
 
 
 def _length(v: Tensor) -> Tensor:
