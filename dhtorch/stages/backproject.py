@@ -145,17 +145,17 @@ def _appearance(image: Tensor, uv: Tensor, dark: float, saturated: float, highli
     hw = (image.shape[-2], image.shape[-1])
     pixel, size = pixels(uv), min(NEIGHBOURHOOD, *hw)
     mean, centre, top, bottom = summarise(image.detach(), pixel, size, _brightness)
-    shine = (top - bottom <= 0.15 * top) & (centre >= highlight) & (centre - mean >= 0.1)
-    return ~fits(pixel, hw, size), mean <= dark, mean >= saturated, shine
+    white = 1 if image.is_floating_point() else 255
+    shine = (top - bottom <= 0.15 * top) & (centre >= highlight * white) & (centre - mean >= 0.1 * white)
+    return ~fits(pixel, hw, size), mean <= dark * white, mean >= saturated * white, shine
 
 
 def _brightness(patch: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Mean grey, and of the pixel in the middle grey, largest and smallest channel; of (C, size, size, P)."""
-    half = patch.shape[1] // 2
-    values, white = (patch, 1) if patch.is_floating_point() else (patch.float(), 255)
-    colour = torch.stack((values.flatten(1, 2).mean(1), values[:, half, half]), 1) / white
-    mean, centre = luma(colour, 0)[0]
-    return mean, centre, colour[:, 1].amax(0), colour[:, 1].amin(0)
+    patch = patch if patch.is_floating_point() else patch.float()
+    middle = patch[:, patch.shape[1] // 2, patch.shape[2] // 2]
+    mean, centre = luma(torch.stack((patch.flatten(1, 2).mean(1), middle), 1), 0)[0]
+    return mean, centre, middle.amax(0), middle.amin(0)
 
 
 def _bits(*masks: tuple[Tensor, int]) -> Tensor:

@@ -158,7 +158,10 @@ class Views:
         if self.depth_unit == "m" and not x.is_floating_point():
             raise SampleError(f"{self.depth}: found whole numbers ({x.dtype}), expected metres; is the unit mm?")
         # Every pass over a whole map costs as much as the front end: no more of them than the numbers ask for.
-        x = x.nan_to_num(0.0, 0.0, 0.0).relu() if x.is_floating_point() else x.float().relu_()
+        if x.is_floating_point():
+            x = x.nan_to_num(0.0, 0.0, 0.0).relu()
+        else:
+            x = x.float().relu_() if x.dtype.is_signed else x.float()
         if not isinstance(self.depth_unit, str):
             z = x * float(self.depth_unit)
         elif self.depth_unit == "m":
