@@ -3,8 +3,10 @@
     python benchmarks/lk.py --json benchmarks/results/lk.json
 
 *Forward* is both pyramids and one search; mode ``cached`` has the pyramid of image 0 made before, as for an anchor seen
-from many views. *Forward-backward* is ``lucas_kanade`` with all its fields against two calls of OpenCV. Times are of
-real pairs where DHTORCH_DATA is set, else of the built-in room; both sides take turns in one process.
+from many views. Mode ``compiled`` has the steps on maps compiled: the whole search under ``torch.compile`` would unroll
+every map that the eager search makes for few points only, and was not compiled after 400 s. *Forward-backward* is
+``lucas_kanade`` with all its fields against two calls of OpenCV. Times are of real pairs where DHTORCH_DATA is set,
+else of the built-in room; both sides take turns in one process.
 
 Errors of forward rows: share of points more than 1 px from where a known warp of the same images, with noise, put them.
 Errors of forward-backward rows: share of points of the real pairs on which the two verdicts differ.
@@ -13,9 +15,12 @@ Errors of forward-backward rows: share of points of the real pairs on which the 
 from __future__ import annotations
 
 import os
-from functools import partial
+import time
+from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import cv2
 import harness
@@ -75,6 +80,18 @@ def forward(image_0: Tensor, image_1: Tensor, uv: Tensor, window: int, pyramid_0
     return (x + d).reshape(2, B, N).permute(1, 2, 0), found.reshape(B, N)
 
 
+@cache
+def compiled_steps() -> Callable[..., Any]:
+    """The part of the search that is many small operations on the same numbers, compiled for any number of points."""
+    return torch.compile(lk._on_map, dynamic=True)
+
+
+def forward_compiled(image_0: Tensor, image_1: Tensor, uv: Tensor, window: int):
+    """:func:`forward` with :func:`compiled_steps`."""
+    with mock.patch.object(lk, "_on_map", compiled_steps()):
+        return forward(image_0, image_1, uv, window)
+
+
 def forward_opencv(image_0: Tensor, image_1: Tensor, uv: Tensor, window: int):
     """The same by OpenCV, pair after pair."""
     options: Any = {"winSize": (window, window), "maxLevel": LEVELS - 1, "criteria": (3, 30, 0.01)}
@@ -117,7 +134,7 @@ def accuracy(images: Tensor, uv: Tensor, window: int) -> list[tuple[float, float
 
 
 def measure(n: int, batch: int, window: int, repeats: int) -> list[dict[str, Any]]:
-    """Rows of one size: forward, forward with the anchor's pyramid cached, forward-backward."""
+    """Rows of one size: forward, the same compiled or with the anchor's pyramid cached, forward-backward."""
     image_0, image_1 = pairs(batch)
     uv = spiral(tuple(image_0.shape[-2:]), n).float().expand(batch, n, 2).contiguous()
     views, suffix = (image_0, image_1, uv), f"_w{window}_n{n}" + (f"_b{batch}" if batch > 1 else "")
@@ -130,16 +147,21 @@ def measure(n: int, batch: int, window: int, repeats: int) -> list[dict[str, Any
         partial(track.lucas_kanade, *views, **options),
         partial(track.lucas_kanade, *views, pyramid_0=anchor, **options),
         partial(opencv.lucas_kanade, *views, **options),
+        partial(forward_compiled, *views, window),
     ]
+    begin = time.perf_counter()
+    calls[-1]()
+    warm_up = time.perf_counter() - begin
     times = [[t / batch for t in side] for side in harness.in_turn(calls, repeats=repeats, warm_up=2)]
     (missed, median), (peer_missed, peer_median) = accuracy(image_0, uv, window)
     differ = (calls[3]().valid != calls[5]().valid).double().mean().item()
     print(
         f"{suffix[1:]}: misses {missed:.4f}, OpenCV {peer_missed:.4f}; median distance {median:.4f}, {peer_median:.4f}"
-        f" px; same verdict {1 - differ:.3f}"
+        f" px; same verdict {1 - differ:.3f}; first compiled call {warm_up:.1f} s"
     )
     common: dict[str, Any] = {"n": n, "batch": batch, "bar": window == 21}
-    rows = []
+    more = {"mode": "compiled", **common, "ours_error": missed, "peer_error": peer_missed}
+    rows = [harness.row(f"lk{suffix}", times[6], "opencv", times[2], **more)]
     for k, mode in enumerate(("eager", "cached")):
         more = {"mode": mode, **common, "ours_error": missed, "peer_error": peer_missed}
         rows.append(harness.row(f"lk{suffix}", times[k], "opencv", times[2], **more))

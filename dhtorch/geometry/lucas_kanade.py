@@ -42,7 +42,6 @@ LEAP, RATIO = 6, (-0.9, 0.9)
 #: On coarse levels a step has converged at so many times ``epsilon_px``.
 COARSE_EPSILON = 4.0
 
-
 #: Gauss-Newton steps on one map.
 STEPS = 8
 
@@ -52,7 +51,6 @@ TOP, BELOW = (3, 2, 2), (1, 2, 2)
 
 #: A ratio of contrasts beyond these limits is not believed.
 GAIN = (0.2, 5.0)
-
 
 #: Variance of rounding grey values to 8 bits; no residual is believed to be smaller.
 QUANTISATION = 1 / (12 * 255**2)
