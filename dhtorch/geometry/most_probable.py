@@ -30,7 +30,7 @@ from dhtorch.geometry.near_far import (
     prior,
     residuals,
     squares,
-    step,
+    trial_step,
 )
 from dhtorch.geometry.se3 import Pose
 
@@ -102,7 +102,7 @@ def most_probable(problem: Problem, start: Pose, o: Options) -> Solution:
         def evaluate(at: Unknowns) -> Normal:
             return normal(problem, at, noise, far, precision, o.kernel, o.bend)
 
-        return minimise(evaluate, at, steps, step=step)
+        return minimise(evaluate, at, steps, step=trial_step)
 
     half = o.near_steps // 2
     near, _ = solve(at, noise_scale(close, at), none, rigid, half, close)
@@ -154,7 +154,7 @@ def _translates(problem: Problem, at: Unknowns, noise: Tensor, far: Tensor, prec
         return Normal(cost, H + torch.diag(H.new_tensor([0.0] * 3 + [held] * 3 + [0.0] * 3)), g)
 
     still = Unknowns(Pose(at.T.R, torch.zeros_like(at.T.t)), at.turn)
-    _, rotation = minimise(evaluate, still, o.steps, step=step)
+    _, rotation = minimise(evaluate, still, o.steps, step=trial_step)
     return rotation - evaluate(at).cost > o.translation_gain * rotation + SLACK
 
 

@@ -70,6 +70,18 @@ def step(at: Unknowns, H: Tensor, g: Tensor) -> tuple[Unknowns, Tensor]:
     return Unknowns(move(at.T, xi[:, :6, 0]), at.turn + xi[:, 6:, 0]), ok
 
 
+def trial_step(at: Unknowns, H: Tensor, g: Tensor) -> tuple[Unknowns, Tensor]:
+    """:func:`step` in a few operations, for proposals that are judged afterwards: see ``least_squares.trial_step``.
+
+    Gradient: none. Raises ValueError for wrong shapes.
+    """
+    check("trial_step", turn=(at.turn, "B 3"), H=(H, "B 9 9"), g=(g, "B 9"))
+    with torch.no_grad():
+        xi, info = torch.linalg.solve_ex(H.double(), -g.double())
+        xi = xi.to(g.dtype)
+        return Unknowns(move(at.T, xi[:, :6]), at.turn + xi[:, 6:]), info == 0
+
+
 def straighten(
     uv: Tensor,  # (B, 2, N) ideal px of camera 1, planes
     f: Tensor,  # (B, 2) px
