@@ -198,10 +198,7 @@ def _robust_pose(
     best = cost.view(-1, keep).argmin(1) + keep * torch.arange(len(f), device=f.device)
     cost_of = _truncated(points, usable, f, c, options.threshold_px, options.kernel, options.kernel_px)
     T, _ = minimise(cost_of, flat[best], options.polish_steps, step=trial_step)
-    safe = found & T.R.isfinite().flatten(1).all(1) & T.t.isfinite().all(1)
-    eye = se3.identity(len(f), T.R)
-    R = torch.where(safe[:, None, None], T.R, eye.R).double()
-    return Pose(_orthonormal(R), torch.where(safe[:, None], T.t, eye.t).double()), safe
+    return Pose(_orthonormal(T.R.double()), T.t.double()), found
 
 
 def _truncated(
