@@ -10,7 +10,8 @@ never change: J ≈ g (T + ∇T · (δ + D p)) + b is linear regression of J on 
 so gain and bias need no iteration of their own. T is never read between pixels, which keeps its noise white.
 
 Such steps shrink by a factor that is nearly constant and, where the noise in T's gradient passes for texture, not
-small. Two of them tell it, and the third takes at once what would follow (Anderson 1965, with a memory of one step).
+small. Two of them tell it, and the third takes part of what would follow at once (Anderson 1965, with a memory of one
+step).
 """
 
 from __future__ import annotations
@@ -34,11 +35,8 @@ CHUNK = 256
 #: Rows of points are filled up to multiples of this, so that a point's rounding does not depend on how many there are.
 LANES = 16
 
-#: Steps are taken so much longer than regression says, which noise in T's gradient makes too short.
-LONGER = 1.4
-
-#: Of what would follow a step, at most so many times that step is taken at once.
-AHEAD = 4.0
+#: Of what would follow a step, at most so many times that step is taken at once; more overshoots under large warps.
+AHEAD = 0.5
 
 #: Added to the normal equations' affine part: what 2 / 255 of noise would say of a corner that moves by 2 px. It only
 #: matters where the window determines no affine motion (a single edge).
@@ -260,7 +258,7 @@ def _descend(
     for _ in range(o.steps):
         sums = torch.mul(Q, J[:, None], out=products).sum(-1)
         change = _change((inverse * sums[:, None]).sum(-1))
-        taken, before = _further(change * LONGER, taken, before), change * LONGER
+        taken, before = _further(change, taken, before), change
         warp = torch.where(moving, _compose(warp, taken, o.window), warp)
         J = _read(patch, warp, o.window)
         moving = moving & (change.abs().sum(0).amax(0) > o.epsilon_px)
