@@ -153,11 +153,10 @@ def _polish(d: Tensor, m: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
     x, y = d - next_d * m, next_d - d * m
     r = d * x + next_d * y - a[:, None]
     # Row k of half the Jacobian has x_k in column k and y_k in the next: Cramer's rule for this circle.
-    one = torch.stack((x, y, r))
-    two = one.roll(-1, 1)
-    (x1, y1, r1), (x2, _, r2) = two, two.roll(-1, 1)
+    x2, r2 = x.roll(-2, 0), r.roll(-2, 0)
     det = 2 * (x[0] * x[1] * x[2] + y[0] * y[1] * y[2])
-    step = (x2 * (r * x1 - r1 * y) + r2 * (y * y1)) * (det / (det * det + 1e-20))
+    step = x2 * (r * x.roll(-1, 0) - r.roll(-1, 0) * y) + r2 * (y * y.roll(-1, 0))
+    step = step * (det / (det * det + 1e-20))  # none where two solutions coincide
     return d - step, step.abs().amax(0)
 
 

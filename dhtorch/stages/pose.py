@@ -174,12 +174,12 @@ def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, f: Tensor, c
 
 def _planes(xyz: Tensor, uv: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
     """x, y, z, u, v (B, 5, N') and usable (B, N'), N' > 0 a multiple of LANES; unusable points at zero."""
-    points = torch.cat((xyz, uv), -1)
-    usable = valid & points.isfinite().all(-1)
-    points = points.masked_fill(~usable[..., None], 0.0).transpose(1, 2)
+    points = torch.cat((xyz.transpose(1, 2), uv.transpose(1, 2)), 1)
+    usable = valid & (points.abs().amax(1) < torch.inf)
+    points = torch.where(usable[:, None], points, torch.zeros_like(points))
     N = usable.shape[1]
     more = (0, max(N + -N % LANES, LANES) - N)
-    return torch.nn.functional.pad(points, more).contiguous(), torch.nn.functional.pad(usable, more)
+    return torch.nn.functional.pad(points, more), torch.nn.functional.pad(usable, more)
 
 
 def _robust_pose(
