@@ -20,8 +20,8 @@ from dhtorch.geometry.se3 import Pose
 from dhtorch.geometry.shapes import check
 from dhtorch.geometry.steady import steady
 
-#: Points of all pairs that :func:`depths` works on at once.
-POINTS = 1 << 17
+#: Points of all pairs that :func:`depths` works on at once: torch does not split so few over threads.
+POINTS = 1 << 15
 
 
 class TwoView(NamedTuple):
