@@ -45,9 +45,9 @@ COARSE_EPSILON = 4.0
 #: Gauss-Newton steps on one map.
 STEPS = 8
 
-#: Radii of a point's successive maps at the top, where nothing is known yet and few cells are to be searched, and below
-#: the top. A map of radius r covers the offsets from -r to r + 1.
-TOP, BELOW = (3, 2, 2), (1, 2, 2)
+#: Radii of a point's successive maps at the top, where nothing is known yet and few cells are to be searched, between,
+#: and on the finest level. A map of radius r covers the offsets from -r to r + 1.
+TOP, BETWEEN, FINEST = (3, 2, 2), (1, 2, 2), (1, 2, 2, 2)
 
 #: A ratio of contrasts beyond these limits is not believed.
 GAIN = (0.2, 5.0)
@@ -98,13 +98,13 @@ def search(
         return coarse(level + 1, x, d, batch) * 2
 
     def coarse(level: int, x: Tensor, d: Tensor, batch: Tensor) -> Tensor:
-        pair, radii = _Pair(source, target, level, *target.bounds(level)), TOP if level == top else BELOW
+        pair, radii = _Pair(source, target, level, *target.bounds(level)), TOP if level == top else BETWEEN
         pixel = source.corner(level, x * 0.5**level + 0.5)  # read between pixels only where it decides the answer
         every = torch.ones_like(batch, dtype=torch.bool)
         return _descend(pair, rough, radii, pixel, start(level, x, d, batch), batch, every)[0]
 
     pair = _Pair(source, target, 0, *target.bounds(0))
-    d, held, textured, A = _descend(pair, o, BELOW if top else TOP, x, start(0, x, d, batch), batch, known)
+    d, held, textured, A = _descend(pair, o, FINEST if top else TOP, x, start(0, x, d, batch), batch, known)
     return d, known & textured & held & within(x + d, pair.low, pair.high), A
 
 
