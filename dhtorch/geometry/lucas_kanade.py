@@ -47,7 +47,7 @@ STEPS = 8
 
 #: Radii of a point's successive maps at the top, where nothing is known yet and few cells are to be searched, between,
 #: and on the finest level. A map of radius r covers the offsets from -r to r + 1.
-TOP, BETWEEN, FINEST = (3, 2, 2), (1, 2, 2), (1, 2, 2, 2)
+TOP, BETWEEN, FINEST = (2, 2, 2, 2), (1, 2, 2), (1, 2, 2, 2)
 
 #: A ratio of contrasts beyond these limits is not believed.
 GAIN = (0.2, 5.0)
