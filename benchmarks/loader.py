@@ -4,7 +4,8 @@
 
 The plain loader decodes a JPEG and a 16-bit PNG with the depth, resizes both where asked for, and resizes the picture
 to 224×224 for a network; only that leaves the worker. ``single`` is one view per sample, of which the transform's
-front end alone is asked; ``pair`` is two views, and beside the transform stands the same with OpenCV in its seats.
+front end alone is asked; ``pair`` is two views, and beside the transform stands the same with OpenCV in its seats. Rows
+with ``by_batch`` collate in the worker first and extend the whole batch at once (``batched=True``): the same answers.
 ``ours_ms`` and ``peer_ms`` are milliseconds per sample in the steady state, workers included. In ``scaling`` rows
 ``peer_ms`` is what two workers would take per sample if the transform scaled from one worker to two as the plain
 loader does. In ``step`` rows the transform alone stands beside a forward pass of DINOv2 (random weights).
@@ -25,7 +26,7 @@ import cv2
 import harness
 import numpy as np
 import torch
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader, Dataset, default_collate
 
 from dhtorch import data, extend
 from dhtorch.baselines import dinov2, opencv
@@ -56,6 +57,7 @@ class Encoded(Dataset[Any]):
         self, pairs: list[dict[str, Any]], hw: tuple[int, int], keys: Sequence[str], length: int, transform: Any = None
     ) -> None:
         self.pairs, self.hw, self.keys, self.length, self.transform = pairs, hw, keys, length, transform
+        self.by_batch = transform is not None and transform.batched
 
     def __len__(self) -> int:
         return self.length
@@ -64,8 +66,19 @@ class Encoded(Dataset[Any]):
         out = self.decoded(i)
         views = {key: out[key] for key in self.keys}
         small = {f"{k}_{SIDE}": cv2.resize(v, (SIDE, SIDE), interpolation=cv2.INTER_AREA) for k, v in views.items()}
+        if self.by_batch:
+            return {**small, **out}
         out = out if self.transform is None else self.transform(out)
-        return {**small, **{k: v for k, v in out.items() if k not in (*self.keys, "depth")}}
+        return {**small, **self.light(out)}
+
+    def collated(self, samples: list[dict[str, Any]]) -> dict[str, Any]:
+        """A batch, extended at once where the transform wants batches."""
+        batch = default_collate(samples)
+        return self.light(self.transform(batch)) if self.by_batch else batch
+
+    def light(self, sample: dict[str, Any]) -> dict[str, Any]:
+        """Without the pictures in full size and the depth, which stay in the worker."""
+        return {k: v for k, v in sample.items() if k not in (*self.keys, "depth")}
 
     def decoded(self, i: int) -> dict[str, Any]:
         """One sample as the transform reads it."""
@@ -99,11 +112,11 @@ def encoded() -> tuple[str, tuple[int, int], list[dict[str, Any]]]:
     return recording.name, recording[0].hw, pairs
 
 
-def per_sample(dataset: Dataset[Any], workers: int, repeats: int, clock: str) -> Iterator[float]:
+def per_sample(dataset: Encoded, workers: int, repeats: int, clock: str) -> Iterator[float]:
     """Milliseconds per sample, one number for each stretch, after one to warm up; of workers always by the wall."""
     now = harness.CLOCKS["wall" if workers else clock]
     options: dict[str, Any] = {"worker_init_fn": one_thread, "multiprocessing_context": "fork"} if workers else {}
-    loader = iter(DataLoader(dataset, BATCH, num_workers=workers, **options))
+    loader = iter(DataLoader(dataset, BATCH, num_workers=workers, collate_fn=dataset.collated, **options))
     for k in range(repeats + 1):
         start = now()
         for _ in range(STRETCH):
@@ -119,7 +132,8 @@ class Bench:
         self.found, self.size, self.mode, self.n = encoded(), size, mode, n
         self.repeats, self.clock = max(repeats // ROUNDS, 1), clock
         self.keys = ("image",) if mode == "single" else ("image", "other")
-        self.transforms = {"transform": self.transform(), "plain_loader": None}
+        self.transforms = {"transform": self.transform(), "by_batch": self.transform(batched=True)}
+        self.transforms["plain_loader"] = None
         if mode == "pair":
             self.transforms["opencv_seats"] = self.transform(method=OPENCV)
         self.times: dict[tuple[str, int], list[float]] = {}
@@ -149,11 +163,18 @@ class Bench:
     def rows(self, workers: int) -> list[dict[str, Any]]:
         """Against the plain loader and against OpenCV; the bars stand on the larger pictures."""
         barred = {"single": "plain_loader", "pair": "opencv_seats"}[self.mode]
-        name, ours = f"loader_{self.mode}_{self.size}_workers{workers}", self.times["transform", workers]
+        name, ours = f"loader_{self.mode}_{self.size}_workers{workers}", ("transform", "by_batch")
         return [
-            harness.row(name, ours, peer, self.times[peer, workers], **self.common(peer == barred))
+            harness.row(
+                name if side == "transform" else f"{name}_{side}",
+                self.times[side, workers],
+                peer,
+                self.times[peer, workers],
+                **self.common(peer == barred),
+            )
+            for side in ours
             for peer in self.transforms
-            if peer != "transform"
+            if peer not in ours
         ]
 
     def scaling(self) -> dict[str, Any]:

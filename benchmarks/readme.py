@@ -1,7 +1,7 @@
-"""README's tables and picture, made from committed result files and the built-in room.
+"""The tables of README.md and benchmarks/README.md, made from committed result files; README's picture.
 
-python benchmarks/readme.py            rewrite the tables between the markers in README.md
-python benchmarks/readme.py --check    exit 1 if README.md does not say what the result files say
+python benchmarks/readme.py            rewrite the tables between the markers of both
+python benchmarks/readme.py --check    exit 1 if they do not say what the result files say
 python benchmarks/readme.py --picture  also render benchmarks/results/room.png again
 """
 
@@ -11,10 +11,12 @@ import argparse
 import json
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import speed_tables
 
 from dhtorch import archive
 from dhtorch.experiments import method_comparison
@@ -91,39 +93,6 @@ def truths() -> str:
             cells.append(" / ".join(percent(summary[f"{p}{key}"]["value"]) for p in prefix.values()))
         rows.append(cells)
     return table(["truth test", "candidates", "coverage", "median error", "p90"], rows)
-
-
-def timings(file: str) -> list[dict[str, Any]]:
-    """Rows of a benchmark's result file."""
-    rows: list[dict[str, Any]] = json.loads((RESULTS / f"{file}.json").read_text())
-    return rows
-
-
-def bars() -> str:
-    """Each speed that has a bar, one thread, beside that bar."""
-    rows = []
-    for file, name, mode, bar, words in SPEED_BARS:
-        found = [r for r in timings(file) if (r["name"], r["mode"], r["threads"], r["bar"]) == (name, mode, 1, True)]
-        (r,) = found
-        errors = " / ".join("–" if r[k] is None else f"{r[k]:.3g}" for k in ("ours_error", "peer_error"))
-        cells = [words if mode == "eager" else f"{words}, {mode}", f"{r['ours_ms']:.2f}", f"{r['peer_ms']:.2f}"]
-        rows.append([*cells, f"{r['ratio']:.2f}", f"≤ {bar:g}", errors])
-    return table(["", "ours, ms", "peer, ms", "ratio", "bar", "errors, ours / peer"], rows)
-
-
-def speed() -> str:
-    """Milliseconds per pair by stage, one thread."""
-    shown = []
-    for batch in (1, 8):
-        for stage in ("", ".track", ".pose", ".triangulate"):
-            cells = [f"B = {batch}, {stage[1:] or 'whole pair'}"]
-            for method in ("paper", "map"):
-                (r,) = (
-                    r for r in timings("pair") if (r["name"], r["threads"]) == (f"pair_{method}_b{batch}{stage}", 1)
-                )
-                cells += [f"{r['ours_ms']:.1f}", f"{r['ratio']:.2f}"]
-            shown.append([*cells, f"{r['peer_ms']:.1f}"])
-    return table(["one thread", "`paper`, ms", "ratio", "`map`, ms", "ratio", "`opencv`, ms"], shown)
 
 
 def comparison() -> str:
@@ -219,28 +188,8 @@ def picture(path: Path) -> None:
     figure.savefig(path, dpi=80, bbox_inches="tight")
 
 
-#: File, row, mode and bar of every speed that has one, in words.
-SPEED_BARS = (
-    ("frontend", "frontend_224", "eager", 1.1, "front end, 224×224, n = 1024"),
-    ("frontend", "frontend_224", "compiled", 0.35, "front end, 224×224, n = 1024"),
-    ("frontend", "frontend_1440", "eager", 0.08, "front end, 1440×1920"),
-    ("lk", "lk_w21_n2048", "eager", 1.1, "search there, n = 2048"),
-    ("lk", "lk_w21_n512_b8", "eager", 1.5, "search there, n = 512, B = 8"),
-    ("lk", "lk_w21_n512_b8", "cached", 1.1, "search there, n = 512, B = 8"),
-    ("lk", "lk_fb_w21_n2048", "eager", 0.7, "search there and back, n = 2048"),
-    ("pnp", "pnp_n500_b16", "eager", 1.0, "pose, 500 points, B = 16"),
-    ("pnp", "pnp_n500_b1", "eager", 4.0, "pose, 500 points, B = 1"),
-    ("pnp", "pnp_n500_b1", "compiled", 2.5, "pose, 500 points, B = 1"),
-    ("triangulate", "triangulate_100k", "eager", 0.03, "triangulation, 100,000 points"),
-    ("pair", "pair_paper_b8", "eager", 1.0, "`paper`, whole pair, B = 8"),
-    ("pair", "pair_map_b8", "eager", 1.6, "`map`, whole pair, B = 8"),
-    ("loader", "loader_single_640x480_workers0", "eager", 1.1, "loader with one view, 640×480"),
-    ("loader", "loader_pair_640x480_workers0", "eager", 1.0, "loader with two views, 640×480"),
-    ("loader", "loader_scaling_pair_640x480", "eager", 1.05, "the same, what two workers gain"),
-)
-
-TABLES = {"room": room, "shared": shared, "truths": truths, "speed": speed, "comparison": comparison, "bars": bars}
-TABLES |= {"comparison scenes": by_scene}
+TABLES = {"room": room, "shared": shared, "truths": truths, "comparison": comparison, "comparison scenes": by_scene}
+TABLES |= {"bars": speed_tables.bars, "speed": speed_tables.stages}
 
 #: Numbers of the method comparison in words, and on which side of its bar each belongs.
 NUMBER = {
@@ -268,6 +217,9 @@ TABLES |= {"pipelines": partial(verdicts, PIPELINES), "stress": stress}
 TABLES |= {"map": partial(verdicts, ("global_map",))}
 
 
+PAGES = {README: TABLES, HERE / "README.md": speed_tables.TABLES}
+
+
 def in_layout(name: str) -> str:
     """The tables of ``results/<name>.json`` in the paper's layout, the paper's figures beside ours."""
     found = layouts.in_layout(archive.read(RESULTS / f"{name}.json"))
@@ -276,31 +228,32 @@ def in_layout(name: str) -> str:
     return text.markdown(found).rstrip()
 
 
-def fill(whole: str) -> str:
-    """README with the tables as the result files have them.
+def fill(page: Path, tables: dict[str, Callable[[], str]]) -> str:
+    """A page with the tables as the result files have them.
 
-    ``<!-- name -->`` up to ``<!-- end -->`` is one of TABLES; ``<!-- results name -->`` the tables of a result file.
+    ``<!-- name -->`` up to ``<!-- end -->`` is one of ``tables``; ``<!-- results name -->`` those of a result file.
     """
+    whole = page.read_text()
     known = {f"results {name}": partial(in_layout, name) for name in re.findall(r"<!-- results ([\w.-]+) -->", whole)}
-    for name, make in (TABLES | known).items():
+    for name, make in (tables | known).items():
         pattern = rf"(<!-- {re.escape(name)} -->\n).*?(<!-- end -->)"
         whole, count = re.subn(pattern, lambda m, make=make: f"{m[1]}{make()}\n{m[2]}", whole, flags=re.DOTALL)
         if count != 1:
-            raise ValueError(f"{README}: marker <!-- {name} -->: found {count}, expected one")
+            raise ValueError(f"{page}: marker <!-- {name} -->: found {count}, expected one")
     return whole
 
 
 def main() -> int:
-    """Rewrite or check README.md."""
+    """Rewrite or check both pages."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true")
     parser.add_argument("--picture", action="store_true")
     options = parser.parse_args()
-    now = README.read_text()
-    wanted = fill(now)
+    wanted = {page: fill(page, tables) for page, tables in PAGES.items()}
     if options.check:
-        return int(now != wanted)
-    README.write_text(wanted)
+        return int(any(page.read_text() != filled for page, filled in wanted.items()))
+    for page, filled in wanted.items():
+        page.write_text(filled)
     if options.picture:
         picture(RESULTS / "room.png")
     return 0

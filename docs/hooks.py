@@ -174,6 +174,11 @@ def readme_table(title: str) -> str:
     return table[0]
 
 
+def speed() -> str:
+    """benchmarks/README.md, whose tables are those of the result files."""
+    return _adopted((REPO / "benchmarks" / "README.md").read_text(encoding="utf-8"))
+
+
 def _adopted(markdown: str) -> str:
     """README's text on a page of the site: pictures where the site has them, links to other files as text."""
     for target in pictures():
@@ -306,6 +311,6 @@ def licences() -> str:
 
 MAKERS: dict[str, Callable[..., str]] = {
     "readme": section,
-    **{f.__name__: f for f in (readme_head, readme_table, module, reader, choices, codes)},
+    **{f.__name__: f for f in (readme_head, readme_table, speed, module, reader, choices, codes)},
     **{f.__name__: f for f in (experiments, verdicts, helps, exit_codes, licences)},
 }

@@ -1,0 +1,110 @@
+"""Tables of the timing scripts' result files, for README.md and benchmarks/README.md; see readme.py."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from dhtorch.report import Table, text
+
+RESULTS = Path(__file__).resolve().parent / "results"
+
+#: File, row, mode and bar of every speed that has one, in words.
+BARS = (
+    ("frontend", "frontend_224", "eager", 1.1, "front end, 224×224, n = 1024"),
+    ("frontend", "frontend_224", "compiled", 0.35, "front end, 224×224, n = 1024"),
+    ("frontend", "frontend_1440", "eager", 0.08, "front end, 1440×1920"),
+    ("lk", "lk_w21_n2048", "eager", 1.1, "search there, n = 2048"),
+    ("lk", "lk_w21_n2048", "compiled", 0.85, "search there, n = 2048"),
+    ("lk", "lk_w21_n512_b8", "eager", 1.5, "search there, n = 512, B = 8"),
+    ("lk", "lk_w21_n512_b8", "cached", 1.1, "search there, n = 512, B = 8"),
+    ("lk", "lk_fb_w21_n2048", "eager", 0.7, "search there and back, n = 2048"),
+    ("pnp", "pnp_n500_b16", "eager", 1.0, "pose, 500 points, B = 16"),
+    ("pnp", "pnp_n500_b1", "eager", 4.0, "pose, 500 points, B = 1"),
+    ("pnp", "pnp_n500_b1", "compiled", 2.5, "pose, 500 points, B = 1"),
+    ("triangulate", "triangulate_100k", "eager", 0.03, "triangulation, 100,000 points"),
+    ("pair", "pair_paper_b8", "eager", 1.0, "`paper`, whole pair, B = 8"),
+    ("pair", "pair_map_b8", "eager", 1.6, "`map`, whole pair, B = 8"),
+    ("loader", "loader_single_640x480_workers0", "eager", 1.1, "loader with one view, 640×480"),
+    ("loader", "loader_single_640x480_workers0_by_batch", "eager", 1.1, "the same, a batch at once"),
+    ("loader", "loader_pair_640x480_workers0", "eager", 1.0, "loader with two views, 640×480"),
+    ("loader", "loader_pair_640x480_workers0_by_batch", "eager", 1.0, "the same, a batch at once"),
+    ("loader", "loader_scaling_pair_640x480", "eager", 1.05, "loader with two views, what two workers gain"),
+)
+
+#: Scripts whose every row is shown.
+SCRIPTS = ("frontend", "lk", "pnp", "triangulate", "pair", "loader")
+
+
+def timings(file: str) -> list[dict[str, Any]]:
+    """Rows of a benchmark's result file."""
+    rows: list[dict[str, Any]] = json.loads((RESULTS / f"{file}.json").read_text())
+    return rows
+
+
+def ratio(value: float) -> str:
+    """Two decimals, and two digits where that would say too little."""
+    return f"{value:.2f}" if value >= 0.1 else f"{value:.2g}"
+
+
+def errors(row: dict[str, Any]) -> str:
+    """Both sides' errors."""
+    return " / ".join("–" if row[k] is None else f"{row[k]:.3g}" for k in ("ours_error", "peer_error"))
+
+
+def bars() -> str:
+    """Each speed that has a bar, one thread, beside that bar."""
+    rows = []
+    for file, name, mode, bar, words in BARS:
+        found = [r for r in timings(file) if (r["name"], r["mode"], r["threads"], r["bar"]) == (name, mode, 1, True)]
+        (r,) = found
+        cells = [words if mode == "eager" else f"{words}, {mode}", f"{r['ours_ms']:.2f}", f"{r['peer_ms']:.2f}"]
+        verdict = "met" if r["ratio"] <= bar else "missed"
+        rows.append([*cells, ratio(r["ratio"]), f"≤ {bar:g}", verdict, errors(r)])
+    return text.grid(Table("", ["", "ours, ms", "peer, ms", "ratio", "bar", "", "errors, ours / peer"], rows))
+
+
+def stages() -> str:
+    """Milliseconds per pair by stage, one thread."""
+    shown = []
+    rows = {r["name"]: r for r in timings("pair") if r["threads"] == 1}
+    for batch in (1, 8):
+        for stage in ("", ".track", ".pose", ".triangulate"):
+            cells = [f"B = {batch}, {stage[1:] or 'whole pair'}"]
+            for method in ("paper", "map"):
+                r = rows[f"pair_{method}_b{batch}{stage}"]
+                cells += [f"{r['ours_ms']:.1f}", f"{r['ratio']:.2f}"]
+            shown.append([*cells, f"{r['peer_ms']:.1f}"])
+    return text.grid(Table("", ["one thread", "`paper`, ms", "ratio", "`map`, ms", "ratio", "`opencv`, ms"], shown))
+
+
+def every_row(file: str) -> str:
+    """All rows of a script, each thread count apart."""
+    rows = []
+    for r in timings(file):
+        mode = r["mode"] if r.get("warm_up_s") is None else f"{r['mode']} (warm-up {r['warm_up_s']:.0f} s)"
+        cells = [f"`{r['name']}`", mode, str(r["threads"]), f"{r['ours_ms']:.2f}", f"{r['ours_iqr']:.2f}"]
+        rows.append([*cells, r["peer"], f"{r['peer_ms']:.2f}", ratio(r["ratio"]), errors(r)])
+    head = ["row", "mode", "threads", "ours, ms", "iqr", "peer", "peer, ms", "ratio", "errors, ours / peer"]
+    return text.grid(Table("", head, rows, n_label=2))
+
+
+def scaling() -> str:
+    """Growth exponents, and the memory of the largest size."""
+    rows = []
+    for r in timings("scaling"):
+        if r["bar"]:
+            name = r["name"].removeprefix("scaling.")
+            grows = ["–" if r.get(k) is None else f"{r[k]:.2f}" for k in ("time_exponent", "memory_exponent")]
+            cells = [str(r["n"]), f"{r['ours_ms']:.1f}", "–" if r["peak_mib"] is None else f"{r['peak_mib']:.0f}"]
+            rows.append([f"`{name}`", *grows, *cells])
+    head = ["what doubles", "time ^", "memory ^", "largest size", "ms there", "MiB above the inputs there"]
+    return text.grid(Table("", head, rows))
+
+
+#: Tables of benchmarks/README.md.
+TABLES: dict[str, Callable[[], str]] = {"bars": bars, "scaling": scaling}
+TABLES |= {f"rows {file}": partial(every_row, file) for file in SCRIPTS}
