@@ -203,7 +203,7 @@ def main() -> None:
             if options.full or threads == 1:
                 sizes += [("224", 2048, 1), ("224", 1024, 64)]
             if options.full:
-                sizes += [("1440", 2048, 1), ("1440", 1024, 8)]
+                sizes += [("1440", 2048, 1), ("1440", 1024, 64)]
             part = []
             for size, n, batch in sizes:
                 part += measure(size, n, batch, options, compile_too=(n, batch) == (1024, 1))
