@@ -397,7 +397,7 @@ ROWS = [
 #: tested where they are at home (test_front_end.py, test_pose.py, test_evaluate.py, test_integrate.py).
 ELSEWHERE = {
     *(f"dhtorch.stages.sample.{name}" for name in ("spiral", "vogel", "grid")),
-    "dhtorch.geometry.shapes.check",
+    *(f"dhtorch.geometry.shapes.{name}" for name in ("check", "is_static")),
     *(f"dhtorch.geometry.cells.{name}" for name in ("occupied", "components")),
     *(f"dhtorch.integrate.volume.{name}" for name in ("empty", "fuse", "splat")),
     *(f"dhtorch.integrate.surface.{name}" for name in ("points", "mesh")),

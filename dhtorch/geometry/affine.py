@@ -16,7 +16,6 @@ step).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -26,14 +25,12 @@ from torch import Tensor
 
 from dhtorch.geometry.least_squares import MIN_PIVOT, solve_spd
 from dhtorch.geometry.lookup import round_half_up
+from dhtorch.geometry.lucas_kanade import for_some
 from dhtorch.geometry.pyramid import GRAD_X, GRAD_Y, GREY, REACH, Pyramid
-from dhtorch.geometry.shapes import check
+from dhtorch.geometry.shapes import check, is_static
 
 #: Points treated at once: few enough for their windows to stay in the cache.
 CHUNK = 256
-
-#: Rows of points are filled up to multiples of this, so that a point's rounding does not depend on how many there are.
-LANES = 16
 
 #: Of what would follow a step, at most so many times that step is taken at once; more overshoots under large warps.
 AHEAD = 0.5
@@ -136,7 +133,7 @@ def register(
         if wanted is not None:
             usable = usable & wanted.reshape(-1)
         o = _Options(window, iterations, epsilon_px, max_shift_px)
-        answer = _for_some(usable, _nothing(there), partial(_register, source, target, o), (here, there, batch))
+        answer = for_some(usable, partial(_register, source, target, o), _nothing(there), (here, there, batch))
 
     def grid(y: Tensor) -> Tensor:  # (..., M) -> (B, N, ...)
         y = y.unflatten(-1, (B, N)).movedim((-2, -1), (0, 1))
@@ -208,7 +205,7 @@ def _register(
     best = state._replace(warp=warp, fit=state.first)
     if len(target.levels) > 1:
         big = _determinant(_linear(state.warp, o.window)) > HALVE**2
-        state = _State(*_for_some(big, state, partial(search, 1), (q, place, state.warp, batch)))
+        state = _State(*for_some(big, partial(search, 1), state, (q, place, state.warp, batch)))
     shift = ((state.warp * place[:, None]).sum(0) - there).square().sum(0).sqrt()
     shift = torch.where(shift.isfinite(), shift, torch.full_like(shift, o.max_shift_px))
     ok = _accept(state, best.fit, target, o.window) & (shift <= o.max_shift_px)
@@ -231,7 +228,7 @@ def _search(
     """Steps of all points, a chunk at a time, reading image 1 from one level."""
     zoom = 0.5**level
     fine = o._replace(epsilon_px=o.epsilon_px * zoom)
-    memory = None if _static(warp) else warp.new_empty(2, min(CHUNK, len(batch)), 8, o.window * o.window)
+    memory = None if is_static(warp) else warp.new_empty(2, min(CHUNK, len(batch)), 8, o.window * o.window)
     parts = []
     for q_, place_, warp_, batch_ in zip(*(y.split(CHUNK, -1) for y in (q, place, warp * zoom, batch)), strict=True):
         patch, corner = _patch(target, level, warp_[0], batch_, o.window)
@@ -262,7 +259,7 @@ def _descend(
         warp = torch.where(moving, _compose(warp, taken, o.window), warp)
         J = _read(patch, warp, o.window)
         moving = moving & (change.abs().sum(0).amax(0) > o.epsilon_px)
-        if not _static(warp) and not moving.any():
+        if not is_static(warp) and not moving.any():
             break
     if o.steps:
         fit = _quality(Q[:, 6], J, _share(_places(warp, o.window).flatten(2)))
@@ -282,18 +279,6 @@ def _nothing(there: Tensor) -> tuple[Tensor, ...]:
     """The fields of a :class:`Registration` for points (2, M) that are not registered."""
     none, zero = torch.zeros_like(there[0], dtype=torch.bool), torch.zeros_like(there[0])
     return there, _still(there), zero, _still(there), zero, none
-
-
-def _for_some(wanted: Tensor, values, fn: Callable[..., tuple[Tensor, ...]], columns: tuple[Tensor, ...]):
-    """``values`` (each (..., M)), replaced where ``wanted`` (M,) by what ``fn(*columns)`` returns."""
-    if _static(wanted):
-        return tuple(torch.where(wanted, new, old) for new, old in zip(fn(*columns), values, strict=True))
-    some = wanted.nonzero()[:, 0]
-    if not len(some):
-        return values
-    some = torch.cat([some, some[:1].expand(-len(some) % LANES)])  # filled up by copies of the first
-    new = fn(*(y.index_select(-1, some) for y in columns))
-    return tuple(old.index_copy(-1, some, n) for old, n in zip(values, new, strict=True))
 
 
 def _accept(state: _State, first: Tensor, target: Pyramid, window: int) -> Tensor:
@@ -462,8 +447,3 @@ def _inverse(A: Tensor) -> Tensor:
 def _product(A: Tensor, B: Tensor) -> Tensor:
     """(2, 2, M) times (2, 2, M), as sums: rounding then does not depend on the batch."""
     return (A[:, :, None] * B[None]).sum(1)
-
-
-def _static(x: Tensor) -> bool:
-    """Whether shapes must not depend on values."""
-    return torch.compiler.is_compiling() or torch._C._functorch.is_functorch_wrapped_tensor(x)

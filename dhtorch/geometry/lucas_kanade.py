@@ -23,6 +23,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch.geometry.pyramid import GRAD_X, GRAD_Y, GREY, Pyramid
+from dhtorch.geometry.shapes import is_static
 
 #: Points whose windows are read at once: few enough for the windows to stay in the cache.
 CHUNK = 256
@@ -149,7 +150,7 @@ def for_some(wanted: Tensor, fn: Callable, values: tuple[Tensor, ...], columns: 
 
     Where shapes may depend on values, ``fn`` sees only the wanted points, filled up by copies of the first.
     """
-    if _static(wanted):
+    if is_static(wanted):
         return tuple(torch.where(wanted, new, old) for new, old in zip(fn(*columns), values, strict=True))
     some = wanted.nonzero()[:, 0]
     if not len(some):
@@ -176,7 +177,7 @@ def _by_cell(pyramid: Pyramid, level: int, fn: Callable, x: Tensor, d: Tensor, b
 
     column, row = ((x - lowest) / size).long().clamp_min(0)
     own = (batch * rows + row.clamp_max(rows - 1)) * columns + column.clamp_max(columns - 1)
-    if _static(x):
+    if is_static(x):
         return search(own)
     wanted = own.new_zeros(len(pyramid.levels[0]) * rows * columns).index_fill_(0, own, 1)
     cells = wanted.nonzero()[:, 0]
@@ -325,8 +326,3 @@ def _small_eigenvalue(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
 def within(x: Tensor, low: Tensor, high: Tensor) -> Tensor:
     """Whether points (2, M) lie between bounds; NaN does not."""
     return ((x >= low) & (x <= high)).all(0)
-
-
-def _static(x: Tensor) -> bool:
-    """Whether shapes must not depend on values."""
-    return torch.compiler.is_compiling() or torch._C._functorch.is_functorch_wrapped_tensor(x)

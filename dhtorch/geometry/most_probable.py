@@ -33,6 +33,7 @@ from dhtorch.geometry.near_far import (
     trial_step,
 )
 from dhtorch.geometry.se3 import Pose
+from dhtorch.geometry.shapes import is_static
 
 #: Standard deviations of a residual coordinate, px, that are believed.
 MIN_NOISE_PX, MAX_NOISE_PX = 0.1, 5.0
@@ -128,7 +129,7 @@ def most_probable(problem: Problem, start: Pose, o: Options) -> Solution:
 
 def _used_first(problem: Problem) -> tuple[Problem, Problem]:
     """The used tracks and the near tracks, each problem as wide as its fullest pair needs; near tracks come first."""
-    if _static(problem.near):
+    if is_static(problem.near):
         return problem, problem
     used = problem.near | problem.far
     order = (used.to(torch.uint8) + problem.near.to(torch.uint8)).argsort(dim=1, descending=True, stable=True)
@@ -236,8 +237,3 @@ def _rise_and_scatter(square: Tensor, weight: Tensor, used: Tensor, size: int, o
     rise = mean / (total(weight) / count).clamp_min(1e-9)
     scatter = total(weight * weight * square) / size / total(weight * weight).clamp_min(1e-9)
     return rise.clamp_min(MIN_RISE) / few, scatter * spent * spent
-
-
-def _static(x: Tensor) -> bool:
-    """Whether shapes must not depend on values."""
-    return torch.compiler.is_compiling() or torch._C._functorch.is_functorch_wrapped_tensor(x)

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 
@@ -40,3 +41,8 @@ def check(where: str, **args: tuple[Tensor | None, str]) -> dict[str, int]:
                 f"{where}: {name} has shape {tuple(x.shape)}, expected ({pattern}) with {bound or 'any sizes'}"
             )
     return sizes
+
+
+def is_static(x: Tensor) -> bool:
+    """Whether shapes must not depend on values: under ``torch.compile``, and under the transforms of ``torch.func``."""
+    return torch.compiler.is_compiling() or torch._C._functorch.is_functorch_wrapped_tensor(x)
