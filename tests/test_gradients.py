@@ -369,11 +369,16 @@ def test_a_window_of_half_precision():
 
 
 class Task:
-    """Far depth of a few pairs against held-back truth; tracks do not depend on what is looked for, so they stay."""
+    """Far depth of a few pairs against held-back truth; tracks do not depend on what is looked for, so they stay.
+
+    Two rooms leave the principal point open by some pixels, whatever tracks them; four hold it within two.
+    """
+
+    rooms = (2, 3, 4, 5)
 
     def __init__(self, n=512):
-        pairs = [views(room(seed, hw=(180, 240)), 0, 16, dtype=torch.float32) for seed in (2, 3)]
-        whole = tree.collate([room(seed, hw=(180, 240))[0] for seed in (2, 3)])
+        pairs = [views(room(seed, hw=(180, 240)), 0, 16, dtype=torch.float32) for seed in self.rooms]
+        whole = tree.collate([room(seed, hw=(180, 240))[0] for seed in self.rooms])
         self.near, self.other = (tree.collate(frames) for frames in zip(*pairs, strict=True))
         self.method = partial(METHODS["map"], n=n, pose=partial(pose.map_pose, turn_sigma=0.0))  # a global shutter
         trace = {}
@@ -446,7 +451,7 @@ def test_intrinsics_five_per_cent_wrong_are_recovered_from_far_depth(task, sign)
     p = fit(residual, start)
     after = residual(p)[1]
     assert abs(float(p[0].exp() - 1)) < 0.01, "focal length within a fifth of its error"
-    assert float((p[1:] * f[0]).abs().max()) < 2.5, "principal point within 2.5 px, from 6 and 4.5"
+    assert float((p[1:] * f[0]).abs().max()) < 2.0, "principal point within 2 px, from 6 and 4.5"
     median = [float(r[counts].abs().median()) for counts, r in (before, after)]
     assert median[1] < 0.2 * median[0] and median[1] < 0.01
 
