@@ -160,7 +160,7 @@ def measure(n: int, batch: int, window: int, repeats: int) -> list[dict[str, Any
         f" px; same verdict {1 - differ:.3f}; first compiled call {warm_up:.1f} s"
     )
     common: dict[str, Any] = {"n": n, "batch": batch, "bar": window == 21}
-    more = {"mode": "compiled", **common, "ours_error": missed, "peer_error": peer_missed}
+    more = {"mode": "compiled", "warm_up_s": warm_up, **common, "ours_error": missed, "peer_error": peer_missed}
     rows = [harness.row(f"lk{suffix}", times[6], "opencv", times[2], **more)]
     for k, mode in enumerate(("eager", "cached")):
         more = {"mode": mode, **common, "ours_error": missed, "peer_error": peer_missed}

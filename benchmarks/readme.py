@@ -106,10 +106,10 @@ def comparison() -> str:
     return table(["number", "`map`", "`window`", "bar"], rows)
 
 
-def by_scene() -> str:
-    """Coverage and median error of every method on every scene, and the ratio at equal coverage over five seeds."""
+def by_scene(comparison: str) -> str:
+    """Coverage and median error of every method on every scene of a comparison, and the ratio at equal coverage."""
     rows = []
-    for scene, methods in scenes("method_comparison", "full").items():
+    for scene, methods in scenes(comparison, "full").items():
         name = f"{scene} ({methods['paper']['role']})" if methods["paper"]["role"] else scene
         cells = [name, str(methods["paper"]["n_candidates"])]
         for key in ("coverage", "median_rel"):
@@ -118,22 +118,7 @@ def by_scene() -> str:
             methods[m].get("against_paper", {}).get("median_rel_ratio_at_equal_coverage") for m in ("map", "window")
         ]
         rows.append([*cells, " / ".join(map(number, ratios))])
-    head = ["scene", "candidates", "coverage", "median error", "ratio at equal coverage, `map` / `window`"]
-    return table(head, rows)
-
-
-def stress() -> str:
-    """Coverage and median error in rooms with one thing wrong, and the ratio at equal coverage."""
-    rows = []
-    for scene, methods in scenes("stress", "full").items():
-        cells = [scene, str(methods["paper"]["n_candidates"])]
-        for key in ("coverage", "median_rel"):
-            cells.append(" / ".join(percent(methods[m].get(key)) for m in ("paper", "map", "window")))
-        ratios = [
-            methods[m].get("against_paper", {}).get("median_rel_ratio_at_equal_coverage") for m in ("map", "window")
-        ]
-        rows.append([*cells, " / ".join(map(number, ratios))])
-    head = ["room", "candidates", "coverage, `paper` / `map` / `window`", "median error", "ratio at equal coverage"]
+    head = ["scene", "candidates", "coverage, `paper` / `map` / `window`", "median error", "ratio at equal coverage"]
     return table(head, rows)
 
 
@@ -188,7 +173,8 @@ def picture(path: Path) -> None:
     figure.savefig(path, dpi=80, bbox_inches="tight")
 
 
-TABLES = {"room": room, "shared": shared, "truths": truths, "comparison": comparison, "comparison scenes": by_scene}
+TABLES = {"room": room, "shared": shared, "truths": truths, "comparison": comparison}
+TABLES |= {"comparison scenes": partial(by_scene, "method_comparison"), "stress": partial(by_scene, "stress")}
 TABLES |= {"bars": speed_tables.bars, "speed": speed_tables.stages}
 
 #: Numbers of the method comparison in words, and on which side of its bar each belongs.
@@ -213,10 +199,9 @@ ASKED = (
 PIPELINES = ("rh20t_probe", "vo_probe", "learned_score")
 NEGATIVE = ("helix_correlation", "defocus", "focus_stack", "defocus_fusion", "icp", "hole_attention")
 TABLES |= {"verdicts": partial(verdicts, ASKED), "negative": partial(verdicts, NEGATIVE)}
-TABLES |= {"pipelines": partial(verdicts, PIPELINES), "stress": stress}
-TABLES |= {"map": partial(verdicts, ("global_map",))}
+TABLES |= {"pipelines": partial(verdicts, PIPELINES), "map": partial(verdicts, ("global_map",))}
 
-
+#: Pages and their tables.
 PAGES = {README: TABLES, HERE / "README.md": speed_tables.TABLES}
 
 

@@ -27,7 +27,7 @@ from dhtorch.stages import sample as _sample
 from dhtorch.stages import score as _score
 from dhtorch.stages import track as _track
 from dhtorch.stages import triangulate as _triangulate
-from dhtorch.tree import collate
+from dhtorch.tree import in_pieces
 
 #: Pairs tracked at once: more are no faster, and their pyramids cost memory.
 PAIRS = 8
@@ -91,7 +91,7 @@ def extend(
     uv = clock("sample", sample(frame_0.hw, n, device=like.device, dtype=like.dtype))
     samples = clock("backproject", backproject(frame_0, uv))
     samples = clock("classify", classify(frame_0, samples))
-    tracks = clock("track", _in_pieces(track, frame_0.image, frame_1.image, samples.uv))
+    tracks = clock("track", in_pieces(track, PAIRS, frame_0.image, frame_1.image, samples.uv))
     textured = samples.trackability >= min_trackability
     usable = tracks.replace(valid=tracks.valid & textured)
     usable = undistort_tracks(usable, frame_0.camera, frame_1.camera)
@@ -167,14 +167,6 @@ def lifted(frame: Frame) -> Frame:
         return camera.map(lambda x: x.float())
 
     return frame.replace(camera=single(frame.camera), depth_camera=single(frame.depth_camera))
-
-
-def _in_pieces(track: Callable[..., Tracks], *views: Tensor) -> Tracks:
-    """Seat 4 for a batch of any size, a few pairs at a time; ``views`` are its arguments, the pair first."""
-    B = len(views[0])
-    if B <= PAIRS:
-        return track(*views)
-    return collate([track(*(x[b : b + PAIRS] for x in views)) for b in range(0, B, PAIRS)])
 
 
 def undistort_tracks(tracks: Tracks, camera_0: Camera, camera_1: Camera) -> Tracks:

@@ -52,7 +52,7 @@ class Samples(Record):
     @property
     def usable(self) -> Tensor:
         """(B, N) bool: there is a point."""
-        return ~self.xyz[..., 2].isnan()
+        return self.xyz.isfinite().all(-1)
 
 
 @record

@@ -77,7 +77,7 @@ def pnp_ransac(
     confidence: float = 0.999,
 ) -> PoseFit:
     """Seat 5 with ``cv2.solvePnPRansac`` (EPnP) and ``cv2.solvePnPRefineLM`` on the inliers."""
-    near = tracks.valid & samples.xyz.isfinite().all(-1)
+    near = tracks.valid & samples.usable
     K = _array(cam.to_matrix(camera_1), np.float64)
     R, t, inlier, code = [], [], [], []
     for b in range(near.shape[0]):

@@ -36,7 +36,7 @@ def sensor_only(
     start = time.perf_counter()
     like = frame_0.camera.f
     samples = classify(frame_0, backproject(frame_0, sample(frame_0.hw, n, device=like.device, dtype=like.dtype)))
-    keep = samples.xyz.isfinite().all(-1)
+    keep = samples.usable
     nan, zero = torch.full_like(samples.depth, torch.nan), torch.zeros_like(samples.depth)
     estimate = Estimate(
         uv=samples.uv,

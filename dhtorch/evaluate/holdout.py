@@ -104,7 +104,7 @@ def half(
         raise ValueError(f"holdout.share: found {share}, expected a number between 0 and 1")
     draw = torch.rand(sizes["N"], generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     first = (draw < share).to(samples.xyz.device)
-    usable = samples.xyz.isfinite().all(-1) & (samples.trackability >= min_trackability)
+    usable = samples.usable & (samples.trackability >= min_trackability)
     return usable & first, usable & ~first
 
 

@@ -48,7 +48,7 @@ def summarise(
     """
     sizes = check("lookup.summarise", image=(image, "B C H W"), pixel=(pixel, "B N 2"))
     B, N, C, H, W = (sizes[k] for k in "BNCHW")
-    _fits("summarise", size, H, W)
+    _must_fit("summarise", size, H, W)
     flat, (b, c, v, u) = _flat(image)
     x, y = _moved_inside(pixel if image.numel() < 1 << 31 else pixel.long(), (H, W), size)
     middle = torch.add(x if u == 1 else x * u, y, alpha=v)
@@ -129,7 +129,7 @@ def _flat(image: Tensor) -> tuple[Tensor, tuple[int, int, int, int]]:
     return image.reshape(-1), (C * H * W, H * W, W, 1)
 
 
-def _fits(where: str, size: int, H: int, W: int) -> None:
+def _must_fit(where: str, size: int, H: int, W: int) -> None:
     if size > min(H, W):
         raise ValueError(f"lookup.{where}: image of {H}x{W} pixels is smaller than a patch of {size}x{size}")
 
@@ -147,7 +147,7 @@ def patches(image: Tensor, corner: Tensor, size: int) -> Tensor:
     """
     sizes = check("lookup.patches", image=(image, "B C H W"), corner=(corner, "B N 2"))
     B, C, H, W = (sizes[k] for k in "BCHW")
-    _fits("patches", size, H, W)
+    _must_fit("patches", size, H, W)
     u = corner[..., 0].clamp(0, W - size)
     v = corner[..., 1].clamp(0, H - size)
     plane = torch.arange(B * C, device=image.device).view(B, 1, C) * (H * W)

@@ -155,9 +155,14 @@ def for_some(wanted: Tensor, fn: Callable, values: tuple[Tensor, ...], columns: 
     some = wanted.nonzero()[:, 0]
     if not len(some):
         return values
-    some = torch.cat([some, some[:1].expand(-len(some) % LANES)])
+    some = _whole_lanes(some)
     new = fn(*(column.index_select(-1, some) for column in columns))
     return tuple(old.index_copy(-1, some, n) for old, n in zip(values, new, strict=True))
+
+
+def _whole_lanes(index: Tensor) -> Tensor:
+    """An index (M,) filled up to whole ``LANES`` by copies of its first."""
+    return torch.cat([index, index[:1].expand(-len(index) % LANES)])
 
 
 def _by_cell(pyramid: Pyramid, level: int, fn: Callable, x: Tensor, d: Tensor, batch: Tensor) -> Tensor:
@@ -180,8 +185,7 @@ def _by_cell(pyramid: Pyramid, level: int, fn: Callable, x: Tensor, d: Tensor, b
     if is_static(x):
         return search(own)
     wanted = own.new_zeros(len(pyramid.levels[0]) * rows * columns).index_fill_(0, own, 1)
-    cells = wanted.nonzero()[:, 0]
-    cells = torch.cat([cells, cells[:1].expand(-len(cells) % LANES)])
+    cells = _whole_lanes(wanted.nonzero()[:, 0])
     return search(cells).index_select(-1, (wanted.cumsum(0) - 1)[own])
 
 

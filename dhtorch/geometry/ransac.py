@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dhtorch.geometry.covariance import median
 from dhtorch.geometry.least_squares import MIN_DEPTH
 from dhtorch.geometry.p3p import p3p
 from dhtorch.geometry.se3 import Pose
@@ -163,8 +164,7 @@ def collinear(
     """
     check("collinear", xyz=(xyz, "B 3 M"), used=(used, "B M"))
     reach = xyz.detach().abs().amax(1)
-    middle = torch.where(used, reach, torch.nan).nanmedian(-1, keepdim=True).values
-    used = (used & (reach <= FAR_OFF * middle))[:, None]
+    used = (used & (reach <= FAR_OFF * median(reach, used)))[:, None]
     x = xyz.masked_fill(~used, 0.0).double()
     x = (x - x.sum(-1, keepdim=True) / used.sum(-1, keepdim=True).clamp_min(1)) * used
     scatter = torch.bmm(x, x.transpose(1, 2))

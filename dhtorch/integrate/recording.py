@@ -49,7 +49,7 @@ class Answer:
     @property
     def recovered(self) -> Tensor:
         """(1, N) bool: answered where the sensor has no usable return, as in ``merge``."""
-        return self.estimate.keep & ~self.samples.xyz.isfinite().all(-1)
+        return self.estimate.keep & ~self.samples.usable
 
 
 @dataclass(frozen=True)

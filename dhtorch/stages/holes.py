@@ -76,11 +76,8 @@ def min_eigenvalue(
     a, b, c = summarise(image, pixels(uv), block + 2, _gradient_sums, grey=True)
     half = (a - c) / 2
     split2 = half * half + b * b
-    if split2.requires_grad:
-        positive = split2 > 0
-        split = torch.where(positive, torch.where(positive, split2, 1.0).sqrt(), split2)
-    else:
-        split = split2.sqrt()
+    positive = split2 > 0
+    split = torch.where(positive, torch.where(positive, split2, 1.0).sqrt(), split2)
     return ((a + c) / 2 - split) / (16 * block * block)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -30,7 +31,7 @@ from dhtorch.geometry.most_probable import covariance as m_covariance
 from dhtorch.geometry.near_far import Problem
 from dhtorch.geometry.shapes import check
 from dhtorch.records import Camera, Pose, PoseFit, Samples, Shutter, Tracks
-from dhtorch.tree import collate
+from dhtorch.tree import in_pieces
 
 #: Pairs solved together: few enough for their temporaries to stay in cache.
 PAIRS = 16
@@ -93,19 +94,17 @@ def pnp_ransac(
     Cost: linear in B, H and N. Float64 in the minimal solver and the last step, the inputs' dtype elsewhere.
     Source: paper, "LiDAR-anchored relative pose", with P3P in place of EPnP. Checked against cv2 and PoseLib.
     """
-    B = check(
+    check(
         "pnp_ransac",
         xyz=(samples.xyz, "B N 3"),
         uv_1=(tracks.uv_1, "B N 2"),
         valid=(tracks.valid, "B N"),
         f_1=(camera_1.f, "B 2"),
         draws=(draws, "B H 3"),
-    )["B"]
+    )
     options = _Options(threshold_px, max(4, min_inlier), local_optimisation, polish_steps, kernel, kernel_px)
     inputs = (samples.xyz, tracks.uv_1, tracks.valid, camera_1.f, camera_1.c, draws.to(samples.xyz))
-    if B <= PAIRS:
-        return _fit(options, *inputs)
-    return collate([_fit(options, *(x[b : b + PAIRS] for x in inputs)) for b in range(0, B, PAIRS)])
+    return in_pieces(partial(_fit, options), PAIRS, *inputs)
 
 
 @dataclass(frozen=True)
@@ -293,13 +292,11 @@ def map_pose(
     Cost: linear in B and N. Float64 in the last step and the covariance, the inputs' dtype elsewhere.
     Source: see :mod:`dhtorch.geometry.near_far`.
     """
-    B = check("map_pose", xyz=(samples.xyz, "B N 3"), uv_1=(tracks.uv_1, "B N 2"), cov=(tracks.cov, "B N 2 2"))["B"]
+    check("map_pose", xyz=(samples.xyz, "B N 3"), uv_1=(tracks.uv_1, "B N 2"), cov=(tracks.cov, "B N 2 2"))
     first = start(samples, tracks, camera_0, camera_1, draws)
     options = Options(far_weight, max_rise, turn_sigma, turn_gain, translation_gain, kernel, bend, near_steps, steps)
-    parts = [slice(b, b + MAP_PAIRS) for b in range(0, B, MAP_PAIRS)]
     problem = _near_far(samples, tracks, camera_0, camera_1, isotropic)
-    fits = [_fit_all(options, threshold_px, first[p], problem[p], tracks[p]) for p in parts]
-    return collate(fits) if len(fits) != 1 else fits[0]
+    return in_pieces(partial(_fit_all, options, threshold_px), MAP_PAIRS, first, problem, tracks)
 
 
 def _fit_all(o: Options, threshold_px: float, first: PoseFit, problem: Problem, tracks: Tracks) -> PoseFit:

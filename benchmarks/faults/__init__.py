@@ -1,0 +1,15 @@
+"""The faults that ``mutants.py`` plants, by the part of the house they are in, and the tests that must notice.
+
+A row is (function, text that is there once, text that takes its place); a fourth entry says why the fault changes no
+answer. Rows come from what was once not noticed, and from what the rules of ``mutants.py --sweep`` drew.
+"""
+
+from faults import entry, front, geometry, joining, judging, solving
+from faults.rows import Fault, faults
+
+PARTS = (geometry, solving, front, joining, entry, judging)
+
+FAULTS: list[Fault] = [fault for part in PARTS for fault in faults(part.FAULTS)]
+
+#: Module → the tests of its own that are to notice, quick ones first.
+TESTS: dict[str, list[str]] = {module: tests for part in PARTS for module, tests in part.TESTS.items()}

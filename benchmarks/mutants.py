@@ -1,0 +1,413 @@
+"""Do the tests notice? Plants one fault at a time in a copy of the tree and runs the tests of the module it is in.
+
+    python benchmarks/mutants.py                                   # every fault of benchmarks/faults/
+    python benchmarks/mutants.py geometry.se3 stages.pose          # those of some modules
+    python benchmarks/mutants.py --sweep 0.1 geometry              # a tenth of what the rules give instead
+    python benchmarks/mutants.py --tests OLD/tests --json FILE     # the tests of another checkout
+
+A fault is caught when a test of the module itself fails. Faults are named by function and by the text that is replaced,
+never by line, so they survive moves; a text that is no longer there, or there twice, is an error. The copy is thrown
+away. Every fault is tried in a process of its own, forked from one that has torch loaded.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import json
+import os
+import random
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from faults import FAULTS, TESTS
+from faults.rows import Fault
+
+ROOT = Path(__file__).resolve().parents[1]
+
+#: Folders and files of the package that faults are planted in.
+PLACES = ("stages", "geometry", "pair", "window", "evaluate", "transform", "archive", "extract")
+
+#: What the copy of the tree leaves behind.
+LEFT = (
+    ".git",
+    ".venv",
+    "outputs",
+    "multirun",
+    "__pycache__",
+    "*.egg-info",
+    ".pytest_cache",
+    ".mypy_cache",
+    ".ruff_cache",
+)
+
+
+# ------------------------------------------------------------------------------------------------ where a fault goes
+
+
+def modules(root: Path = ROOT) -> dict[str, Path]:
+    """Modules of the places by dotted name below the package."""
+    found = {}
+    for place in PLACES:
+        base = root / "dhtorch" / place
+        for path in [base.with_suffix(".py")] if base.with_suffix(".py").exists() else sorted(base.rglob("*.py")):
+            parts = path.relative_to(root / "dhtorch").with_suffix("").parts
+            found[".".join(p for p in parts if p != "__init__")] = path
+    return found
+
+
+def module_of(name: str, known: Iterable[str]) -> str:
+    """The one known module whose dotted name is ``name`` or ends in it."""
+    known = list(known)
+    ends = [name] if name in known else [k for k in known if k.endswith(f".{name}")]
+    if len(ends) != 1:
+        raise ValueError(f"mutants: {name!r} names {ends or 'no module'}, expected one")
+    return ends[0]
+
+
+def span(source: str, function: str) -> tuple[int, int]:
+    """Where the definition of ``function`` begins and ends, in characters."""
+    body: Sequence[ast.stmt] = ast.parse(source).body
+    lines = source.splitlines(keepends=True)
+    offset = [0]
+    for line in lines:
+        offset.append(offset[-1] + len(line))
+    node: Any = None
+    for word in function.split("."):
+        node = next((x for x in body if word in _names(x)), None)
+        if node is None:
+            raise ValueError(f"mutants: no {function} to plant a fault in")
+        body = getattr(node, "body", [])
+    first = min([node.lineno, *(d.lineno for d in getattr(node, "decorator_list", []))])
+    return offset[first - 1], offset[node.end_lineno]
+
+
+def _names(node: ast.stmt) -> list[str]:
+    if isinstance(node, ast.FunctionDef | ast.ClassDef):
+        return [node.name]
+    if isinstance(node, ast.Assign):
+        return [name.id for t in node.targets for name in ast.walk(t) if isinstance(name, ast.Name)]
+    if isinstance(node, ast.AnnAssign | ast.AugAssign) and isinstance(node.target, ast.Name):
+        return [node.target.id]
+    return []
+
+
+def planted(source: str, fault: Fault) -> str:
+    """The source with the fault in it."""
+    first, last = span(source, fault.function)
+    inside = source[first:last]
+    if inside.count(fault.old) != 1:
+        raise ValueError(
+            f"mutants: {fault.module}.{fault.function} holds {fault.old!r} {inside.count(fault.old)} times, expected 1"
+        )
+    changed = source[:first] + inside.replace(fault.old, fault.new) + source[last:]
+    ast.parse(changed)
+    return changed
+
+
+# ------------------------------------------------------------------------------------------------ faults by rule
+
+_SWAPS: dict[type, tuple[str, str]] = {
+    **{ast.Add: ("+", "-"), ast.Sub: ("-", "+"), ast.Mult: ("*", "/"), ast.Div: ("/", "*"), ast.Pow: ("**", "*")},
+    **{ast.Lt: ("<", ">"), ast.Gt: (">", "<"), ast.LtE: ("<=", ">="), ast.GtE: (">=", "<="), ast.Eq: ("==", "!=")},
+    **{ast.BitAnd: ("&", "|"), ast.BitOr: ("|", "&"), ast.And: ("and", "or"), ast.Or: ("or", "and")},
+    **{ast.FloorDiv: ("//", "/"), ast.NotEq: ("!=", "=="), ast.Is: ("is", "is not"), ast.IsNot: ("is not", "is")},
+}
+
+_TWINS = {"minimum": "maximum", "sin": "cos", "amin": "amax", "any": "all", "argmin": "argmax", "min": "max"}
+_TWINS |= {"clamp_min": "clamp_max", "zeros_like": "ones_like", "mean": "sum", "floor": "ceil", "cumsum": "flip"}
+_TWINS |= {b: a for a, b in _TWINS.items()}
+
+
+def by_rule(source: str, module: str) -> Iterator[Fault]:
+    """Every operator exchanged, number changed, sign and negation dropped: one fault each, where the text is unique."""
+    for function in _functions(ast.parse(source)):
+        first, last = span(source, function)
+        inside = source[first:last]
+        tree = ast.parse(_dedented(inside))
+        flat = _dedented(inside).splitlines(keepends=True)
+        for node in ast.walk(tree):
+            for statement, (a, b), new in _changes(node, flat):
+                old, changed = _around(flat, statement, a, b, new)
+                if inside.count(old) == 1 and old != changed:
+                    yield Fault(module, function, old, changed)
+
+
+def _functions(tree: ast.Module) -> Iterator[str]:
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef):
+            yield node.name
+        elif isinstance(node, ast.ClassDef):
+            yield from (f"{node.name}.{x.name}" for x in node.body if isinstance(x, ast.FunctionDef))
+
+
+def _dedented(text: str) -> str:
+    indent = len(text) - len(text.lstrip(" "))
+    return "".join(line[indent:] if line[:indent].isspace() or not indent else line for line in text.splitlines(True))
+
+
+def _changes(node: ast.AST, lines: list[str]) -> Iterator[tuple[int, tuple[int, int], str]]:
+    """(line, (first, last) column, new text) of what the rules do to a node that fits on one line."""
+    if getattr(node, "lineno", 0) != getattr(node, "end_lineno", -1):
+        return
+    row: int = node.lineno - 1  # type: ignore[attr-defined]
+    pairs = []
+    if isinstance(node, ast.BinOp):
+        pairs = [(node.left, node.op, node.right)]
+    elif isinstance(node, ast.Compare) and len(node.ops) == 1:
+        pairs = [(node.left, node.ops[0], node.comparators[0])]
+    elif isinstance(node, ast.BoolOp):
+        pairs = [(node.values[0], node.op, node.values[1])]
+    for left, op, right in pairs:
+        if type(op) in _SWAPS:
+            old, new = _SWAPS[type(op)]
+            a = lines[row].find(
+                old, _column(lines[row], left.end_col_offset or 0), _column(lines[row], right.col_offset)
+            )
+            if a >= 0:
+                yield row, (a, a + len(old)), new
+    if isinstance(node, ast.Constant) and type(node.value) in (int, float):
+        a, b = _column(lines[row], node.col_offset), _column(lines[row], node.end_col_offset or 0)
+        yield row, (a, b), str(node.value + 1 if type(node.value) is int else node.value * 2 or 1.0)
+    if isinstance(node, ast.Constant) and type(node.value) is bool:
+        a, b = _column(lines[row], node.col_offset), _column(lines[row], node.end_col_offset or 0)
+        yield row, (a, b), str(not node.value)
+    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.Invert):
+        a = _column(lines[row], node.col_offset)
+        yield row, (a, a + 1), " "
+    if isinstance(node, ast.Attribute) and node.attr in _TWINS:
+        b = _column(lines[row], node.end_col_offset or 0)
+        yield row, (b - len(node.attr), b), _TWINS[node.attr]
+
+
+def _column(line: str, offset: int) -> int:
+    """Characters for ast's bytes."""
+    return len(line.encode()[:offset].decode())
+
+
+def _around(lines: list[str], row: int, a: int, b: int, new: str) -> tuple[str, str]:
+    line = lines[row].rstrip("\n")
+    strip = len(line) - len(line.lstrip())
+    return line[strip:], line[strip:a] + new + line[b:]
+
+
+# ------------------------------------------------------------------------------------------------ trying one
+
+
+def warm() -> None:
+    """What every trial needs and no fault is in, loaded once."""
+    import cv2  # noqa: F401
+    import hydra  # noqa: F401
+    import hypothesis  # noqa: F401
+    import kornia  # noqa: F401
+    import matplotlib.pyplot  # noqa: F401
+    import pytest  # noqa: F401
+    import torch
+    import torch._dynamo
+    from torch.func import jacfwd  # noqa: F401
+
+    torch.set_num_threads(1)
+
+
+class Only:
+    """Keeps those tests of the contract's table that belong to the module."""
+
+    def __init__(self, module: str) -> None:
+        self.stem = module.rsplit(".", 1)[-1]
+
+    def pytest_collection_modifyitems(self, items: list) -> None:
+        """Drop the rows of other modules."""
+        items[:] = [
+            x
+            for x in items
+            if "test_contract" not in x.nodeid or f"[{self.stem}." in x.nodeid or f"-{self.stem}." in x.nodeid
+        ]
+
+
+class First:
+    """Remembers the first test that failed, and why."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        """Write it down at once: the process may not end well."""
+        if report.failed and not self.path.exists():
+            crash = getattr(report.longrepr, "reprcrash", None)
+            self.path.write_text(f"{report.nodeid}\n{getattr(crash, 'message', report.longrepr)}")
+
+    def pytest_collectreport(self, report: Any) -> None:
+        """A module that cannot be imported is noticed, too."""
+        self.pytest_runtest_logreport(report)
+
+
+def trial(tree: Path, module: str, tests: Sequence[str], limit_s: float) -> tuple[bool, str, float]:
+    """Run the module's tests over the tree in a fork: (a test failed, which and why, seconds)."""
+    said = tree / "first_failure.txt"
+    said.unlink(missing_ok=True)
+    start = time.perf_counter()
+    child = os.fork()
+    if child == 0:
+        os.setsid()
+        _run_tests(tree, module, tests, said)
+    while True:
+        done, status = os.waitpid(child, os.WNOHANG)
+        if done or time.perf_counter() - start > limit_s:
+            break
+        time.sleep(0.02)
+    if not done:
+        os.killpg(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        return True, f"did not end in {limit_s:.0f} s", time.perf_counter() - start
+    code = os.waitstatus_to_exitcode(status)
+    if code not in (0, 1) and not said.exists():
+        raise RuntimeError(
+            f"mutants: the tests of {module} could not be run (exit code {code}): {(tree / 'log').read_text()[-2000:]}"
+        )
+    return code != 0, said.read_text() if said.exists() else "", time.perf_counter() - start
+
+
+def _run_tests(tree: Path, module: str, tests: Sequence[str], said: Path) -> None:
+    """In the fork: the package and its tests come from the tree, also for processes that the tests start."""
+    code = 2
+    try:
+        log = os.open(tree / "log", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        os.dup2(log, 1)
+        os.dup2(log, 2)
+        os.chdir(tree)
+        sys.dont_write_bytecode = True
+        os.environ |= {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
+        sys.path[:0] = [str(tree)]
+        import pytest
+
+        options = ["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "-p", "no:randomly"]
+        code = int(pytest.main([*options, *tests], plugins=[Only(module), First(said)]))
+    finally:
+        sys.stdout.flush()
+        os._exit(code)
+
+
+class Bench:
+    """A copy of the tree that faults are planted in, one after the other."""
+
+    def __init__(self, folder: Path, tests: Path) -> None:
+        self.tree = folder
+        shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(*LEFT), dirs_exist_ok=True)
+        shutil.rmtree(folder / "tests")
+        shutil.copytree(tests, folder / "tests", ignore=shutil.ignore_patterns("__pycache__"))
+
+    def run(self, fault: Fault | None, module: str, tests: Sequence[str], limit_s: float) -> tuple[bool, str, float]:
+        """Plant, run, take out again."""
+        path = modules(self.tree)[module]
+        source = path.read_text()
+        tests = [t for t in tests if (self.tree / t.split("::")[0]).exists()]
+        if not tests:
+            return False, "no test", 0.0
+        try:
+            if fault is not None:
+                path.write_text(planted(source, fault))
+            return trial(self.tree, module, tests, limit_s)
+        finally:
+            path.write_text(source)
+
+
+def run(
+    faults: Sequence[Fault], tests_of: dict[str, list[str]], tests: Path, jobs: int, quiet: bool
+) -> list[dict[str, Any]]:
+    """Try every fault; rows with what caught it."""
+    known = modules()
+    named = [(module_of(f.module, known), f) for f in faults]
+    for module, fault in named:
+        planted(known[module].read_text(), fault)  # said before anything runs
+    warm()
+    with tempfile.TemporaryDirectory(prefix="mutants") as folder:
+        benches = [Bench(Path(folder) / str(k), tests) for k in range(jobs)]
+        clean = _clean(benches, sorted({m for m, _ in named}), tests_of)
+
+        def one(k: int) -> dict[str, Any]:
+            bench = free.pop()
+            module, fault = named[k]
+            try:
+                failed, why, seconds = bench.run(fault, module, tests_of[module], 30 + 4 * clean[module])
+            finally:
+                free.append(bench)
+            row = row_of(module, fault, failed, why, seconds)
+            if not quiet or row["verdict"] in ("missed", "noticed"):
+                print(
+                    f"{row['verdict']:10} {module}.{fault.function}: {fault.old!r} -> {fault.new!r}  {row['by']}",
+                    flush=True,
+                )
+            return row
+
+        free = list(benches)
+        with ThreadPoolExecutor(jobs) as pool:
+            return list(pool.map(one, range(len(named))))
+
+
+def _clean(benches: list[Bench], wanted: list[str], tests_of: dict[str, list[str]]) -> dict[str, float]:
+    """Seconds that the tests of every module take as they are; they must pass."""
+    seconds = {}
+    for module in wanted:
+        if module not in tests_of:
+            raise ValueError(f"mutants: no tests are named for {module}, add them to benchmarks/faults/")
+        failed, why, seconds[module] = benches[0].run(None, module, tests_of[module], 600)
+        if failed:
+            raise RuntimeError(f"mutants: the tests of {module} fail without a fault: {why}")
+    return seconds
+
+
+def row_of(module: str, fault: Fault, failed: bool, why: str, seconds: float) -> dict[str, Any]:
+    """What became of one fault. ``noticed``: said to change no answer, and yet a test failed."""
+    verdict = ("noticed" if failed else "equivalent") if fault.equivalent else ("caught" if failed else "missed")
+    by, _, reason = why.partition("\n")
+    row = {"module": module, "function": fault.function, "old": fault.old, "new": fault.new, "verdict": verdict}
+    return row | {"by": by, "reason": (fault.equivalent or reason).split("\n")[0][:200], "seconds": round(seconds, 1)}
+
+
+def summary(rows: Sequence[dict[str, Any]]) -> str:
+    """Caught of those that change an answer, by module."""
+    count = Counter((row["module"], row["verdict"]) for row in rows)
+    lines = [f"{'module':28} caught  of  equivalent"]
+    total = Counter(row["verdict"] for row in rows)
+    for module in sorted({row["module"] for row in rows}):
+        caught, missed = count[module, "caught"], count[module, "missed"]
+        lines.append(f"{module:28} {caught:6} {caught + missed:3} {count[module, 'equivalent'] or '':>6}")
+    of = total["caught"] + total["missed"]
+    share = f" = {total['caught'] / of:.1%}" if of else ""
+    return "\n".join([*lines, f"{'all':28} {total['caught']:6} {of:3} {total['equivalent'] or '':>6}{share}"])
+
+
+def main() -> int:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("modules", nargs="*", help="dotted names below dhtorch, or their beginnings; all of them")
+    parser.add_argument("--sweep", type=float, default=0.0, help="draw this share of what the rules give instead")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--tests", type=Path, default=ROOT / "tests", help="folder of tests, this checkout's")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--quiet", action="store_true", help="print only what was missed")
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    wanted = [m for m in modules() if not args.modules or any(f"{m}.".startswith(f"{w}.") for w in args.modules)]
+    if args.sweep:
+        drawn = [f for m in wanted for f in by_rule(modules()[m].read_text(), m)]
+        faults = random.Random(args.seed).sample(drawn, round(args.sweep * len(drawn)))
+    else:
+        faults = [f for f in FAULTS if module_of(f.module, modules()) in wanted]
+    rows = run(faults, TESTS, args.tests, args.jobs, args.quiet)
+    print(summary(rows))
+    if args.json:
+        args.json.write_text(json.dumps(rows, indent=1) + "\n")
+    return int(any(row["verdict"] == "noticed" for row in rows))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
