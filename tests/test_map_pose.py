@@ -122,7 +122,7 @@ def test_elimination_is_the_schur_complement_of_the_whole_problem():
     samples, tracks, camera_0, camera_1, _ = args
     problem = _near_far(samples, tracks, camera_0, camera_1, 0.2)
     at = near_far.Unknowns(T, torch.zeros(1, 3, dtype=D))
-    noise = torch.full((1, 64), 0.09, dtype=D)
+    noise = torch.full((1, near_far.LANES), 0.09, dtype=D)
     one = torch.ones(1, dtype=D)
     cost, H, g = near_far.normal(problem, at, noise, one, 0 * one, None, 1.0)
     ray = problem.ray[0].T
@@ -153,7 +153,7 @@ def test_elimination_is_the_schur_complement_of_the_whole_problem():
     right = b[:9] - A[:9, 9:] @ torch.linalg.solve(A[9:, 9:], b[9:])
     torch.testing.assert_close(H[0], reduced, rtol=2e-3, atol=1e-6 * float(reduced.abs().max()))
     torch.testing.assert_close(g[0], right, rtol=2e-2, atol=1e-3 * float(right.abs().max()))
-    assert linear.front.all() and cost > 0 and a.shape[0] == 64 and t.isfinite().all()
+    assert linear.front.all() and cost > 0 and a.shape[0] == near_far.LANES and t.isfinite().all()
 
 
 def near_far_shape(problem):

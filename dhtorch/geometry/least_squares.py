@@ -129,15 +129,25 @@ def weight_slope(square: Tensor, kernel: str | None, scale: float) -> Tensor:
 def normal_equations(
     rows: Tensor,  # (B, n + 1, 2, N), of linearise; N a multiple of LANES for answers that do not depend on the batch
     weight: Tensor,  # (B, N) ≥ 0, one per point
+    *,
+    block: int | None = None,
 ) -> tuple[Tensor, Tensor]:
     """H = Σ w Jᵀ J (B, n, n) and g = Σ w Jᵀ r (B, n), for n unknowns: six of a pose, or more.
 
+    Args:
+        rows, weight: of the points.
+        block: points that are summed at a time; all by default. How a matrix product rounds depends on how long it is,
+            on some processors: where N is a multiple of ``block``, empty points behind the last change no bit.
+
     Gradient: to rows and weights. Raises ValueError for wrong shapes.
     """
-    check("normal_equations", rows=(rows, "B n 2 N"), weight=(weight, "B N"))
-    weighted = (rows[:, :-1] * weight[:, None, None]).flatten(2)
-    product = torch.bmm(weighted, rows.flatten(2).transpose(1, 2))
-    return product[..., :-1], product[..., -1]
+    N = check("normal_equations", rows=(rows, "B n 2 N"), weight=(weight, "B N"))["N"]
+    sums: Tensor | None = None
+    for part, share in zip(rows.split(block or max(N, 1), -1), weight.split(block or max(N, 1), -1), strict=True):
+        weighted, whole = (part[:, :-1] * share[:, None, None]).flatten(2), part.flatten(2).transpose(1, 2)
+        sums = torch.bmm(weighted, whole) if sums is None else torch.baddbmm(sums, weighted, whole)
+    assert sums is not None  # an empty tensor is split into one
+    return sums[..., :-1], sums[..., -1]
 
 
 def solve_spd(

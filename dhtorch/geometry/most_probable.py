@@ -200,8 +200,8 @@ def covariance(problem: Problem, solution: Solution, o: Options) -> tuple[Tensor
         bread = torch.where(used, weight * (omega * rise)[:, None], bread)
         meat = torch.where(used, weight * weight * (omega * omega * scatter)[:, None], meat)
     rows = residuals(problem, linear, solution.noise).double()
-    A, _ = normal_equations(rows, bread.double())
-    M, _ = normal_equations(rows, meat.double())
+    A, _ = normal_equations(rows, bread.double(), block=LANES)
+    M, _ = normal_equations(rows, meat.double(), block=LANES)
     free = o.turn_sigma**-2 if o.turn_sigma > 0 else RIGID
     known = torch.diag_embed(prior(torch.full_like(solution.turn_precision, free).double()))
     A, M = A + known, M + known

@@ -28,8 +28,8 @@ from dhtorch.geometry.se3 import Pose
 from dhtorch.geometry.shapes import check
 from dhtorch.tree import Record, record
 
-#: Sums and products over whole blocks of so many tracks round alike in any company, however many empty ones follow.
-LANES = 64
+#: Sums over whole blocks of so many tracks round alike in any company, however many empty ones follow.
+LANES = 256
 
 #: A far track is not closer to the anchor than the nearest point of the sensor by more than this factor.
 MAX_NEARER = 2.0
@@ -201,7 +201,7 @@ def normal(
     rows = residuals(problem, linear, noise)
     rho, weight = robust(_square(linear, rows[:, -1]), kernel, bend)
     share = problem.near + far_weight[:, None] * problem.far
-    H, g = normal_equations(rows, weight * share * linear.front)
+    H, g = normal_equations(rows, weight * share * linear.front, block=LANES)
     known = prior(turn_precision.to(g.dtype))
     turn = torch.cat((torch.zeros_like(g[:, :6]), at.turn), -1)
     cost = (rho * share).sum(-1) + turn_precision * (at.turn * at.turn).sum(-1)
