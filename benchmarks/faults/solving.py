@@ -1,4 +1,4 @@
-"""Poses: minimal solver, search, least squares, near and far tracks; registration and search of windows."""
+"""Poses: minimal solver, search, least squares, near and far tracks."""
 
 TESTS: dict[str, list[str]] = {
     "geometry.least_squares": ["tests/test_p3p.py", "tests/test_speed.py", "tests/test_contract.py"],
@@ -7,10 +7,7 @@ TESTS: dict[str, list[str]] = {
     "geometry.ransac": ["tests/test_p3p.py", "tests/test_pose.py", "tests/test_contract.py"],
     "geometry.p3p": ["tests/test_p3p.py", "tests/test_contract.py"],
     "geometry.covariance": ["tests/test_pose.py", "tests/test_contract.py"],
-    "geometry.affine": ["tests/test_affine.py", "tests/test_contract.py"],
-    "geometry.lucas_kanade": ["tests/test_track.py", "tests/test_contract.py"],
     "stages.pose": ["tests/test_pose.py", "tests/test_map_pose.py", "tests/test_contract.py"],
-    "stages.track": ["tests/test_track.py", "tests/test_contract.py"],
 }
 
 FAULTS: dict[str, list[tuple[str, ...]]] = {}
