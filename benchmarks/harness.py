@@ -1,7 +1,7 @@
 """Timing both sides in turn, in one process, and one row format for every script.
 
-Rows: ``{name, mode, n, batch, threads, device, ours_ms, ours_iqr, peer, peer_ms, ratio, ours_error, peer_error, bar}``;
-``ratio`` is ours / peer of medians, below 1 = ours is faster.
+Rows: ``{name, mode, n, batch, threads, processor, device, ours_ms, ours_iqr, peer, peer_ms, ratio, ours_error,
+peer_error, bar}``; ``ratio`` is ours / peer of medians, below 1 = ours is faster.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from typing import Any
 
 import cv2
 import torch
+
+from dhtorch import archive
 
 #: Clocks by name: what a wall shows, or (on a busy machine) the time this process was really given.
 CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
@@ -85,7 +87,8 @@ def row(name: str, ours: Sequence[float], peer: str, theirs: Sequence[float], **
         "bar": False,
     }
     timing = {"ours_ms": a, "ours_iqr": iqr(ours), "peer": peer, "peer_ms": b, "ratio": a / b}
-    return {"name": name, **base, "threads": torch.get_num_threads(), **timing, **more}
+    place = {"threads": torch.get_num_threads(), "processor": archive.processor()}
+    return {"name": name, **base, **place, **timing, **more}
 
 
 def set_threads(threads: int) -> None:

@@ -25,7 +25,7 @@ from typing import Any
 
 import torch
 
-from dhtorch import data
+from dhtorch import archive, data
 from dhtorch.data import writers
 from dhtorch.data.stacks import FocalStack
 from dhtorch.geometry import camera as cameras
@@ -209,7 +209,7 @@ def _work(name: str, n: int) -> dict[str, Any]:
         root.mkdir()
         path = pool.apply(_write, (name, root, n))
         size = sum(f.stat().st_size for f in root.rglob("*") if f.is_file())
-        return pool.apply(measure, (name, path)) | {"mib": size / 2**20}
+        return pool.apply(measure, (name, path)) | {"mib": size / 2**20, "processor": archive.processor()}
 
 
 def _write(name: str, root: Path, n: int) -> Path:

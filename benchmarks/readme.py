@@ -26,6 +26,9 @@ HERE = Path(__file__).resolve().parent
 README = HERE.parent / "README.md"
 RESULTS = HERE / "results"
 
+#: The room of conf/data/synthetic.yaml among those of synthetic_seeds.yaml.
+DEFAULT_ROOM = "synthetic_walk_2"
+
 
 def percent(value: float | None) -> str:
     """A share as text."""
@@ -57,15 +60,27 @@ def kept(row: dict[str, Any]) -> float:
 
 
 def room() -> str:
-    """The built-in room: exact and with the LiDAR model, both methods."""
+    """The built-in room, exact and with the LiDAR model, both methods: the default seed's and, in brackets, all seeds'."""
     rows = []
     for name, words in (("room_exact", "exact depth, no noise"), ("room_phone", "LiDAR model")):
-        (methods,) = scenes(name, "full").values()
+        rooms = scenes(name, "full")
         for method in ("paper", "opencv"):
-            r = methods[method]
-            numbers = [percent(r[k]) for k in ("coverage", "median_rel", "p90_rel", "wrong_share")]
-            rows.append([f"{words}, `{method}`", str(r["n_candidates"]), *numbers])
+            found = {scene: methods[method] for scene, methods in rooms.items()}
+            numbers = []
+            for key in ("coverage", "median_rel", "p90_rel", "wrong_share"):
+                of = [r[key] for r in found.values()]
+                numbers.append(f"{percent(found[DEFAULT_ROOM][key])} ({100 * min(of):.1f} to {100 * max(of):.1f})")
+            rows.append([f"{words}, `{method}`", str(found[DEFAULT_ROOM]["n_candidates"]), *numbers])
     return table(["sensor, method", "candidates", "coverage", "median error", "p90", "> 20 % off"], rows)
+
+
+def room_by_seed() -> str:
+    """Median error of `paper` in the room of every seed."""
+    rows = []
+    for name, words in (("room_exact", "exact depth, no noise"), ("room_phone", "LiDAR model")):
+        rows.append([words, *(percent(methods["paper"]["median_rel"]) for methods in scenes(name, "full").values())])
+    seeds = [scene.rpartition("_")[2] for scene in scenes("room_exact", "full")]
+    return table(["median error of `paper`, seed", *seeds], rows)
 
 
 def shared() -> str:
@@ -173,7 +188,7 @@ def picture(path: Path) -> None:
     figure.savefig(path, dpi=80, bbox_inches="tight")
 
 
-TABLES = {"room": room, "shared": shared, "truths": truths, "comparison": comparison}
+TABLES = {"room": room, "room seeds": room_by_seed, "shared": shared, "truths": truths, "comparison": comparison}
 TABLES |= {"comparison scenes": partial(by_scene, "method_comparison"), "stress": partial(by_scene, "stress")}
 TABLES |= {"bars": speed_tables.bars, "speed": speed_tables.stages}
 

@@ -55,6 +55,12 @@ def errors(row: dict[str, Any]) -> str:
     return " / ".join("–" if row[k] is None else f"{row[k]:.3g}" for k in ("ours_error", "peer_error"))
 
 
+def on(file: str, shown: str) -> str:
+    """A table, and under it the processor that its file was measured on."""
+    (name,) = {r.get("processor", "a processor that was not written down") for r in timings(file)}
+    return f"{shown}\n\nMeasured on: {name}."
+
+
 def bars() -> str:
     """Each speed that has a bar, one thread, beside that bar."""
     rows = []
@@ -64,7 +70,8 @@ def bars() -> str:
         cells = [words if mode == "eager" else f"{words}, {mode}", f"{r['ours_ms']:.2f}", f"{r['peer_ms']:.2f}"]
         verdict = "met" if r["ratio"] <= bar else "missed"
         rows.append([*cells, ratio(r["ratio"]), f"≤ {bar:g}", verdict, errors(r)])
-    return text.grid(Table("", ["", "ours, ms", "peer, ms", "ratio", "bar", "", "errors, ours / peer"], rows))
+    head = ["", "ours, ms", "peer, ms", "ratio", "bar", "", "errors, ours / peer"]
+    return on("pair", text.grid(Table("", head, rows)))
 
 
 def stages() -> str:
@@ -78,7 +85,8 @@ def stages() -> str:
                 r = rows[f"pair_{method}_b{batch}{stage}"]
                 cells += [f"{r['ours_ms']:.1f}", f"{r['ratio']:.2f}"]
             shown.append([*cells, f"{r['peer_ms']:.1f}"])
-    return text.grid(Table("", ["one thread", "`paper`, ms", "ratio", "`map`, ms", "ratio", "`opencv`, ms"], shown))
+    head = ["one thread", "`paper`, ms", "ratio", "`map`, ms", "ratio", "`opencv`, ms"]
+    return on("pair", text.grid(Table("", head, shown)))
 
 
 def every_row(file: str) -> str:
@@ -89,7 +97,7 @@ def every_row(file: str) -> str:
         cells = [f"`{r['name']}`", mode, str(r["threads"]), f"{r['ours_ms']:.2f}", f"{r['ours_iqr']:.2f}"]
         rows.append([*cells, r["peer"], f"{r['peer_ms']:.2f}", ratio(r["ratio"]), errors(r)])
     head = ["row", "mode", "threads", "ours, ms", "iqr", "peer", "peer, ms", "ratio", "errors, ours / peer"]
-    return text.grid(Table("", head, rows, n_label=2))
+    return on(file, text.grid(Table("", head, rows, n_label=2)))
 
 
 def scaling() -> str:
@@ -102,7 +110,7 @@ def scaling() -> str:
             cells = [str(r["n"]), f"{r['ours_ms']:.1f}", "–" if r["peak_mib"] is None else f"{r['peak_mib']:.0f}"]
             rows.append([f"`{name}`", *grows, *cells])
     head = ["what doubles", "time ^", "memory ^", "largest size", "ms there", "MiB above the inputs there"]
-    return text.grid(Table("", head, rows))
+    return on("scaling", text.grid(Table("", head, rows)))
 
 
 #: Tables of benchmarks/README.md.

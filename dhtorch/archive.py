@@ -40,6 +40,9 @@ _PLACES = ("hydra", "output")
 #: Ends the name of a file that is being written.
 _UNFINISHED = ".tmp"
 
+#: Flags of x86 processors, widest vectors first, and what they are called.
+_VECTORS = {"amx_tile": "AVX-512 and AMX", "avx512f": "AVX-512", "avx2": "AVX2"}
+
 _PACKAGES = ("dhtorch", "torch", "kornia", "numpy", "opencv-python-headless", "hydra-core")
 
 #: Field → type, for the result and for its parts.
@@ -51,6 +54,8 @@ _TOP: dict[str, Any] = {
 }
 _META: dict[str, Any] = {"utc": str, "git": _TEXT, "versions": dict}
 _META |= {"device": str, "dtype": str, "threads": int, "seed": int}
+#: What results did not hold from the start.
+_META_LATER: dict[str, Any] = {"processor": str}
 _DATA: dict[str, Any] = {"name": str, "scenes": list, "n_pairs": int, "digest": str}
 _SUMMARY: dict[str, Any] = {"value": _NUMBER, "low": _NUMBER, "high": _NUMBER, "n": int, "unit": str}
 _ROW: dict[str, Any] = {"scene": str, "pair": (list, None), "method": str}
@@ -103,7 +108,8 @@ def validate(result: Any, where: str = "result") -> None:
     _verdict(result, where)
     key = result["key"]
     _expect(len(key) == 64 and set(key) <= set("0123456789abcdef"), f"{where}.key", key, "64 hexadecimal digits")
-    _fields(result["meta"], _META, f"{where}.meta")
+    later = {k: v for k, v in _META_LATER.items() if isinstance(result["meta"], dict) and k in result["meta"]}
+    _fields(result["meta"], _META | later, f"{where}.meta")
     _fields(result["data"], _DATA, f"{where}.data")
     for name, entry in result["summary"].items():
         _fields(entry, _SUMMARY, f"{where}.summary.{name}")
@@ -279,11 +285,29 @@ def meta(*, device: str, dtype: str, threads: int, seed: int) -> dict[str, Any]:
         "utc": datetime.now(UTC).isoformat(timespec="seconds"),
         "git": _git(Path(__file__).parent),
         "versions": versions,
+        "processor": processor(),
         "device": str(device),
         "dtype": str(dtype).removeprefix("torch."),
         "threads": threads,
         "seed": seed,
     }
+
+
+def processor(info: str | Path = "/proc/cpuinfo") -> str:
+    """The processor by its maker's name, family and model, and the widest vectors it has: speeds depend on them.
+
+    Args:
+        info: where Linux describes it; elsewhere only what Python knows is said.
+    """
+    try:
+        lines = Path(info).read_text(encoding="utf-8", errors="replace").split("\n\n")[0].splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    known = {k.strip(): v.strip() for k, _, v in (line.partition(":") for line in lines)}
+    flags = known.get("flags", "").split()
+    vectors = next((word for flag, word in _VECTORS.items() if flag in flags), platform.machine())
+    model = f"family {known['cpu family']} model {known['model']}" if {"cpu family", "model"} <= set(known) else ""
+    return ", ".join(word for word in (known.get("model name", ""), model, vectors) if word)
 
 
 def portable(config: Mapping[str, Any], base: str | Path | None = None) -> dict[str, Any]:

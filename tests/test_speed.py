@@ -89,6 +89,7 @@ def test_rows_of_benchmarks_are_strict_json(tmp_path, capsys):
         "n",
         "batch",
         "threads",
+        "processor",
         "device",
         "ours_ms",
         "ours_iqr",

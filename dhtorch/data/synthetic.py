@@ -7,6 +7,7 @@ frames, the order of access, the process or the number of threads.
 
 from __future__ import annotations
 
+import itertools
 import math
 import operator
 from collections.abc import Sequence
@@ -187,7 +188,7 @@ class SyntheticRoom(Sequence[Frame]):
 def open_rooms(
     paths: Sequence[str] = tuple(PATHS),
     *,
-    seed: int = 2,
+    seed: int | Sequence[int] = 2,
     n_frames: int = 12,
     hw: tuple[int, int] = (480, 640),
     lidar: str | None = "phone",
@@ -196,12 +197,17 @@ def open_rooms(
     near: float = 2.0,
     gap: int = 6,
 ) -> list[SyntheticRoom]:
-    """The room along several paths, one recording each, named after its path; options as :class:`SyntheticRoom`."""
-    options: dict[str, Any] = {"seed": seed, "n_frames": n_frames, "hw": hw, "lidar": lidar, "near": near, "gap": gap}
+    """The room along several paths, or built of several seeds, one recording each; options as :class:`SyntheticRoom`.
+
+    A recording is named after its path and, where there are several, its seed.
+    """
+    options: dict[str, Any] = {"n_frames": n_frames, "hw": hw, "lidar": lidar, "near": near, "gap": gap}
     options |= {"depth_noise": depth_noise, "image_noise": image_noise}
-    rooms = [SyntheticRoom(path=path, **options) for path in paths]
-    for room in rooms:
-        room.name = f"synthetic_{room.path}"
+    seeds = [seed] if isinstance(seed, int) else list(seed)
+    rooms = []
+    for path, number in itertools.product(paths, seeds):
+        rooms.append(SyntheticRoom(path=path, seed=number, **options))
+        rooms[-1].name = f"synthetic_{path}" if isinstance(seed, int) else f"synthetic_{path}_{number}"
     return rooms
 
 

@@ -1,0 +1,143 @@
+"""Every committed result file and the command that makes it.
+
+python benchmarks/reproduce.py                  run all of them again, one after the other (hours)
+python benchmarks/reproduce.py heldout icp      some of them
+python benchmarks/reproduce.py --check          exit 1 where a file holds other settings than its command gives today
+
+Experiments read real sequences from DHTORCH_DATA. Speeds are only worth something on a machine that does nothing else.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from dhtorch import archive
+from dhtorch.run import config_dir, job_name
+
+HERE = Path(__file__).resolve().parent
+RESULTS = HERE / "results"
+
+#: Result of an experiment → what ``dhtorch`` is told; pictures are left out of all of them.
+EXPERIMENTS = {
+    "method_comparison": "experiment=method_comparison data=shared_scenes",
+    "part_ablation": "experiment=part_ablation data=shared_scenes",
+    "stress": "experiment=method_comparison data=synthetic_stress experiment.seeds=2",
+    "shared_scenes": "experiment=opencv_twin data=shared_scenes",
+    "room_exact": "experiment=opencv_twin data=synthetic_seeds data.lidar=exact data.image_noise=0",
+    "room_phone": "experiment=opencv_twin data=synthetic_seeds",
+    "room_rotation": "experiment=opencv_twin data.lidar=exact data.path=rotation",
+    "heldout": "experiment=heldout data=shared_scenes method=paper",
+    "range_split": "experiment=range_split data=shared_scenes method=paper",
+    "gate_ablation": "experiment=gate_ablation data=shared_scenes method=paper",
+    "calibration": "experiment=calibration data=shared_scenes method=paper",
+    "device_pose": "experiment=device_pose data=shared_scenes method=paper",
+    "hole_census": "experiment=hole_census data=shared_scenes method=paper experiment.stride=4",
+    "motion": "experiment=motion data=shared_scenes method=paper",
+    "ablation": "experiment=ablation data=shared_scenes method=paper",
+    "latency": "experiment=latency method=paper",
+    "paths_motion": "experiment=motion data=synthetic_paths method=paper",
+    "room_device_pose": "experiment=device_pose data=synthetic_long pairs.stride=10 method=paper",
+    "room_gate_ablation": "experiment=gate_ablation data=synthetic_long pairs.stride=10 method=paper "
+    "experiment.factors=[] experiment.gaps=[16,60]",
+    "room_range_split": "experiment=range_split data=synthetic_long pairs.stride=10 method=paper "
+    "experiment.cutoff_factors=[] experiment.cutoffs=[1.5,2.5]",
+    "room_real_holes": "experiment=real_holes data=synthetic_long pairs.stride=10 method=paper",
+    "global_map": "experiment=global_map data=shared_scenes pairs.stride=8 experiment.n=1024",
+    "helix_correlation": "experiment=helix_correlation data=shared_scenes",
+    "hole_attention": "experiment=hole_attention data=shared_scenes",
+    "icp": "experiment=icp data=shared_scenes",
+    "defocus": "experiment=defocus data=synthetic_views",
+    "defocus_fusion": "experiment=defocus_fusion data=synthetic_views",
+    "focus_stack": "experiment=focus_stack data=synthetic_views",
+    "learned_score": "experiment=learned_score data=shared_scenes",
+    "rh20t_probe": "experiment=rh20t_probe data=rh20t_synthetic",
+    "vo_probe": "experiment=vo_probe data=shared_scenes",
+}
+
+#: Result of a script of this folder → its arguments.
+SCRIPTS = dict.fromkeys(("frontend", "lk", "pnp", "triangulate", "pair", "loader", "scaling", "readers"), "")
+SCRIPTS |= {"degenerate": "", "mutants": "--quiet"}
+
+
+def command(name: str) -> str:
+    """What a shell is told to make a result file."""
+    if name in EXPERIMENTS:
+        return f"dhtorch figures=false {EXPERIMENTS[name]}"
+    return " ".join(f"python benchmarks/{name}.py {SCRIPTS[name]} --json benchmarks/results/{name}.json".split())
+
+
+def settings(name: str) -> dict[str, Any]:
+    """The settings that the command of an experiment composes to, as a result file holds them."""
+    import hydra
+    from omegaconf import OmegaConf
+
+    OmegaConf.register_new_resolver("dhtorch.job_name", job_name, replace=True)
+    with hydra.initialize_config_dir(str(config_dir()), version_base="1.3", job_name="dhtorch"):
+        cfg = hydra.compose("run", ["figures=false", *shlex.split(EXPERIMENTS[name])])
+    return archive.strict(archive.portable(OmegaConf.to_container(cfg, resolve=True)))  # type: ignore[arg-type]
+
+
+def differences(found: Any, expected: Any, where: str = "") -> list[str]:
+    """Options that two settings do not share, as ``name: found, expected``."""
+    if isinstance(found, Mapping) and isinstance(expected, Mapping):
+        names = sorted({*found, *expected})
+        return [d for k in names for d in differences(found.get(k), expected.get(k), f"{where}.{k}".strip("."))]
+    return [] if found == expected else [f"{where}: found {found!r}, expected {expected!r}"]
+
+
+def check(name: str) -> list[str]:
+    """What a committed file holds otherwise than its command would give today."""
+    path = RESULTS / f"{name}.json"
+    if not path.is_file():
+        return [f"no {path.name}; run: {command(name)}"]
+    if name in SCRIPTS:
+        return []
+    config = archive.read(path)["config"]
+    return [f"{path.name}: {line}; run: {command(name)}" for line in differences(config, settings(name))]
+
+
+def run(name: str) -> bool:
+    """Make one result file; whether that went well."""
+    print(f"== {command(name)}", flush=True)
+    if name in SCRIPTS:
+        words = [sys.executable, *command(name).split()[1:]]
+        return subprocess.run(words, cwd=HERE.parent, check=False).returncode == 0
+    with tempfile.TemporaryDirectory() as folder:
+        words = [*command(name).split()[1:], f"output={folder}"]
+        done = subprocess.run([sys.executable, "-m", "dhtorch", *words], cwd=folder, check=False)
+        if done.returncode == 0:
+            shutil.copyfile(Path(folder) / "result.json", RESULTS / f"{name}.json")
+    return done.returncode == 0
+
+
+def main() -> int:
+    """The command."""
+    known = {**EXPERIMENTS, **SCRIPTS}
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(known))
+    parser.add_argument("--check", action="store_true")
+    args = parser.parse_args()
+    for name in args.names:
+        if name not in known:
+            parser.error(f"found {name!r}, expected {', '.join(known)}")
+    names = args.names or list(known)
+    if args.check:
+        wrong = [line for name in names for line in check(name)]
+        print("\n".join(wrong) or f"{len(names)} result files have the settings of their commands")
+        return int(bool(wrong))
+    failed = [name for name in names if not run(name)]
+    print(json.dumps({"failed": failed}) if failed else "all done")
+    return int(bool(failed))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
