@@ -145,7 +145,8 @@ class Views:
             depth = torch.zeros_like(anchor.depth)
             if self.other_image is None and depths.shape[1] > 1:
                 depth = depths[:, p].contiguous()
-            hw, numbers = (image.shape[-2], image.shape[-1]), self.other_intrinsics or self.intrinsics
+            hw = image.shape[-2], image.shape[-1]
+            numbers = self.intrinsics if self.other_intrinsics is None else self.other_intrinsics
             # The anchor's numbers along time belong to its own frames, not to those of another image.
             shared = self.other_image is not None and self.other_intrinsics is None
             count, when = (T, at) if shared else (images.shape[1], p)
