@@ -1,0 +1,79 @@
+"""What normal equations say about an estimate, against numpy."""
+
+import numpy as np
+import pytest
+import torch
+
+from dhtorch.geometry import covariance
+
+D = torch.float64
+
+
+def positive(n, batch=2, seed=0):
+    A = torch.randn(batch, n, n + 2, generator=torch.Generator().manual_seed(seed), dtype=D)
+    return A @ A.mT
+
+
+def test_the_covariance_is_the_inverse_times_the_variance():
+    H, sigma = positive(6, 3), torch.tensor([0.5, 3.0, 2.0], dtype=D)
+    H[1, 0], H[1, :, 0] = 0, 0
+    cov, ok = covariance.from_normal(H, sigma)
+    assert ok.tolist() == [True, False, True] and (cov[1] == 0).all()
+    for b in (0, 2):
+        np.testing.assert_allclose(cov[b], float(sigma[b]) ** 2 * np.linalg.inv(H[b].numpy()), rtol=1e-9, atol=1e-12)
+
+
+def test_a_covariance_is_symmetric_bit_for_bit():
+    cov, _ = covariance.from_normal(
+        (positive(5, 20) * torch.logspace(-3, 3, 5, dtype=D)[:, None]).float(), torch.ones(20)
+    )
+    assert torch.equal(cov, cov.mT)
+
+
+def test_a_length_in_standard_deviations():
+    g = torch.Generator().manual_seed(1)
+    x, cov = torch.randn(3, 4, generator=g, dtype=D), positive(4, 3)
+    cov[1] = 0
+    found = covariance.mahalanobis(x, cov)
+    wanted = [np.sqrt(x[b].numpy() @ np.linalg.inv(cov[b].numpy()) @ x[b].numpy()) for b in (0, 2)]
+    np.testing.assert_allclose(found[::2], wanted, rtol=1e-9)
+    assert found[1] == 0 and covariance.mahalanobis(0 * x, cov)[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("values", "used", "wanted"),
+    [
+        ([3.0, 1.0, 2.0], [1, 1, 1], 2.0),
+        ([4.0, 1.0, 2.0, 3.0], [1, 1, 1, 1], 2.0),  # the lower of the middle two
+        ([9.0, 1.0, 0.0, 3.0], [0, 1, 0, 1], 1.0),
+        ([9.0, float("nan"), 5.0, 3.0], [1, 0, 1, 1], 5.0),
+        ([9.0, 5.0], [0, 0], 1.0),
+        ([], [], 1.0),
+    ],
+)
+def test_the_median_of_the_used(values, used, wanted):
+    found = covariance.median(torch.tensor([values], dtype=D), torch.tensor([used], dtype=torch.bool))
+    assert found.tolist() == [[wanted]]
+
+
+@pytest.mark.parametrize("isotropic", [0.0, 0.3, 1.0])
+def test_shapes_are_covariances_over_the_median_of_their_mean_variance(isotropic):
+    """Unused ones and those that are no covariance count for nothing and are round."""
+    cov = torch.stack((positive(2, 9), 7 * positive(2, 9, seed=1)))
+    used = torch.ones(2, 9, dtype=torch.bool)
+    used[0, 2] = False
+    nan, inf = torch.nan, torch.inf
+    bad = [[[1, 0], [0, -1]], [[-1, 0], [0, 1]], [[1, 2], [2, 1]], [[1, 1], [1, 1]], [[nan, 0], [0, 1]]]
+    bad += [[[inf, 0], [0, 1]], [[0, 0], [0, 1]], [[1, 0], [0, 0]]]
+    cov[1, :8] = torch.tensor(bad, dtype=D)
+    shape = covariance.noise_shape(cov, used, isotropic)
+    good = used.clone()
+    good[1, :8] = False
+    for b in range(2):
+        mean = [float(torch.trace(cov[b, n])) / 2 for n in range(9) if good[b, n]]
+        scale = sorted(mean)[(len(mean) - 1) // 2]
+        for n in range(9):
+            wanted = np.eye(2)
+            if good[b, n]:
+                wanted = (1 - isotropic) * cov[b, n].numpy() / scale + isotropic * np.eye(2)
+            np.testing.assert_allclose(shape[b, n], wanted, rtol=1e-12)

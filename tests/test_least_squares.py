@@ -1,0 +1,299 @@
+"""Residuals, kernels, normal equations, solves and steps, against loops, autograd, scipy and matrices written out."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.special import huber
+
+from dhtorch.geometry import se3
+from dhtorch.geometry.least_squares import (
+    MIN_DEPTH,
+    MIN_PIVOT,
+    Normal,
+    choose,
+    gauss_newton_step,
+    linearise,
+    minimise,
+    move,
+    normal_equations,
+    robust,
+    solve_spd,
+    trial_step,
+    weight_slope,
+)
+from dhtorch.geometry.se3 import Pose
+
+D = torch.float64
+KERNELS = [None, "huber", "cauchy", "geman_mcclure"]
+
+
+def drawn(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=D)
+
+
+def scene(batch=2, n=7, off=3.0, seed=1):
+    """A pose, two unlike focal lengths, points in front and where they were seen, ``off`` px beside it."""
+    T = se3.exp(0.2 * drawn(batch, 6, seed=seed))
+    f, c = 300 + 50 * drawn(batch, 2, seed=seed + 1), 100 + 20 * drawn(batch, 2, seed=seed + 2)
+    xyz = drawn(batch, 3, n, seed=seed + 3) * 0.5 + torch.tensor([0.0, 0.0, 3.0], dtype=D)[:, None]
+    return T, f, c, xyz, seen(T, f, c, xyz) + off * drawn(batch, 2, n, seed=seed + 4)
+
+
+def seen(T, f, c, xyz):
+    Y = T.R @ xyz + T.t[..., None]
+    return f[..., None] * Y[:, :2] / Y[:, 2:] + c[..., None]
+
+
+# ------------------------------------------------------------------------------------------------ linearise
+
+
+def test_the_residual_is_projected_minus_measured_and_its_jacobian_that_of_a_left_perturbation():
+    T, f, c, xyz, uv = scene()
+    rows, depth = linearise(T, f, c, xyz, uv)
+    J = torch.func.jacrev(lambda xi: seen(se3.retract(T, xi), f, c, xyz))(torch.zeros(2, 6, dtype=D))
+    for b in range(2):
+        torch.testing.assert_close(rows[b, :6], J[b, :, :, b].movedim(-1, 0))
+    torch.testing.assert_close(rows[:, 6], seen(T, f, c, xyz) - uv)
+    torch.testing.assert_close(depth, (T.R @ xyz + T.t[..., None])[:, 2])
+
+
+def test_points_behind_the_camera_have_finite_rows_and_their_true_depth():
+    T, f, c, xyz, uv = scene(1, 4)
+    T = se3.identity(1, f)
+    xyz[0, 2] = torch.tensor([-2.0, 0.0, 0.5 * MIN_DEPTH, 2 * MIN_DEPTH], dtype=D)
+    rows, depth = linearise(T, f, c, xyz, uv)
+    assert rows.isfinite().all() and torch.equal(depth, xyz[:, 2])
+    clamped = torch.tensor([MIN_DEPTH, MIN_DEPTH, MIN_DEPTH, 2 * MIN_DEPTH], dtype=D)
+    torch.testing.assert_close(rows[0, 6], f[0, :, None] * xyz[0, :2] / clamped + c[0, :, None] - uv[0])
+
+
+# ------------------------------------------------------------------------------------------------ kernels
+
+
+def plain_rho(square, kernel, k):
+    r = np.sqrt(square)
+    return {
+        None: square,
+        "huber": 2 * huber(k, r),
+        "cauchy": k * k * np.log1p(square / (k * k)),
+        "geman_mcclure": k * k * square / (k * k + square),
+    }[kernel]
+
+
+@pytest.mark.parametrize("scale", [0.5, 2.0])
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_cost_weight_and_slope_are_a_formula_its_derivative_and_its_second(kernel, scale):
+    r = torch.tensor([0.0, 1e-4, 0.3, 0.499, 0.501, 1.9, 1.999, 2.001, 3.0, 20.0], dtype=D)
+    square = (r * r).requires_grad_()
+    rho, weight = robust(square, kernel, scale)
+    np.testing.assert_allclose(rho.detach(), plain_rho(square.detach().numpy(), kernel, scale), rtol=1e-12, atol=1e-15)
+    torch.testing.assert_close(torch.autograd.grad(rho.sum(), square, retain_graph=True)[0], weight)
+    assert weight[0] == 1
+    slope = torch.autograd.grad(weight.sum(), square)[0] if weight.requires_grad else torch.zeros_like(square)
+    assert slope.isfinite().all()
+    torch.testing.assert_close(weight_slope(square, kernel, scale), slope, rtol=1e-12, atol=1e-15)
+
+
+def test_an_unknown_kernel_raises():
+    for function in (robust, weight_slope):
+        with pytest.raises(ValueError, match="kernel is 'tukey'"):
+            function(torch.ones(1), "tukey", 1.0)
+
+
+# ------------------------------------------------------------------------------------------------ normal equations
+
+
+@pytest.mark.parametrize("block", [None, 1, 4, 9, 16])
+def test_normal_equations_are_weighted_sums_over_points(block):
+    rows, weight = drawn(2, 4, 2, 9), drawn(2, 9, seed=1).abs()
+    H, g = normal_equations(rows, weight, block=block)
+    for b in range(2):
+        wanted_H, wanted_g = np.zeros((3, 3)), np.zeros(3)
+        for n in range(9):
+            for k in range(2):
+                J, r, w = rows[b, :3, k, n].numpy(), float(rows[b, 3, k, n]), float(weight[b, n])
+                wanted_H, wanted_g = wanted_H + w * np.outer(J, J), wanted_g + w * J * r
+        np.testing.assert_allclose(H[b], wanted_H, rtol=1e-12)
+        np.testing.assert_allclose(g[b], wanted_g, rtol=1e-12)
+
+
+def test_no_points_sum_to_nothing():
+    H, g = normal_equations(drawn(2, 7, 2, 0), drawn(2, 0))
+    assert torch.equal(H, torch.zeros(2, 6, 6, dtype=D)) and torch.equal(g, torch.zeros(2, 6, dtype=D))
+
+
+def test_empty_points_behind_the_last_block_change_no_bit():
+    rows, weight = drawn(3, 7, 2, 64).float(), drawn(3, 64, seed=1).float().abs()
+    more = (torch.nn.functional.pad(rows, (0, 192), value=1.0), torch.nn.functional.pad(weight, (0, 192)))
+    for x, y in zip(normal_equations(rows, weight, block=64), normal_equations(*more, block=64), strict=True):
+        assert torch.equal(x, y)
+
+
+# ------------------------------------------------------------------------------------------------ solving
+
+
+def positive(n, batch=2, seed=0):
+    A = drawn(batch, n, n + 3, seed=seed)
+    return A @ A.mT
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 5, 6, 9])
+@pytest.mark.parametrize("columns", [1, 4])
+def test_systems_of_any_size_are_solved(n, columns):
+    H, b = positive(n), drawn(2, n, columns, seed=1)
+    x, ok = solve_spd(H, b)
+    assert ok.all() and x.shape == b.shape
+    torch.testing.assert_close(x, torch.linalg.solve(H, b), rtol=1e-9, atol=1e-12)
+
+
+def test_units_of_the_unknowns_do_not_matter():
+    """Metres beside nanoradians: a diagonal over 24 orders of magnitude."""
+    H, b = positive(6), drawn(2, 6, 1, seed=1)
+    unit = torch.logspace(-6, 6, 6, dtype=D)
+    x, ok = solve_spd(unit[:, None] * H * unit, unit[:, None] * b)
+    assert ok.all()
+    torch.testing.assert_close(x * unit[:, None], torch.linalg.solve(H, b), rtol=1e-9, atol=0)
+
+
+def test_single_precision_is_solved_in_double():
+    H = positive(6)
+    H = (H + 3e4 * torch.outer(*2 * [torch.ones(6, dtype=D)])).float()
+    b = drawn(2, 6, 1, seed=1).float()
+    x, ok = solve_spd(H, b)
+    assert ok.all() and x.dtype == torch.float32
+    torch.testing.assert_close(x, torch.linalg.solve(H.double(), b.double()).float(), rtol=1e-6, atol=0)
+
+
+def test_only_a_positive_definite_matrix_of_numbers_is_solved():
+    """The pivot of [[1, r], [r, 1]] is sqrt(1 - r²)."""
+
+    def pair(r):
+        return [[1.0, r], [r, 1.0]]
+
+    good, bad = (float(np.sqrt(1 - (x * MIN_PIVOT) ** 2)) for x in (1.5, 0.7))
+    rows = [pair(good), pair(bad), pair(1.0), pair(2.0), pair(torch.nan), [[0.0] * 2] * 2, [[-1.0, 0], [0, 1.0]]]
+    H = torch.tensor(rows, dtype=D)
+    x, ok = solve_spd(H, torch.ones(7, 2, 1, dtype=D))
+    assert ok.tolist() == [True] + [False] * 6 and (x[1:] == 0).all()
+    b = torch.tensor([[1.0, 2.0], [torch.inf, 0.0], [0.0, torch.nan]], dtype=D)[..., None]
+    x, ok = solve_spd(torch.eye(2, dtype=D).expand(3, 2, 2), b)
+    assert ok.tolist() == [True, False, False] and x[..., 0].tolist() == [[1.0, 2.0], [0.0, 0.0], [0.0, 0.0]]
+
+
+@pytest.mark.parametrize("n", [3, 6])
+def test_a_solution_is_differentiated_without_its_factorisation_and_silent_where_there_is_none(n):
+    H, b = positive(n), drawn(2, n, 2, seed=1)
+    symmetric = lambda M, v: solve_spd(M + M.mT, v)[0]  # noqa: E731
+    assert torch.autograd.gradcheck(symmetric, (H.requires_grad_(), b.requires_grad_()))
+    spoilt = torch.cat((H.detach(), H.detach()))
+    spoilt[0, 0, 0], spoilt[1], spoilt[2] = torch.nan, 0, torch.outer(spoilt[2, 0], spoilt[2, 0])
+    spoilt.requires_grad_()
+    x, ok = solve_spd(spoilt, b.detach().repeat(2, 1, 1))
+    assert ok.tolist() == [False, False, False, True]
+    x.sum().backward()
+    assert (spoilt.grad[:3] == 0).all() and spoilt.grad[3].isfinite().all() and spoilt.grad[3].any()
+
+
+# ------------------------------------------------------------------------------------------------ steps
+
+
+def cayley(T, xi):
+    """(1 − ½ W)⁻¹ (1 + ½ W) applied to a pose, then the translation."""
+    W, eye = 0.5 * se3.hat(xi[:, :3]), torch.eye(3, dtype=D)
+    turn = torch.linalg.inv(eye - W) @ (eye + W)
+    return turn @ T.R, (turn @ T.t[..., None])[..., 0] + xi[:, 3:]
+
+
+def test_a_pose_moves_by_cayleys_map():
+    T, xi = se3.exp(drawn(5, 6)), drawn(5, 6, seed=1)
+    moved = move(T, xi)
+    for x, y in zip((moved.R, moved.t), cayley(T, xi), strict=True):
+        torch.testing.assert_close(x, y)
+    small = 1e-3 * xi
+    exact, near = se3.retract(T, small), move(T, small)
+    assert (exact.R - near.R).abs().max() < 3e-9 and (exact.t - near.t).abs().max() < 3e-6
+
+
+@pytest.mark.parametrize("step", [gauss_newton_step, trial_step])
+def test_a_step_solves_the_normal_equations(step):
+    T, H, g = se3.exp(drawn(3, 6)), positive(6, 3), 0.1 * drawn(3, 6, seed=1)
+    H[1] = 0
+    moved, ok = step(T, H, g)
+    wanted = cayley(T[::2], -torch.linalg.solve(H[::2], g[::2]))
+    assert ok.tolist() == [True, False, True]
+    torch.testing.assert_close(moved.R[::2], wanted[0])
+    torch.testing.assert_close(moved.t[::2], wanted[1])
+    if step is gauss_newton_step:
+        assert torch.equal(moved.R[1], T.R[1]) and torch.equal(moved.t[1], T.t[1])
+    else:
+        assert not trial_step(T, H.requires_grad_(), g)[0].R.requires_grad
+
+
+def test_one_step_passes_gradcheck_through_the_normal_equations():
+    T, f, c, xyz, uv = scene(1, 5, off=0.5)
+
+    def step(f, c, xyz, uv, weight):
+        rows, _ = linearise(T, f, c, xyz, uv)
+        moved, _ = gauss_newton_step(T, *normal_equations(rows, weight))
+        return moved.R, moved.t
+
+    inputs = tuple(x.clone().requires_grad_() for x in (f, c, xyz, uv, drawn(1, 5).abs() + 0.1))
+    assert torch.autograd.gradcheck(step, inputs, fast_mode=True)
+
+
+# ------------------------------------------------------------------------------------------------ minimise
+
+
+def test_damping_follows_success_and_each_element_goes_its_own_way():
+    """Costs are read from a script; the unknown is the number of the evaluation that it was proposed for."""
+    costs = torch.tensor([[9.0, 8, 7, 6, 5, 4], [9.0, 9, 10, 8, 8.5, 7], [9.0, 1, 2, 3, 4, 5], [9.0, 5, 4, 3, 2, 1]])
+    accepted = [[1, 1, 1, 1, 1], [0, 0, 1, 0, 1], [1, 0, 0, 0, 0], [1, 0, 1, 1, 1]]  # equal costs are not better ones
+    factors, places = [], []
+
+    def evaluate(x):
+        places.append(x)
+        return Normal(costs[:, len(places) - 1], 2 * torch.eye(2).expand(4, 2, 2), x)
+
+    def step(x, H, g):
+        assert torch.equal(x, g) and (H[:, 0, 1] == 0).all()  # equations of the place that is left
+        factors.append(H[:, 1, 1] / 2 - 1)
+        return torch.full_like(x, len(places)), torch.tensor([True, True, True, len(places) != 2])
+
+    x, cost = minimise(evaluate, torch.zeros(4, 1), 5, damping=0.1, step=step)
+    assert x[:, 0].tolist() == [5, 5, 1, 5] and cost.tolist() == [4, 7, 1, 1]
+    wanted = 0.1 * np.cumprod(np.where(np.insert(accepted, 0, 2, axis=1) == 1, 0.1, 10), 1)[:, :-1] / 10
+    np.testing.assert_allclose(torch.stack(factors, 1), wanted, rtol=1e-2, atol=1e-6)
+
+
+def test_the_first_step_is_damped_by_a_ten_thousandth():
+    H = positive(2, 1)
+    seen_H = []
+
+    def evaluate(x):
+        return Normal(x[:, 0], H, x)
+
+    minimise(evaluate, torch.zeros(1, 2, dtype=D), 1, step=lambda x, A, g: (seen_H.append(A), (x, x[:, 0] == 0))[1])
+    torch.testing.assert_close(seen_H[0] - H, 1e-4 * torch.diag_embed(H.diagonal(dim1=1, dim2=2)), rtol=1e-9, atol=0)
+
+
+def test_minimise_descends_to_the_optimum_and_leaves_what_is_no_number():
+    T, f, c, xyz, uv = scene(3, 20, off=0.0)
+
+    def evaluate(T):
+        rows, _ = linearise(T, f, c, xyz, uv)
+        one = torch.ones_like(rows[:, 0, 0])
+        return Normal((rows[:, 6] ** 2).sum((1, 2)), *normal_equations(rows, one))
+
+    start = se3.retract(T, torch.full((3, 6), 0.1, dtype=D))
+    best, cost = minimise(evaluate, start, 8)
+    assert (cost < 1e-12).all()
+    torch.testing.assert_close(best.R, T.R)
+    unchanged, cost = minimise(evaluate, Pose(T.R * torch.nan, T.t), 3)
+    assert unchanged.R.isnan().all() and cost.isnan().all()
+
+
+def test_choose_takes_whole_elements_of_trees():
+    new, old = (Pose(x * torch.ones(3, 3, 3), x * torch.ones(3, 3)) for x in (1.0, 2.0))
+    mixed = choose(torch.tensor([True, False, True]), (new, torch.zeros(3)), (old, torch.ones(3)))
+    assert mixed[0].R[:, 1, 1].tolist() == [1, 2, 1] and mixed[0].t[:, 2].tolist() == [1, 2, 1]
+    assert mixed[1].tolist() == [0, 1, 0]
