@@ -156,10 +156,10 @@ def test_triangles_flatter_than_a_thousandth_and_rays_closer_than_a_microradian_
 
 def test_units_and_places_do_not_matter():
     """Millimetres, kilometres, a world origin far away."""
-    rays, xyz, T = triples(200, seed=11)
+    rays, xyz, _ = triples(200, seed=11)
     plain = p3p(rays, xyz)
     for unit in (1e-3, 1e3):
-        R, t, valid = p3p(rays * 7, xyz * unit)
+        _, t, valid = p3p(rays * 7, xyz * unit)
         assert torch.equal(valid, plain[2])
         torch.testing.assert_close(t / unit, plain[1], rtol=0, atol=1e-8 * float(plain[1].abs().max()))
 
