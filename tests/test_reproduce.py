@@ -1,0 +1,70 @@
+"""Committed results: each has its command, the command's settings are the file's, and what is told names it whole."""
+
+import json
+import re
+import shlex
+import sys
+from pathlib import Path
+
+import pytest
+
+from dhtorch import archive
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+
+import reproduce
+import speed_tables
+
+REPO = Path(__file__).resolve().parents[1]
+RESULTS = {path.stem for path in (REPO / "benchmarks/results").glob("*.json")}
+PAGES = ("README.md", "benchmarks/README.md", *sorted(str(p.relative_to(REPO)) for p in REPO.glob("docs/*.md")))
+
+
+def test_every_result_has_a_command_and_every_command_its_result():
+    assert {*reproduce.EXPERIMENTS, *reproduce.SCRIPTS} == RESULTS
+
+
+@pytest.mark.parametrize("name", sorted(reproduce.EXPERIMENTS))
+def test_a_result_was_made_with_the_settings_that_its_command_has_today(name):
+    assert reproduce.check(name) == []
+
+
+def test_another_setting_is_seen(tmp_path, monkeypatch):
+    result = archive.read(REPO / "benchmarks/results/hole_census.json")
+    result["config"]["experiment"]["stride"] = 1
+    (tmp_path / "hole_census.json").write_text(json.dumps(result))
+    monkeypatch.setattr(reproduce, "RESULTS", tmp_path)
+    (line,) = reproduce.check("hole_census")
+    assert "experiment.stride: found 1, expected 4" in line and "experiment.stride=4" in line
+    (line,) = reproduce.check("icp")
+    assert "no icp.json" in line
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_commands_on_the_pages_are_those_that_made_the_results(page):
+    """Whatever a page tells to type for an experiment on named data makes one of the files."""
+    known = [set(shlex.split(words)) for words in reproduce.EXPERIMENTS.values()]
+    text = (REPO / page).read_text().replace("\n", " ")
+    told = re.findall(r"`dhtorch ((?:[\w.]+=[\w.,\[\]]+ ?)+)`", text)
+    for words in told:
+        asked = set(words.split())
+        if {"experiment", "data"} <= {w.partition("=")[0] for w in asked}:
+            assert any(asked == command for command in known), words
+
+
+def test_a_speed_is_told_with_its_processor():
+    for name in (*speed_tables.SCRIPTS, "scaling", "readers"):
+        rows = json.loads((REPO / f"benchmarks/results/{name}.json").read_text())
+        assert len({row["processor"] for row in rows}) == 1, name
+    for page in ("README.md", "benchmarks/README.md"):
+        assert "Measured on: " in (REPO / page).read_text()
+    assert archive.read(REPO / "benchmarks/results/latency.json")["meta"]["processor"]
+
+
+def test_a_processor_is_named_by_maker_model_and_vectors(tmp_path):
+    told = "processor : 0\nmodel name\t: A. Maker 9000 @ 2 GHz\ncpu family\t: 6\nmodel\t\t: 85\nflags\t: fpu avx2{}\n\nmodel : 2"
+    info = tmp_path / "cpuinfo"
+    for more, vectors in (("", "AVX2"), (" avx512f", "AVX-512"), (" avx512f amx_tile", "AVX-512 and AMX")):
+        info.write_text(told.format(more))
+        assert archive.processor(info) == f"A. Maker 9000 @ 2 GHz, family 6 model 85, {vectors}"
+    assert archive.processor(tmp_path / "none")
