@@ -5,14 +5,14 @@ TESTS: dict[str, list[str]] = {
     "evaluate.correlation": ["tests/test_evaluate.py"],
     "evaluate.curves": ["tests/test_evaluate.py"],
     "evaluate.errors": ["tests/test_evaluate.py"],
-    "evaluate.holdout": ["tests/test_evaluate.py"],
-    "evaluate.risk": ["tests/test_evaluate.py"],
-    "evaluate.calibrate": ["tests/test_calibrate.py"],
-    "evaluate.monotone": ["tests/test_calibrate.py"],
+    "evaluate.holdout": ["tests/test_holdout.py"],
+    "evaluate.risk": ["tests/test_risk.py"],
+    "evaluate.calibrate": ["tests/test_reliability.py"],
+    "evaluate.monotone": ["tests/test_monotone.py"],
     "evaluate.recalibrate": ["tests/test_calibrate.py"],
-    "evaluate.compare": ["tests/test_method_comparison.py"],
+    "evaluate.compare": ["tests/test_compare.py"],
     "evaluate.control": ["tests/test_control.py"],
-    "evaluate.probe": ["tests/test_probe.py"],
+    "evaluate.probe": ["tests/test_ridge.py"],
 }
 
 FAULTS: dict[str, list[tuple[str, ...]]] = {}
