@@ -44,7 +44,8 @@ def backproject(
         min_conf: lowest accepted sensor confidence (0, 1, 2) where the frame has a confidence map.
         sigma_m, sigma_rel: sensor noise, sigma² = sigma_m² + (sigma_rel · z)².
         search_px: radius of the search for a return, depth pixels.
-        edge_rel: max / min − 1 of the returns in the 5×5 neighbourhood above which DEPTH_EDGE is set.
+        edge_rel: max / min − 1 of the returns in the 5×5 neighbourhood (or as far as is searched, where that is
+            farther) above which DEPTH_EDGE is set.
         dark, saturated: mean grey of the neighbourhood below / above which UNDEREXPOSED / SATURATED is set.
         highlight: a colourless pixel above it that outshines its neighbourhood is SPECULAR.
 
@@ -126,14 +127,15 @@ def _extremes(window: Tensor) -> tuple[Tensor, Tensor]:
 def _nearest_return(depth: Tensor, place: Tensor, size: int, search_px: int) -> Tensor:
     """The pixel (B, N, 2) with a return nearest to each ``place``, ``place`` itself where none is within reach."""
     h, w = depth.shape[-2:]
-    pixel = pixels(place).clamp(-1, max(h, w))
+    pixel = pixels(place).clamp(-1 - search_px, max(h, w) + search_px)  # farther outside, nothing is within reach
     window = patches(depth.detach()[:, None], pixel - size // 2, size).flatten(2)  # moved inside at the border
     last = torch.tensor([w - size, h - size], device=depth.device)
     first = torch.minimum((pixel - size // 2).clamp_min(0), last)
     steps = torch.arange(size, device=depth.device)
     du, dv = ((first - pixel)[..., k, None] + steps for k in (0, 1))
     du, dv = du[..., None, :], dv[..., :, None]
-    reachable = (torch.maximum(du.abs(), dv.abs()) <= search_px).flatten(-2) & (window > 0) & (window < torch.inf)
+    near = (torch.maximum(du.abs(), dv.abs()) <= search_px).flatten(-2) & place.isfinite().all(-1, keepdim=True)
+    reachable = near & (window > 0) & (window < torch.inf)
     distance = (du * du + dv * dv).flatten(-2)
     pick = torch.where(reachable, distance, distance.new_full((), 1 << 30)).argmin(-1, keepdim=True)
     found = first + torch.cat((pick % size, torch.div(pick, size, rounding_mode="floor")), -1)

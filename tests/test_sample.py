@@ -1,0 +1,135 @@
+"""Seat 1 against its formulas, point by point in plain Python, and what it refuses."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from dhtorch.stages.sample import grid, spiral, vogel
+
+
+def to_border(centre, angle, low, high):
+    """How far the box reaches from its centre in a direction."""
+    ways = []
+    for k, d in enumerate((math.cos(angle), math.sin(angle))):
+        room = high[k] - centre[k] if d > 0 else centre[k] - low[k]
+        ways.append(room / max(abs(d), 1e-12))
+    return min(ways)
+
+
+def box(hw, margin):
+    low, high = (margin, margin), (hw[1] - 1 - margin, hw[0] - 1 - margin)
+    return low, high, tuple((a + b) / 2 for a, b in zip(low, high, strict=True))
+
+
+def plain_spiral(hw, n, turns=None, foveation=1.0, gaze=None, inner_px=1.0, margin_px=2.0):
+    low, high, middle = box(hw, margin_px)
+    centre = gaze or middle
+    turns = math.sqrt(foveation * n / (2 * math.pi)) if turns is None else turns
+    points = []
+    for k in range(n):
+        s = (k // 2 + 0.5) / math.ceil(n / 2)
+        angle = 2 * math.pi * turns * math.sqrt(s) + math.pi * (k % 2)
+        reach = to_border(centre, angle, low, high)
+        first = min(inner_px, reach)
+        r = first + (reach - first) * s**foveation
+        points.append((centre[0] + r * math.cos(angle), centre[1] + r * math.sin(angle)))
+    return np.array(points)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"turns": 3.5},
+        {"foveation": 0.5},
+        {"foveation": 2.5},
+        {"gaze": (20.0, 55.25)},
+        {"gaze": (2.0, 57.0)},  # on the margin itself
+        {"inner_px": 6.0},
+        {"inner_px": 0.0},
+        {"margin_px": 0.0},
+        {"margin_px": 7.5, "gaze": (8.0, 20.0), "inner_px": 4.0, "foveation": 0.8, "turns": 2.0},
+    ],
+)
+@pytest.mark.parametrize("n", [40, 41])
+def test_the_spiral_is_its_formula(options, n):
+    found = spiral((60, 80), n, **options, dtype=torch.float64)
+    np.testing.assert_allclose(found.numpy(), plain_spiral((60, 80), n, **options), atol=1e-9)
+
+
+@pytest.mark.parametrize("foveation", [0.5, 1.3])
+def test_spacing_along_an_arm_is_that_between_arms(foveation):
+    """What the default number of turns is for. With steps of angle and radius from point to point of an arm, the way
+    is r Δθ, and after half a turn the other arm passes at a distance of π Δr / Δθ; radii in shares of the border's."""
+    hw, n = (600, 800), 3000
+    low, high, middle = box(hw, 0.0)
+    uv = spiral(hw, n, foveation=foveation, margin_px=0, inner_px=0, dtype=torch.float64)[0::2].numpy() - middle
+    angle = np.unwrap(np.arctan2(uv[:, 1], uv[:, 0]))
+    radius = np.hypot(*uv.T) / [to_border(middle, x, low, high) for x in angle]
+    some = slice(300, 1400)
+    step, out = np.diff(angle)[some], np.diff(radius)[some]
+    np.testing.assert_allclose(radius[some] * step, math.pi * out / step, rtol=5e-3)
+
+
+@pytest.mark.parametrize(("gaze", "margin_px", "n"), [(None, 2.0, 30), ((15.0, 40.0), 5.0, 31)])
+def test_vogels_sunflower_is_its_formula(gaze, margin_px, n):
+    low, high, middle = box((60, 80), margin_px)
+    centre, expected = gaze or middle, []
+    for k in range(n):
+        angle = k * math.pi * (3 - math.sqrt(5))
+        r = to_border(centre, angle, low, high) * math.sqrt((k + 0.5) / n)
+        expected.append((centre[0] + r * math.cos(angle), centre[1] + r * math.sin(angle)))
+    found = vogel((60, 80), n, gaze=gaze, margin_px=margin_px, dtype=torch.float64)
+    np.testing.assert_allclose(found.numpy(), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(("hw", "n", "margin_px"), [((60, 80), 50, 2.0), ((20, 90), 7, 0.0), ((90, 20), 13, 4.0)])
+def test_a_grid_fills_rows_of_equal_height_evenly(hw, n, margin_px):
+    rows = min(max(round(math.sqrt(n * hw[0] / hw[1])), 1), n)
+    (low_u, low_v), (high_u, high_v), _ = box(hw, margin_px)
+    number = [sum(k * rows // n == row for k in range(n)) for row in range(rows)]
+    assert max(number) - min(number) <= 1
+    expected = [
+        (low_u + (i + 0.5) / count * (high_u - low_u), low_v + (row + 0.5) / rows * (high_v - low_v))
+        for row, count in enumerate(number)
+        for i in range(count)
+    ]
+    found = grid(hw, n, margin_px=margin_px, dtype=torch.float64)
+    np.testing.assert_allclose(found.numpy(), expected, atol=1e-6)
+
+
+def test_a_grid_of_a_long_image_is_one_row_and_that_of_a_tall_one_has_no_more_rows_than_points():
+    assert grid((4, 900), 3, margin_px=1).tolist() == [[150.5, 1.5], [449.5, 1.5], [748.5, 1.5]]
+    assert grid((900, 4), 3, margin_px=1).tolist() == [[1.5, 150.5], [1.5, 449.5], [1.5, 748.5]]
+
+
+@pytest.mark.parametrize("sampler", [spiral, grid, vogel])
+def test_the_margin_may_leave_one_pixel_and_no_less(sampler):
+    assert sampler((5, 9), 4, margin_px=2)[:, 1].tolist() == [2.0] * 4
+    assert sampler((5, 5), 3).tolist() == [[2.0, 2.0]] * 3, "two pixels by default"
+    assert sampler((5, 5), 0).shape == (0, 2)
+    for n, margin in ((4, 2.01), (4, -0.1)):
+        with pytest.raises(ValueError, match="margin_px"):
+            sampler((5, 9), n, margin_px=margin)
+    with pytest.raises(ValueError, match="n is -1"):
+        sampler((5, 9), -1)
+    assert sampler((50, 90)).shape == (2048, 2)
+    assert sampler((50, 90), 3, dtype=torch.float64).dtype == torch.float64
+
+
+@pytest.mark.parametrize("sampler", [spiral, vogel])
+def test_the_gaze_may_lie_on_the_margin_and_not_beyond(sampler):
+    for gaze in ((2.0, 2.0), (87.0, 47.0)):
+        uv = sampler((50, 90), 9, gaze=gaze)
+        assert uv.amin(0).tolist() >= [2.0, 2.0] and (uv <= torch.tensor([87.0, 47.0])).all()
+    for gaze in ((1.9, 20.0), (20.0, 1.9), (87.1, 20.0), (20.0, 47.1)):
+        with pytest.raises(ValueError, match="gaze"):
+            sampler((50, 90), 9, gaze=gaze)
+
+
+def test_a_spiral_needs_a_foveation_above_zero():
+    for bad in (0.0, -1.0):
+        with pytest.raises(ValueError, match="foveation"):
+            spiral((50, 90), 9, foveation=bad)
