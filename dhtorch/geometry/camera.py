@@ -15,6 +15,9 @@ from torch import Tensor
 from dhtorch.geometry.shapes import check
 from dhtorch.tree import Record, record
 
+#: How many coefficients a distortion may have: k1 k2 p1 p2 [k3 [k4 k5 k6]].
+COEFFICIENTS = (4, 5, 8)
+
 
 @record
 class Camera(Record):
@@ -56,7 +59,8 @@ def project(
 ) -> Tensor:
     """Pixels (B, N, 2) of points; the sign of z is the caller's affair, |z| is kept away from zero.
 
-    Gradient: to points, intrinsics and distortion. Checked against ``kornia.geometry.PinholeCamera`` and cv2.
+    Gradient: to points, intrinsics and distortion. Checked against ``cv2.projectPoints`` and
+    ``kornia.geometry.camera.PinholeCamera`` (``tests/test_camera.py``).
     """
     check("camera.project", f=(camera.f, "B 2"), xyz=(xyz, "B N 3"))
     z = xyz[..., 2:]
@@ -97,7 +101,8 @@ def undistort(camera: Camera, uv: Tensor, *, iterations: int = 12) -> Tensor:
     the model's invertible field) becomes NaN.
 
     Gradient: one Newton step from the detached solution, which is the implicit derivative, to ``uv``, intrinsics and
-    distortion. Checked against ``cv2.undistortPoints`` and ``kornia.geometry.calibration.undistort_points``.
+    distortion. Checked against ``cv2.undistortPoints`` and ``kornia.geometry.calibration.undistort_points``
+    (``tests/test_camera.py``).
     """
     check("camera.undistort", f=(camera.f, "B 2"), uv=(uv, "B N 2"))
     if camera.distortion is None:
@@ -166,8 +171,10 @@ def _newton_step(distortion: Tensor, xy: Tensor, target: Tensor) -> Tensor:
 
 def _distort(distortion: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
     """Brown's rational model and its Jacobian: ideal xy (B, N, 2) → distorted xy (B, N, 2), (B, N, 2, 2)."""
-    missing = 8 - distortion.shape[-1]
-    k1, k2, p1, p2, k3, k4, k5, k6 = torch.nn.functional.pad(distortion, (0, missing))[:, None].unbind(-1)
+    count = distortion.shape[-1]
+    if count not in COEFFICIENTS:  # more would be OpenCV's thin prism and tilted sensor
+        raise ValueError(f"camera: distortion has {count} coefficients, expected one of {COEFFICIENTS}")
+    k1, k2, p1, p2, k3, k4, k5, k6 = torch.nn.functional.pad(distortion, (0, 8 - count))[:, None].unbind(-1)
     x, y = xy.unbind(-1)
     r2 = x * x + y * y
     top = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))

@@ -48,10 +48,12 @@ def triangulate(
     correction for isotropic noise in view 1; the two rays then meet, and depth is a quotient of lengths along the line.
 
     Returns:
-        :class:`TwoView`. Without a baseline, or where the rays are parallel, depth is 0 and the slope 0.
+        :class:`TwoView`. Without a baseline, or where the rays are exactly parallel, depth is 0 and the rest, though
+        finite, means nothing.
 
     Gradient: to pixels, both cameras and the pose; smooth except at the epipole.
-    Checked against ``cv2.triangulatePoints`` and ``kornia.geometry.epipolar.triangulate_points``.
+    Checked against ``cv2.triangulatePoints`` and ``kornia.geometry.epipolar.triangulate_points``
+    (``tests/test_epipolar.py``).
     Source: R. Hartley, A. Zisserman, "Multiple View Geometry", section 12.3, with one noise-free view.
     """
     check("triangulate", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), f0=(camera_0.f, "B 2"), f1=(camera_1.f, "B 2"))
@@ -142,7 +144,7 @@ def point_jacobians(
 ) -> tuple[Tensor, Tensor]:
     """d(pixel) / d(point) (B, N, 2, 3) and d(pixel) / d(left pose perturbation) (B, N, 2, 6), ideal pinhole.
 
-    |z| is kept away from zero. Checked against autograd.
+    |z| is kept away from zero. Checked against ``torch.func.jacrev`` (``tests/test_epipolar.py``).
     """
     check("point_jacobians", f=(camera.f, "B 2"), xyz=(xyz, "B N 3"))
     x, y, z = xyz.unbind(-1)

@@ -57,7 +57,8 @@ def linearise(
     Raises:
         ValueError: wrong shapes.
 
-    Gradient: to pose, f, c, xyz and uv. The Jacobian is checked against autograd.
+    Gradient: to pose, f, c, xyz and uv. The Jacobian is checked against ``torch.func.jacrev``
+    (``tests/test_least_squares.py``).
     """
     check("linearise", R=(T.R, "B 3 3"), f=(f, "B 2"), c=(c, "B 2"), xyz=(xyz, "B 3 N"), uv=(uv, "B 2 N"))
     Y = torch.baddbmm(T.t[..., None], T.R, xyz)

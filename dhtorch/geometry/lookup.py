@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dhtorch.geometry.shapes import check
 
-#: ITU-R BT.601 luma, the weights of ``cv2.cvtColor`` and ``kornia.color.rgb_to_grayscale``.
+#: ITU-R BT.601 luma, the weights of ``cv2.cvtColor`` (``tests/test_lookup.py``).
 LUMA = (0.299, 0.587, 0.114)
 _THOUSANDTHS = (299.0, 587.0, 114.0)
 

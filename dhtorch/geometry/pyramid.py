@@ -93,8 +93,8 @@ def build_pyramid(
 
     Each level is the one below, smoothed by the binomial filter (1 4 6 4 1) / 16 and taken at even pixels; gradients
     are Scharr's, per pixel. Outside the image the grey value is mirrored about the border pixel and the gradient is
-    zero (a mirrored gradient would hold a window back at the border). As in ``cv2.buildOpticalFlowPyramid``, a level
-    that would be no larger than the window is not made.
+    zero (a mirrored gradient would hold a window back at the border). As in ``cv2.buildOpticalFlowPyramid``
+    (``tests/test_statements.py``), a level that would be no larger than the window is not made.
 
     Args:
         gradients: without them the pyramid takes a third of the memory; windows can be searched in it, not for it.
@@ -142,9 +142,10 @@ def _bands(image: Tensor, hw: tuple[int, ...]) -> list[slice]:
 
 
 def _half(level: Tensor, pad: int, part: slice) -> Tensor:
-    """Rows ``part`` of the half-size image of a padded one, as ``cv2.pyrDown`` (kornia's samples at other places).
+    """Rows ``part`` of the half-size image of a padded one, as ``cv2.pyrDown`` (``tests/test_track.py``).
 
-    Rows first, because their slices are contiguous; then even and odd columns are taken apart once.
+    kornia samples at other places. Rows first, because their slices are contiguous; then even and odd columns are
+    taken apart once.
     """
     w = (level.shape[-1] - 2 * pad + 1) // 2
     top, bottom = (pad + 2 * row for row in (part.start, part.stop))

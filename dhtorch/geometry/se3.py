@@ -84,8 +84,8 @@ def exp(xi: Tensor) -> Pose:
     """Exponential map: (B, 6) rotation vector (rad) then translation part (m) → Pose.
 
     Closed form with series below 0.1 rad, so that value and gradient are exact at zero as well. Equal to
-    ``kornia.geometry.liegroup.Se3.exp`` of the reordered vector (tested); written out because it sits in the inner
-    loop of every refinement.
+    ``kornia.geometry.liegroup.Se3.exp`` of the reordered vector (``tests/test_se3.py``); written out because it sits in
+    the inner loop of every refinement.
     """
     check("se3.exp", xi=(xi, "B 6"))
     omega, upsilon = xi[..., :3], xi[..., 3:]

@@ -35,7 +35,8 @@ def largest_cluster(
 
     Holes are connected where one is among the nearest ``neighbours`` samples of the other. Labels spread by taking the
     smallest among neighbours and jumping to the label of the label; the number of rounds is fixed and suffices for any
-    set of samples in general position (twice the logarithm of N, checked against a search that follows every edge).
+    set of samples in general position (twice the logarithm of N, checked against a search that follows every edge,
+    ``oracle`` of ``tests/test_hole_attention.py``).
 
     Args:
         uv: the samples, holes and others.

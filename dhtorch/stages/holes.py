@@ -67,8 +67,7 @@ def min_eigenvalue(
     """Smaller eigenvalue (B, N) of the mean gradient matrix around pixels: Shi–Tomasi trackability.
 
     Equal to ``cv2.cornerMinEigenVal(grey, block, 3)`` at the nearest pixel wherever the block and the 3×3 Sobel
-    filter stay inside the image; nearer to the border the block is moved inside. The Sobel pair is the one of
-    ``kornia.filters.spatial_gradient(normalized=False)``, scaled by ¼.
+    filter stay inside the image (``tests/test_holes.py``); nearer to the border the block is moved inside.
 
     Gradient: to the image; at equal eigenvalues the subgradient without the split is taken.
     """

@@ -92,7 +92,8 @@ def pnp_ransac(
     Gradient: R and t to near ``xyz``, ``uv_1`` and camera 1, exact to first order for small residuals, zero for
     outliers; cov, rms_px, sigma_px and t_snr are detached.
     Cost: linear in B, H and N. Float64 in the minimal solver and the last step, the inputs' dtype elsewhere.
-    Source: paper, "LiDAR-anchored relative pose", with P3P in place of EPnP. Checked against cv2 and PoseLib.
+    Source: paper, "LiDAR-anchored relative pose", with P3P in place of EPnP. Checked against
+    ``cv2.solvePnPRansac`` and ``poselib.estimate_absolute_pose`` (``tests/test_pose.py``).
     """
     check(
         "pnp_ransac",

@@ -73,7 +73,7 @@ def lucas_kanade(
     step (:func:`refine`); all other fields are detached.
 
     Source: Lucas and Kanade 1981; Bouguet 2000 (pyramid); Baker and Matthews 2004 (inverse composition); checked
-    against ``cv2.calcOpticalFlowPyrLK``.
+    against ``cv2.calcOpticalFlowPyrLK`` (``tests/test_track.py``).
     """
     check("lucas_kanade", image_0=(image_0, "B C H W"), uv_0=(uv_0, "B N 2"), uv_1_init=(uv_1_init, "B N 2"))
     check("lucas_kanade", image_1=(image_1, "B C H W"), uv_0=(uv_0, "B N 2"))
