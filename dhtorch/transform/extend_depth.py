@@ -174,7 +174,7 @@ class ExtendDepth(torch.nn.Module):
             "tokens_valid": known,
         }
         if bool(bad.any()):
-            added = {key: torch.where(bad.view(-1, *[1] * (x.ndim - 1)), 0, x) for key, x in added.items()}
+            added = {key: x.masked_fill(bad.view(-1, *[1] * (x.ndim - 1)), 0) for key, x in added.items()}
             problem = torch.where(bad, Problem.UNREADABLE, problem)
         return {**added, "problem": problem}
 
