@@ -435,3 +435,45 @@ def test_some_are_replaced_and_the_others_kept():
     low, high = torch.tensor([[0.0], [1.0]]), torch.tensor([[2.0], [3.0]])
     x = torch.tensor([[0.0, 2.0, 2.1, 1.0, 1.0, math.nan, -0.1], [1.0, 3.0, 2.0, 3.1, 0.9, 2.0, 2.0]])
     assert lk.within(x, low, high).tolist() == [True, True, False, False, False, False, False]
+
+
+# --- options as they are and with a graph ----------------------------------------------------------------------------
+
+
+def test_the_usual_search_has_four_levels_windows_of_21_px_30_steps_and_no_normalisation():
+    draw = torch.Generator().manual_seed(0)
+    coarse = torch.rand(1, 1, 50, 50, generator=draw, dtype=torch.float64)
+    src = torch.nn.functional.interpolate(coarse, (340, 340), mode="bicubic")
+    dst = 1.2 * src.roll((9, -6), (2, 3)) + 0.1 * torch.rand(src.shape, generator=draw, dtype=torch.float64)
+    dst[..., :170] = src.flip(3)[..., :170]  # where nothing comes to rest
+    uv = places(1, 24, 340, 340, margin=20)
+    named = {"window": 21, "levels": 4, "iterations": 30, "epsilon_px": 0.01, "max_round_trip_px": 1.0}
+    named |= {"normalise": "none", "min_eigenvalue": 1e-4 * 1024 / 255**2}
+    usual, plain = lucas_kanade(src, dst, uv, **named), lucas_kanade(src, dst, uv)
+    assert all(torch.equal(getattr(usual, f), getattr(plain, f)) for f in FIELDS)
+    for name, value in {"window": 23, "levels": 5, "iterations": 31, "epsilon_px": 0.02}.items():
+        assert not torch.equal(lucas_kanade(src, dst, uv, **named | {name: value}).uv_1, plain.uv_1), name
+
+
+@pytest.mark.parametrize("normalise", NORMALISE)
+@pytest.mark.parametrize("who", range(3))
+def test_with_a_graph_valid_tracks_take_one_more_step(normalise, who):
+    src, dst = two_views((0.5, -0.4))
+    fade = torch.linspace(0.001, 0.1, W, dtype=torch.float64)  # also less texture than by default is enough
+    leaves = [0.5 + fade * (src - 0.5), 0.5 + fade * (dst - 0.5), places(2, 20, H, W, margin=12)]
+    options = OPTIONS | {"normalise": normalise, "min_eigenvalue": 1e-9}
+    options |= {"iterations": 1, "max_round_trip_px": 0.01}
+    plain = lucas_kanade(*leaves, **options)
+    assert 0.1 < plain.valid.float().mean() < 0.95 and not plain.uv_1.requires_grad
+    leaves[who] = leaves[who].requires_grad_()
+    graph = lucas_kanade(*leaves, **options)
+    step = refine(*leaves, plain.uv_1, window=WINDOW, normalise=normalise, min_eigenvalue=1e-9)
+    assert torch.equal(graph.uv_1, torch.where(plain.valid[..., None], step, plain.uv_1))
+    assert all(torch.equal(getattr(graph, f), getattr(plain, f)) for f in FIELDS[1:])
+    assert not graph.error.requires_grad and not graph.cov.requires_grad
+    (slope,) = torch.autograd.grad(graph.uv_1[plain.valid].sum(), leaves[who], retain_graph=True)
+    assert (slope != 0).any()
+    (none,) = torch.autograd.grad(graph.uv_1[~plain.valid].sum(), leaves[who])
+    assert (none == 0).all()
+    with torch.no_grad():
+        assert torch.equal(lucas_kanade(*leaves, **options).uv_1, plain.uv_1)

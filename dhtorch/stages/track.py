@@ -85,7 +85,9 @@ def lucas_kanade(
         target = build_pyramid(image_1, levels, window)
         tracks = _there_and_back(source, target, uv_0.detach(), uv_1_init, max_round_trip_px, o)
     if torch.is_grad_enabled() and (image_0.requires_grad or image_1.requires_grad or uv_0.requires_grad):
-        uv_1 = refine(image_0, image_1, uv_0, tracks.uv_1, window=window, normalise=normalise)
+        uv_1 = refine(
+            image_0, image_1, uv_0, tracks.uv_1, window=window, normalise=normalise, min_eigenvalue=min_eigenvalue
+        )
         return tracks.replace(uv_0=uv_0, uv_1=torch.where(tracks.valid[..., None], uv_1, tracks.uv_1))
     return tracks
 

@@ -1,0 +1,386 @@
+"""Affine registration against a slow twin: eight pictures, one regression at a time, matrices as NumPy has them."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from by_hand import REACH, levels, places, waves
+
+from dhtorch.geometry import affine
+from dhtorch.geometry.pyramid import build_pyramid
+from dhtorch.records import Tracks
+from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
+
+H, W, WINDOW = 90, 106, 11
+TURNED = [[1.03, 0.06], [-0.04, 0.96]]
+
+
+def two_views(linear=TURNED, shift=(0.4, -0.7), gain=1.0, bias=0.0, noise=0.0, shortest=8.0):
+    """Two pairs, the second image of each warped; different textures, noise and motion."""
+    src, draw = waves(2, H, W, shortest=shortest), np.random.default_rng(5)
+    dst = torch.cat(
+        [
+            waves(2, H, W, [s * x for x in shift], shortest=shortest, linear=linear)[k : k + 1]
+            for k, s in enumerate((1, -1))
+        ]
+    )
+    src, dst = (y + noise * torch.from_numpy(draw.standard_normal(y.shape)) for y in (src, dst))
+    return src, gain * dst + bias
+
+
+def pyramids(src, dst, n=2, window=WINDOW):
+    return build_pyramid(src, n, window), build_pyramid(dst, n, window, gradients=False)
+
+
+# --- the twin --------------------------------------------------------------------------------------------------------
+
+
+class Window:
+    """Around the whole pixel nearest to a place of image 0: regression of what image 1 shows on eight pictures."""
+
+    def __init__(self, level, uv, window):
+        self.w, self.h, self.q = window, window // 2, np.floor(uv + 0.5)
+        v, u = np.mgrid[-self.h : self.h + 1, -self.h : self.h + 1]
+        self.p = np.stack([u.ravel(), v.ravel()])
+        self.u, self.v = self.p / self.h
+        gx, gy, T = (level.window(k, self.q, window) for k in (1, 2, 0))
+        self.T = T - T.mean()
+        self.Q = np.stack([gx, gy, self.u * gx, self.u * gy, self.v * gx, self.v * gy, self.T, np.ones_like(T)])
+        damping = (2 / 255 / 2) ** 2  # 2 / 255 of noise, of a corner that moves by 2 px
+        self.S = self.Q @ self.Q.T + np.diag([0, 0, 1, 1, 1, 1, 0, 0]) * damping
+        offset = uv - self.q
+        self.place = np.array([1, *(offset / self.h)])
+        self.textured = np.linalg.cond(self.S) < 1e12
+
+    def reads(self, level, patch, middle, A):
+        """Image 1 at middle + A p; beyond a patch around the start the value of the patch's border."""
+        low, high = patch
+        return level.read(0, *np.clip(middle[:, None] + A @ self.p, low[:, None], high[:, None]))
+
+    def solve(self, J):
+        """The motion of the template's pixels that explains what image 1 shows: at its middle, and what that adds at
+        u = 1 and at v = 1."""
+        s = np.linalg.solve(self.S, self.Q @ J)
+        return s[:6].reshape(3, 2) / np.clip(s[6], 0.2, 5)
+
+    def fit(self, places, J):
+        """Gain, mean square that gain and bias leave, and what reading between pixels leaves of white noise."""
+        gain = self.T @ J / (self.T @ self.T)
+        rest = J - gain * self.T
+        f = places - np.floor(places)
+        return gain, rest.var(), np.prod(f**2 + (1 - f) ** 2, axis=0).mean()
+
+
+def compose(middle, A, change, h):
+    """On the template's side: x -> x + δ + D x there, undone, before the warp that was."""
+    D = np.stack([change[1], change[2]], 1) / h
+    back = A @ np.linalg.inv(np.eye(2) + D)
+    return middle - back @ change[0], back
+
+
+def noise_of(fit):
+    gain, variance, share = fit
+    return variance / (share + np.clip(gain, 0.2, 5) ** 2)
+
+
+def search(window, level, zoom, middle, A, steps, epsilon):
+    """Gauss-Newton steps with Anderson's of one memory; the warp, how well it fits, and how well at the start."""
+    middle, A = middle * zoom, A * zoom
+    reach = window.h + REACH
+    centre = np.clip(np.floor(middle + 0.5), 0, [level.W - 1, level.H - 1])
+    patch = (centre - reach, centre + reach)
+    first = window.fit(middle[:, None], window.reads(level, patch, middle, A))
+    taken = before = None
+    for _ in range(steps):
+        change = window.solve(window.reads(level, patch, middle, A))
+        step = change
+        if taken is not None:
+            bend = change - before
+            share = np.clip((change * bend).sum() / (bend**2).sum(), -0.5, 0.5 / 1.5)
+            step = change - share * (taken + bend)
+        taken, before = step, change
+        middle, A = compose(middle, A, step, window.h)
+        if np.abs(change).sum(0).max() <= epsilon * zoom:
+            break
+    J = window.reads(level, patch, middle, A)
+    return middle / zoom, A / zoom, window.fit(middle[:, None] + A @ window.p, J), first
+
+
+def covariance_by_hand(window, A, fit):
+    """White noise of one variance in both images through the regression; what it adds to the texture taken out."""
+    n = window.w**2
+    gain2, s2 = np.clip(fit[0], 0.2, 5) ** 2, max(noise_of(fit), 1 / 12 / 255**2) * n / (n - 8)
+    P = np.kron(window.place, np.eye(2))  # (2, 6) what the six motions do to the place
+    R = P @ np.linalg.inv(window.S)[:6]
+    C = R[:, :6] @ P.T
+    scharr = np.outer([3, 10, 3], [-1, 0, 1]) / 32
+    slope = (scharr**2).sum()
+    u2, v2 = (window.u**2).sum(), (window.v**2).sum()
+    energy = np.diag([slope * n, slope * n, slope * u2, slope * u2, slope * v2, slope * v2, n, 0]) * s2
+    S = np.linalg.inv(C)
+    false = S @ R @ energy @ R.T @ S
+    most = np.linalg.eigvals(C @ false).real.max()
+    true = np.linalg.inv(S - false * (0.9 / max(most, 0.9)))
+    return A @ (true @ S @ true) @ A.T * s2 * (1 + gain2) / gain2
+
+
+def inside(x):
+    return bool(((x >= -0.5) & (x <= [W - 0.5, H - 0.5])).all())
+
+
+def by_hand(src, dst, uv, uv_1, steps=7, epsilon=0.01, max_shift=2.0, n_levels=2, window=WINDOW):
+    rows = []
+    for b in range(len(uv)):
+        here, there = levels(src[b], 1, window)[0], levels(dst[b], n_levels, window)
+        for x, x_1 in zip(uv[b].numpy(), uv_1[b].numpy(), strict=True):
+            if not (inside(x) and inside(x_1)):
+                rows.append((x_1, np.eye(2), 0.0, np.eye(2), 0.0, False))
+                continue
+            w = Window(here, x, window)
+            start, eye = x_1 - (x - w.q), np.eye(2)
+            middle, A, fit, first = search(w, there[0], 1.0, start, eye, steps, epsilon)
+            began, size = first, np.linalg.det(A)
+            if n_levels > 1 and size > 1.5**2:
+                middle, A, fit, _ = search(w, there[1], 0.5, middle, A, steps, epsilon)
+            size, end = np.linalg.det(A), middle + A @ (x - w.q)
+            shift = np.linalg.norm(end - x_1)
+            shift = shift if np.isfinite(shift) else max_shift
+            ok = w.textured and 0.4**2 < size < 2.5**2 and 0.2 < fit[0] < 5 and shift <= max_shift
+            ok = ok and noise_of(fit) <= 1.2 * noise_of(began)
+            ok = ok and inside(middle)
+            if not ok:
+                end, A, fit = x_1, eye, began
+            rms = math.sqrt(fit[1]) / np.clip(fit[0], 0.2, 5)
+            rows.append((end, A, rms, covariance_by_hand(w, A, fit), shift, ok))
+    return [np.array(c).reshape(*uv.shape[:2], *np.shape(c[0])) for c in zip(*rows, strict=True)]
+
+
+def agrees(found, expected, rtol=1e-6):
+    for name, want in zip(found._fields, expected, strict=True):
+        have = getattr(found, name).numpy()
+        if name == "ok":
+            assert (have == want).all()
+        else:
+            np.testing.assert_allclose(have, want, rtol=rtol, atol=1e-8, err_msg=name)
+
+
+def near(uv, linear=TURNED, shift=(0.4, -0.7), spread=0.4, seed=3):
+    """Starts about where the windows are."""
+    middle = torch.tensor([(W - 1) / 2, (H - 1) / 2], dtype=uv.dtype)
+    A, t = torch.tensor(linear, dtype=uv.dtype), torch.tensor([shift, [-s for s in shift]], dtype=uv.dtype)
+    away = torch.from_numpy(np.random.default_rng(seed).uniform(-spread, spread, uv.shape))
+    return (uv - middle) @ A.T + middle + t[:, None] + away
+
+
+# --- what is found ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("steps", [0, 1, 2, 3, 6])
+def test_every_step_is_the_regression_of_one_window(steps):
+    src, dst = two_views(noise=0.01)
+    uv = places(2, 6, H, W, margin=14)
+    found = affine.register(*pyramids(src, dst), uv, near(uv), window=WINDOW, iterations=steps, epsilon_px=0.0)
+    expected = by_hand(src, dst, uv, near(uv), steps, 0.0)
+    agrees(found, expected)
+    assert expected[-1].mean() > 0.8 or not steps
+
+
+@pytest.mark.parametrize(("gain", "bias"), [(1.6, -0.3), (0.5, 0.2), (0.21, 0.0), (0.19, 0.0), (4.8, 0.1), (5.3, 0.0)])
+def test_contrast_is_taken_out_and_not_believed_beyond_five_times(gain, bias):
+    src, dst = two_views(gain=gain, bias=bias)
+    uv = places(2, 6, H, W, margin=14)
+    expected = by_hand(src, dst, uv, near(uv))
+    agrees(affine.register(*pyramids(src, dst), uv, near(uv), window=WINDOW), expected)
+    assert expected[-1].mean() > 0.8 if 0.2 < gain < 5 else expected[-1].mean() < 0.5
+
+
+@pytest.mark.parametrize("epsilon", [0.002, 0.03, 0.3])
+def test_a_step_that_moves_no_corner_further_than_epsilon_is_the_last(epsilon):
+    src, dst = two_views(noise=0.02, shortest=6.0)
+    uv = places(2, 8, H, W, margin=14)
+    options = {"window": WINDOW, "iterations": 12, "epsilon_px": epsilon}
+    agrees(affine.register(*pyramids(src, dst), uv, near(uv), **options), by_hand(src, dst, uv, near(uv), 12, epsilon))
+
+
+@pytest.mark.parametrize(("scale", "n_levels"), [(1.9, 2), (1.9, 1), (2.7, 2), (0.55, 2), (0.35, 2)])
+def test_magnified_windows_are_read_from_the_half_size_level_and_extreme_ones_not_believed(scale, n_levels):
+    src, dst = two_views([[scale, 0.1], [-0.1, scale]], (0.3, 0.2), shortest=14.0)
+    uv = torch.tensor([[[52.0, 44.0], [53.3, 45.2], [50.4, 43.6], [54.9, 46.0], [51.1, 46.8]]] * 2, dtype=torch.float64)
+    start = near(uv, [[scale, 0.1], [-0.1, scale]], (0.3, 0.2), spread=0.2)
+    options = {"window": WINDOW, "iterations": 12, "max_shift_px": 3.0}
+    found = affine.register(*pyramids(src, dst, n_levels), uv, start, **options)
+    expected = by_hand(src, dst, uv, start, 12, max_shift=3.0, n_levels=n_levels)
+    agrees(found, expected, rtol=1e-5)
+
+
+def test_a_search_that_ends_too_far_or_worse_or_outside_keeps_its_start():
+    src, dst = two_views(noise=0.03)
+    uv = torch.cat([places(2, 20, H, W, margin=14), places(2, 10, H, W, margin=1, seed=8)], 1)
+    start = near(uv, spread=5.0)
+    seen = set()
+    for limit in (0.5, 2.0, 50.0):
+        found = affine.register(*pyramids(src, dst), uv, start, window=WINDOW, max_shift_px=limit)
+        expected = by_hand(src, dst, uv, start, max_shift=limit)
+        agrees(found, expected, rtol=1e-3)  # where a search runs away, every rounding counts
+        ok = found.ok
+        assert (found.shift_px[ok] <= limit).all() and torch.equal(found.uv_1[~ok], start[~ok])
+        assert (found.linear[~ok] == torch.eye(2)).all()
+        seen.add(int(ok.sum()))
+    assert len(seen) == 3
+
+
+@pytest.mark.parametrize("window", [5, 9])
+@pytest.mark.parametrize(("noise", "contrast"), [(0.0, 1.0), (0.05, 0.3), (0.02, 0.02)])
+def test_the_covariance_in_windows_of_little_texture_and_much_noise(window, noise, contrast):
+    """No residual below that of 8-bit rounding is believed, and at most nine tenths of the texture taken for noise."""
+    src, dst = two_views(noise=noise / contrast)
+    src, dst = 0.5 + contrast * (src - 0.5), 0.5 + contrast * (dst - 0.5)
+    uv = places(2, 8, H, W, margin=14)
+    found = affine.register(*pyramids(src, dst, 1, window), uv, near(uv), window=window, iterations=2, epsilon_px=0.0)
+    agrees(found, by_hand(src, dst, uv, near(uv), 2, 0.0, n_levels=1, window=window), rtol=1e-5)
+    assert torch.linalg.eigvalsh(found.cov).min() > 0
+
+
+def test_nothing_is_found_without_texture_and_of_points_that_are_not_wanted():
+    src, dst = two_views()
+    src[0, :, :, 60:] = 0.3
+    uv = places(2, 12, H, W, margin=14)
+    start, views = near(uv), pyramids(src, dst)
+    found = affine.register(*views, uv, start, window=WINDOW)
+    flat = torch.zeros(2, 12, dtype=torch.bool)
+    flat[0] = uv[0, :, 0] > 67
+    assert flat.sum() > 2 and not found.ok[flat].any() and found.ok[1].float().mean() > 0.8
+    wanted = torch.arange(12) % 3 == torch.tensor([[0], [1]])
+    some = affine.register(*views, uv, start, wanted=wanted, window=WINDOW)
+    assert torch.equal(some.ok, found.ok & wanted) and torch.equal(some.uv_1[~wanted], start[~wanted])
+    for name in found._fields:
+        assert torch.equal(getattr(some, name)[wanted], getattr(found, name)[wanted]), name
+
+
+# --- one more step ---------------------------------------------------------------------------------------------------
+
+
+def test_the_differentiable_step_is_one_regression_from_where_it_is_put():
+    src, dst = two_views(gain=1.2, bias=-0.1)
+    uv = places(2, 6, H, W, margin=14)
+    uv_1 = near(uv)
+    linear = torch.eye(2, dtype=uv.dtype) + 0.1 * (
+        torch.from_numpy(np.random.default_rng(2).random((2, 6, 2, 2))) - 0.5
+    )
+    source, target = pyramids(src, dst, 1)
+    found = affine.step(source, target, uv, uv_1, linear, window=WINDOW)
+    for b in range(2):
+        here, there = levels(src[b], 1, WINDOW)[0], levels(dst[b], 1, WINDOW)[0]
+        for n in range(6):
+            x, A = uv[b, n].numpy(), linear[b, n].numpy()
+            w = Window(here, x, WINDOW)
+            middle = uv_1[b, n].numpy() - A @ (x - w.q)
+            J = w.reads(there, (np.zeros(2), np.array([W - 1, H - 1])), middle, A)
+            moved, turned = compose(middle, A, w.solve(J), w.h)
+            np.testing.assert_allclose(found[b, n].numpy(), moved + turned @ (x - w.q), atol=1e-8)
+
+
+def test_a_step_leaves_what_it_cannot_move():
+    src, dst = two_views()
+    src[:, :, :30] = 0.5
+    place = torch.tensor([[60.0, 12.0], [60, 60], [-0.6, 60], [60, 60], [math.nan, 60], [60, 60]]).double()
+    place_1 = torch.tensor([[61.0, 12.0], [61, 60], [50, 60], [W, 60], [62, 60], [61, 60]]).double()
+    linear = torch.eye(2).double().repeat(2, 6, 1, 1)
+    linear[:, 5, 0, 1] = math.nan
+    uv, uv_1 = place.expand(2, -1, -1), place_1.expand(2, -1, -1)
+    found = affine.step(*pyramids(src, dst, 1), uv, uv_1, linear, window=WINDOW)
+    moved = (found != uv_1).any(-1)
+    assert found.isfinite().all()
+    assert moved[:, [0, 1]].tolist() == [[False, True]] * 2
+    assert not moved[:, 5].any()
+
+
+# --- as a stage ------------------------------------------------------------------------------------------------------
+
+
+def given(uv, uv_1, valid):
+    """A search that finds what it is told to, with numbers that can be told apart."""
+    number = torch.arange(float(uv[..., 0].numel()), dtype=uv.dtype).view(uv.shape[:2])
+    cov = (5 + number)[..., None, None] * torch.eye(2, dtype=uv.dtype)
+    tracks = Tracks(uv_0=uv, uv_1=uv_1, error=0.1 * number, photometric=3 + number, cov=cov, valid=valid)
+    return lambda *_, **__: tracks
+
+
+@pytest.mark.parametrize("linear", [TURNED, [[1.9, 0.1], [-0.1, 1.9]]])
+@pytest.mark.parametrize("made", [False, True])
+def test_valid_tracks_are_registered_and_rejected_ones_say_how_far_they_went(linear, made):
+    big = linear is not TURNED
+    src, dst = two_views(linear, (0.3, 0.2), shortest=14.0 if big else 8.0, noise=0.01)
+    uv = places(2, 10, H, W, margin=40 if big else 14)
+    start = near(uv, linear, (0.3, 0.2), spread=0.3 if big else 1.2)
+    valid = torch.arange(20).view(2, 10) % 4 != 1
+    options = {"window": WINDOW, "iterations": 9, "epsilon_px": 0.05, "max_shift_px": 0.9}
+    images = (torch.zeros_like(src) if made else src, dst)
+    extra = {"pyramid_0": build_pyramid(src, 1, WINDOW)} if made else {}
+    tracks = lucas_kanade_affine(*images, uv, track=given(uv, start, valid), **options, **extra)
+    found, _, rms, cov, shift, ok = (torch.from_numpy(x) for x in by_hand(src, dst, uv, start, 9, 0.05, 0.9))
+    old = given(uv, start, valid)()
+    error = torch.where(valid & ~ok, torch.maximum(old.error, shift.clamp(max=0.9)), old.error)
+    want = {"uv_1": torch.where((valid & ok)[..., None], found, start), "error": error}
+    want |= {
+        "photometric": torch.where(valid, rms, old.photometric),
+        "cov": torch.where(valid[..., None, None], cov, old.cov),
+    }
+    for name, value in want.items():
+        torch.testing.assert_close(getattr(tracks, name), value, rtol=1e-5, atol=1e-7)
+    assert torch.equal(tracks.valid, valid) and torch.equal(tracks.uv_0, uv)
+    assert (valid & ok).sum() > 2 and (error > old.error).any() and (valid & ~ok & (error == old.error)).any()
+
+
+def test_the_search_before_it_is_given_the_start_the_pyramid_and_the_sizes():
+    src, dst = two_views()
+    uv, seen = places(2, 5, H, W, margin=14), []
+
+    def track(*images, **options):
+        seen.append((*images, options))
+        return lucas_kanade(*images, **options)
+
+    made = build_pyramid(src, 2, WINDOW)
+    run = lambda **options: lucas_kanade_affine(src, dst, uv, track=track, **options)  # noqa: E731
+    run(uv_1_init=uv + 1, pyramid_0=made, window=WINDOW, levels=2)
+    run(window=7, levels=3)
+    run()
+    (a, b, x, first), (*_, second), (*_, usual) = seen
+    assert a is src and b is dst and x is uv and set(first) == {"uv_1_init", "pyramid_0", "window", "levels"}
+    assert torch.equal(first["uv_1_init"], uv + 1) and first["pyramid_0"] is made
+    assert (first["window"], first["levels"]) == (WINDOW, 2) and (second["window"], second["levels"]) == (7, 3)
+    assert len(second["pyramid_0"].levels) == 3 and second["pyramid_0"].pad == build_pyramid(src, 1, 7).pad
+    assert (usual["window"], usual["levels"], usual["uv_1_init"]) == (21, 4, None)
+
+
+def test_the_usual_registration_takes_seven_steps_of_a_window_of_21_px_and_2_px_at_most():
+    src, dst = two_views(noise=0.02, shortest=6.0)
+    uv = places(2, 16, H, W, margin=22)
+    start = near(uv, spread=1.8)
+    sure = torch.ones(2, 16, dtype=torch.bool)
+    usual = lucas_kanade_affine(src, dst, uv, track=given(uv, start, sure))
+    plain = affine.register(*pyramids(src, dst, 2, 21), uv, start)
+    expected = by_hand(src, dst, uv, start, 7, 0.01, 2.0, window=21)
+    agrees(plain, expected, rtol=1e-5)
+    np.testing.assert_allclose(usual.uv_1.numpy(), expected[0], rtol=1e-6)
+    assert 0 < expected[-1].mean() < 1 and (expected[-2] > 1.8).any() and (expected[-2] < 2).any()
+
+
+def test_only_valid_tracks_have_a_derivative():
+    src, dst = two_views()
+    uv = places(2, 6, H, W, margin=14).requires_grad_()
+    valid = torch.arange(12).view(2, 6) % 2 == 0
+    options = {"track": given(uv.detach(), near(uv.detach()), valid), "window": WINDOW}
+    for leaf, call in (
+        (uv, lambda: lucas_kanade_affine(src, dst, uv, **options)),
+        (src, lambda: lucas_kanade_affine(src.requires_grad_(), dst, uv.detach(), **options)),
+        (dst, lambda: lucas_kanade_affine(src.detach(), dst.requires_grad_(), uv.detach(), **options)),
+    ):
+        tracks = call()
+        assert not tracks.cov.requires_grad and not tracks.error.requires_grad
+        for keep, some in ((valid, True), (~valid, False)):
+            (slope,) = torch.autograd.grad(tracks.uv_1[keep].sum(), leaf, retain_graph=True, allow_unused=True)
+            assert bool((slope != 0).any()) == some
+        with torch.no_grad():
+            assert torch.equal(call().uv_1, tracks.uv_1) and not call().uv_1.requires_grad
