@@ -150,9 +150,11 @@ def _used_first(problem: Problem) -> tuple[Problem, Problem]:
 def _translates(problem: Problem, at: Unknowns, noise: Tensor, far: Tensor, precision: Tensor, o: Options) -> Tensor:
     """Whether (B,) the cost is far below that of the best rotation without translation, under the same noise."""
 
-    def evaluate(at: Unknowns, held: float = RIGID) -> Normal:
+    free = at.turn.new_tensor([1.0] * 3 + [0.0] * 3 + [1.0] * 3)  # a trace of t would be a baseline to a far track
+
+    def evaluate(at: Unknowns) -> Normal:
         cost, H, g = normal(problem, at, noise, far, precision, o.kernel, o.bend)
-        return Normal(cost, H + torch.diag(H.new_tensor([0.0] * 3 + [held] * 3 + [0.0] * 3)), g)
+        return Normal(cost, H * free * free[:, None] + torch.diag(1 - free), g * free)
 
     still = Unknowns(Pose(at.T.R, torch.zeros_like(at.T.t)), at.turn)
     _, rotation = minimise(evaluate, still, o.steps, step=trial_step)
