@@ -75,6 +75,8 @@ def test_no_level_is_smaller_than_the_window_or_its_padding(window, least):
 
 def test_as_many_levels_are_made_as_asked_for():
     assert [len(build_pyramid(noise(1, 1, 90, 90), n, 5).levels) for n in (1, 2, 3, 4, 9)] == [1, 2, 3, 4, 4]
+    usual = build_pyramid(noise(1, 1, 180, 180), window=5), build_pyramid(noise(1, 1, 60, 60))
+    assert len(usual[0].levels) == 4 and usual[1].pad == 21 // 2 + REACH, "four, and windows of 21 px"
 
 
 @pytest.mark.parametrize(
@@ -138,7 +140,9 @@ def test_windows_begin_at_whole_pixels_with_the_rest_beside_them():
     x = torch.tensor([[8.25, 20.0], [11.75, 3.5]], dtype=torch.float64)
     first, fraction = found.locate(0, x, torch.tensor([1, 0]), 2, (GRAD_Y, GREY))
     assert fraction.tolist() == [[0.25, 0.0], [0.75, 0.5]]
-    whole = found.read(0, first, 3).view(2, 2, 3, 3)
+    read = found.read(0, first, 3)
+    assert read.shape == (2, 2, 9)
+    whole = read.view(2, 2, 3, 3)
     for k, plane in enumerate((GRAD_Y, GREY)):
         for n, (b, u, v) in enumerate(((1, 8, 11), (0, 20, 3))):
             left, top = u + found.pad - 2, v + found.pad - 2
