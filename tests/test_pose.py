@@ -11,14 +11,6 @@ from dhtorch.records import Camera, Samples, Tracks
 from dhtorch.stages.pose import SEARCH_POINTS, pnp_ransac
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 def pairs(batch, n, *, noise=0.0, outliers=0.0, planar=False, seed=0, dtype=torch.float64):
     """Near points seen by two different cameras; arguments of the seat, and the true pose."""
     g = torch.Generator().manual_seed(seed)
@@ -121,12 +113,12 @@ def by_poselib(xyz, uv, K):
 @pytest.mark.parametrize("peer", [by_opencv, by_poselib])
 @pytest.mark.parametrize("planar", [False, True])
 def test_no_less_accurate_than(peer, planar):
-    """500 points, 30 % outliers, 0.5 px: mean errors over 100 pairs, both sides near the statistical limit."""
-    args, T = pairs(100, 500, noise=0.5, outliers=0.3, planar=planar, dtype=torch.float32)
+    """500 points, 30 % outliers, 0.5 px: mean errors over 40 pairs, both sides near the statistical limit."""
+    args, T = pairs(40, 500, noise=0.5, outliers=0.3, planar=planar, dtype=torch.float32)
     rotation, translation = errors(pnp_ransac(*args), T)
     samples, tracks, _, camera_1, _ = args
     theirs = []
-    for b in range(100):
+    for b in range(40):
         K = np.eye(3)
         K[[0, 1], [0, 1]], K[:2, 2] = camera_1.f[b].numpy(), camera_1.c[b].numpy()
         theirs.append(peer(samples.xyz[b].double().numpy(), tracks.uv_1[b].double().numpy(), K))
@@ -138,8 +130,9 @@ def test_no_less_accurate_than(peer, planar):
 
 
 def test_covariance_is_that_of_the_errors():
-    """Normalised squared error over 300 trials: its mean over 6 lies within the 95 % band of chi² with 6 × 300."""
-    args, T = pairs(300, 60, noise=0.5, seed=5)
+    """Normalised squared error over 200 trials: its mean over 6 lies within the 95 % band of chi² with 6 × 200."""
+    args, T = pairs(200, 40, noise=0.5, seed=5)
+    args = (*args[:4], args[4][:, :30])
     fit = pnp_ransac(*args)
     assert fit.ok.all()
     delta = se3.compose(fit.T_1_from_0, se3.invert(T))
@@ -147,10 +140,124 @@ def test_covariance_is_that_of_the_errors():
     omega = 0.5 * torch.stack((R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]), -1)
     xi = torch.cat((omega, delta.t), -1)
     nees = covariance.mahalanobis(xi, fit.cov) ** 2 / 6
-    band = 1.96 * (2 / (6 * 300)) ** 0.5
+    band = 1.96 * (2 / (6 * 200)) ** 0.5
     assert abs(nees.mean() - 1) < band
-    snr = covariance.mahalanobis(fit.T_1_from_0.t, fit.cov[:, 3:, 3:])
-    torch.testing.assert_close(fit.t_snr, snr)
+
+
+def plain(args, fit, b, kernel=None, kernel_px=1.0):
+    """Of one pair, in numpy: Σ r² over the inliers, and H = Σ w Jᵀ J with J by differences."""
+    samples, tracks, _, camera, _ = args
+    inlier = fit.inlier[b]
+    X, uv = samples.xyz[b, inlier].double().numpy(), tracks.uv_1[b, inlier].double().numpy()
+
+    def residuals(xi):
+        T = se3.retract(fit.T_1_from_0[b : b + 1].to(torch.float64), torch.tensor(xi)[None])
+        Y = X @ T.R[0].numpy().T + T.t[0].numpy()
+        return camera.f[b].numpy() * Y[:, :2] / Y[:, 2:] + camera.c[b].numpy() - uv
+
+    J = [(residuals(h) - residuals(-h)) / 2e-6 for h in 1e-6 * np.eye(6)]
+    r2 = (residuals(np.zeros(6)) ** 2).sum(-1)
+    w = {None: 1 + 0 * r2, "cauchy": 1 / (1 + r2 / kernel_px**2)}[kernel]
+    return r2.sum(), np.einsum("ank,bnk,n->ab", J, J, w)
+
+
+@pytest.mark.parametrize("kernel", [None, "cauchy"])
+def test_what_is_said_about_a_pose_follows_from_its_residuals(kernel):
+    """rms, noise (2 n - 6 degrees of freedom), covariance and significance of the translation, from numpy."""
+    args, _ = pairs(3, 14, noise=0.7, outliers=0.2, seed=4)
+    fit = pnp_ransac(*args, polish_steps=40, kernel=kernel, kernel_px=0.8)
+    assert fit.ok.all() and (fit.n_inlier < 14).all()
+    for b in range(3):
+        n = int(fit.n_inlier[b])
+        total, H = plain(args, fit, b, kernel, 0.8)
+        np.testing.assert_allclose(float(fit.rms_px[b]), np.sqrt(total / n), rtol=1e-5)
+        np.testing.assert_allclose(float(fit.sigma_px[b]), np.sqrt(total / (2 * n - 6)), rtol=1e-5)
+        cov = total / (2 * n - 6) * np.linalg.inv(H)
+        scale = np.sqrt(np.outer(np.diag(cov), np.diag(cov)))
+        np.testing.assert_allclose(fit.cov[b].numpy() / scale, cov / scale, atol=1e-4)
+        t = fit.T_1_from_0.t[b].numpy()
+        snr = np.sqrt(t @ np.linalg.inv(fit.cov[b, 3:, 3:].numpy()) @ t)
+        np.testing.assert_allclose(float(fit.t_snr[b]), snr, rtol=1e-9)
+        assert torch.equal(fit.cov[b], fit.cov[b].mT)
+
+
+def test_residuals_that_are_rounding_are_not_believed():
+    args, _ = pairs(2, 30)
+    fit = pnp_ransac(*args)
+    assert (fit.sigma_px == 1e-6).all() and (fit.rms_px < 1e-6).all()
+    assert (fit.t_snr > 1e4).all() and fit.cov.diagonal(dim1=1, dim2=2).sqrt().amax() < 1e-6
+
+
+# -------------------------------------------------------------------------------------------------- options
+
+
+def test_an_inlier_is_nearer_than_the_threshold():
+    args, _ = pairs(1, 80)
+    uv_1 = args[1].uv_1.clone()
+    uv_1[0, 3, 0] += 1.9
+    uv_1[0, 9, 1] -= 2.1
+    uv_1[0, 20] += 1.4 * torch.tensor([1.0, -1.0], dtype=torch.float64)  # 1.98 px
+    uv_1[0, 33] += 1.6 * torch.tensor([-1.0, 1.0], dtype=torch.float64)  # 2.26 px
+    moved = with_points(args, uv_1=uv_1)
+    for limit, out in ((1.5, [3, 9, 20, 33]), (2.0, [9, 33]), (2.2, [33]), (3.0, [])):
+        fit = pnp_ransac(*moved, threshold_px=limit, kernel="geman_mcclure", kernel_px=0.05, polish_steps=6)
+        assert (~fit.inlier[0]).nonzero()[:, 0].tolist() == out and int(fit.n_inlier) == 80 - len(out)
+
+
+def test_so_many_inliers_are_asked_for_but_never_less_than_four():
+    for usable, least, ok in ((8, 8, True), (7, 8, False), (5, 5, True), (4, 5, False), (4, 1, True), (3, 1, False)):
+        args, _ = pairs(1, 20)
+        few = with_points(args, valid=torch.arange(20)[None] < usable)
+        fit = pnp_ransac(*few, min_inlier=least)
+        assert bool(fit.ok) is ok and (ok or int(fit.code) == PoseCode.TOO_FEW)
+    args, _ = pairs(1, 24)
+    anywhere = torch.rand(24, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 480
+    for right, ok in ((8, True), (7, False)):
+        uv_1 = torch.where((torch.arange(24) < right)[:, None], args[1].uv_1, anywhere)
+        fit = pnp_ransac(*with_points(args, uv_1=uv_1))
+        assert bool(fit.ok) is ok and int(fit.n_inlier) == right
+
+
+def test_each_refinement_brings_the_answer_nearer_to_the_optimum():
+    """Search on few draws; steps on the search's points, then on all."""
+    args, _ = pairs(12, 300, noise=2.0, seed=2)
+    args = (*args[:4], args[4][:, :1])
+    best = pnp_ransac(*args, threshold_px=60.0, local_optimisation=8, polish_steps=12)
+
+    def off(local, polish):
+        fit = pnp_ransac(*args, threshold_px=60.0, local_optimisation=local, polish_steps=polish)
+        return float((fit.T_1_from_0.t - best.T_1_from_0.t).norm(dim=-1).amax())
+
+    none, local, locals_, polish, polished = (off(*x) for x in ((0, 0), (1, 0), (2, 0), (0, 1), (0, 2)))
+    assert local < 0.02 * none and locals_ < 0.1 * local and polish < 0.02 * none and polished < 0.01 * polish
+
+
+def test_the_better_of_two_hypotheses_is_kept_whichever_comes_first():
+    """Three quarters of the points move one way, a quarter another; each motion is drawn once, in either order."""
+    args, T = pairs(2, 80, noise=0.1)
+    other = se3.retract(T, torch.tensor([[0.0, 0.02, 0.0, 0.2, 0.0, 0.0]], dtype=torch.float64).expand(2, 6))
+    Y = se3.apply(other, args[0].xyz)
+    seen = Y[..., :2] / Y[..., 2:] * args[3].f[:, None] + args[3].c[:, None]
+    uv_1 = torch.where((torch.arange(80) >= 60)[:, None], seen, args[1].uv_1)
+    triple = lambda a, b, c: [(a + 0.5) / 80, (b - 0.5) / 79, (c - 1.5) / 78]  # noqa: E731
+    first, second = triple(3, 25, 50), triple(61, 68, 76)
+    draws = torch.tensor([[first, second], [second, first]], dtype=torch.float64)
+    fit = pnp_ransac(*with_points(args, uv_1=uv_1)[:4], draws)
+    assert fit.inlier[:, :60].all() and (fit.n_inlier <= 70).all()
+    rotation, _ = errors(fit, T)
+    assert rotation.max() < 0.05
+
+
+@pytest.mark.parametrize("kernel", ["huber", "cauchy", "geman_mcclure"])
+def test_where_a_kernel_bends_is_an_option(kernel):
+    """Far beyond every residual it is no kernel, far below it is another one."""
+    args, _ = pairs(1, 60, noise=0.5)
+    plain, wide, narrow = (
+        pnp_ransac(*args, kernel=k, kernel_px=px, polish_steps=8).T_1_from_0.t
+        for k, px in ((None, 1.0), (kernel, 1e4), (kernel, 0.3))
+    )
+    torch.testing.assert_close(wide, plain, rtol=0, atol=1e-7)
+    assert (narrow - plain).norm() > 1e-5
 
 
 @pytest.mark.parametrize("kernel", ["huber", "cauchy", "geman_mcclure"])
@@ -290,14 +397,14 @@ def test_an_answer_does_not_depend_on_company(n, hypotheses, dtype):
 
 
 def test_gradient_of_the_whole_stage_at_exact_data():
-    args, _ = pairs(2, 9)
+    args, _ = pairs(1, 8)
     xyz, uv_1, f, c = (x.clone().requires_grad_() for x in (args[0].xyz, args[1].uv_1, args[3].f, args[3].c))
 
     def pose(xyz, uv_1, f, c):
         fit = pnp_ransac(*with_points(args, xyz=xyz, uv_1=uv_1, camera_1=Camera(f, c)))
         return fit.T_1_from_0.R, fit.T_1_from_0.t
 
-    assert torch.autograd.gradcheck(pose, (xyz, uv_1, f, c), eps=1e-5, atol=1e-5, rtol=1e-4)
+    assert torch.autograd.gradcheck(pose, (xyz, uv_1, f, c), eps=1e-5, atol=1e-5, rtol=1e-4, fast_mode=True)
 
 
 def test_gradient_with_noise_is_that_of_the_optimum_to_first_order():
@@ -328,21 +435,3 @@ def test_gradients_stay_finite_whatever_the_input():
         assert x.grad.isfinite().all()
     assert (leaves[0].grad[2:] == 0).all() and (leaves[0].grad[0, 1::2][fit.inlier[0, 1::2]] != 0).any()
     assert not fit.cov.requires_grad and not fit.rms_px.requires_grad
-
-
-def test_it_captures_as_one_graph():
-    args, _ = pairs(2, 40, noise=0.3, outliers=0.2)
-    torch._dynamo.reset()
-    captured = torch.compile(pnp_ransac, fullgraph=True, backend="eager")
-    for x, y in zip(fields(captured(*args)), fields(pnp_ransac(*args)), strict=True):
-        assert same(x, y)
-
-
-def test_it_maps_over_a_leading_dimension():
-    args, _ = pairs(6, 40, noise=0.3, outliers=0.2)
-    nested = tuple(
-        x.map(lambda v: v.unflatten(0, (3, 2))) if hasattr(x, "map") else x.unflatten(0, (3, 2)) for x in args
-    )
-    mapped = torch.func.vmap(lambda *a: fields(pnp_ransac(*a)))(*nested)
-    for x, y in zip(mapped, fields(pnp_ransac(*args)), strict=True):
-        torch.testing.assert_close(x.flatten(0, 1), y)
