@@ -6,7 +6,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: run test lint clean
+.PHONY: run test test-all everything lint clean
 
 run: $(VENV)/.installed
 	@echo "== dhtorch on the built-in scene"
@@ -16,6 +16,15 @@ test: $(VENV)/.installed-dev lint
 	@echo "== tests (real sequences: $${DHTORCH_DATA:-DHTORCH_DATA is unset, their tests skip})"
 	$(BIN)/python -m pytest -n 2 --dist worksteal $(ARGS)
 	@echo "== done; nothing was written outside $(VENV), the caches and temporary folders"
+
+# Everything that can be tested on one machine, in an environment of its own: the peers (Ray, Rerun, COLMAP, Open3D) are
+# large. Open3D needs Debian's libusb-1.0-0 and the pages are looked at in Debian's chromium.
+test-all:
+	@$(MAKE) VENV=$(if $(filter file,$(origin VENV)),.venv-all,$(VENV)) everything
+
+everything: $(VENV)/.installed-all lint
+	@echo "== all tests, the slow ones too (real sequences: $${DHTORCH_DATA:-DHTORCH_DATA is unset, their tests skip})"
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "" $(ARGS)
 
 lint: $(VENV)/.installed-dev
 	@echo "== lint, format, types"
@@ -35,5 +44,10 @@ $(VENV)/.installed-dev: pyproject.toml constraints.txt
 	$(PIP) -e ".[dev]"
 	@touch $@ $(VENV)/.installed
 
+$(VENV)/.installed-all: $(VENV)/.installed-dev
+	@echo "== installing into $(VENV), with all that is read or written by other packages"
+	$(PIP) -e ".[dev,peers,scale,view]"
+	@touch $@
+
 clean:
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache build dist
+	rm -rf $(VENV) .venv-all .pytest_cache .mypy_cache .ruff_cache build dist

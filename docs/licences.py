@@ -31,6 +31,8 @@ ELSEWHERE = {
     "hydra-submitit-launcher": "MIT",
     "rerun-sdk": "MIT OR Apache-2.0",
     "ray": "Apache-2.0",
+    "open3d-cpu": "MIT",
+    "pycolmap": "BSD-3-Clause",
     "mkdocs-material": "MIT",
     "mkdocstrings": "ISC",
 }
