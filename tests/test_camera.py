@@ -132,7 +132,7 @@ def test_lens_is_that_of_kornia_both_ways(lens):
     camera, uv = pinhole(lens, batch=2), grid(2)
     K, ideal = cam.to_matrix(camera), cam.undistort(camera, uv)
     close(cam.distort(camera, ideal), distort_points(ideal, K, camera.distortion))
-    close(ideal, undistort_points(uv, K, camera.distortion, num_iters=300), atol=1e-8)
+    close(ideal, undistort_points(uv, K, camera.distortion, num_iters=100), atol=1e-8)
     close(cam.distort(camera, ideal), uv)
 
 
@@ -269,6 +269,27 @@ def test_depth_pixels_follow_the_resize_rule_or_the_viewing_ray():
                 rays = cam.rays(camera, uv)[b].numpy()
                 theirs, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), *numpys(depth_camera, b))
                 close(found[b], torch.from_numpy(theirs[:, 0]))
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda one, uv: cam.project(one, torch.zeros(2, 35, 3)),
+        lambda one, uv: cam.unproject(one, uv, torch.ones(2, 35)),
+        lambda one, uv: cam.unproject(pinhole(batch=2), uv, torch.ones(2, 34)),
+        lambda one, uv: cam.unproject(pinhole(batch=2), uv, torch.ones(2, 1)),
+        cam.rays,
+        cam.distort,
+        cam.undistort,
+        cam.undistort_jacobian,
+        lambda one, uv: cam.from_matrix(torch.eye(3).expand(2, 3, 3), torch.zeros(1, 4)),
+        lambda one, uv: cam.from_matrix(torch.eye(4).expand(2, 4, 4)),
+    ],
+)
+def test_nothing_is_repeated_to_fit(call):
+    """One camera for the points of two views, or one depth for all points, is a mistake and no broadcast."""
+    with pytest.raises(ValueError, match=r"camera.*expected"):
+        call(pinhole(), grid(2))
 
 
 def test_whole_numbers_of_a_picture_are_taken_in_the_camera_s_precision():

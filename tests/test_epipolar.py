@@ -246,6 +246,20 @@ def test_lenses_of_the_cameras_play_no_part():
             assert torch.equal(a, b)
 
 
+def test_nothing_is_repeated_to_fit():
+    """One view's pixels, camera or points for two pairs, or one pixel for many, are mistakes and no broadcasts."""
+    uv, xyz, (a, b) = torch.zeros(2, 5, 2), torch.ones(2, 5, 3), (CAMERA_0, CAMERA_1)
+    for fn in (epipolar.triangulate, epipolar.depths):
+        for args in ((uv[:1], uv, a, b), (uv, uv[:, :1], a, b), (uv, uv, a[:1], b), (uv, uv, a, b[:1])):
+            with pytest.raises(ValueError, match=f"{fn.__name__}.*expected"):
+                fn(*args, MOTIONS)
+    for args in ((xyz[:1], uv, uv), (xyz, uv[:, :1], uv), (xyz, uv, uv[:, :1])):
+        with pytest.raises(ValueError, match=r"describe.*expected"):
+            epipolar.describe(*args, a, b, MOTIONS)
+    with pytest.raises(ValueError, match=r"point_jacobians.*expected"):
+        epipolar.point_jacobians(a[:1], xyz)
+
+
 # ------------------------------------------------------------------------------------------------ variance
 
 
