@@ -39,7 +39,7 @@ def frames(depth_hw=DEPTH_HW, seed=0, dtype=torch.float64):
     """Two frames whose depth has steps, holes and values that are none, with a confidence map."""
     rng = np.random.default_rng(seed)
     depth = rng.uniform(1.0, 1.05, (2, *depth_hw)) * np.where(np.arange(depth_hw[1]) < depth_hw[1] // 2, 1.3, 2.0)
-    depth[:, depth_hw[0] // 2 :] *= 1.2
+    depth[:, depth_hw[0] // 2 :] *= 1.12
     for odd in (0.0, np.nan, np.inf, -1.0):
         depth[rng.random(depth.shape) < 0.06] = odd
     depth[:, 3:9, 4:10] = 0.0

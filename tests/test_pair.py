@@ -1,21 +1,21 @@
-"""The whole method: exact scenes, hopeless input, company of other pairs, gradients, undistortion."""
+"""The whole method: exact scenes, hopeless input, company of other pairs, gradients; its parts alone: test_merge.py."""
 
 import os
 from functools import partial
 from pathlib import Path
 
+import box
 import pytest
 import torch
+import walls
 
-from dhtorch import data, pair, tree
+from dhtorch import data, tree
 from dhtorch.baselines import opencv
 from dhtorch.baselines.device_pose import device_pose, given_pose
 from dhtorch.codes import Flag, Gate, PoseCode, Source
-from dhtorch.data.synthetic import SyntheticRoom
-from dhtorch.evaluate import errors, holdout
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
-from dhtorch.pair import extend, merge
+from dhtorch.pair import METHODS, extend, merge
 from dhtorch.stages import triangulate
 
 ROOT = os.environ.get("DHTORCH_DATA")
@@ -28,41 +28,41 @@ OPENCV = partial(
 )
 
 
-def cut(frame, near):
-    return frame.replace(depth=torch.where(frame.depth <= near, frame.depth, torch.zeros_like(frame.depth)))
+HW = (144, 192)
+CAMERA = cam.resize(walls.CAMERA, walls.HW, HW)
+GAP = 4
 
 
 @pytest.fixture(scope="module")
-def room():
-    return SyntheticRoom(hw=(240, 320), n_frames=9, lidar="exact", image_noise=0.0)
-
-
-@pytest.fixture(scope="module")
-def views(room):
-    """Three pairs of the exact room, near returns only, and the exact depth of the anchors."""
-    gap = room.gap
-    pairs = [(cut(room[i], 2.0), cut(room[i + gap], 2.0)) for i in range(3)]
-    return pairs, [room[i] for i in range(3)]
+def views():
+    """Three pairs of an exact room, near returns only, and the same with all of them."""
+    full = [[walls.view(walls.at(k), HW, CAMERA) for k in (i, i + GAP)] for i in range(3)]
+    return [tuple(map(walls.near, pair)) for pair in full], full
 
 
 def together(pairs):
     return tree.collate([p[0] for p in pairs]), tree.collate([p[1] for p in pairs])
 
 
-def test_exact_scene_gives_pose_and_far_depth(views, room):
+def truth_of(frame, uv):
+    """Exact depth (1, N) of the points that an exact frame shows at pixels."""
+    _, depth = box.hit(frame.camera, frame.T_world_from_cam, frame.hw)
+    v, u = (uv[0] + 0.5).floor().long().flip(-1).unbind(-1)
+    return depth[v, u][None]
+
+
+def test_exact_scene_gives_pose_and_far_depth(views):
     pairs, full = views
-    for k, ((frame_0, frame_1), whole) in enumerate(zip(pairs, full, strict=True)):
+    for (frame_0, frame_1), whole in zip(pairs, full, strict=True):
         trace = {}
-        estimate = extend(frame_0, frame_1, n=1024, trace=trace)
-        exact, surface = room.truth(k)["depth"], room.truth(k)["surface"]
-        truth = holdout.truth_at(whole.replace(depth=exact, depth_camera=None), estimate.uv)
-        odd = surface[0][tuple((estimate.uv[0] + 0.5).floor().long().flip(-1).unbind(-1))][None] != 0
-        points = errors.select(estimate, holdout.candidates(trace["samples"], truth, 2.0, excluded=odd))
-        found = errors.measure(points)
-        assert found["n_kept"] > 100 and found["median_rel"] < 0.03 and found["wrong_share"] < 0.03, found
-        T = se3.relative(whole.T_world_from_cam, room[k + room.gap].T_world_from_cam)
+        estimate = extend(frame_0, frame_1, n=512, trace=trace)
+        far = estimate.keep & (trace["samples"].depth == 0)
+        error = ((estimate.depth - truth_of(whole[0], estimate.uv)) / truth_of(whole[0], estimate.uv)).abs()[far]
+        T = se3.relative(*(f.T_world_from_cam for f in whole))
         off = se3.compose(trace["fit"].T_1_from_0, se3.invert(T).to(torch.float32))
-        assert se3.rotation_angle(off.R) < 3e-3 and off.t.norm() < 6e-3
+        found = int(far.sum()), float(error.median()), float(se3.rotation_angle(off.R)), float(off.t.norm())
+        assert found[0] > 300 and found[1] < 0.03 and (error > 0.1).float().mean() < 0.04, found
+        assert found[2] < 6e-3 and found[3] < 2e-2, found
 
 
 def test_map_takes_the_sensor_first(views):
@@ -101,9 +101,9 @@ def test_an_answer_does_not_depend_on_its_company(views):
 def test_threads_change_rounding_at_most(views):
     pairs = together(views[0])
     torch.set_num_threads(2)
-    two = extend(*pairs, n=512)
+    two = extend(*pairs, n=200)
     torch.set_num_threads(1)
-    one = extend(*pairs, n=512)
+    one = extend(*pairs, n=200)
     both = one.keep & two.keep
     assert ((one.depth - two.depth).abs()[both] <= 1e-3 * one.sigma[both]).all()
     differ = one.gate != two.gate
@@ -142,14 +142,16 @@ def test_hopeless_input_is_silent_with_a_reason(views, what):
         frame_0 = frame_0.replace(depth=torch.nan * frame_0.depth)
     if what == "one point":
         depth = torch.zeros_like(frame_0.depth)
-        depth[0, 120, 160] = 1.5
+        depth[0, 60, 80] = 1.5
         frame_0 = frame_0.replace(depth=depth)
     if what in ("black", "white"):
         frame_0 = frame_0.replace(image=torch.full_like(frame_0.image, 0 if what == "black" else 255))
     if what == "identical":
         frame_1 = frame_0
     if what == "unrelated":
-        frame_1 = frame_1.replace(image=torch.randint_like(frame_1.image, 0, 256))
+        frame_1 = frame_1.replace(
+            image=frame_1.image[..., torch.randperm(HW[1], generator=torch.Generator().manual_seed(0))]
+        )
     if what == "swapped":
         frame_0, frame_1 = frame_1, other
     trace = {}
@@ -168,57 +170,29 @@ def test_hopeless_input_is_silent_with_a_reason(views, what):
         assert not estimate.keep.any(), "no baseline, no answer"
 
 
-def test_pure_rotation_is_answered_only_by_noise_and_counted():
-    """The paper's gate trusts parallax from a noisy pose; what it still answers is reported, here only bounded."""
-    room = SyntheticRoom(hw=(240, 320), n_frames=4, path="rotation", lidar="exact", image_noise=0.0)
-    estimate = extend(cut(room[0], 2.0), cut(room[2], 2.0), n=512)
-    assert estimate.depth[estimate.keep].isfinite().all()
-    assert estimate.keep.float().mean() < 0.5
-
-
-def test_wrong_shapes_raise(views):
-    (frame_0, frame_1), *_ = views[0]
-    with pytest.raises(ValueError, match="expected"):
-        extend(frame_0, tree.collate([frame_1, frame_1]))
-    with pytest.raises(ValueError, match="expected"):
-        extend(frame_0.replace(depth=frame_0.depth[0]), frame_1)
+def test_a_pure_rotation_is_not_answered():
+    T = walls.at(0)
+    turned = se3.Pose(T.R @ se3.exp(torch.tensor([[0.01, -0.04, 0.02, 0, 0, 0]]).double()).R, T.t)
+    frame_0, frame_1 = (walls.near(walls.view(pose, HW, CAMERA)) for pose in (T, turned))
+    for name in ("paper", "map"):
+        assert not METHODS[name](frame_0, frame_1, n=256).keep.any(), name
 
 
 # ---------------------------------------------------------------------------------------------------- pose, cameras
 
 
-def test_a_given_pose_replaces_seat_five(views, room):
+def test_a_given_pose_replaces_seat_five(views):
     (frame_0, frame_1), *_ = views[0]
     n = 512
     fit = device_pose(frame_0, frame_1, n)
     estimate = extend(frame_0.replace(depth=0 * frame_0.depth), frame_1, n=n, fit=fit)
-    z = room.truth(0)["depth"][0][tuple((estimate.uv[0] + 0.5).floor().long().flip(-1).unbind(-1))]
-    error = ((estimate.depth[0] - z).abs() / z)[estimate.keep[0]]
-    assert estimate.keep.sum() > 100 and error.median() < 0.01
+    z = truth_of(frame_0, estimate.uv)
+    error = ((estimate.depth - z).abs() / z)[estimate.keep]
+    assert estimate.keep.sum() > 450 and error.median() < 0.025
     with pytest.raises(ValueError, match="T_world_from_cam"):
         device_pose(frame_0.replace(T_world_from_cam=None), frame_1, n)
     lost = given_pose(fit.T_1_from_0.map(lambda x: x * torch.nan), n)
     assert not lost.ok.any() and not extend(frame_0, frame_1, n=n, fit=lost).keep.any()
-
-
-def test_undistorted_tracks_are_ideal_pixels_with_covariance():
-    camera = cam.Camera(
-        torch.tensor([[517.3, 516.5]], dtype=torch.float64),
-        torch.tensor([[318.6, 255.3]], dtype=torch.float64),
-        torch.tensor([[0.262383, -0.953104, -0.005358, 0.002628, 1.163314]], dtype=torch.float64),
-    )
-    uv = torch.rand(1, 50, 2, dtype=torch.float64) * torch.tensor([639.0, 479.0])
-    zero = torch.zeros(1, 50, dtype=torch.float64)
-    cov = torch.eye(2, dtype=torch.float64).expand(1, 50, 2, 2)
-    tracks = pair.Tracks(uv, uv, zero, zero, cov, zero == 0)
-    ideal = pair.undistort_tracks(tracks, camera, camera)
-    assert torch.allclose(cam.distort(camera, ideal.uv_1), uv, atol=1e-6) and ideal.valid.all()
-    step = torch.tensor([1e-4, 0.0], dtype=torch.float64)
-    moved = (cam.undistort(camera, uv + step) - cam.undistort(camera, uv - step)) / 2e-4
-    J = cam.undistort_jacobian(camera, ideal.uv_1)
-    assert torch.allclose(J[..., 0], moved, atol=1e-5)
-    assert torch.allclose(ideal.cov, J @ J.mT)
-    assert pair.undistort_tracks(tracks, cam.ideal(camera), cam.ideal(camera)) is tracks
 
 
 # ---------------------------------------------------------------------------------------------------- gradients
@@ -227,7 +201,7 @@ def test_undistorted_tracks_are_ideal_pixels_with_covariance():
 def gradients_are_finite(frame_0, frame_1, near, n):
     image_0 = (frame_0.image.float() / 255).requires_grad_()
     image_1 = (frame_1.image.float() / 255).requires_grad_()
-    depth = cut(frame_0, near).depth.clone().requires_grad_()
+    depth = walls.near(frame_0, near).depth.clone().requires_grad_()
     f, c = frame_0.camera.f.clone().requires_grad_(), frame_1.camera.c.clone().requires_grad_()
     a = frame_0.replace(image=image_0, depth=depth, camera=frame_0.camera.replace(f=f))
     b = frame_1.replace(image=image_1, camera=frame_1.camera.replace(c=c))
@@ -239,8 +213,8 @@ def gradients_are_finite(frame_0, frame_1, near, n):
         assert x.grad.abs().max() > 0, name
 
 
-def test_gradients_reach_images_near_depth_and_intrinsics(views, room):
-    gradients_are_finite(room[0], room[room.gap], 2.0, 256)
+def test_gradients_reach_images_near_depth_and_intrinsics(views):
+    gradients_are_finite(*views[1][0], walls.NEAR, 256)
 
 
 @pytest.mark.parametrize(
@@ -263,7 +237,7 @@ def test_scaling_the_near_depth_scales_the_answer(views):
     assert both.sum() > 50 and torch.allclose(ratio, torch.full_like(ratio, 1.1), rtol=1e-2)
 
 
-def test_opencv_fills_the_same_seats(views, room):
+def test_opencv_fills_the_same_seats(views):
     (frame_0, frame_1), *_ = views[0]
     ours, theirs = extend(frame_0, frame_1, n=1024), OPENCV(frame_0, frame_1, n=1024)
     both = ours.keep & theirs.keep
