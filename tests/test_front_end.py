@@ -11,11 +11,15 @@ from dhtorch.geometry import lookup
 from dhtorch.geometry.lookup import luma, nearest, patches
 from dhtorch.records import Camera, Frame
 from dhtorch.stages.backproject import backproject
-from dhtorch.stages.holes import classify, min_eigenvalue, route
+from dhtorch.stages.holes import classify, min_eigenvalue
 from dhtorch.stages.sample import grid, spiral, vogel
 
 HW = (96, 128)
 SAMPLERS = [spiral, grid, vogel]
+
+
+def rand(*shape, seed=0):
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
 
 
 def make_frame(depth=None, image=None, conf=None, **changes):
@@ -63,12 +67,6 @@ def test_spiral_arms_are_half_a_turn_apart_and_foveation_flattens():
     assert torch.allclose(first, -second, atol=1e-3)
     inner = [(spiral((400, 400), 1000, foveation=g) - 199.5).norm(dim=1).lt(60).float().mean() for g in (0.5, 1.0, 2.0)]
     assert inner[0] < inner[1] < inner[2]
-    with pytest.raises(ValueError, match="foveation"):
-        spiral(HW, 10, foveation=0)
-    with pytest.raises(ValueError, match="gaze"):
-        spiral(HW, 10, gaze=(500.0, 3.0))
-    with pytest.raises(ValueError, match="margin_px"):
-        grid(HW, 10, margin_px=80)
 
 
 def test_vogel_and_grid_are_uniform():
@@ -79,7 +77,7 @@ def test_vogel_and_grid_are_uniform():
 
 
 def test_patches_agree_with_slices_and_shift_inside():
-    image = torch.rand(2, 3, 20, 30)
+    image = rand(2, 3, 20, 30)
     corner = torch.tensor([[[4, 5], [-3, 18], [29, 0]], [[0, 0], [25, 15], [7, 7]]])
     out = patches(image, corner, 5)
     assert torch.equal(out[0, 0], image[0, :, 5:10, 4:9])
@@ -91,7 +89,7 @@ def test_patches_agree_with_slices_and_shift_inside():
 
 
 def test_luma_is_opencv_grey():
-    rgb = torch.randint(0, 256, (1, 3, 20, 30), dtype=torch.uint8)
+    rgb = (256 * rand(1, 3, 20, 30)).to(torch.uint8)
     ours = luma(rgb, 1)[0, 0].numpy() * 255
     theirs = cv2.cvtColor(rgb[0].permute(1, 2, 0).numpy(), cv2.COLOR_RGB2GRAY)
     assert np.abs(ours - theirs).max() <= 0.51  # OpenCV rounds to integers
@@ -104,7 +102,7 @@ def test_nearest_reads_the_nearest_pixel_and_knows_the_border():
 
 
 def test_backprojection_is_the_pinhole_formula():
-    depth = torch.rand(1, *HW) + 1
+    depth = rand(1, *HW) + 1
     frame = make_frame(depth)
     uv = spiral(HW, 300)
     s = backproject(frame, uv)
@@ -145,7 +143,7 @@ def test_search_takes_the_nearest_return_of_a_sparse_map():
 
 
 def test_depth_of_its_own_resolution_and_camera():
-    small = torch.rand(1, 24, 32) + 1
+    small = rand(1, 24, 32) + 1
     uv = spiral(HW, 200)
     coarse = backproject(make_frame(small), uv)
     pixel = ((uv + 0.5) / 4 - 0.5 + 0.5).floor().long()
@@ -185,16 +183,6 @@ def test_flags_confidence_and_limits():
     assert s.depth[0, 5] == 4 and s.xyz[0, 5].isnan().all()
 
 
-@pytest.mark.parametrize("block", [3, 5, 7])
-def test_trackability_is_opencvs_minimum_eigenvalue(block):
-    image = torch.rand(1, 1, *HW)
-    uv = spiral(HW, 400, margin_px=10)
-    ours = min_eigenvalue(image, uv[None], block=block)[0]
-    theirs = torch.from_numpy(cv2.cornerMinEigenVal(image[0, 0].numpy(), block, ksize=3))
-    pixel = (uv + 0.5).floor().long()
-    assert torch.allclose(ours, theirs[pixel[:, 1], pixel[:, 0]], atol=2e-6, rtol=1e-4)
-
-
 @pytest.mark.parametrize("colour", [1, 3])
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
 def test_summaries_are_those_of_the_patches_for_planar_and_interleaved_pictures(monkeypatch, colour, dtype):
@@ -228,7 +216,7 @@ def test_a_spiral_asked_for_twice_is_the_same_and_each_is_its_own():
     assert torch.equal(spiral(HW, 50), spiral(HW, 50, dtype=torch.float64).float()) and spiral(HW, 50).abs().min() > 0
 
 
-def test_every_hole_has_one_class_and_a_route():
+def test_every_hole_has_one_class():
     image = torch.randint(60, 200, (1, 3, *HW), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     image[:, :, :30, :30], image[:, :, :30, 60:], image[:, :, 60:, :40] = 2, 255, 128
     depth = torch.zeros(1, *HW)
@@ -239,12 +227,11 @@ def test_every_hole_has_one_class_and_a_route():
     expected = [Hole.TOO_DARK, Hole.TOO_BRIGHT, Hole.LOW_TEXTURE, Hole.TRACKABLE_NO_LIDAR, Hole.NONE, Hole.AT_BORDER]
     assert s.hole[0].tolist() == expected
     assert set(ROUTE_OF_HOLE) == set(names(Hole)) and set(ROUTE_OF_HOLE.values()) <= set(names(Route))
-    assert route(s.hole)[0, 3] == Route.TRIANGULATE and route(s.hole)[0, 0] == Route.CHANGE_EXPOSURE
 
 
 def test_cost_does_not_grow_with_the_image(monkeypatch):
     """The stages read patches only: pixels away from every sample may hold anything without changing the answer."""
-    frame = make_frame(image=torch.rand(1, 3, *HW))
+    frame = make_frame(image=rand(1, 3, *HW))
     uv = torch.tensor([[60.0, 50.0], [64.0, 52.0]])
     a = classify(frame, backproject(frame, uv))
     image, depth = torch.full_like(frame.image, torch.nan), torch.full_like(frame.depth, torch.nan)
