@@ -117,11 +117,93 @@ def test_nine_scenes_cannot_promise_five_per_cent():
     assert control.plug_in(scenes, 0.05).threshold is not None
 
 
-@pytest.mark.parametrize(("target", "n"), [(0.05, 100), (0.1, 100), (0.1, 25), (0.05, 19)])
-def test_conformal_keeps_its_promise_for_the_next_scene(target, n):
+def loop_confident(scenes, target, confidence):
+    """The lowest threshold at and above which scipy's p-value is small enough."""
+    stats = pytest.importorskip("scipy.stats")
+    n, best = len(scenes), None
+    for threshold in reversed(every_threshold(scenes)):
+        mean = sum(sum(table(p, threshold)) / p.keep.numel() for p in scenes) / n
+        divergence = stats.entropy([mean, 1 - mean], [target, 1 - target])
+        hoeffding = math.exp(-n * divergence) if mean < target else 1.0
+        bentkus = math.e * stats.binom.cdf(math.ceil(n * mean - 1e-9), n, target)
+        if min(hoeffding, bentkus) > 1 - confidence:
+            return best
+        best = threshold
+    return best
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize(("target", "confidence"), [(0.1, 0.5), (0.15, 0.8), (0.3, 0.95), (0.4, 0.2)])
+def test_the_control_with_confidence_equals_plain_loops(target, confidence, seed):
+    scenes = scenes_of(14, points=10, seed=seed)
+    found = control.conformal(scenes, target, confidence=confidence)
+    assert found.threshold == loop_confident(scenes, target, confidence)
+    assert (found.target, found.confidence, found.n) == (target, confidence, 14)
+    assert found.bound == (None if found.threshold is None else pytest.approx(1 - confidence))
+    assert found.needed == control.scenes_needed(target, confidence=confidence)
+
+
+def equal_errors(error, n, scenes=2):
+    """Scenes of n answers of the same error and of as many silent candidates."""
+    depth = torch.cat((torch.full((n,), 4 * (1 + error)), torch.full((n,), math.nan))).double()
+    return [errors.points(depth, torch.full_like(depth, 4.0)) for _ in range(scenes)]
+
+
+def test_a_bound_of_exactly_the_target_is_accepted():
+    assert control.plug_in(equal_errors(0.25, 8), 0.25).threshold == 1
+    assert control.plug_in(equal_errors(0.25, 8), 0.2499).threshold is None
+    scenes = equal_errors(0.5, 8, scenes=3)  # loss ½ of ½ the candidates: (3/4 + 1) / 4
+    assert control.conformal(scenes, 0.4375).threshold == 1 and control.conformal(scenes, 0.4374).threshold is None
+    found = control.conformal(scenes, 0.4375)
+    assert (found.bound, found.risk, found.coverage, found.needed) == (0.4375, 0.25, 0.5, 2)
+    found = control.plug_in(scenes, 0.5)
+    assert (found.bound, found.risk, found.coverage) == (0.5, 0.5, 0.5)
+    assert (found.needed, found.confidence, found.target, found.n) == (None, None, 0.5, 3)
+
+
+def test_one_error_is_never_worse_than_one():
+    assert control.plug_in(equal_errors(7.0, 4), 0.99).threshold is None
+    assert control.conformal(equal_errors(7.0, 4, scenes=9), 0.55).bound == pytest.approx((9 * 0.5 + 1) / 10)
+
+
+def test_silent_scenes_count_with_risk_0_and_scenes_without_candidates_not_at_all():
+    silent, empty = errors.points(torch.full((5,), math.nan), torch.ones(5)), errors.points(*[torch.zeros(0)] * 2)
+    found = control.plug_in([*equal_errors(0.25, 8), silent, empty], 0.3)
+    risks = [0.25, 0.25, 0.0]
+    assert found.n == 3 and found.risk == pytest.approx(0.5 / 3) and found.coverage == pytest.approx(1 / 3)
+    assert found.bound == pytest.approx(0.5 / 3 + statistics.stdev(risks) / math.sqrt(3))
+
+
+def test_thinned_thresholds_are_spread_evenly_from_the_lowest_score_to_the_highest(monkeypatch):
+    monkeypatch.setattr(control, "MOST_THRESHOLDS", 5)
+    n = 17
+    for first_good, expected in ((0, 0), (1, 4), (4, 4), (5, 8), (13, 16), (16, 16)):
+        wrong = torch.arange(n) < first_good
+        scene = errors.points(torch.where(wrong, 9.0, 1.0), torch.ones(n), torch.arange(float(n)))
+        assert control.plug_in([scene, scene], 0.01).threshold == expected
+    monkeypatch.setattr(control, "MOST_THRESHOLDS", 17)
+    wrong = torch.arange(n) < 5
+    scene = errors.points(torch.where(wrong, 9.0, 1.0), torch.ones(n), torch.arange(float(n)))
+    assert control.plug_in([scene, scene], 0.01).threshold == 5, "as many as there are: none is left out"
+
+
+def test_the_reason_is_said_in_words():
+    assert control.plug_in(equal_errors(0.0, 8), 0.1).why == "score ≥ 1 answers 50.0% of the candidates"
+    few = control.conformal(equal_errors(0.0, 8), 0.1).why
+    assert few == "2 scenes are too few: a target of 0.1 takes at least 9"
+    bad = control.conformal(equal_errors(9.0, 8, scenes=9), 0.1)
+    assert bad.why == "no threshold meets 0.1 on these 9 scenes" and bad.needed == 9 and bad.bound is None
+
+
+def test_no_scene_is_no_evidence():
+    assert control.p_value(0.0, 0, 0.1) == 1 and control.p_value(0.0, 1, 0.5) == 0.5
+
+
+@pytest.mark.parametrize(("target", "n", "worlds"), [(0.1, 100, 30), (0.1, 25, 60), (0.05, 19, 60)])
+def test_conformal_keeps_its_promise_for_the_next_scene(target, n, worlds):
     losses, none = [], 0
-    for world in range(100):
-        scenes = world_of(n + 20, seed=1000 + world)
+    for world in range(worlds):
+        scenes = world_of(n + 20, points=20, seed=1000 + world)
         found = control.conformal(split(scenes[:n]), target)
         none += found.threshold is None
         losses.append(mean_loss(scenes[n:], found.threshold))
@@ -131,10 +213,11 @@ def test_conformal_keeps_its_promise_for_the_next_scene(target, n):
         assert none == 0 and statistics.mean(losses) > 0.5 * target, "a control that is silent keeps any promise"
 
 
-@pytest.mark.parametrize(("target", "confidence"), [(0.1, 0.9), (0.15, 0.8)])
-def test_with_confidence_few_worlds_exceed_the_target(target, confidence):
-    judge, worlds = world_of(1500, seed=5), 100
-    found = [control.conformal(scenes_of(100, seed=2000 + w), target, confidence=confidence) for w in range(worlds)]
+def test_with_confidence_few_worlds_exceed_the_target():
+    judge, worlds, target, confidence = world_of(1500, points=20, seed=5), 40, 0.15, 0.8
+    found = [
+        control.conformal(scenes_of(60, points=20, seed=2000 + w), target, confidence=confidence) for w in range(worlds)
+    ]
     exceeded = sum(mean_loss(judge, f.threshold) > target for f in found)
     allowed = 1 - confidence
     assert exceeded / worlds <= allowed + 2 * math.sqrt(allowed * (1 - allowed) / worlds)
@@ -152,14 +235,14 @@ def test_with_confidence_the_lowest_threshold_of_small_p_value_is_taken():
 
 def test_plug_in_holds_in_the_mean_and_promises_no_scene():
     realised, over = [], 0
-    for world in range(60):
-        scenes = scenes_of(40, seed=3000 + world)
+    for world in range(40):
+        scenes = scenes_of(40, points=20, seed=3000 + world)
         threshold = control.plug_in(scenes[:20], 0.1).threshold
         risks = [risk.realised(p, threshold) or 0.0 for p in scenes[20:]]
         realised.append(statistics.mean(risks))
         over += sum(r > 0.1 for r in risks)
     assert statistics.mean(realised) <= 0.1
-    assert over > 0.1 * 60 * 20, "hostile scenes exceed the target: the control is about the mean over scenes"
+    assert over > 0.1 * 40 * 20, "hostile scenes exceed the target: the control is about the mean over scenes"
 
 
 def binomial_cdf(k, n, p):

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 import torch
 from box import BOX, HW, off_wall, walk
+from room_truth import room_distance
 
-from dhtorch import integrate
 from dhtorch.baselines.device_pose import given_pose
 from dhtorch.codes import Source
-from dhtorch.data.room import furnished_room
 from dhtorch.data.synthetic import SyntheticRoom
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import cells, se3
@@ -90,19 +89,6 @@ def test_colours_are_those_of_the_pictures(box):
     ]
     error = (surface.features - (torch.stack(tone, -1) * 0.5 + 0.5)).abs()
     assert float(error.median()) < 0.02 and float(error.quantile(0.95)) < 0.08
-
-
-def room_distance(xyz):
-    """Distance (P,) of points from the nearest surface of the built-in room, exact."""
-    solids = furnished_room().solids
-    best = torch.full((len(xyz),), torch.inf, dtype=torch.float64)
-    for k in range(len(solids.each)):
-        q = (xyz.double() - solids.centre[k].double()) @ solids.R[k].double()
-        half = solids.half[k].double()
-        out = q.abs() - half
-        flat = (out.clamp_min(0).norm(dim=-1) + out.amax(-1).clamp_max(0)).abs()
-        best = torch.minimum(best, (q.norm(dim=-1) - half[0]).abs() if solids.ball[k] else flat)
-    return best
 
 
 @pytest.fixture(scope="module")
@@ -479,51 +465,7 @@ def test_recovered_points_widen_the_map_beyond_the_sensor(walked):
     assert torch.equal(again.distance, both.distance) and torch.equal(again.key, both.key)
 
 
-# ---------------------------------------------------------------------------------------------------------------- cells
-
-
-def test_cells_number_places_in_order_and_back():
-    ijk = torch.randint(-cells.REACH, cells.REACH, (500, 3), generator=torch.Generator().manual_seed(0))
-    key = cells.pack(ijk)
-    assert torch.equal(cells.unpack(key), ijk)
-    rows = sorted(map(tuple, ijk.tolist()))
-    assert [tuple(r) for r in cells.unpack(key.sort().values).tolist()] == rows
-    assert cells.pack(torch.tensor([[0, 0, cells.REACH], [-cells.REACH - 1, 0, 0]])).tolist() == [cells.NOWHERE] * 2
-    xyz = torch.tensor([[0.1, -0.1, 0.0], [math.nan, 0, 0], [math.inf, 0, 0], [0.15, -0.05, 0.1], [1e12, 0, 0]])
-    assert cells.unpack(cells.occupied(xyz, 0.2)).tolist() == [[0, -1, 0]]
-    with pytest.raises(ValueError, match="side is 0"):
-        cells.occupied(xyz, 0)
-
-
-def test_components_are_those_of_a_flood_fill():
-    ndimage = pytest.importorskip("scipy.ndimage")
-    for n, size in ((0, 5), (1, 5), (300, 9), (2000, 24), (3000, 14)):
-        ijk = torch.randint(0, size, (n, 3), generator=torch.Generator().manual_seed(n))
-        key = cells.pack(ijk).unique()
-        label = cells.components(key)
-        grid = np.zeros((size,) * 3, bool)
-        place = tuple(cells.unpack(key).T.numpy())
-        grid[place] = True
-        theirs, count = ndimage.label(grid, np.ones((3, 3, 3)))
-        assert len(label.unique()) == count == len(set(zip(theirs[place].tolist(), label.tolist(), strict=True)))
-
-
-def test_a_long_chain_of_cells_is_one_component():
-    spiral = torch.tensor([[round(9 * math.cos(k / 9)), round(9 * math.sin(k / 9)), k] for k in range(3000)])
-    assert int(cells.components(cells.pack(spiral).unique()).max()) == 0
-    broken = torch.cat((spiral[:1000], spiral[1001:2000], spiral[2001:]))
-    assert cells.components(cells.pack(broken).unique()).unique().tolist() == [0, 1, 2]
-
-
-def test_neighbours_touch_by_corners():
-    key = cells.pack(torch.tensor([[0, 0, 0], [5, 5, 5], [1, 1, 1]])).unique()
-    other = cells.pack(torch.tensor([[1, 1, 1], [7, 5, 5]])).unique()
-    assert cells.near(key, other).tolist() == [True, True, False]
-    assert not cells.near(key, other[:0]).any() and cells.near(key[:0], other).shape == (0,)
-
-
 def test_memory_is_that_of_the_blocks(room):
     _, volume, _ = room
     assert volume.bytes == len(volume.key) * (8 + 512 * (4 + 2 * 4 + (1 + 3) * 2))
     assert volume.bytes < 30 * 2**20, "a side of the room at 2 cm"
-    assert isinstance(integrate.__doc__, str)

@@ -41,13 +41,6 @@ def test_pool_adjacent_violators_equals_the_min_max_formula(n):
         assert found == pytest.approx(brute_isotonic(torch.tensor(y).tolist(), torch.tensor(w).tolist()), abs=1e-6)
 
 
-def test_pool_adjacent_violators_equals_scikit_learn():
-    sklearn = pytest.importorskip("sklearn.isotonic")
-    y, w = uniform(3000) + torch.linspace(0, 1, 3000, dtype=torch.float64), uniform(3000, seed=1) + 0.01
-    expected = sklearn.isotonic_regression(y.numpy(), sample_weight=w.numpy())
-    assert monotone.pool_adjacent_violators(y, w).tolist() == pytest.approx(expected.tolist(), abs=1e-12)
-
-
 def test_a_table_runs_through_the_middles_of_the_blocks():
     x = torch.tensor([0.1, 0.2, 0.3, 0.5, 0.7, 0.9])
     y = torch.tensor([0.0, 0.0, 1.0, 0.0, 1.0, 1.0])  # blocks: .1 .2 at 0, .3 .5 at ½, .7 .9 at 1
@@ -117,18 +110,6 @@ def test_platt_minimises_the_log_loss():
     )
 
 
-def test_platt_equals_scikit_learn():
-    linear = pytest.importorskip("sklearn.linear_model")
-    p, w = uniform(800), uniform(800, seed=1)
-    good = uniform(800, seed=2) < p**2
-    model = linear.LogisticRegression(C=1e8, tol=1e-10, max_iter=1000)
-    model.fit(torch.logit(p, eps=1e-6)[:, None].numpy(), good.numpy(), sample_weight=w.numpy())
-    found = monotone.platt(p, good, w)
-    assert [float(found.slope), float(found.offset)] == pytest.approx(
-        [model.coef_[0, 0], model.intercept_[0]], abs=1e-3
-    )
-
-
 def test_platt_survives_separable_one_sided_and_missing_data():
     p = torch.linspace(0, 1, 50, dtype=torch.float64)
     for good in (p > 0.5, p > 2, p >= 0):
@@ -178,19 +159,19 @@ def test_a_sigmoid_is_scipys_of_the_logit():
 
 
 def loop_isotonic(x, y, weight, rising, min_share, ends):
-    """Corners of the table: scikit-learn's blocks, joined while they are light, their middles, the tilted ends."""
-    sklearn = pytest.importorskip("sklearn.isotonic")
+    """Corners of the table: the blocks, joined while they are light, their middles, the tilted ends."""
     at = sorted({a for a, w in zip(x, weight, strict=True) if w})
     mass = [sum(w for a, w in zip(x, weight, strict=True) if a == b) for b in at]
     mean = [
         sum(w * v for a, v, w in zip(x, y, weight, strict=True) if a == b) / m for b, m in zip(at, mass, strict=True)
     ]
-    fitted = sklearn.isotonic_regression(mean, sample_weight=mass, increasing=rising)
+    sign = 1 if rising else -1
+    fitted = [sign * v for v in brute_isotonic([sign * v for v in mean], mass)]
     blocks = []  # weight, weight · x, weight · y
     for key, group in itertools.groupby(range(len(at)), key=lambda k: round(fitted[k], 12)):
         rows = list(group)
-        block = [sum(mass[k] * v for k in rows) for v in (1,)] + [sum(mass[k] * at[k] for k in rows), 0.0]
-        block[2] = block[0] * key
+        heavy = sum(mass[k] for k in rows)
+        block = [heavy, sum(mass[k] * at[k] for k in rows), heavy * key]
         if blocks and blocks[-1][0] < min_share * sum(mass):
             blocks[-1] = [a + b for a, b in zip(blocks[-1], block, strict=True)]
         else:
@@ -216,7 +197,7 @@ def loop_isotonic(x, y, weight, rising, min_share, ends):
     "options", [{}, {"min_share": 0.15}, {"ends": (-1.0, 2.0)}, {"min_share": 0.3, "ends": (0.0, 1.0)}]
 )
 @pytest.mark.parametrize("n", [4, 25, 80])
-def test_a_table_equals_scikit_learns_blocks_joined_at_their_middles(n, options, rising):
+def test_a_table_runs_straight_from_the_middle_of_a_block_to_the_next(n, options, rising):
     g = np.random.default_rng(n)
     x = g.integers(1, 20, n) / 20
     y = np.where(g.uniform(size=n) < x, 1.0, 0.0) if n == 80 else x + g.normal(0, 0.2, n)
@@ -274,3 +255,22 @@ def test_platt_takes_as_many_steps_as_asked():
         monotone.platt(p, good[1:])
     with pytest.raises(ValueError, match="pool_adjacent_violators: "):
         monotone.pool_adjacent_violators(p, p[1:])
+
+
+def test_pool_adjacent_violators_equals_scikit_learn():
+    sklearn = pytest.importorskip("sklearn.isotonic")
+    y, w = uniform(3000) + torch.linspace(0, 1, 3000, dtype=torch.float64), uniform(3000, seed=1) + 0.01
+    expected = sklearn.isotonic_regression(y.numpy(), sample_weight=w.numpy())
+    assert monotone.pool_adjacent_violators(y, w).tolist() == pytest.approx(expected.tolist(), abs=1e-12)
+
+
+def test_platt_equals_scikit_learn():
+    linear = pytest.importorskip("sklearn.linear_model")
+    p, w = uniform(800), uniform(800, seed=1)
+    good = uniform(800, seed=2) < p**2
+    model = linear.LogisticRegression(C=1e8, tol=1e-10, max_iter=1000)
+    model.fit(torch.logit(p, eps=1e-6)[:, None].numpy(), good.numpy(), sample_weight=w.numpy())
+    found = monotone.platt(p, good, w)
+    assert [float(found.slope), float(found.offset)] == pytest.approx(
+        [model.coef_[0, 0], model.intercept_[0]], abs=1e-3
+    )

@@ -1,5 +1,6 @@
 """What a score is worth: risk and coverage against plain loops, with ties, at the limits, and where the cut falls."""
 
+import itertools
 import math
 import statistics
 
@@ -193,6 +194,13 @@ def test_silent_candidates_come_last_whatever_the_scores_of_the_others():
     assert risk.measure(both)["aurc_full"] == pytest.approx((0.5 + 0.25 + 1.5 / 3 + 2.5 / 4) / 4)
 
 
+def test_silent_scenes_and_none_at_all():
+    silent = risk.measure(errors.points(torch.full((12,), math.nan), torch.ones(12)))
+    assert {k for k, v in silent.items() if v is not None} == {f"coverage_at_{p}" for p in (5, 10, 20)} | {"aurc_full"}
+    assert silent["aurc_full"] == 1 and silent["coverage_at_5"] == silent["coverage_at_20"] == 0
+    assert set(risk.measure(errors.points(torch.zeros(0), torch.zeros(0))).values()) == {None}
+
+
 def test_coverage_is_a_share_of_all_candidates():
     p = random_points(50, silent=0.5)
     kept = int(p.keep.sum())
@@ -202,6 +210,7 @@ def test_coverage_is_a_share_of_all_candidates():
     assert found.tolist() == pytest.approx(brute_curve(loss, p.answered().score.tolist()))
     assert risk.risk_coverage(p, oracle=True)[1].tolist() == pytest.approx(brute_curve(loss, [-e for e in loss]))
     assert [x.numel() for x in risk.risk_coverage(p[:0])] == [0, 0]
+    assert [x.tolist() for x in risk.risk_coverage(with_errors([0.5]))] == [[1.0], [0.5]]
 
 
 @pytest.mark.parametrize("n", [10, 11, 19, 23, 57])
@@ -211,7 +220,7 @@ def test_monotonicity_equals_brute_force(n, seed):
     loss = risk.capped(p.error)[p.score.argsort(descending=True)].tolist()
     tenths = [statistics.mean(loss[: n * k // 10]) for k in range(1, 11)]
     found = risk.measure(p)
-    assert found["monotonicity"] == sum(b >= a for a, b in zip(tenths, tenths[1:], strict=False)) / 9
+    assert found["monotonicity"] == sum(b >= a for a, b in itertools.pairwise(tenths)) / 9
     falls = [a - b for k, a in enumerate(tenths) for b in tenths[k:]]
     assert found["largest_fall"] == pytest.approx(max(falls), abs=1e-12)
 
