@@ -28,6 +28,8 @@ class Row:
     grad: tuple[int, ...] = ()  # positions of arguments whose floating leaves are differentiated
     shared: tuple[int, ...] = ()  # positions of arguments without a batch axis
     bad: Callable[[tuple], tuple] | None = None  # arguments → a call with a wrong shape
+    leaks: bool = False  # "nan": 0 · NaN of a hopeless point reaches the gradient of what all points share
+    slow: str = ""  # promises that take long: tested with the slow ones
     atol: float = 1e-6  # shuffle, padding, capture: how equal
 
 
