@@ -33,7 +33,12 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("undistort", "< 0.01", "< 0.1"),
         ("undistort", "torch.where(solved, uv, torch.full_like(uv, torch.nan))", "uv"),
         ("undistort", "xy = _newton_step(camera.distortion, start, ", "xy = start + 0 * ("),
-        ("undistort", "torch.where(solved, target, torch.zeros_like(target))", "target"),
+        (
+            "undistort",
+            "torch.where(solved, target, torch.zeros_like(target))",
+            "target",
+            "what is not solved becomes NaN after any step, and no gradient passes it",
+        ),
         ("depth_pixels", "_seen(depth_camera, _normalised(camera, ", "_seen(camera, _normalised(depth_camera, "),
         ("depth_pixels", "undistort(camera, uv)", "uv"),
         ("depth_pixels", "[depth_hw[1] / hw[1], depth_hw[0] / hw[0]]", "[hw[1] / depth_hw[1], hw[0] / depth_hw[0]]"),
