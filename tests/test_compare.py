@@ -129,6 +129,15 @@ def test_errors_below_a_millionth_count_as_one():
     assert compare.ratio_over_seeds(ours, ours, measure)[0]["a"] == 1
 
 
+def test_a_scene_without_any_error_is_not_silent():
+    perfect, paper = ({name: [exact(30, error)] for name in "abc"} for error in (0.0, 0.5))
+    found = compare.method_ratios({"paper": paper, "map": perfect}, draws=20)
+    assert found.silent == {"map.10": [], "map.5": []} and found.summary["map.realised_risk_5"]["value"] == 0
+    back = compare.method_ratios({"map": perfect, "paper": paper}, reference="map", draws=20)
+    assert back.silent == {"paper.10": list("abc"), "paper.5": list("abc")}
+    assert back.summary["paper.within_target_5"]["value"] == 1, "silence keeps any promise"
+
+
 def test_seeds_without_the_number_are_passed_over_and_a_scene_without_any_is_left_out():
     ours, theirs = {"a": [exact(30, 0.5), exact(30, 0.25)]}, {"a": [exact(30, 0.5)] * 2}
     some = lambda p: None if float(p.depth[0]) < 1.4 else errors.measure(p)["median_rel"]  # noqa: E731
