@@ -45,8 +45,9 @@ class Level:
         return Level(cv2.pyrDown(self.grey), window)
 
     def read(self, plane, u, v):
-        """Values at places (u, v) between pixels, of plane 0 (grey), 1 or 2 (its slopes)."""
-        x, u, v = self.planes[plane], u + self.pad, v + self.pad
+        """Values at places (u, v) between pixels, of plane 0 (grey), 1 or 2 (its slopes); the padding's last beyond."""
+        x = self.planes[plane]
+        u, v = (np.clip(y + self.pad, 0, n - 1) for y, n in ((u, x.shape[1]), (v, x.shape[0])))
         i, j = np.floor(v).astype(int), np.floor(u).astype(int)
         a, b = v - i, u - j
         i2, j2 = np.minimum(i + 1, x.shape[0] - 1), np.minimum(j + 1, x.shape[1] - 1)

@@ -1,4 +1,4 @@
-"""Lucas-Kanade: known motions, OpenCV as oracle, brute force for the formulation, and the house rules."""
+"""Lucas-Kanade: known motions, OpenCV as oracle, and the house rules; number by number: test_lucas_kanade.py."""
 
 import os
 from functools import partial
@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from by_hand import levels
 
 from dhtorch.geometry.lucas_kanade import CELL_LEVEL
-from dhtorch.geometry.pyramid import GRAD_X, GRAD_Y, GREY, build_pyramid
+from dhtorch.geometry.pyramid import build_pyramid
 from dhtorch.stages.track import lucas_kanade, refine
 
 ROOT = os.environ.get("DHTORCH_DATA")
@@ -45,119 +46,59 @@ def points(B, N, H, W, margin=0.0, seed=1, dtype=torch.float64):
     return torch.rand(B, N, 2, generator=draw, dtype=torch.float64).to(dtype) * size + margin
 
 
-# --- pyramid ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("hw", [(120, 160), (97, 131)])
-def test_pyramid_is_opencvs(hw):
-    image = scene(1, *hw, dtype=torch.float32)
-    pyramid = build_pyramid(image, 3)
-    expected = image[0, 0].numpy()
-    for level in range(len(pyramid.levels)):
-        inner = slice(pyramid.pad, -pyramid.pad)
-        planes = pyramid.levels[level][0].numpy()
-        border = cv2.copyMakeBorder(expected, *(pyramid.pad,) * 4, cv2.BORDER_REFLECT_101)
-        assert pyramid.hw(level) == expected.shape
-        assert np.abs(planes[GREY] - border).max() < 1e-6
-        for plane, order in ((GRAD_X, (1, 0)), (GRAD_Y, (0, 1))):
-            slope = cv2.Scharr(expected, cv2.CV_32F, *order, borderType=cv2.BORDER_REFLECT_101) / 32
-            assert np.abs(planes[plane, inner, inner] - slope).max() < 1e-6
-            outside = planes[plane].copy()
-            outside[inner, inner] = 0
-            assert not outside.any()
-        expected = cv2.pyrDown(expected)
-
-
-def test_pyramid_stops_before_levels_that_no_window_fits_and_refuses_small_images():
-    assert len(build_pyramid(torch.rand(1, 1, 100, 100), 6, window=21).levels) == 3
-    assert build_pyramid(torch.zeros(1, 3, 40, 40, dtype=torch.uint8)).levels[0].dtype == torch.float32
-    for bad in ({"window": 20}, {"levels": 0}, {"window": 41}):
-        with pytest.raises(ValueError, match="build_pyramid"):
-            build_pyramid(torch.rand(1, 1, 40, 40), **bad)
-
-
-def test_a_pyramid_without_gradients_has_the_same_grey_values():
-    image = torch.rand(2, 3, 97, 131)
-    for level, grey in zip(build_pyramid(image, 3)[0], build_pyramid(image, 3, gradients=False)[0], strict=True):
-        assert torch.equal(level[:, GREY : GREY + 1], grey)
-
-
-def test_pyramid_gradcheck():
-    image = torch.rand(1, 1, 16, 17, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda x: build_pyramid(x, 1, 3).levels, image, fast_mode=True)
-
-
 # --- what is found ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.37, -0.61), (5.3, 3.8), (-17.2, 11.6)])
 def test_known_shift(shift):
     H, W = 150, 190
-    uv = points(1, 300, H, W, margin=35)
+    uv = points(1, 60, H, W, margin=35)
     tracks = lucas_kanade(scene(1, H, W), scene(1, H, W, shift), uv, levels=3)
     distance = (tracks.uv_1 - uv - torch.tensor(shift)).norm(dim=-1)
-    assert tracks.valid.float().mean() > 0.97
-    assert distance[tracks.valid].quantile(0.95) < 0.03
-    assert tracks.error[tracks.valid].median() < 0.02
+    assert tracks.valid.all()
+    assert distance.quantile(0.95) < 0.02
+    assert tracks.error.median() < 1e-4
 
 
-def brute_force_steps(src, dst, uv, d, steps, window=21):
-    """Gauss-Newton steps at one level, window by window, in numpy."""
-    h = window // 2
-    planes = build_pyramid(src, 1, window).levels[0][0].numpy()
-    target = build_pyramid(dst, 1, window)
-    pad, grey = target.pad, target.levels[0][0, GREY].numpy()
-    y, x = np.mgrid[-h : h + 1, -h : h + 1]
-
-    def read(plane, u, v):
-        u, v = u + x + pad, v + y + pad
-        i, j = np.floor(v).astype(int), np.floor(u).astype(int)
-        a, b = v - i, u - j
-        top = (1 - b) * plane[i, j] + b * plane[i, j + 1]
-        return (1 - a) * top + a * ((1 - b) * plane[i + 1, j] + b * plane[i + 1, j + 1])
-
-    T, g = read(planes[GREY], *uv), np.stack([read(planes[k], *uv).ravel() for k in (GRAD_X, GRAD_Y)])
-    for _ in range(steps):
-        d = d - np.linalg.solve(g @ g.T, g @ (read(grey, *(uv + d)) - T).ravel())
-    return d
-
-
-@pytest.mark.parametrize(("steps", "shift"), [(1, (1.7, -1.2)), (2, (1.7, -1.2)), (5, (1.7, -1.2)), (60, (4.7, -3.2))])
-def test_steps_on_maps_are_gauss_newton_steps_on_pixels(steps, shift):
-    """Exactly ``iterations`` steps of the direct formulation; over many maps, where those end."""
-    src, dst = scene(1, 90, 90), scene(1, 90, 90, shift)
+def test_many_maps_lead_where_steps_on_pixels_do():
+    src, dst = scene(1, 90, 90), scene(1, 90, 90, (4.7, -3.2))
     uv = points(1, 12, 90, 90, margin=25)
-    found = lucas_kanade(src, dst, uv, levels=1, iterations=steps, epsilon_px=0.0, max_round_trip_px=1e9).uv_1 - uv
-    for n in range(12):
-        expected = brute_force_steps(src, dst, uv[0, n].numpy(), np.zeros(2), steps)
-        assert np.abs(found[0, n].numpy() - expected).max() < 1e-9
+    options = {"levels": 1, "iterations": 60, "epsilon_px": 0.0, "max_round_trip_px": 1e9}
+    found = lucas_kanade(src, dst, uv, **options).uv_1
+    level_0, level_1 = (levels(image[0], 1, 21)[0] for image in (src, dst))
+    for n, x in enumerate(uv[0].numpy()):
+        T, g, d = level_0.window(0, x, 21), np.stack([level_0.window(k, x, 21) for k in (1, 2)]), np.zeros(2)
+        for _ in range(60):
+            d = d - np.linalg.solve(g @ g.T, g @ (level_1.window(0, x + d, 21) - T))
+        assert np.abs(found[0, n].numpy() - x - d).max() < 1e-9
 
 
-@pytest.mark.parametrize("normalise", ["none", "bias", "gain_bias"])
-@pytest.mark.parametrize("change", ["none", "bias", "gain_bias"])
-def test_illumination(normalise, change):
-    """J = 1.3 I + 0.1: every normalisation undoes what it names; plain differences do not survive the offset."""
-    H, W, shift = 150, 190, torch.tensor([2.3, -1.4])
+@pytest.mark.parametrize(
+    ("normalise", "change"),
+    [("bias", "none"), ("bias", "bias"), ("gain_bias", "none"), ("gain_bias", "bias"), ("gain_bias", "gain_bias")],
+)
+def test_illumination_that_a_normalisation_names_is_undone(normalise, change):
+    """J = 1.3 I + 0.1; plain differences do not survive the offset."""
+    H, W, shift = 100, 120, torch.tensor([2.3, -1.4])
     src, dst = scene(1, H, W) * 0.6, scene(1, H, W, shift.tolist()) * 0.6
     dst = {"none": dst, "bias": dst + 0.1, "gain_bias": 1.3 * dst + 0.1}[change]
     assert dst.max() < 1
-    uv = points(1, 300, H, W, margin=30)
-    tracks = lucas_kanade(src, dst, uv, normalise=normalise, levels=3)
+    uv = points(1, 60, H, W, margin=25)
+    tracks = lucas_kanade(src, dst, uv, normalise=normalise, levels=2)
     distance = (tracks.uv_1 - uv - shift).norm(dim=-1)[0]
-    names = ["none", "bias", "gain_bias"]
-    if names.index(normalise) >= names.index(change):
-        assert distance.quantile(0.95) < 0.1
-        assert tracks.photometric.median() < 0.005
-        assert tracks.valid.float().mean() > 0.97
-    elif normalise == "none":
-        assert distance.median() > 0.3
+    assert distance.quantile(0.95) < 0.03
+    assert tracks.photometric.median() < 0.0006
+    assert tracks.valid.all()
+    if change != "none":
+        plain = lucas_kanade(src, dst, uv, levels=2)
+        assert (plain.uv_1 - uv - shift).norm(dim=-1).median() > 0.3
 
 
 def test_covariance_is_that_of_the_errors():
     """Noise of known size at whole pixels: errors have the size that the reported covariance claims."""
     H, W, noise = 200, 260, 0.02
     src, clean = scene(1, H, W), scene(1, H, W, (2.0, 1.0))
-    uv = points(1, 1500, H, W, margin=25).round()
+    uv = points(1, 800, H, W, margin=25).round()
     dst = clean + noise * torch.randn(clean.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     tracks = lucas_kanade(src, dst, uv, levels=2)
     error = (tracks.uv_1 - uv - torch.tensor([2.0, 1.0], dtype=torch.float64))[0]
@@ -233,7 +174,7 @@ def test_bad_values_are_flagged_and_do_not_spread():
 
 
 def test_wrong_shapes_and_options_raise():
-    image, uv = torch.rand(2, 1, 50, 60), torch.zeros(2, 5, 2)
+    image, uv = scene(2, 50, 60, dtype=torch.float32), torch.zeros(2, 5, 2)
     calls = [
         lambda: lucas_kanade(image, image[:1], uv),
         lambda: lucas_kanade(image, image, uv[:1]),
@@ -295,20 +236,20 @@ def test_colour_and_bytes_are_grey_images_of_opencv():
 @pytest.mark.parametrize("normalise", ["none", "gain_bias"])
 def test_a_point_does_not_depend_on_its_company(normalise):
     """Bit for bit: alone or in a batch, in any order, with points and pairs added."""
-    src, dst = scene(3, 90, 110, dtype=torch.float32), scene(3, 90, 110, (3.4, -1.2), dtype=torch.float32)
-    uv = points(3, 300, 90, 110, dtype=torch.float32)
+    src, dst = scene(2, 80, 90, dtype=torch.float32), scene(2, 80, 90, (3.4, -1.2), dtype=torch.float32)
+    uv = points(2, 150, 80, 90, dtype=torch.float32)
     run = lambda *args: lucas_kanade(*args, normalise=normalise)  # noqa: E731
     whole = run(src, dst, uv)
-    order = torch.randperm(300, generator=torch.Generator().manual_seed(0))
-    for b in range(3):
-        for part in (slice(0, 300), slice(7, 8), slice(0, 131)):
+    order = torch.randperm(150, generator=torch.Generator().manual_seed(0))
+    for b in range(2):
+        for part in (slice(7, 8), slice(0, 131)):
             alone = run(src[b : b + 1], dst[b : b + 1], uv[b : b + 1, part])
             assert all(torch.equal(getattr(alone, f)[0], getattr(whole, f)[b, part]) for f in FIELDS)
     shuffled = run(src, dst, uv[:, order])
     assert all(torch.equal(getattr(shuffled, f), getattr(whole, f)[:, order]) for f in FIELDS)
-    padded = run(src, dst, torch.cat([uv, torch.full((3, 40, 2), float("nan"))], 1))
-    assert all(torch.equal(getattr(padded, f)[:, :300], getattr(whole, f)) for f in FIELDS)
-    assert not padded.valid[:, 300:].any()
+    padded = run(src, dst, torch.cat([uv, torch.full((2, 40, 2), float("nan"))], 1))
+    assert all(torch.equal(getattr(padded, f)[:, :150], getattr(whole, f)) for f in FIELDS)
+    assert not padded.valid[:, 150:].any()
 
 
 def test_points_that_share_a_coarse_search_do_not_depend_on_each_other():
@@ -316,7 +257,7 @@ def test_points_that_share_a_coarse_search_do_not_depend_on_each_other():
     (under vmap)."""
     H, W = 176, 200
     src, dst = (scene(2, H, W, shift, dtype=torch.float32) for shift in ((0.0, 0.0), (11.3, -6.2)))
-    uv = points(2, 200, H, W, dtype=torch.float32)
+    uv = points(2, 100, H, W, dtype=torch.float32)
     assert len(build_pyramid(src).levels) > CELL_LEVEL
     whole = lucas_kanade(src, dst, uv)
     assert whole.valid.float().mean() > 0.5
@@ -335,16 +276,15 @@ def test_no_points():
     assert refine(src, src, torch.zeros(2, 0, 2), torch.zeros(2, 0, 2)).shape == (2, 0, 2)
 
 
-def test_captured_and_mapped_equal_eager():
+def test_mapped_and_captured_with_a_graph_it_equals_eager():
     """The search picks out points by value in eager mode only; a graph or vmap sees fixed shapes and the same answers."""
     src, dst = scene(2, 70, 90, dtype=torch.float32), scene(2, 70, 90, (6.0, 2.0), dtype=torch.float32)
     uv = points(2, 60, 70, 90, dtype=torch.float32)
     mapped = torch.func.vmap(lambda i, j, x: lucas_kanade(i[None], j[None], x[None])[0])(src, dst, uv)
     assert all(torch.equal(getattr(mapped, f), getattr(lucas_kanade(src, dst, uv), f)) for f in FIELDS)
-    short = partial(lucas_kanade, levels=2, iterations=10)
-    graph = torch.compile(short, fullgraph=True, backend="eager")
-    assert all(torch.equal(getattr(graph(src, dst, uv), f), getattr(short(src, dst, uv), f)) for f in FIELDS)
-    refined = graph(src.clone().requires_grad_(), dst, uv)
+    short, leaf = partial(lucas_kanade, levels=1, iterations=1), src.clone().requires_grad_()
+    refined = torch.compile(short, fullgraph=True, backend="eager")(leaf, dst, uv)
+    assert all(torch.equal(getattr(refined, f), getattr(short(leaf, dst, uv), f)) for f in FIELDS)
     assert refined.uv_1.requires_grad and not refined.cov.requires_grad
 
 
@@ -394,16 +334,16 @@ def real_pairs():
     kitchen = [(f"7s_redkitchen_{k}", 20) for k in ("000", "200", "400", "600")]
     for name, gap in (("holo_a", 3), *kitchen, ("tum_fr1_desk9", 4)):
         files = sorted(f for f in (root / name).rglob("*") if f.suffix in (".png", ".jpg") and "depth" not in str(f))
-        yield from ((name, files[i], files[i + gap], 4) for i in range(0, len(files) - gap, 12))
+        yield from ((name, files[i], files[i + gap], 4) for i in range(0, len(files) - gap, 24))
     motorcycle = root / "middlebury_motorcycle"
     yield "motorcycle", motorcycle / "motorcycle_left.png", motorcycle / "motorcycle_right.png", 6
     files = sorted((root / "dgp_drive6cam").rglob("*.jpg"))
     yield from (("dgp", a, b, 6) for a, b in pairwise(files) if a.parent == b.parent)
 
 
-def opencv(a, b, uv, levels):
+def opencv(a, b, uv, n_levels):
     """Forward and back, as users of OpenCV do: positions, and round trips below 1 px."""
-    options = {"winSize": (21, 21), "maxLevel": levels - 1, "criteria": (3, 30, 0.01)}
+    options = {"winSize": (21, 21), "maxLevel": n_levels - 1, "criteria": (3, 30, 0.01)}
     there, ok, _ = cv2.calcOpticalFlowPyrLK(a, b, uv[:, None], None, **options)
     back, ok_back, _ = cv2.calcOpticalFlowPyrLK(b, a, there, None, **options)
     return (
@@ -421,11 +361,11 @@ def tensor(image):
 @pytest.mark.skipif(not ROOT, reason="DHTORCH_DATA is not set")
 def test_real_pairs_agree_with_opencv():
     draw, distances, verdicts = np.random.default_rng(0), {}, []
-    for name, file_0, file_1, levels in real_pairs():
+    for name, file_0, file_1, n_levels in real_pairs():
         a, b = (cv2.imread(str(f), cv2.IMREAD_GRAYSCALE) for f in (file_0, file_1))
-        uv = (draw.random((2048, 2)) * [a.shape[1] - 1, a.shape[0] - 1]).astype(np.float32)
-        expected, ok, _ = opencv(a, b, uv, levels)
-        tracks = lucas_kanade(tensor(a), tensor(b), torch.from_numpy(uv)[None], levels=levels)
+        uv = (draw.random((800, 2)) * [a.shape[1] - 1, a.shape[0] - 1]).astype(np.float32)
+        expected, ok, _ = opencv(a, b, uv, n_levels)
+        tracks = lucas_kanade(tensor(a), tensor(b), torch.from_numpy(uv)[None], levels=n_levels)
         valid = tracks.valid[0].numpy()
         distance = np.linalg.norm(tracks.uv_1[0].numpy() - expected, axis=1)
         distances.setdefault(name, []).append(distance[ok & valid])
@@ -453,7 +393,7 @@ def test_misses_on_known_warps_of_real_images():
         M[:, 2] += draw.uniform(-12, 12, 2)
         b = cv2.warpAffine(a, M, (W, H), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101)
         b = np.clip(b + draw.normal(0, 2, b.shape), 0, 255).astype(np.uint8)
-        uv = (draw.random((2048, 2)) * [W - 1, H - 1]).astype(np.float32)
+        uv = (draw.random((1024, 2)) * [W - 1, H - 1]).astype(np.float32)
         truth = uv @ M[:, :2].T + M[:, 2]
         inside = ((truth >= 0) & (truth <= [W - 1, H - 1])).all(1)
         theirs, _, found = opencv(a, b, uv, 4)
