@@ -7,7 +7,7 @@ from dhtorch.data.room import furnished_room
 
 def room_distance(xyz):
     """Distance (P,) of points from the nearest surface of the built-in room, exact."""
-    solids = furnished_room().solids
+    solids = furnished_room(2).solids
     best = torch.full((len(xyz),), torch.inf, dtype=torch.float64)
     for k in range(len(solids.each)):
         q = (xyz.double() - solids.centre[k].double()) @ solids.R[k].double()

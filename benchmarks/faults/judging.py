@@ -86,7 +86,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_thresholds", "scores.numel() - 1, MOST_THRESHOLDS", "scores.numel() / 2, MOST_THRESHOLDS"),
         ("_lowest", "float(coverage[:, k].mean())", "float(coverage.mean())"),
         ("_checked", "if s.keep.numel()", "if s.keep.any()"),
-        ("_largest_mean", "> level:", ">= 2 * level:"),
+        ("_largest_mean", "range(60)", "range(6)"),
         ("_binomial_cdf", "range(k + 1)", "range(k)"),
         ("Control.why", "self.n < self.needed", "self.n <= self.needed"),
     ],
