@@ -62,8 +62,10 @@ def test_shapes_are_covariances_over_the_median_of_their_mean_variance(isotropic
     cov = torch.stack((positive(2, 9), 7 * positive(2, 9, seed=1)))
     used = torch.ones(2, 9, dtype=torch.bool)
     used[0, 2] = False
+    cov[0, 5] = torch.tensor([[0.5, -0.4], [-0.4, 0.5]], dtype=D)  # correlated, and yet a covariance
+    cov[0, 6] = cov[0, 5].abs()
     nan, inf = torch.nan, torch.inf
-    bad = [[[1, 0], [0, -1]], [[-1, 0], [0, 1]], [[1, 2], [2, 1]], [[1, 1], [1, 1]], [[nan, 0], [0, 1]]]
+    bad = [[[1, 0], [0, -1]], [[-1, 0], [0, 1]], [[1, -2], [-2, 1]], [[1, 1], [1, 1]], [[nan, 0], [0, 1]]]
     bad += [[[inf, 0], [0, 1]], [[0, 0], [0, 1]], [[1, 0], [0, 0]]]
     cov[1, :8] = torch.tensor(bad, dtype=D)
     shape = covariance.noise_shape(cov, used, isotropic)

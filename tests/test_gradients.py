@@ -54,10 +54,11 @@ def stages(pair, trace):
     """Name → (function, arguments): every stage on what the stages before it found."""
     frame, other = pair
     samples, tracks, fit, estimate = (trace[k] for k in ("samples", "tracks_ideal", "fit", "estimate"))
-    posing = samples, tracks, frame.camera, other.camera, torch.rand(1, 50, 3, dtype=D)
+    draws = torch.rand(1, 50, 3, generator=torch.Generator().manual_seed(0), dtype=D)
+    posing = samples, tracks, frame.camera, other.camera, draws
     geometry = samples, tracks, fit, frame.camera, other.camera
     scorer = score.LearnedScore(seed=1)
-    torch.nn.init.normal_(scorer.last, std=0.1)
+    torch.nn.init.normal_(scorer.last, std=0.1, generator=torch.Generator().manual_seed(0))
     lens = torch.tensor([[0.05, -0.02, 0.001, -0.002, 0.01]], dtype=D)
     bent = [f.camera.replace(distortion=lens) for f in pair]
     return {

@@ -128,6 +128,21 @@ def test_without_baseline_a_pixel_tells_nothing_of_depth_and_counts_in_full():
     assert near_far.residuals(problem, linear, NOISE).isfinite().all()
 
 
+def test_a_baseline_of_a_tenth_of_a_millimetre_is_one():
+    """The inverse depth of a far track is then free by metres, and yet eliminated."""
+    problem, at = scene(off=0.0, turn=0.0)
+    at = at._replace(T=se3.Pose(at.T.R, 3e-4 * at.T.t))
+    Y = at.T.R @ problem.ray + problem.inverse[:, None] * at.T.t[..., None]
+    uv = Y[:, :2] / Y[:, 2:] * problem.f[..., None] + problem.c[..., None]
+    problem = problem.replace(uv=uv)
+    rows = near_far.residuals(problem, near_far.linearise_tracks(problem, at), NOISE)
+    for b, tracks in enumerate(every(problem, at)):
+        for k in FAR:
+            assert tracks[k].front and tracks[k].v == np.inf and tracks[k].s @ tracks[k].W @ tracks[k].s < 0.1
+            gram = rows[b, :, :, k] @ rows[b, :, :, k].T
+            np.testing.assert_allclose(gram, tracks[k].gram, rtol=0, atol=1e-6 * np.abs(tracks[k].gram).max())
+
+
 # ------------------------------------------------------------------------------------------------ all tracks
 
 
