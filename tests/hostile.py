@@ -3,7 +3,7 @@
 ``attack(write, read, tmp_path)`` lets ``write`` make one intact sample, then makes seeded mutants of it. Each one is
 read in a forked child of this (warmed-up) process, under a limit of time and of memory, with no right to write. The
 outcome of a mutant is ``"frames"`` (it read as valid data), ``"FormatError"`` (one line that names file and field) or a
-failure: another exception, a crash, a hang, too much memory, a file touched outside the capture, code executed.
+failure: another exception, a crash, a hang, too much work or memory, a file touched outside the capture, code executed.
 
 What is done to a sample stands in ``mutations``; a mutant is known by its seed alone: ``attack(..., only=17)`` repeats
 mutant 17.
@@ -34,7 +34,8 @@ from dhtorch import data
 from dhtorch.data import FormatError, files
 from dhtorch.data.stacks import FocalStack
 
-SECONDS = 2.0  # wall clock for one mutant
+SECONDS = 2  # of a processor for one mutant, whatever else the machine does
+PATIENCE = 60.0  # wall clock after which it hangs
 BYTES = 512 << 20  # resident, above the level before the call
 FINE = ("frames", "FormatError")
 
@@ -160,12 +161,7 @@ def sample(
 
 
 def run(read: Callable[[Path], Any], path: Path, tmp_path: Path) -> Outcome:
-    """Read ``path`` in a forked child. A child that got no processor on a busy machine has a second try."""
-    outcome, cpu = _run(read, path, tmp_path)
-    return _run(read, path, tmp_path)[0] if outcome.kind == "hang" and cpu < SECONDS / 2 else outcome
-
-
-def _run(read: Callable[[Path], Any], path: Path, tmp_path: Path) -> tuple[Outcome, float]:
+    """Read ``path`` in a forked child, which may use a processor for ``SECONDS``."""
     end, child_end = os.pipe()
     start = time.perf_counter()
     pid = os.fork()
@@ -182,7 +178,7 @@ def _run(read: Callable[[Path], Any], path: Path, tmp_path: Path) -> tuple[Outco
                 break
             said += chunk
             level = level or int(said.split(b"\n")[0] if b"\n" in said else 0)
-        if not killed and time.perf_counter() - start > SECONDS:
+        if not killed and time.perf_counter() - start > PATIENCE:
             killed = "hang"
             os.kill(pid, signal.SIGKILL)
         elif not killed and level and _resident(pid) - level > BYTES:
@@ -197,9 +193,11 @@ def _run(read: Callable[[Path], Any], path: Path, tmp_path: Path) -> tuple[Outco
     kind, _, detail = rest.decode(errors="replace").partition("\n")
     if killed or peak > BYTES:
         kind, detail = killed or "memory", ""
+    elif code == -signal.SIGXCPU:
+        kind, detail = "busy", detail[-2000:]
     elif code != 0:
         kind, detail = ("code executed" if code == EXECUTED else "crash"), f"exit code {code} {kind} {detail[-2000:]}"
-    return Outcome(kind, detail, seconds, peak), used.ru_utime + used.ru_stime
+    return Outcome(kind, detail, seconds, peak)
 
 
 def _child(read: Callable[[Path], Any], path: Path, tmp_path: Path, report: int) -> None:
@@ -213,6 +211,7 @@ def _child(read: Callable[[Path], Any], path: Path, tmp_path: Path, report: int)
         signal.signal(signal.SIGXFSZ, signal.SIG_DFL)  # Python turns it into an error that a reader might swallow
         resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS + 1))
         resource.setrlimit(
             resource.RLIMIT_AS, (_virtual() + 8 * BYTES, -1)
         )  # the machine survives what the watch misses

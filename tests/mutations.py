@@ -281,7 +281,7 @@ def _zip(content: bytes, name: str, draw: random.Random) -> bytes:
     with zipfile.ZipFile(out, "w", method) as archive:
         for member, body in members.items():
             archive.writestr(member, body or b"")
-    return _with_bomb(out.getvalue(), bomb) if bomb else out.getvalue()
+    return with_bomb(out.getvalue(), bomb) if bomb else out.getvalue()
 
 
 def _tar(content: bytes, name: str, draw: random.Random) -> bytes:
@@ -325,7 +325,7 @@ def _member(members: Capture, draw: random.Random) -> str | None:
     return None
 
 
-def _with_bomb(content: bytes, name: str) -> str | bytes:
+def with_bomb(content: bytes, name: str) -> str | bytes:
     """The archive with member ``name`` replaced by a gigabyte of zeros, deflated."""
     packed, crc, size = _bomb()
     out = io.BytesIO()

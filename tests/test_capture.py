@@ -125,8 +125,7 @@ def test_written_captures_are_found_and_shown(
     said = capsys.readouterr().out
     sheets = sorted((tmp_path / "out").iterdir())
     assert len(sheets) == count and said.count("wrote ") == count and f" {format} (" in said
-    for sheet in sheets:
-        check_sheet(sheet)
+    check_sheet(sheets[0])
     if below:
         assert all(sheet.name.startswith("given_one") for sheet in sheets)
 
@@ -270,10 +269,20 @@ def test_one_frame_is_enough(name: str, tmp_path: Path) -> None:
     shown = list(capture.surveys(found))
     assert found.format == format and len(shown) == count
     assert facts(shown[0])["frames"] == "1" and len(shown[0].tiles) == 1
-    check_sheet(capture.write_sheet(shown[0], tmp_path / "out"))
+    tile = shown[0].tiles[0]
+    assert float(tile.depth.max()) > 0 and (name == "stray_depth_only" or tile.image.shape[0] == 3)
+    if name in ("tum", "stray_depth_only"):
+        check_sheet(capture.write_sheet(shown[0], tmp_path / "out"))
 
 
-@pytest.mark.parametrize("name", sorted({*RECORDED} - {"stray_depth_only"}))
+#: The command on a recording of one and of several cameras; on all other formats with the slow tests.
+COMMANDED = [
+    name if name in ("tum", "driving") else pytest.param(name, marks=pytest.mark.slow)
+    for name in sorted({*RECORDED} - {"stray_depth_only"})
+]
+
+
+@pytest.mark.parametrize("name", COMMANDED)
 def test_the_command_takes_what_inspect_finds(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Focal stacks, which have no pairs: test_focal_stacks."""
     RECORDED[name][0](tmp_path, 3)
@@ -367,7 +376,7 @@ def test_damaged_captures_are_inspected_or_refused_in_one_line(name: str, tmp_pa
             for survey in capture.surveys(found, 3):
                 assert survey.facts
 
-    hostile.attack(WRITTEN[name][0], look, tmp_path, mutants=60)
+    hostile.attack(WRITTEN[name][0], look, tmp_path, mutants=15)
 
 
 # --------------------------------------------------------------------------------------------------------- real pieces
@@ -395,8 +404,11 @@ REAL = {
 def test_real_pieces_are_inspected(name: str, tmp_path: Path) -> None:
     (found,) = capture.find(Path(ROOT) / name)
     assert found.format == REAL[name]
-    for survey in capture.surveys(found, 3):
-        check_sheet(capture.write_sheet(survey, tmp_path))
+    surveys = list(capture.surveys(found, 3))
+    assert surveys and all(survey.tiles for survey in surveys)
+    if name in ("arkit_single", "holo_a", "stray_room"):
+        check_sheet(capture.write_sheet(surveys[0], tmp_path))
+    for survey in surveys:
         assert not any("contradict" in w or "constant" in w or "jumps" in w for w in survey.warnings)
         if "depth and poses" in facts(survey):  # measured 0.3 to 1.3 %
             assert float(facts(survey)["depth and poses"].split()[2]) < 2
