@@ -144,11 +144,11 @@ def test_ctrl_c_keeps_the_scenes_that_are_whole(tmp_path, monkeypatch):
         if made:
             raise KeyboardInterrupt
         made.append(source)
-        return mapping.Scene(source, [], None, None, None, {"seconds": 0.0, "scene": source.name})
+        row = {"seconds": 0.0, "scene": source.name, "method": "map", "truth": "device"}
+        return mapping.Scene(source, [], None, None, None, row)
 
     monkeypatch.setattr(mapping, "make", make)
     monkeypatch.setattr(mapping, "write", lambda *_: [])
-    monkeypatch.setattr(mapping, "_pair_rows", lambda _: [])
     settings = {"output": str(tmp_path), "dtype": "float32", "poses": "device", "mesh": None, "threads": None}
     settings |= {"voxel": 0.1, "truncation": None, "min_weight": 0.0, "cutoff": None}
     rooms = [SyntheticRoom(n_frames=2), SyntheticRoom(n_frames=2)]

@@ -22,7 +22,7 @@ def method(name="paper"):
 
 @pytest.fixture(scope="module")
 def outcome():
-    rooms = open_rooms(("walk", "lateral", "rotation"), n_frames=5, hw=(192, 256), gap=3, lidar="exact")
+    rooms = open_rooms(("walk", "lateral", "rotation"), n_frames=4, hw=(192, 256), gap=3, lidar="exact")
     methods = {"paper": method(), "strict": refill(method(), triangulate={"max_residual_px": 0.5})}
     methods["opencv"] = method("opencv")
     return method_comparison.run(rooms, {}, by_gap, Settings(), methods=methods, seeds=2)
