@@ -303,7 +303,7 @@ def test_whole_numbers_of_a_picture_are_taken_in_the_camera_s_precision():
 
 def test_equal_letters_are_equal_sizes_and_the_sizes_come_back():
     x, y = torch.zeros(2, 5, 3), torch.zeros(5)
-    assert check("here", x=(x, "B N 3"), y=(y, "N"), missing=(None, "B 7")) == {"B": 2, "N": 5}
+    assert check("here", x=(x, "B N 3"), missing=(None, "B 7"), y=(y, "N")) == {"B": 2, "N": 5}
     assert check("here", x=(x, "* 3")) == {} and check("here", y=(y, "*")) == {}
     assert check("here", x=(x, "* N 3"), y=(y, "* N")) == {"N": 5}
 
@@ -330,6 +330,10 @@ def test_the_message_names_place_argument_shape_and_what_is_bound():
         check("here", x=(x, "B N 3"), y=(y, "B N 3"))
     with pytest.raises(ValueError, match=r"here: x has shape \(2, 5, 3\), expected \(3 3\) with any sizes$"):
         check("here", x=(x, "3 3"))
+    with pytest.raises(ValueError, match=r"x has shape \(2, 5, 3\), expected \(\* 4 3\)"):
+        check("here", x=(x, "* 4 3"))
+    with pytest.raises(ValueError, match=r"y has shape \(3, 5, 3\)"):
+        check("here", none=(None, "B"), x=(x, "B 5 3"), y=(y, "B 5 3"))
 
 
 def test_shapes_are_static_in_graphs_and_transforms_only():

@@ -234,3 +234,5 @@ def test_an_element_s_value_does_not_hang_on_its_place():
 def test_unequal_shapes_are_refused():
     with pytest.raises(ValueError, match=r"shapes are \[\(3,\), \(1,\)\], expected equal shapes"):
         steady(torch.atan2, torch.ones(3), torch.ones(1))
+    with pytest.raises(ValueError, match="equal shapes"):
+        steady(torch.atan2, torch.ones(2, 3), torch.ones(3, 2))
