@@ -1,4 +1,5 @@
-"""Affine re-registration: exact warps, Monte-Carlo for the covariance, rejections, gradients, batch independence."""
+"""Affine re-registration: exact warps, Monte-Carlo for the covariance, rejections, gradients, batch independence; number
+by number: test_affine_by_hand.py."""
 
 import math
 
@@ -52,7 +53,7 @@ def registered(image_0, image_1, uv_0, uv_1, **options):
     return affine.register(source, target, uv_0, uv_1, **options)
 
 
-SLANTED = [[1.06, 0.05], [-0.07, 0.95]]
+SLANTED, STILL = [[1.06, 0.05], [-0.07, 0.95]], [[1.0, 0.0], [0.0, 1.0]]
 
 
 @pytest.mark.parametrize(
@@ -61,39 +62,33 @@ SLANTED = [[1.06, 0.05], [-0.07, 0.95]]
 )
 def test_an_exact_warp_is_found(linear, gain, bias):
     image_0, image_1, warp = warped(linear, (0.37, -0.61), gain=gain, bias=bias, shortest=12)
-    uv = points(200)
+    uv = points(100)
     start = warp(uv) + 0.3 * torch.randn(uv.shape, generator=torch.Generator().manual_seed(2), dtype=uv.dtype)
     found = registered(image_0, image_1, uv, start)
     miss = (found.uv_1 - warp(uv)).norm(dim=-1)
     assert found.ok.all()
-    assert miss.median() < 0.02 and miss.max() < 0.12  # what reading between pixels costs at waves of 12 px
-    assert (found.linear - torch.tensor(linear, dtype=uv.dtype)).abs().median() < 0.005
-    assert found.rms.median() < 0.01
-
-
-def test_magnified_windows_are_read_from_the_half_size_level():
-    image_0, image_1, warp = warped([[1.8, 0.1], [-0.1, 1.8]], (0.3, 0.2), shortest=14, hw=(300, 300))
-    uv = points(60, hw=(300, 300), margin=110)
-    found = registered(image_0, image_1, uv, warp(uv), iterations=30)
-    assert found.ok.float().mean() > 0.9
-    assert (found.uv_1 - warp(uv)).norm(dim=-1)[found.ok].median() < 0.06
+    assert miss.median() < 0.025 and miss.max() < 0.09  # what reading between pixels costs at waves of 12 px
+    assert (found.linear - torch.tensor(linear, dtype=uv.dtype)).abs().median() < 0.0025
+    assert found.rms.median() < 0.0007
 
 
 def test_it_improves_plain_tracks_of_a_slanted_texture():
     image_0, image_1, warp = warped(SLANTED, (2.2, -1.4), shortest=12)
-    uv = points(200)
+    uv = points(100)
     plain, better = (fn(image_0, image_1, uv) for fn in (lucas_kanade, lucas_kanade_affine))
     miss = lambda tracks: (tracks.uv_1 - warp(uv)).norm(dim=-1)[plain.valid].median()  # noqa: E731
-    assert torch.equal(plain.valid, better.valid) and plain.valid.float().mean() > 0.95
-    assert miss(better) < 0.2 * miss(plain)
+    assert torch.equal(plain.valid, better.valid) and plain.valid.all()
+    assert miss(better) < 0.1 * miss(plain)
 
 
-@pytest.mark.parametrize("shift", [(1.0, -2.0), (0.5, 0.5), (0.3, -0.71)])
-@pytest.mark.parametrize("linear", [[[1.0, 0.0], [0.0, 1.0]], SLANTED])
+@pytest.mark.parametrize(
+    ("linear", "shift"),
+    [(STILL, (1.0, -2.0)), (STILL, (0.3, -0.71)), (SLANTED, (0.5, 0.5)), (SLANTED, (0.3, -0.71))],
+)
 def test_covariance_is_right_on_white_noise(linear, shift):
     """Mean squared error in units of the covariance: 1 in expectation, at whole, half and other positions."""
     square = []
-    for seed in range(3):
+    for seed in range(2):
         image_0, image_1, warp = warped(linear, shift, seed=seed, noise=3 / 255, shortest=8)
         uv = points(250, seed=seed)
         start = warp(uv) + 0.2 * torch.randn(uv.shape, generator=torch.Generator().manual_seed(seed), dtype=uv.dtype)
@@ -101,7 +96,7 @@ def test_covariance_is_right_on_white_noise(linear, shift):
         assert found.ok.float().mean() > 0.99
         e = (found.uv_1 - warp(uv))[..., None]
         square.append((e * torch.linalg.solve(found.cov, e)).sum((-2, -1))[found.ok] / 2)
-    assert 0.85 < torch.cat(square).mean() < 1.25
+    assert 0.9 < torch.cat(square).mean() < 1.2
 
 
 def test_covariance_grows_where_noise_is_most_of_the_gradient():
@@ -109,12 +104,12 @@ def test_covariance_grows_where_noise_is_most_of_the_gradient():
     uv = points(250)
     found = registered(image_0, image_1, uv, warp(uv))
     e = (found.uv_1 - warp(uv))[..., None]
-    assert 0.5 < ((e * torch.linalg.solve(found.cov, e)).sum((-2, -1)) / 2).mean() < 2
+    assert 0.75 < ((e * torch.linalg.solve(found.cov, e)).sum((-2, -1)) / 2).mean() < 1.5
 
 
 def test_rejected_registrations_keep_the_track_and_say_so():
     image_0, image_1, _ = warped([[1.0, 0.0], [0.0, 1.0]], (0.0, 0.0))
-    uv = points(100)
+    uv = points(60)
     astray = uv + torch.tensor([7.0, 5.0], dtype=uv.dtype)  # on another part of the texture
 
     def track(image_0, image_1, uv_0, **options):
@@ -133,18 +128,18 @@ def test_nothing_to_hold_on_to():
     uv = torch.tensor([[[50.0, 50.0], [torch.nan, 20.0], [-30.0, 20.0], [3.0, 3.0], [199.4, 159.4]]])
     found = registered(flat, flat, uv, uv)
     assert not found.ok.any() and torch.equal(found.uv_1.nan_to_num(), uv.nan_to_num())
-    for image in (flat, torch.rand(1, 1, *HW)):
+    for image in (flat, torch.rand(1, 1, *HW, generator=torch.Generator().manual_seed(0))):
         tracks = lucas_kanade_affine(image, image, uv)
         assert all(getattr(tracks, k).isfinite().all() for k in FIELDS)
 
 
-@pytest.mark.parametrize("n", [37, 300])
+@pytest.mark.parametrize("n", [37, 270])
 def test_a_pairs_answer_does_not_depend_on_its_batch_mates(n):
-    views = [warped(SLANTED, (0.7 * k, -0.4), seed=k, noise=0.01) for k in range(3)]
+    views = [warped(SLANTED, (0.7 * k, -0.4), seed=k, noise=0.01) for k in range(2)]
     image_0, image_1 = (torch.cat([v[k] for v in views]).float() for k in (0, 1))
-    uv = torch.cat([points(n, seed=k, margin=2) for k in range(3)]).float()
+    uv = torch.cat([points(n, seed=k, margin=2) for k in range(2)]).float()
     together = lucas_kanade_affine(image_0, image_1, uv)
-    for b in range(3):
+    for b in range(2):
         alone = lucas_kanade_affine(image_0[b : b + 1], image_1[b : b + 1], uv[b : b + 1])
         for field in FIELDS:
             assert torch.equal(getattr(together, field)[b], getattr(alone, field)[0]), field
