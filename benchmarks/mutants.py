@@ -2,6 +2,7 @@
 
     python benchmarks/mutants.py                                   # every fault of benchmarks/faults/
     python benchmarks/mutants.py geometry.se3 stages.pose          # those of some modules
+    python benchmarks/mutants.py --every 4                         # a quarter of each module's
     python benchmarks/mutants.py --sweep 0.1 geometry              # a tenth of what the rules give instead
     python benchmarks/mutants.py --tests OLD/tests --json FILE     # the tests of another checkout
 
@@ -391,6 +392,9 @@ def main() -> int:
     parser.add_argument("modules", nargs="*", help="dotted names below dhtorch, or their beginnings; all of them")
     parser.add_argument("--sweep", type=float, default=0.0, help="draw this share of what the rules give instead")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--every", type=int, default=1, help="of each module's faults only every so many, the first too"
+    )
     parser.add_argument("--tests", type=Path, default=ROOT / "tests", help="folder of tests, this checkout's")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--quiet", action="store_true", help="print only what was missed")
@@ -401,7 +405,7 @@ def main() -> int:
         drawn = [f for m in wanted for f in by_rule(modules()[m].read_text(), m)]
         faults = random.Random(args.seed).sample(drawn, round(args.sweep * len(drawn)))
     else:
-        faults = [f for f in FAULTS if module_of(f.module, modules()) in wanted]
+        faults = [f for m in wanted for f in [f for f in FAULTS if module_of(f.module, modules()) == m][:: args.every]]
     rows = run(faults, TESTS, args.tests, args.jobs, args.quiet)
     print(summary(rows))
     if args.json:
