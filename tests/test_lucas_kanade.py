@@ -377,13 +377,12 @@ def test_refining_leaves_what_it_cannot_refine():
 
 
 def test_the_usual_limit_of_texture_is_opencvs():
-    """1e-4 of ``minEigThreshold``: of grey values from 0 to 255 and gradients 32 times those per pixel, over 2^10."""
+    """``minEigThreshold`` 1e-4: of bytes, whose slopes Scharr's filter makes 32 times as large, in units of 2^20."""
     wave = (127.5 + 60 * np.sin(np.arange(64) / 3.0)[None] * np.cos(np.arange(64) / 4.0)[:, None]).astype(np.uint8)
     g = [cv2.Scharr(wave, cv2.CV_64F, *o)[22:43, 22:43] for o in ((1, 0), (0, 1))]
-    theirs = np.linalg.eigvalsh([[(a * b).sum() for a in g] for b in g])[0] / 2**20 / 21**2  # A in units of 2^-10 each
+    theirs = np.linalg.eigvalsh([[(a * b).sum() for a in g] for b in g])[0] / 2**20 / 21**2
     level = Level(wave / 255.0, 21)
     ours = template(level, np.array([32.0, 32.0]), 21, "none")[0]
-    # OpenCV stores slopes of 32 per pixel in units of 2^-5: FLT_SCALE = 2^-20 for a product of two.
     assert theirs / 1e-4 == pytest.approx(np.linalg.eigvalsh(ours @ ours.T)[0] / 21**2 / MIN_EIGENVALUE, rel=1e-6)
 
 
