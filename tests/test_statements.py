@@ -72,6 +72,12 @@ def used(tree: ast.AST) -> set[str]:
     }
 
 
+def read_with(path: Path) -> list[ast.Module]:
+    """A file of tests and the helpers beside it that it imports."""
+    helpers = (path.with_name(f"{name}.py") for name in sorted(roots(parsed(path))))
+    return [parsed(path), *(parsed(helper) for helper in helpers if helper.is_file())]
+
+
 def peers_of(sentence: str) -> list[str]:
     """What a sentence compares with: names of other packages, and plain names that follow "against"."""
     quoted = re.findall(r"`+([A-Za-z_][\w.]*)(?:\([^`]*\))?`+", sentence)
@@ -90,7 +96,7 @@ def wrong_with(sentence: str, owner: str = "", root: Path = REPO) -> list[str]:
         return [f"{name} does not exist" for name in missing]
     if not peers:
         return ["names no peer in backquotes"]
-    trees = [parsed(root / name) for name in named]
+    trees = [tree for name in named for tree in read_with(root / name)]
     found = []
     for peer in peers:
         first, last = peer.split(".")[0], peer.rsplit(".", 1)[-1]
@@ -180,6 +186,16 @@ def test_a_sentence_is_held_to_what_it_says(tmp_path, sentence, fault):
     (tmp_path / "tests" / "test_a.py").write_text(TESTED)
     found = wrong_with(sentence, "mine", tmp_path)
     assert (not found) if fault is None else any(fault in f for f in found), found
+
+
+def test_what_a_helper_of_the_test_uses_counts(tmp_path):
+    (tmp_path / "tests").mkdir()
+    (tmp_path / "tests" / "test_a.py").write_text("from helper import slow\n")
+    (tmp_path / "tests" / "helper.py").write_text(TESTED)
+    sentence = "Checked against ``cv2.undistort`` (``tests/test_a.py``)."
+    assert not wrong_with(sentence, "mine", tmp_path)
+    (tmp_path / "tests" / "test_c.py").write_text("import other\n")
+    assert wrong_with(sentence.replace("test_a", "test_c"), "mine", tmp_path)
 
 
 def test_a_test_that_leaves_out_the_function_itself_does_not_count(tmp_path):

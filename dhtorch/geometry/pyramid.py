@@ -142,7 +142,7 @@ def _bands(image: Tensor, hw: tuple[int, ...]) -> list[slice]:
 
 
 def _half(level: Tensor, pad: int, part: slice) -> Tensor:
-    """Rows ``part`` of the half-size image of a padded one, as ``cv2.pyrDown`` (``tests/test_track.py``).
+    """Rows ``part`` of the half-size image of a padded one, as ``cv2.pyrDown`` (``tests/test_pyramid.py``).
 
     kornia samples at other places. Rows first, because their slices are contiguous; then even and odd columns are
     taken apart once.
