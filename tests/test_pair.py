@@ -234,12 +234,12 @@ def test_scaling_the_near_depth_scales_the_answer(views):
     longer = extend(frame_0.replace(depth=1.1 * frame_0.depth), frame_1, n=512)
     both = once.keep & longer.keep
     ratio = (longer.depth / once.depth)[both]
-    assert both.sum() > 50 and torch.allclose(ratio, torch.full_like(ratio, 1.1), rtol=1e-2)
+    assert both.sum() > 450 and torch.allclose(ratio, torch.full_like(ratio, 1.1), rtol=1e-5)
 
 
 def test_opencv_fills_the_same_seats(views):
     (frame_0, frame_1), *_ = views[0]
     ours, theirs = extend(frame_0, frame_1, n=1024), OPENCV(frame_0, frame_1, n=1024)
     both = ours.keep & theirs.keep
-    assert both.sum() > 0.8 * max(ours.keep.sum(), theirs.keep.sum())
-    assert ((ours.depth / theirs.depth)[both] - 1).abs().median() < 0.02
+    assert both.sum() > 0.98 * max(ours.keep.sum(), theirs.keep.sum())
+    assert ((ours.depth / theirs.depth)[both] - 1).abs().median() < 1e-3
