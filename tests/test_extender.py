@@ -265,6 +265,49 @@ def test_the_worst_problem_is_told():
 # ---------------------------------------------------------------------------------------------------- bad samples
 
 
+BAD = {
+    "missing key": (
+        lambda s: {k: v for k, v in s.items() if k != "depth"},
+        "depth: found no such key, expected one of",
+    ),
+    "missing other": (lambda s: {k: v for k, v in s.items() if k != "before"}, "before: found no such key"),
+    "metres as mm": (lambda s: {**s, "depth": s["depth"] / 1e3}, r"0\.00.* m .*are the numbers metres"),
+    "mm as 10 m": (lambda s: {**s, "depth": s["depth"] * 1e3}, "millimetres"),
+    "transposed": (lambda s: {**s, "depth": s["depth"].T}, "transposed"),
+    "two channels": (lambda s: {**s, "image": s["image"][..., :2]}, "1 or 3 channels"),
+    "two dimensions": (lambda s: {**s, "image": s["image"][..., 0]}, "expected .C, H, W. or .H, W, C."),
+    "normalised": (lambda s: {**s, "image": s["image"] / 127.5 - 1}, r"expected floats in \[0, 1\]"),
+    "0 to 255 float": (lambda s: {**s, "image": s["image"].astype(np.float32)}, r"expected floats in \[0, 1\]"),
+    "int32 image": (lambda s: {**s, "image": s["image"].astype(np.int32)}, "expected uint8"),
+    "nan image": (lambda s: {**s, "image": s["image"] * np.nan}, r"expected floats in \[0, 1\]"),
+    "other K": (lambda s: {**s, "intrinsics": s["intrinsics"] * 4}, "principal point"),
+    "nan K": (lambda s: {**s, "intrinsics": s["intrinsics"] * np.nan}, "principal point"),
+    "no focal length": (lambda s: {**s, "intrinsics": s["intrinsics"] * [0.0, 1, 1, 1]}, "focal length"),
+    "K of six": (lambda s: {**s, "intrinsics": np.ones(6)}, "3x3, or fx fy cx cy"),
+    "text": (lambda s: {**s, "depth": "depth.png"}, "expected an array of numbers"),
+    "none": (lambda s: {**s, "depth": None}, "expected an array of numbers"),
+    "index": (lambda s: {**s, "index": 0.5}, "whole numbers"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_samples_say_what_is_wrong(name):
+    change, message = BAD[name]
+    with pytest.raises(SampleError, match=message):
+        tiny(index_key="index")(change(sample()))
+    for policy in ("skip", "flag"):
+        careful = tiny(index_key="index", on_error=policy)
+        good = careful(sample())  # an image that cannot be read takes its size from one that could
+        with pytest.warns(UserWarning, match=message):
+            out = careful(change(sample()))
+        assert careful.report() == {**QUIET, "none": 1, "unreadable": 1}
+        if policy == "skip":
+            assert out is None
+        else:
+            assert added(out)["problem"] == Problem.UNREADABLE and not added(out)["valid"].any()
+            assert default_collate([added(out), added(good)])["depth"].shape == (2, N)
+
+
 def test_a_flagged_sample_has_the_shapes_of_a_good_one_and_no_number():
     extender = tiny(on_error="flag", patch=7, n=12)
     good = added(extender(sample()))

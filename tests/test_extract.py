@@ -1,9 +1,7 @@
 """Features of a whole data set: right rows, once each, whoever makes them and whatever interrupts it."""
 
 import itertools
-import json
 import os
-import pickle
 import signal
 import sys
 from functools import partial
@@ -25,27 +23,32 @@ from pyarrow import parquet
 from dhtorch import data, extract
 from dhtorch.data import writers
 from dhtorch.data.synthetic import SyntheticRoom
-from dhtorch.extract import Features, JoinedDataset, columns, engines, plan, shards
+from dhtorch.extract import Features, JoinedDataset, columns, engines, shards
 from dhtorch.geometry import camera as cam
-from dhtorch.pair import METHODS
 from dhtorch.run import config_dir, main
-from dhtorch.transform import CHANNELS, ExtendDepth, ExtendedDataset, Problem
+from dhtorch.transform import ExtendDepth, ExtendedDataset, Problem
 
-HW, GAP, N = (72, 96), 2, 128
+HW, GAP, N, NEAR = (72, 96), 2, 128, 2.5
 LENGTHS = (5, 4, 3)
 PAPER = ["method=paper", f"method.n={N}", "method.hypotheses=20"]
 CAMERA = "observation.images.front"
 
 
 @pytest.fixture(scope="module")
-def robot(tmp_path_factory):
+def shots():
+    """Frames of the synthetic room, whose sensor sees no farther than NEAR."""
+    room = SyntheticRoom(hw=HW, n_frames=sum(LENGTHS), lidar="exact", supersample=1)
+    frames = [room[i] for i in range(len(room))]
+    return [frame.replace(depth=torch.where(frame.depth <= NEAR, frame.depth, 0.0)) for frame in frames]
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory, shots):
     """A LeRobot v3 data set of three episodes through the synthetic room."""
     root = tmp_path_factory.mktemp("robot") / "set"
     root.mkdir()
-    room = SyntheticRoom(hw=HW, n_frames=sum(LENGTHS), lidar="exact", supersample=1)
     starts = np.cumsum((0, *LENGTHS))
-    episodes = [[room[i] for i in range(a, b)] for a, b in itertools.pairwise(starts)]
-    writers.write_lerobot(root, episodes, depth="tiff")
+    writers.write_lerobot(root, [shots[a:b] for a, b in itertools.pairwise(starts)], depth="tiff")
     return root
 
 
@@ -126,8 +129,8 @@ def test_rows_are_those_of_the_transform_in_a_loader(robot, command):
                 assert torch.equal(mine[key], value), (i, key)
     recovered = sum(int((row["dhtorch.source"] == 2).sum()) for row in features)
     sensed = sum(int((row["dhtorch.source"] == 1).sum()) for row in features)
-    assert sensed > 100, "an empty answer would compare equal as well"
-    assert recovered >= 0 and any(bool(row["dhtorch.pose_ok"]) for row in features)
+    assert recovered > 75 and sensed > 400, "an empty answer would compare equal as well"
+    assert sum(int(row["dhtorch.pose_ok"]) for row in features) == 6
 
 
 def test_rows_join_the_data_set_by_episode_and_frame(robot, command):
@@ -155,64 +158,37 @@ def test_episodes_keep_their_numbers(robot, command):
         features.at(1, 0)
 
 
-def test_the_schema_says_what_the_columns_mean(robot, command):
+def test_workers_make_the_same_files(robot, command):
     assert command(*asked(robot))[0] == 0
-    path = files("features")[0]
-    schema = parquet.read_schema(path)
-    assert schema.field("uv").type == pyarrow.list_(pyarrow.list_(pyarrow.float32(), 2), N)
-    assert schema.field("tokens").type == pyarrow.list_(pyarrow.list_(pyarrow.float32(), len(CHANNELS)), 256)
-    for field in schema:
-        assert field.metadata[b"unit"] and field.metadata[b"about"] and not field.nullable, field.name
-    shared, own = shards.described(path)
-    assert shared["codes"]["hole"]["1"] == "TRACKABLE_NO_LIDAR" and shared["codes"]["problem"]["3"] == "UNREADABLE"
-    assert shared["config"]["method"]["n"] == N and shared["channels"] == list(CHANNELS) and shared["grid"] == [16, 16]
-    assert shared["data"]["frames"] == 12 and len(shared["key"]) == len(shared["data"]["digest"]) == 64
-    assert {"version", "git"} <= set(shared) and set(shared["columns"]) == set(schema.names)
-    assert own == {"number": 0, "of": 3, "counts": {"no_second_view": 2, "none": 3, "skipped": 0}}
-    assert str(robot) not in json.dumps(shared), "no place of this machine"
-
-
-def test_every_key_of_the_transform_has_a_column():
-    transform = ExtendDepth(depth_unit="m", n=7, tokens_hw=(28, 42))
-    found = columns.columns(7, 6)
-    blank = transform._blank((28, 42))
-    assert set(found) == set(columns.PLACE) | set(blank)
-    for name, value in blank.items():
-        assert tuple(value.shape[1:]) == found[name].shape, name
-        assert found[name].kind in ("float32", "bool", "uint8")
-    for name, table in columns.CODES.items():
-        assert max(columns.code_tables()[name]) < 256 and table, "codes fit a byte"
-        assert sum(k for k in columns.code_tables()["flag"]) < 256
-
-
-@pytest.mark.parametrize("workers", [1, 2])
-def test_workers_make_the_same_files(robot, command, workers):
-    assert command(*asked(robot))[0] == 0
-    code, _, err = command(*asked(robot, f"workers={workers}", out="other"))
+    code, _, err = command(*asked(robot, "workers=2", out="other"))
     assert code == 0 and err == "", err
     assert contents("features") == contents("other") and len(files("other")) == 3
 
 
-MANY = ["data.hw=[60,80]", "data.n_frames=60", "data.supersample=1", "out=features", "extract.shard_rows=4"]
+@pytest.fixture
+def many(tmp_path, shots):
+    """Numbered frames on the disk, each a shard."""
+    writers.write_counted_frames(tmp_path / "set", shots)
+    return ["data=auto", f"data.root={tmp_path / 'set'}", "data.gap=2", "out=features", "extract.shard_rows=1", *PAPER]
 
 
-def test_kill_9_in_the_middle_loses_and_doubles_nothing(tmp_path, command):
-    """With workers, in the middle of a shard; then the same command again."""
-    args = [*MANY, *PAPER, "workers=1"]
+def test_kill_9_in_the_middle_loses_and_doubles_nothing(tmp_path, many, command):
+    """With a worker; then the same command again."""
+    args = [*many, "workers=1"]
     process = start(tmp_path, "extract", *args)
     assert stop(process, partial(files, tmp_path / "features"), 3, signal.SIGKILL) == -signal.SIGKILL, (
         tmp_path / "err"
     ).read_text()
     before = seen(files("features"))
-    assert 3 <= len(before) < 15
-    assert all(parquet.read_table(Path("features") / name).num_rows == 4 for name in before)
-    (Path("features") / ".shard-00014.parquet.tmp").write_bytes(b"PAR1")  # as a killed writer leaves it
+    assert 3 <= len(before) < 12
+    assert all(parquet.read_table(Path("features") / name).num_rows == 1 for name in before)
+    (Path("features") / ".shard-00011.parquet.tmp").write_bytes(b"PAR1")  # as a killed writer leaves it
     code, out, err = command(*args)
     assert code == 0, err
-    assert f"15 shards ({len(before)} left untouched), 60 rows" in out
+    assert f"12 shards ({len(before)} left untouched), 12 rows" in out
     after = seen(files("features"))
     assert {k: after[k] for k in before} == before, "what was finished is untouched"
-    assert Features("features", ["depth"]).place["frame_index"].tolist() == list(range(60)), "none lost, none doubled"
+    assert Features("features", ["depth"]).place["frame_index"].tolist() == list(range(12)), "none lost, none doubled"
     assert [p.name for p in Path("features").iterdir() if p.name.startswith(".")] == []
     assert command(*[a.replace("out=features", "out=whole") for a in args])[0] == 0
     assert contents("whole") == contents("features"), "the same as without the kill"
@@ -238,40 +214,27 @@ def test_ctrl_c_leaves_whole_shards_and_says_how_to_go_on(robot, command, monkey
     code, out, _ = command(*asked(robot))
     assert code == 0 and "3 shards (1 left untouched)" in out
     assert {k: v for k, v in seen(files("features")).items() if k in before} == before
-    code, out, _ = command(*asked(robot))
-    assert code == 0 and "3 shards (3 left untouched), 12 rows" in out and "6 no second view" in out
 
 
-def test_ctrl_c_from_a_terminal_ends_the_workers_quietly(tmp_path):
-    process = start(tmp_path, "extract", *MANY, *PAPER, "workers=2")
+def test_ctrl_c_from_a_terminal_ends_the_workers_quietly(tmp_path, many):
+    process = start(tmp_path, "extract", *many, "workers=2")
     code = stop(process, partial(files, tmp_path / "features"), 2, signal.SIGINT)
     err = (tmp_path / "err").read_text()
     assert code == 130 and "Traceback" not in err and len(err.strip().splitlines()) == 1, err
     assert "whole and stay" in err
 
 
-def test_a_torn_shard_is_written_again(robot, command):
-    assert command(*asked(robot))[0] == 0
-    whole = contents("features")
-    torn = files("features")[1]
-    torn.write_bytes(torn.read_bytes()[:-100])
-    code, out, _ = command(*asked(robot))
-    assert code == 0 and "(2 left untouched)" in out and contents("features") == whole
-
-
 @pytest.fixture
-def damaged(tmp_path):
+def damaged(tmp_path, shots):
     """Numbered frames, the fourth with half a picture."""
-    room = SyntheticRoom(hw=HW, n_frames=8, lidar="exact", supersample=1)
-    writers.write_counted_frames(tmp_path / "set", [room[i] for i in range(8)])
+    writers.write_counted_frames(tmp_path / "set", shots[:8])
     image = tmp_path / "set" / "images" / "00003.png"
     image.write_bytes(image.read_bytes()[:500])
     return ["data=auto", f"data.root={tmp_path / 'set'}", "data.gap=2", "out=features", "extract.shard_rows=3", *PAPER]
 
 
-@pytest.mark.parametrize("workers", [0, 1])
-def test_a_corrupt_frame_raises_in_one_line(damaged, command, workers):
-    code, _, err = command(*damaged, f"workers={workers}")
+def test_a_corrupt_frame_raises_in_one_line(damaged, command):
+    code, _, err = command(*damaged, "workers=1")
     assert code == 2 and "Traceback" not in err and len(err.strip().splitlines()) == 1, err
     assert all(word in err for word in ("frame 3", "00003.png", "expected", "extract.on_error=skip")), err
     assert [p.name for p in files("features")] == ["shard-00000.parquet"], "what was whole before it stays"
@@ -295,10 +258,7 @@ def test_a_corrupt_frame_is_flagged_with_zeros(damaged, command):
     assert [int(row["dhtorch.problem"]) for row in features] == [1, 1, 0, 3, 0, 1, 0, 0]
     row = features.at(0, 3)
     assert int(row.pop("dhtorch.problem")) == Problem.UNREADABLE and all(not x.any() for x in row.values())
-    assert [features.place["timestamp"][i] == features.place["timestamp"][i] for i in (2, 3)] in (
-        [True] * 2,
-        [False] * 2,
-    )
+    assert np.isnan(features.place["timestamp"]).all(), "counted frames have no times"
 
 
 @pytest.mark.parametrize(
@@ -308,13 +268,7 @@ def test_a_corrupt_frame_is_flagged_with_zeros(damaged, command):
         (["data=lerobot", "out=x"], ["data.root"]),
         (["data.n_frames=3"], ["out"]),
         (["out=x", "extract.engine=dask"], ["extract.engine", "dask", "local, ray"]),
-        (["out=x", "extract.on_error=ignore"], ["extract.on_error", "raise, skip, flag"]),
-        (["out=x", "extract.columns=[depth,colour]"], ["extract.columns", "colour", "tokens"]),
-        (["out=x", "extract.gap=-1"], ["extract.gap", "-1"]),
-        (["out=x", "extract.shard_rows=0"], ["extract.shard_rows", "0"]),
-        (["out=x", "extract.tokens_hw=[7,7]"], ["7x7", "14"]),
         (["out=x", "extract.tokens_hw=null"], ["extract.tokens_hw", "height and width"]),
-        (["out=x", "workers=-1"], ["workers", "-1"]),
         (["out=x", "extract.shardrows=4"], ["shardrows"]),
         (["out=file", "data.n_frames=3"], ["file", "expected a folder"]),
         (["out=file/below", "data.n_frames=3"], ["file"]),
@@ -333,12 +287,6 @@ def test_bad_input_gets_one_clear_line(command, args, words):
 def test_a_recording_without_a_gap_asks_for_one(robot, command):
     code, _, err = command("data=lerobot", f"data.root={robot}", "out=x", *PAPER)
     assert code == 2 and "extract.gap" in err and "0 = front end alone" in err
-
-
-def test_two_cameras_of_one_episode_are_not_one_row(robot):
-    (one, *_), (two, *_) = data.open_all(robot), data.open_all(robot)
-    with pytest.raises(ValueError, match="are one episode, expected one camera of it"):
-        plan.make([one, two], GAP, 1)
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
@@ -367,22 +315,11 @@ def test_shards_of_another_extraction_are_not_mixed(robot, command, tmp_path):
     before = seen(files("features"))
     for other, words in (
         ("seed=1", "seed 0 there, 1 here"),
-        ("method.n=64", "method.n 128 there, 64 here"),
-        ("extract.half=true", "extract.half False there, True here"),
         ("data.episode=0", "data.episode None there, 0 here"),
     ):
         code, _, err = command(*asked(robot, other))
         assert code == 2 and words in err and "another extraction" in err and len(err.strip().splitlines()) == 1, err
-    (robot.parent / "set2").mkdir(exist_ok=True)
     assert seen(files("features")) == before
-
-
-def test_more_data_is_another_extraction(damaged, command):
-    assert command(*damaged, "extract.on_error=skip")[0] == 0
-    image = Path("set/images/00003.png")
-    image.write_bytes((image.parent / "00002.png").read_bytes())
-    code, _, err = command(*damaged, "extract.on_error=skip")
-    assert code == 2 and "(other data)" in err
 
 
 def test_a_missing_pyarrow_names_the_extra(command, monkeypatch):
@@ -409,27 +346,7 @@ def test_a_killed_worker_is_said(monkeypatch):
         list(engines.here(Deadly(), range(4), 1))
 
 
-def test_halves_and_chosen_columns_are_smaller(robot, command):
-    for out, more in (("all", []), ("half", ["extract.half=true"]), ("few", ["extract.columns=[tokens]"])):
-        assert command(*asked(robot, *more, out=out))[0] == 0
-    sizes = [sum(p.stat().st_size for p in files(folder)) for folder in ("all", "half", "few")]
-    assert sizes[0] > sizes[1] > sizes[2]
-    whole, half, few = (Features(folder) for folder in ("all", "half", "few"))
-    assert (
-        few.columns == ("tokens", "problem")
-        and parquet.read_schema(half.files[0]).field("uv").type.value_type.value_type == pyarrow.float32()
-    )
-    for one, two in zip(whole, half, strict=True):
-        for key, value in one.items():
-            exact = key.removeprefix("dhtorch.") not in columns.MAY_BE_HALF
-            assert two[key].dtype == value.dtype
-            torch.testing.assert_close(two[key], value, rtol=0 if exact else 2**-11, atol=0 if exact else 1e-7)
-
-
-def test_front_end_alone_and_a_method_of_many_views(robot, command):
-    code, out, _ = command(*asked(robot, "extract.gap=0", out="alone"))
-    assert code == 0 and "12 no second view" in out
-    assert not any(bool((row["dhtorch.source"] == 2).any()) for row in Features("alone"))
+def test_a_method_of_many_views_looks_back_several_times(command):
     window = ["data.hw=[72,96]", "data.n_frames=6", "data.supersample=1", "data.lidar=exact", "method=window"]
     code, out, err = command(*window, "method.n=64", "method.views=2", "extract.gap=3", "out=window")
     assert code == 0 and "6 rows" in out, err
@@ -442,38 +359,3 @@ def test_settings_are_the_defaults():
     assert cfg.pop("_target_") == "dhtorch.extract.Options"
     defaults = {k: f.default for k, f in extract.Options.__dataclass_fields__.items()}
     assert cfg == {k: list(v) if isinstance(v, tuple) else v for k, v in defaults.items()}
-
-
-def test_features_and_plans_pickle_and_stay_small(robot, command):
-    assert command(*asked(robot))[0] == 0
-    features = Features("features", ["tokens", "tokens_valid"])
-    loader = torch.utils.data.DataLoader(JoinedDataset(Items(robot), features), batch_size=4, num_workers=1)
-    assert sum(len(batch["dhtorch.tokens"]) for batch in loader) == 12
-    recordings = data.open_all(robot)
-    whole = plan.make(recordings, GAP, 1)
-    rows = extract.Rows(
-        recordings, whole, columns.columns(N, 256), method=instantiate_paper(), gap=GAP, seed=0, tokens_hw=(224, 224)
-    )
-    rows[3]
-    twin = pickle.loads(pickle.dumps(rows))
-    assert twin._opened is None and torch.equal(
-        torch.from_numpy(twin[7].features["depth"]), torch.from_numpy(rows[7].features["depth"])
-    )
-
-
-def instantiate_paper():
-    return instantiate(OmegaConf.create({"_target_": "dhtorch.pair.extend", "_partial_": True, "n": N}))
-
-
-def test_positions_and_places():
-    whole = plan.Plan(order=(2, 0, 1), episodes=(0, 4, 9), ends=(3, 4, 8), roots=())
-    assert [whole.place(i) for i in range(8)] == [
-        (2, 0, 0),
-        (2, 0, 1),
-        (2, 0, 2),
-        (0, 4, 0),
-        *((1, 9, i) for i in range(4)),
-    ]
-    pieces = whole.shards(3)
-    assert [list(s.rows) for s in pieces] == [[0, 1, 2], [3, 4, 5], [6, 7]] and pieces[2].name == "shard-00002.parquet"
-    assert set(METHODS) >= {"paper", "map"}

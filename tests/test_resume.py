@@ -9,7 +9,6 @@ import sys
 import warnings
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import hydra
 import pytest
@@ -18,7 +17,9 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 from processes import start, stop
 
-from dhtorch import archive, console, job, run
+from dhtorch import archive, console, job
+from dhtorch.data import writers
+from dhtorch.data.synthetic import SyntheticRoom
 from dhtorch.run import config_dir, job_name, main
 
 ROOM = ["data.hw=[60,80]", "data.n_frames=3", "data.supersample=1", "data.lidar=exact"]
@@ -175,13 +176,16 @@ def test_joblib_runs_jobs_and_any_launcher_resumes_them(tmp_path, command):
     assert code == 1 and "0 finished, 1 left untouched, 1 failed" in out and seen(before) == before
 
 
-def test_a_broken_launcher_says_how_to_go_on(capsys):
+def test_a_broken_launcher_says_how_to_go_on(command, monkeypatch):
     def die(*_args):
         raise RuntimeError("a worker process was killed")
 
-    assert run._sweep(SimpleNamespace(multirun=die), [], "dhtorch -m resume=true", show=False) == 1
-    err = capsys.readouterr().err
-    assert "a worker process was killed" in err and err.endswith("dhtorch -m resume=true\n")
+    monkeypatch.setattr("hydra._internal.hydra.Hydra.multirun", die)
+    code, out, err = command("-m", *TINY, "seed=0,1")
+    assert code == 1 and out == "" and "a worker process was killed" in err
+    assert "What is finished stays. To do the rest:\n  dhtorch " in err
+    words = shlex.split(err.strip().splitlines()[-1])
+    assert {"-m", "resume=true", "seed=0,1", *TINY} <= set(words) and any(w.startswith("output=") for w in words)
 
 
 @pytest.mark.parametrize("name", LAUNCHERS)
@@ -225,28 +229,32 @@ def test_names_of_jobs_can_be_read(monkeypatch):
     assert job_name("data.root=/elsewhere/tum") == job_name("data.root=tum")
 
 
-def test_data_and_weights_count_by_content_not_by_place(tmp_path):
-    digests = []
-    for k, (one, two) in enumerate((("a", "b"), ("a", "b"), ("a", "c"))):
-        roots = [tmp_path / f"{k}{scene}" / "iphone" for scene in "xy"]
-        for root, text in zip(roots, (one, two), strict=True):
-            root.mkdir(parents=True)
-            (root / "depth.bin").write_text(text)
-        digests.append(archive.data_digest(job._files([SimpleNamespace(root=r) for r in (*roots, None)])))
-    assert digests[0] == digests[1] != digests[2], "folders of the same name are told apart"
-    weights = tmp_path / "net.pt"
-    weights.write_text("w")
-    settings = {g: {} for g in job.GROUPS} | {"method": {"weights": str(weights), "name": "a/b"}}
-    assert list(job._named_files(settings).values()) == [weights]
+def test_changed_data_are_another_question(command, tmp_path):
+    room = SyntheticRoom(hw=(60, 80), n_frames=3, supersample=1, lidar="exact")
+    writers.write_counted_frames(tmp_path / "set", [room[i] for i in range(3)])
+    asked = ["data=auto", "pairs.gap=2", "method.n=256", "figures=false", "resume=true", "output=here"]
+    assert command(*asked, f"data.root={tmp_path / 'set'}")[0] == 0
+    (path,) = results(tmp_path)
+    config, digest = archive.read(path)["config"], archive.read(path)["data"]["digest"]
+    assert digest == archive.data_digest(archive.files_below([tmp_path / "set"]))
+    assert config["data"]["root"] == "set", "no place of this machine"
+    same = [*asked, f"data.root={tmp_path / 'set'}"]
+    assert "left untouched" in command(*same)[1]
+    image = next((tmp_path / "set").rglob("*.png"))
+    image.write_bytes(image.read_bytes() + b"\0")
+    assert "wrote" in command(*same)[1] and archive.read(path)["data"]["digest"] != digest
 
 
-def test_only_our_own_warnings_are_seen():
+@pytest.mark.parametrize("asked", [[], ["always"]])
+def test_only_our_own_warnings_are_seen(monkeypatch, asked):
+    monkeypatch.setattr(sys, "warnoptions", asked)
+    modules = ["torch.nn", "hydra.main", "dhtorchy", "dhtorch.pair"]
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         console.hush()
-        for module in ("torch.nn", "hydra.main", "dhtorchy", "dhtorch.pair"):
+        for module in modules:
             warnings.warn_explicit("careful", UserWarning, f"{module}.py", 1, module=module)
-    assert [Path(w.filename).stem for w in caught] == ([] if sys.warnoptions else ["dhtorch.pair"]) or sys.warnoptions
+    assert [Path(w.filename).stem for w in caught] == (modules if asked else ["dhtorch.pair"])
 
 
 def test_the_result_is_strict_json_of_its_own_job(command, tmp_path):

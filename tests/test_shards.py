@@ -340,6 +340,16 @@ def test_items_are_joined_by_the_numbers_of_episode_and_frame(tmp_path):
         JoinedDataset([{"episode_index": 0, "frame_index": 5}], features)[0]
 
 
+def test_a_joined_data_set_goes_through_a_loader(tmp_path):
+    features = Features(written(tmp_path / "out", [[row(k) for k in range(4)]]), ["tokens", "tokens_valid"])
+    joined = JoinedDataset([{"episode_index": 0, "frame_index": k} for k in (3, 1, 0, 2)], features)
+    (batch,) = torch.utils.data.DataLoader(joined, batch_size=4, num_workers=1, multiprocessing_context="fork")
+    assert batch["dhtorch.tokens"].shape == (4, P, 10) and batch["frame_index"].tolist() == [3, 1, 0, 2]
+    assert all(
+        torch.equal(batch["dhtorch.tokens"][k], features[i]["dhtorch.tokens"]) for k, i in enumerate((3, 1, 0, 2))
+    )
+
+
 # ---------------------------------------------------------------------------------------------------- engines
 
 

@@ -6,6 +6,7 @@ import torch
 from torch.utils.data import default_collate
 
 from dhtorch.transform import SampleError, Views
+from dhtorch.transform.leaves import to_tensor
 
 H, W = 6, 8
 K = [20.0, 22.0, 3.6, 2.4]  # fx fy cx cy
@@ -204,6 +205,12 @@ def test_planes_come_with_or_without_channel_and_time():
         )
 
 
+def test_maps_one_pixel_wide_along_time_are_no_channels():
+    images, depths = picture(shape=(3, 5, 1, 3)), metres(shape=(3, 5, 1))
+    found = read(sample(image=images, depth=depths, intrinsics=[4, 4, 0, 2]), layout="hwc", other_at=1)
+    assert np.array_equal(found.anchor.depth[0], depths[2]) and np.array_equal(found.other.depth[0], depths[1])
+
+
 def test_a_median_return_beyond_the_limits_is_a_wrong_unit():
     for value, bad in ((100, False), (100.1, True), (0.01, False), (0.0099, True), (0.0, False)):
         depth = np.full((H, W), value, np.float32)
@@ -303,6 +310,16 @@ def test_a_shared_array_is_not_written_to():
     frozen = np.full((H, W), 1000, np.uint16)
     frozen.setflags(write=False)
     assert (read(sample(depth=frozen), depth_unit="mm").anchor.depth == 1).all() and (frozen == 1000).all()
+
+
+def test_unsigned_words_become_signed_ones_that_hold_them():
+    for dtype, wanted in ((np.uint16, torch.int32), (np.uint32, torch.int64), (np.uint8, torch.uint8)):
+        top = np.array([0, np.iinfo(dtype).max], dtype)
+        for given in (top, torch.from_numpy(top)):
+            found = to_tensor(given, "x")
+            assert found.dtype == wanted and found.tolist() == top.tolist()
+        assert to_tensor(top, "x", signed=False).dtype == torch.from_numpy(top).dtype
+    assert to_tensor(np.int16([-3]), "x").dtype == torch.int16 and to_tensor(True, "x").dtype == torch.bool
 
 
 def test_subclasses_of_tensors_become_plain():
@@ -435,6 +452,14 @@ def test_frames_along_time_are_picked_by_place():
     assert alone.other is None and alone.paired.tolist() == [False]
 
 
+def test_only_frames_that_are_asked_for_are_judged():
+    for place, bad in ((0, False), (1, True), (2, True)):
+        images = np.stack([picture(k) for k in range(3)]) / 255
+        images[place, 0, 0, 0] = 7
+        found = read(sample(image=images), at=2, other_at=1)
+        assert found.bad.tolist() == [bad], place
+
+
 def test_several_other_views_are_stacked_in_their_order():
     images, depths = np.stack([picture(k) for k in range(4)]), np.stack([metres(k) for k in range(4)])
     found = read(sample(image=images, depth=depths), other_at=(2, 0))
@@ -451,6 +476,8 @@ def test_several_other_views_are_stacked_in_their_order():
     assert (some.paired.tolist(), none.paired.tolist(), mixed.paired.tolist()) == ([True], [False], [False])
     same = read(sample(image=images, image_is_pad=[True, False, False, False]), other_at=(0, 3))
     assert same.paired.tolist() == [False], "the anchor is no view beside itself"
+    both = read(sample(image=images), other_at=(0, 3))
+    assert both.paired.tolist() == [True] and both.other.image.shape[0] == 2, "but one of several"
 
 
 def test_another_key_names_the_other_view():
@@ -555,7 +582,11 @@ def test_the_first_bad_sample_of_a_batch_speaks():
 
 def test_every_part_of_a_batch_holds_the_same_samples():
     batch = default_collate([sample(), sample()])
-    for key, value in (("depth", batch["depth"][:1]), ("intrinsics", torch.tensor(5.0))):
+    for key, value in (
+        ("depth", batch["depth"][:1]),
+        ("depth", batch["depth"].repeat(2, 1, 1)),
+        ("intrinsics", torch.tensor(5.0)),
+    ):
         refused({**batch, key: value}, f"{key}: found shape .*, expected 2 samples in front", batched=True)
 
 
@@ -573,7 +604,7 @@ def test_the_size_of_the_picture_is_height_and_width():
 
 @pytest.mark.parametrize("unit", ["cm", "", 0, -0.001, None])
 def test_a_unit_is_a_name_or_a_positive_number(unit):
-    with pytest.raises(ValueError, match="depth_unit is .*, expected one of"):
+    with pytest.raises(ValueError, match=r"depth_unit is .*, expected one of"):
         Views(depth_unit=unit)
 
 
