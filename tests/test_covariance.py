@@ -24,10 +24,9 @@ def test_the_covariance_is_the_inverse_times_the_variance():
 
 
 def test_a_covariance_is_symmetric_bit_for_bit():
-    cov, _ = covariance.from_normal(
-        (positive(5, 20) * torch.logspace(-3, 3, 5, dtype=D)[:, None]).float(), torch.ones(20)
-    )
-    assert torch.equal(cov, cov.mT)
+    unit = torch.logspace(-3, 3, 5, dtype=D)
+    cov, ok = covariance.from_normal(unit[:, None] * positive(5, 20) * unit, torch.ones(20, dtype=D))
+    assert ok.all() and torch.equal(cov, cov.mT)
 
 
 def test_a_length_in_standard_deviations():
@@ -59,22 +58,22 @@ def test_the_median_of_the_used(values, used, wanted):
 @pytest.mark.parametrize("isotropic", [0.0, 0.3, 1.0])
 def test_shapes_are_covariances_over_the_median_of_their_mean_variance(isotropic):
     """Unused ones and those that are no covariance count for nothing and are round."""
-    cov = torch.stack((positive(2, 9), 7 * positive(2, 9, seed=1)))
-    used = torch.ones(2, 9, dtype=torch.bool)
+    cov = torch.stack((positive(2, 10), 7 * positive(2, 10, seed=1)))
+    used = torch.ones(2, 10, dtype=torch.bool)
     used[0, 2] = False
     cov[0, 5] = torch.tensor([[0.5, -0.4], [-0.4, 0.5]], dtype=D)  # correlated, and yet a covariance
     cov[0, 6] = cov[0, 5].abs()
     nan, inf = torch.nan, torch.inf
     bad = [[[1, 0], [0, -1]], [[-1, 0], [0, 1]], [[1, -2], [-2, 1]], [[1, 1], [1, 1]], [[nan, 0], [0, 1]]]
-    bad += [[[inf, 0], [0, 1]], [[0, 0], [0, 1]], [[1, 0], [0, 0]]]
-    cov[1, :8] = torch.tensor(bad, dtype=D)
+    bad += [[[inf, 0], [0, 1]], [[0, 0], [0, 1]], [[1, 0], [0, 0]], [[1, 0], [0, inf]]]
+    cov[1, :9] = torch.tensor(bad, dtype=D)
     shape = covariance.noise_shape(cov, used, isotropic)
     good = used.clone()
-    good[1, :8] = False
+    good[1, :9] = False
     for b in range(2):
-        mean = [float(torch.trace(cov[b, n])) / 2 for n in range(9) if good[b, n]]
+        mean = [float(torch.trace(cov[b, n])) / 2 for n in range(10) if good[b, n]]
         scale = sorted(mean)[(len(mean) - 1) // 2]
-        for n in range(9):
+        for n in range(10):
             wanted = np.eye(2)
             if good[b, n]:
                 wanted = (1 - isotropic) * cov[b, n].numpy() / scale + isotropic * np.eye(2)

@@ -180,7 +180,7 @@ def test_what_is_said_about_a_pose_follows_from_its_tracks():
             noise = most_probable.noise_scale(problem, at)[b]
             np.testing.assert_allclose(float(fit.sigma_px[b]) ** 2, float(noise[30]), rtol=0.2)
         assert torch.equal(fit.cov, fit.shutter.cov[:, :6, :6])
-    args = put(args, valid=tracks.valid & (torch.arange(64) < 24))
+    args = put(args, uv_1=tracks.uv_1, valid=tracks.valid & (torch.arange(64) < 24))
     alone = map_pose(*args, translation_gain=-9.0)  # without far tracks their noise is that of the near ones
     at = dense.unknowns(alone.T_1_from_0.R, alone.T_1_from_0.t, alone.shutter.turn)
     noise = most_probable.noise_scale(dense.problem_of(args, 0.1), at)[:, 0]

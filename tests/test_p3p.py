@@ -130,6 +130,8 @@ def test_p3p_does_not_depend_on_company(hypotheses):
     rays, xyz, _ = triples(8 * hypotheses)
     rays, xyz = (x.view(8, hypotheses, 3, 3).float() for x in (rays, xyz))
     together = p3p(rays, xyz)
+    flat = p3p(rays.flatten(0, 1), xyz.flatten(0, 1))
+    assert all(torch.equal(x.flatten(0, 1), y) for x, y in zip(together, flat, strict=True))
     for b in range(8):
         for x, y in zip(p3p(rays[b : b + 1].clone(), xyz[b : b + 1].clone()), together, strict=True):
             assert torch.equal(x[0], y[b])

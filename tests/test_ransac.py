@@ -26,10 +26,15 @@ def test_slots_are_counted_up_or_thinned_evenly(size):
 
 
 def test_usable_points_come_first_and_are_thinned_evenly():
-    usable = torch.tensor([[0, 1, 0, 1, 1, 0], [0, 0, 0, 0, 0, 0], [1, 1, 1, 1, 1, 1], [0, 1, 1, 1, 1, 1]]) > 0
+    usable = (
+        torch.tensor(
+            [[0, 1, 0, 1, 1, 0], [0, 0, 0, 0, 0, 0], [1, 1, 1, 1, 1, 1], [0, 1, 1, 1, 1, 1], [0, 0, 0, 0, 0, 1]]
+        )
+        > 0
+    )
     index, count = ransac.usable_first(usable, 4)
-    assert count.tolist() == [3, 0, 4, 4]
-    assert index.tolist()[::2] == [[1, 3, 4, 4], [0, 1, 3, 4]] and index[3].tolist() == [1, 2, 3, 4]
+    assert count.tolist() == [3, 0, 4, 4, 1] and index[4].tolist() == [5, 5, 5, 5]
+    assert index.tolist()[:3:2] == [[1, 3, 4, 4], [0, 1, 3, 4]] and index[3].tolist() == [1, 2, 3, 4]
     assert (index[1] < 6).all()
     with pytest.raises(ValueError, match="no points"):
         ransac.usable_first(usable[:, :0], 4)
@@ -184,6 +189,8 @@ def test_a_line_is_a_thousand_times_as_long_as_wide():
     used = torch.tensor([[1, 1, 1, 1, 0, 0]]) > 0
     assert [bool(ransac.collinear(cross(s), used)) for s in (0.0, 0.9e-3, 1.1e-3, 0.5)] == [True, True, False, False]
     assert [bool(ransac.collinear(cross(0.3, s), used)) for s in (0.25e-3, 0.4e-3)] == [True, False]
+    three = torch.cat((cross(0.3), cross(0.0), cross(0.0)[..., [2, 3, 4, 5, 0, 1]]))
+    assert ransac.collinear(three, torch.cat((used, used, used[:, [2, 3, 4, 5, 0, 1]]))).tolist() == [False, True, True]
     assert ransac.collinear(cross(0.5), torch.zeros(1, 6, dtype=torch.bool)).item()
     assert ransac.collinear(cross(0.5), torch.tensor([[1, 0, 0, 0, 0, 0]]) > 0).item()
     unused = cross(0.0)

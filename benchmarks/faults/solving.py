@@ -113,7 +113,12 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("noise_scale", "/ MEDIAN_1D", "/ MEDIAN_2D"),
         ("noise_scale", "noise * factor * factor", "noise * factor"),
         ("noise_scale", "MIN_NOISE_PX**2, MAX_NOISE_PX**2", "MIN_NOISE_PX, MAX_NOISE_PX"),
-        ("noise_scale", "far = torch.where(problem.far.any(-1, keepdim=True), far, near)", "far = far"),
+        (
+            "noise_scale",
+            "far = torch.where(problem.far.any(-1, keepdim=True), far, near)",
+            "far = far",
+            "without far tracks nothing is read of theirs",
+        ),
         ("noise_scale", "problem.near & linear.front", "problem.near"),
         ("most_probable", "1 + o.max_rise", "1 + 2 * o.max_rise"),
         ("most_probable", "cost_near * (1 + o.max_rise) + SLACK", "cost_near * (1 + o.max_rise)"),
