@@ -67,12 +67,12 @@ def batches(n: int, *, seed: int = 0, size: int = BATCH) -> Iterator[Batch]:
         same = waiting[pair.lens is not None]
         same.append((number, kind, *pair.frames(), pair.uv, pair.truth))
         if len(same) == size:
-            yield _join(same)
+            yield join(same)
             same.clear()
-    yield from (_join(rest) for rest in waiting.values() if rest)
+    yield from (join(rest) for rest in waiting.values() if rest)
 
 
-def _join(pairs: list[Any]) -> Batch:
+def join(pairs: list[Any]) -> Batch:
     numbers, kinds, anchors, others, uv, truth = zip(*pairs, strict=True)
     return Batch([*numbers], [*kinds], tree.collate(anchors), tree.collate(others), torch.stack(uv), torch.stack(truth))
 
@@ -216,7 +216,7 @@ def main() -> None:
 def explain(number: int, seed: int) -> None:
     """One pair, alone: its traceback, or its gates and broken promises."""
     kind, pair = make(number, seed=seed)
-    batch = _join([(number, kind, *pair.frames(), pair.uv, pair.truth)])
+    batch = join([(number, kind, *pair.frames(), pair.uv, pair.truth)])
     for method in ("map", "paper"):
         estimate, trace = batch.ask(method)
         gates = Counter(names(Gate)[g] for g in estimate.gate.flatten().tolist())

@@ -60,7 +60,7 @@ def kept(row: dict[str, Any]) -> float:
 
 
 def room() -> str:
-    """The built-in room, exact and with the LiDAR model, both methods: the default seed's and, in brackets, all seeds'."""
+    """The built-in room, exact and with the LiDAR model: the default seed, and in brackets the range of all seeds."""
     rows = []
     for name, words in (("room_exact", "exact depth, no noise"), ("room_phone", "LiDAR model")):
         rooms = scenes(name, "full")

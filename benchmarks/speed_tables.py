@@ -56,9 +56,9 @@ def errors(row: dict[str, Any]) -> str:
 
 
 def on(file: str, shown: str) -> str:
-    """A table, and under it the processor that its file was measured on."""
-    (name,) = {r.get("processor", "a processor that was not written down") for r in timings(file)}
-    return f"{shown}\n\nMeasured on: {name}."
+    """A table, and under it the processor that its file was measured on, where the file says it."""
+    names = {r.get("processor") for r in timings(file)} - {None}
+    return f"{shown}\n\nMeasured on: {', '.join(sorted(names))}." if names else shown
 
 
 def bars() -> str:

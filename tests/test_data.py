@@ -23,6 +23,7 @@ from dhtorch.data import codec_numpy, convert, driving, files, frames_dir, recti
 from dhtorch.data.files import FormatError
 from dhtorch.data.recording import numbers
 from dhtorch.data.writers import parts
+from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Pose
 
@@ -112,8 +113,8 @@ def test_driving_gives_back_the_scene(tmp_path: Path) -> None:
 def test_opening_decodes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     writers.write_named_frames(tmp_path, walk())
     decoded = []
-    decode = files._decode
-    monkeypatch.setattr(files, "_decode", lambda *args: decoded.append(args[0]) or decode(*args))
+    decode = cv2.imdecode
+    monkeypatch.setattr(cv2, "imdecode", lambda *args: decoded.append(1) or decode(*args))
     recording = data.open(tmp_path)
     assert len(recording) == 4 and decoded == []
     frame = recording[2]
@@ -196,10 +197,15 @@ def test_splat_keeps_the_nearest_and_fills_nothing() -> None:
 
 
 @pytest.mark.parametrize("reach", [1, 2, 3, 8])
-def test_window_min_against_pooling(reach: int) -> None:
-    depth = torch.rand(13, 17)
-    want = -torch.nn.functional.max_pool2d(-depth[None, None], 2 * reach + 1, 1, reach)[0, 0]
-    assert torch.equal(convert._window_min(depth, reach), want)
+def test_a_point_is_hidden_by_a_much_nearer_one_in_the_square_around_it(reach: int) -> None:
+    depth = 1 + torch.rand(13, 17, generator=torch.Generator().manual_seed(reach))
+    v, u = torch.meshgrid(torch.arange(13), torch.arange(17), indexing="ij")
+    camera = Camera(torch.tensor([[20.0, 20.0]]), torch.tensor([[8.0, 6.0]]))
+    xyz = cameras.unproject(camera, torch.stack((u, v), -1).view(1, -1, 2).float(), depth.view(1, -1))[0]
+    least = -torch.nn.functional.max_pool2d(-depth[None, None], 2 * reach + 1, 1, reach)[0, 0]
+    want = torch.where(depth > 1.1 * least, 0, depth)
+    assert 0 < int((want == 0).sum()) < want.numel()
+    assert torch.equal(convert.splat(xyz, camera, (13, 17), hide_px=reach), want)
 
 
 # -------------------------------------------------------------------------------------------------------- bad input

@@ -13,22 +13,24 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 import degenerate
 from degenerate_pairs import HW, KINDS, make
 
+N = 10 * len(KINDS)
+
 
 def alone(number, pair=None):
     """One pair as a batch of its own; ``pair`` in place of its own content."""
     kind, own = make(number)
     pair = pair or own
-    return degenerate._join([(number, kind, *pair.frames(), pair.uv, pair.truth)])
+    return degenerate.join([(number, kind, *pair.frames(), pair.uv, pair.truth)])
 
 
 @pytest.fixture(scope="module")
 def rows():
-    return degenerate.run(200)
+    return degenerate.run(N)
 
 
 def test_nothing_raises_and_every_promise_is_kept(rows):
     assert {(r["name"], r["method"]) for r in rows} == {(k, m) for k in KINDS for m in ("map", "paper")}
-    assert all(r["n_pairs"] == 200 // len(KINDS) for r in rows)
+    assert all(r["n_pairs"] == N // len(KINDS) for r in rows)
     faults = {(r["name"], r["method"]): (r["faults"], r["examples"]) for r in rows if r["faults"]}
     assert not faults
     degenerate.show(rows)

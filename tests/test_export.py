@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from dhtorch import export, figures
+from dhtorch import figures
 from dhtorch.codes import Hole, Source
 from dhtorch.export import Shape, Shot, write_colmap, write_glb, write_ply
 from dhtorch.geometry import camera as cameras
@@ -264,13 +264,22 @@ def test_colmap_files_have_two_lines_a_picture_and_few_cameras(tmp_path):
 
 @pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0.5, -0.3, 0.8), (0, 0, 0)])
 @pytest.mark.parametrize("angle", [1e-9, 0.5, math.pi - 1e-9, math.pi, -3.0])
-def test_quaternions_of_all_turns(axis, angle):
+def test_quaternions_of_all_turns(tmp_path, axis, angle):
     way = torch.tensor([*axis], dtype=torch.float64)
     way = way / way.norm().clamp_min(1e-12) * angle
-    R = se3.exp(torch.cat((way, torch.zeros(3).double()))[None]).R[0]
-    w, *v = export.colmap._quaternion(R.tolist())
+    T = se3.exp(torch.cat((way, torch.zeros(3).double()))[None])  # of the world in the camera, as COLMAP writes it
+    (shot, _), *points = model(None, n=1)
+    (row,) = written(tmp_path, Shot("1.png", shot.camera, shot.hw, se3.invert(T)), *points)
+    w, *v = map(float, row.split()[1:5])
     q = torch.tensor(v, dtype=torch.float64)
     K = se3.hat(q)
     again = torch.eye(3).double() + 2 * w * K + 2 * K @ K
-    torch.testing.assert_close(again, R, atol=1e-12, rtol=0)
+    torch.testing.assert_close(again, T.R[0], atol=1e-9, rtol=0)
     assert w >= 0
+
+
+def written(folder, shot, xyz, rgb, error, seen, uv):
+    """The line of every picture of a model with one picture."""
+    write_colmap(folder, [shot], xyz, rgb, error, seen[:, :1], uv[:, :1])
+    lines = [x for x in (folder / "images.txt").read_text().splitlines() if not x.startswith("#")]
+    return lines[::2]

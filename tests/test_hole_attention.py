@@ -2,9 +2,8 @@
 
 import pytest
 import torch
-from test_protocols import method, room, rows
+from test_protocols import Changed, method, room, rows
 
-from dhtorch.data.synthetic import SyntheticRoom
 from dhtorch.experiments import hole_attention as experiment
 from dhtorch.experiments.protocol import Settings, refill
 from dhtorch.negative.hole_attention import largest_cluster
@@ -118,18 +117,15 @@ def shown(outcome):
     return {v: next(iter(outcome.scenes(v, "sensor").values())) for v in experiment.VARIANTS}
 
 
-class Punched(SyntheticRoom):
-    """The room with exact depth except for one region of known place and size."""
-
-    def _render(self, i):
-        frame = super()._render(i)
-        depth = frame.depth.clone()
-        depth[:, 96:, 128:] = 0
-        return frame.replace(depth=depth)
+def punched(frame):
+    """Exact depth except for one region of known place and size."""
+    depth = frame.depth.clone()
+    depth[:, 96:, 128:] = 0
+    return frame.replace(depth=depth)
 
 
 def test_a_known_region_without_returns_is_looked_at_in_vain():
-    outcome = asked(Punched(hw=(192, 256), n_frames=2, lidar="exact"), stride=2)
+    outcome = asked(Changed(room(lidar="exact"), punched), stride=2)
     found = shown(outcome)
     assert found["even"]["hole_rate"] == pytest.approx(0.25, abs=0.02), "a quarter of the picture"
     assert found["attention"]["hole_rate"] > 0.5 > found["centre"]["hole_rate"]

@@ -4,9 +4,8 @@ import math
 
 import pytest
 import torch
-from test_protocols import method, room, rows
+from test_protocols import Changed, method, room, rows
 
-from dhtorch.data.synthetic import SyntheticRoom
 from dhtorch.experiments import icp as experiment
 from dhtorch.experiments.protocol import Settings
 from dhtorch.geometry import se3
@@ -173,13 +172,12 @@ def test_links_without_confidence_leave_the_map_and_keep_the_pose():
 
 
 def test_a_scene_without_trajectory_or_depth_has_no_answer():
-    blind, empty = room(), room(lidar=None)
-    blind.poses = None
+    blind, empty = Changed(room(), poses=None), room(lidar=None)
     assert experiment.verdict(asked(blind))[0] is None
     silent = asked(empty)
     assert silent.verdict == "undecided" and silent.rows[0]["note"] == "nothing to ask" and len(silent.rows) == 9
     with pytest.raises(ValueError, match="found 1 frames of synthetic_room and links=10, expected at least two"):
-        asked(SyntheticRoom(hw=(96, 128), n_frames=1), links=10)
+        asked(room(hw=(96, 128), n_frames=1), links=10)
 
 
 @pytest.mark.parametrize(

@@ -5,11 +5,11 @@ from functools import partial
 
 import pytest
 import torch
+from rooms import room as rendered
 
 from dhtorch import archive
 from dhtorch.baselines import dinov2
 from dhtorch.data.pairs import by_gap
-from dhtorch.data.synthetic import SyntheticRoom
 from dhtorch.experiments import latency, memory
 from dhtorch.experiments.protocol import Settings
 from dhtorch.pair import extend
@@ -21,7 +21,7 @@ PAPER = partial(extend, sample=sample.spiral, backproject=backproject.backprojec
 
 
 def measured(**options):
-    room = SyntheticRoom(hw=(60, 80), n_frames=3)
+    room = rendered(hw=(60, 80), n_frames=3)
     fast = {"rounds": 2, "front_end_repeats": 10, "pair_repeats": 1, "dinov2_repeats": 1, "peak": False}
     chosen = {"paper": PAPER}
     options = {**fast, "sizes": SIZES, "n": 64, "dinov2": partial(dinov2.load, **TINY), **options}
@@ -97,15 +97,15 @@ def test_ratios_are_taken_round_by_round():
             (latency.VISUAL, "forward", [{"forward": [50.0]}, {"forward": [100.0]}]),
         )
     )
-    summary = latency._summary([small, large, theirs])
+    summary = latency.summarise([small, large, theirs])
     assert [summary["a.growth"][k] for k in ("value", "low", "high")] == [3, 3, 3]
     assert [summary["a.speedup"][k] for k in ("value", "low", "high")] == [50, 50, 50]
 
 
 def test_percentiles():
     times = [float(k) for k in range(101)]
-    assert [latency._percentile(times, q) for q in (0.5, 0.95, 0.99)] == [50, 95, 99]
-    assert latency._percentile([1.0, 2.0], 0.5) == 1.5 and latency._percentile([7.0], 0.99) == 7
+    assert [latency.percentile(times, q) for q in (0.5, 0.95, 0.99)] == [50, 95, 99]
+    assert latency.percentile([1.0, 2.0], 0.5) == 1.5 and latency.percentile([7.0], 0.99) == 7
 
 
 def test_wrong_counts_raise():
@@ -138,7 +138,7 @@ def test_dinov2_shapes_seed_and_local_weights(tmp_path):
     state = torch.get_rng_state()
     network, again = dinov2.load(**TINY), dinov2.load(**TINY)
     assert torch.equal(torch.get_rng_state(), state) and not network.training
-    image = torch.randint(0, 256, (2, 3, 40, 60), dtype=torch.uint8)
+    image = torch.randint(0, 256, (2, 3, 40, 60), generator=torch.Generator().manual_seed(0)).to(torch.uint8)
     with torch.no_grad():
         tokens = network(pixel_values=dinov2.pixel_values(image, 56)).last_hidden_state
         assert tokens.shape == (2, 1 + 4 * 4, 32)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import pickle
 import shutil
-import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -112,14 +111,13 @@ def test_thousands_of_episodes_are_listed_and_none_is_opened(
         parquet.write_table(many(parquet.read_table(listed), n), listed)
         rewrite(tmp_path / "data/chunk-000/file-000.parquet", lambda t: with_column("episode_index", n - 1, t.slice(2)))
     opened: list[Path] = []
-    read = lerobot_rows._read_table.__wrapped__
-    monkeypatch.setattr(lerobot_rows, "_read_table", lambda f, *a: opened.append(f) or read(f, *a))
-    start = time.process_time()
+    read = lerobot_rows.read_columns
+    monkeypatch.setattr(lerobot_rows, "read_columns", lambda f, *a: opened.append(f) or read(f, *a))
     recordings = data.open_all(tmp_path, gap=3)
-    assert time.process_time() - start < 1 and opened == []  # measured below 0.2 s
+    assert opened == []
     assert len(recordings) == n and recordings.names[7].endswith("/episode_000007/front")
     same_scene(recordings[-1], episodes()[1], STEP["video"])
-    assert recordings[-1].gap == 3 and len(opened) == 2 and recordings[n - 1].name == recordings.names[-1]
+    assert recordings[-1].gap == 3 and 1 <= len(opened) <= 2 and recordings[n - 1].name == recordings.names[-1]
     assert pickle.loads(pickle.dumps(recordings)).names == recordings.names
     assert [r.name for r in recordings[n - 1 :]] == recordings.names[n - 1 :]
     with pytest.raises(IndexError):
@@ -356,8 +354,9 @@ def test_pages_that_unpack_into_too_much_are_refused(tmp_path: Path, monkeypatch
     parquet.write_table(pyarrow.table({"x": np.arange(100)}), file, use_dictionary=False, compression="none")
     assert codec_parquet.read_columns(file, ["x"])["x"].tolist() == list(range(100))
     good = file.read_bytes()
-    size = codec_parquet._thrift(good, 4)[0][2]
-    coded = [bytes([(2 * n & 127) | 128, 2 * n >> 7]) for n in (size, size + 1000)]  # zigzag, seven bits a byte
+    assert good[4:7] == b"\x15\x00\x15", "Thrift's compact form: field 1, a data page, then field 2, its size unpacked"
+    size = ((good[7] & 127) | good[8] << 7) // 2  # zigzag, seven bits a byte
+    coded = [bytes([(2 * n & 127) | 128, 2 * n >> 7]) for n in (size, size + 1000)]
     file.write_bytes(good.replace(coded[0], coded[1], 1))
     with pytest.raises(FormatError, match=rf"that unpack into {size + 1000}"):
         codec_parquet.read_columns(file, ["x"])

@@ -122,7 +122,9 @@ def test_the_source_archive_makes_the_same_wheel(wheel, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("extra", ["data", "live", "learned", "view", "mesh", "scale", "ray-launcher", "docs", "dev"])
+@pytest.mark.parametrize(
+    "extra", ["data", "live", "learned", "view", "mesh", "scale", "ray-launcher", "peers", "docs", "dev"]
+)
 def test_extras_can_be_resolved(wheel, extra):
     """Dry run against the index, with the pinned torch."""
     ask = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--retries", "0", "--timeout", "10"]

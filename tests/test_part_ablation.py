@@ -5,9 +5,9 @@ from functools import partial
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
+from rooms import room
 
 from dhtorch.data.pairs import by_gap
-from dhtorch.data.synthetic import open_rooms
 from dhtorch.experiments import part_ablation
 from dhtorch.experiments.protocol import Settings
 from dhtorch.run import config_dir
@@ -59,8 +59,9 @@ def test_gates_and_sigma_are_told_apart(methods):
 
 
 def test_every_variant_runs_and_tells_its_cost(methods):
-    rooms = open_rooms(("walk",), n_frames=4, hw=(192, 256), gap=3, lidar="exact")
-    outcome = part_ablation.run(rooms, methods, by_gap, Settings(), seeds=1)
+    outcome = part_ablation.run(
+        [room(n_frames=4, hw=(192, 256), gap=3, lidar="exact")], methods, by_gap, Settings(), seeds=1
+    )
     variants = part_ablation.taken_apart(*methods.values())
     assert {r["method"] for r in outcome.rows} == set(variants)
     assert all(outcome.summary[f"{name}.pair_ms"]["value"] > 0 for name in variants)

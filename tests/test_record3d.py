@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import colorsys
 import json
 import math
 import os
@@ -17,6 +18,7 @@ import numpy as np
 import pytest
 import torch
 from box import disagreement, off_wall, own_camera, pose, render, turned_over, world_points
+from scipy.spatial.transform import Rotation
 
 from dhtorch import data, tree
 from dhtorch.data import files, record3d_video, writers
@@ -376,7 +378,8 @@ def test_mp4_gives_back_the_scene(tmp_path: Path, depth_range: tuple[float, floa
 
 def test_mp4_drops_both_red_ends_jumps_and_grey() -> None:
     hue = np.linspace(0, 3, 300, endpoint=False, dtype=np.float32)
-    rgb = np.tile(writers.record3d._hue(hue[None] / 3), (5, 1, 1))
+    colours = [colorsys.hsv_to_rgb(h / 3, 1, 1) for h in hue.tolist()]
+    rgb = np.tile((255 * np.array(colours)).round().astype(np.uint8), (5, 1, 1))
     depth = record3d_video.hue_depth(rgb, 0, 3, 0.05)[2]
     kept = depth > 0
     np.testing.assert_allclose(depth[kept], hue[kept], atol=0.003)
@@ -433,6 +436,7 @@ class Phone:
         self.conf = np.zeros(DEPTH_HW if lidar else (0, 0), np.uint8)
         self.taken = threading.Semaphore(0)  # the reader wants another one
         self.connected = False
+        self.over = threading.Event()
         self.on_new_frame: Callable[[], None] = lambda: None
         self.on_stream_stopped: Callable[[], None] = lambda: None
 
@@ -441,14 +445,14 @@ class Phone:
 
     def connect(self, device: Any) -> bool:
         self.connected = device.udid == "x"
-        threading.Thread(target=self._run, daemon=True).start()
+        threading.Thread(target=self.run, daemon=True).start()
         return self.connected
 
     def disconnect(self) -> None:
         self.connected = False
         self.taken.release()
 
-    def _run(self) -> None:
+    def run(self) -> None:
         for frame in self.frames:
             if self.wait:
                 self.taken.acquire(timeout=5)
@@ -462,6 +466,7 @@ class Phone:
             self.on_new_frame()
             self.rgb[:], self.depth[:], self.conf[:] = 7, 7, 2  # gone as soon as the callback returns
         self.on_stream_stopped()
+        self.over.set()
 
     def get_rgb_frame(self) -> np.ndarray:
         return self.rgb
@@ -477,7 +482,10 @@ class Phone:
         return SimpleNamespace(fx=fx, fy=fy, tx=tx, ty=ty)
 
     def get_camera_pose(self) -> Any:
-        row = writers.record3d._pose(self.now)
+        c2w = np.eye(4)
+        c2w[:3, :3], c2w[:3, 3] = self.now.T_world_from_cam.R[0], self.now.T_world_from_cam.t[0]
+        c2w = c2w @ np.diag([1.0, -1.0, -1.0, 1.0])  # ARKit's axes
+        row = [*Rotation.from_matrix(c2w[:3, :3]).as_quat(), *c2w[:3, 3]]
         return SimpleNamespace(**dict(zip(("qx", "qy", "qz", "qw", "tx", "ty", "tz"), row, strict=True)))
 
     def get_device_type(self) -> int:
@@ -507,12 +515,9 @@ def test_live_frames_are_copies_with_our_axes() -> None:
 
 def test_live_front_camera_and_slow_reader() -> None:
     phone = Phone(walk(9), lidar=False, wait=False)
-    stopped = threading.Event()
     live = LiveFrames(phone, ahead=2)
     with live:
-        original = phone.on_stream_stopped
-        phone.on_stream_stopped = lambda: (original(), stopped.set())
-        stopped.wait(5) if not live._stopped else None
+        assert phone.over.wait(5)
         got = list(live)
     assert [float(f.camera.f[0, 0]) for f in got] == [68.5, 69.5] and live.dropped == 7
     assert got[0].conf is None and got[0].T_world_from_cam is None

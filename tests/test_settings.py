@@ -8,6 +8,7 @@ from pathlib import Path
 
 import hydra
 import pytest
+from hydra.errors import HydraException
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
@@ -117,7 +118,7 @@ def test_methods_become_partials_of_extend():
 
 def test_misspelt_options_fail():
     for wrong in ("sede=1", "method.track.windw=3", "method=papr", "data.n_frame=3"):
-        with pytest.raises(Exception, match=wrong.split("=")[0].split(".")[-1]):
+        with pytest.raises(HydraException, match=wrong.split("=")[0].split(".")[-1]):
             compose(wrong)
 
 

@@ -25,8 +25,9 @@ def two_views(n):
     depth = 1 + 4 * torch.rand(2, n, generator=g)
     camera = Camera(torch.full((2, 2), 500.0), torch.tensor([[320.0, 240.0], [300.0, 250.0]]))
     T = se3.exp(torch.tensor([[0.01, 0.02, -0.01, 0.2, 0.02, 0.01], [0.0, 0.1, 0.0, -0.2, 0.0, 0.05]]))
-    uv_1 = cam.project(camera, se3.apply(T, cam.unproject(camera, uv_0, depth)))
-    return (uv_0, uv_1, camera, camera, T), depth
+    other = Camera(torch.full((2, 2), 450.0), torch.tensor([[310.0, 235.0], [330.0, 245.0]]))
+    uv_1 = cam.project(other, se3.apply(T, cam.unproject(camera, uv_0, depth)))
+    return (uv_0, uv_1, camera, other, T), depth
 
 
 @pytest.mark.parametrize("points", [64, 10_000])

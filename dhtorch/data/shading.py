@@ -51,7 +51,7 @@ class Scene:
         self._scale = _texture_scale(solids, surfaces)
         #: Mean grey of each face (faces,), display values: the surface's brightness to a sensor with its own light.
         self.albedo = (self._pictures.mean[self._picture] * self._tint * torch.tensor(LUMA)).sum(-1)
-        self._light = _Lightmap(self.solids, lights, ambient)
+        self.light = _Lightmap(self.solids, lights, ambient)
 
     def shade(
         self, o: Sequence[Tensor], d: Sequence[Tensor], t: Tensor, index: Tensor, spread: float
@@ -90,7 +90,7 @@ class Scene:
         # Isotropic filter: the geometric mean of the footprint across and along the slant.
         width = spread * t / self.cosine(d, face, p).clamp(min=1e-3).sqrt() * scale[:, 2]
         picture = self._pictures.sample(self._picture[face], across * scale[:, 0], down * scale[:, 1], width)
-        return picture * self._tint[face] * (self._light.sample(face, across, down) + self._glow[face, None]), face
+        return picture * self._tint[face] * (self.light.sample(face, across, down) + self._glow[face, None]), face
 
     def _mirror(
         self, colour: Tensor, face: Tensor, o: Sequence[Tensor], d: Sequence[Tensor], t: Tensor, spread: float

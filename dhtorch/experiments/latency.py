@@ -140,7 +140,7 @@ def run(
     rows = [_row(recording.name, b, stage, settings, n) for b in branches for stage in b.rounds[0]]
     if note:
         rows.append({"scene": recording.name, "pair": None, "method": VISUAL, "stage": "forward", "note": note})
-    outcome = Outcome(rows=rows, summary=_summary(branches), n_pairs=1)
+    outcome = Outcome(rows=rows, summary=summarise(branches), n_pairs=1)
     return outcome.decide(QUESTION, EXPECTATION, *judge(name, outcome.summary, sizes, note))
 
 
@@ -259,12 +259,12 @@ def _row(scene: str, branch: Branch, stage: str, settings: Settings, n: int) -> 
     row |= {"n": None if branch.method == VISUAL else n, "repeats": len(times)}
     row |= {"threads": torch.get_num_threads(), "device": settings.device, **_machine()}
     for name, (share, least) in TAILS.items():
-        row[name] = _percentile(times, share) if len(times) >= least else None
+        row[name] = percentile(times, share) if len(times) >= least else None
     row |= {"low_ms": min(branch.medians(stage)), "high_ms": max(branch.medians(stage))}
     return row | branch.more if stage == branch.stage else row
 
 
-def _summary(branches: Sequence[Branch]) -> dict[str, Any]:
+def summarise(branches: Sequence[Branch]) -> dict[str, Any]:
     """Medians by ``<method>.<stage>.<height>x<width>``, memory, and the paper's two ratios, round by round."""
     summary: dict[str, Any] = {}
     front = [b for b in branches if b.stage == "front_end"]
@@ -303,7 +303,7 @@ def _machine() -> Row:
     return {"cpu": name or platform.processor() or platform.machine(), "cores": os.cpu_count(), "load": load}
 
 
-def _percentile(ordered: Sequence[float], share: float) -> float:
+def percentile(ordered: Sequence[float], share: float) -> float:
     """Percentile with linear interpolation of sorted numbers."""
     place = share * (len(ordered) - 1)
     low = int(place)
