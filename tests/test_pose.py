@@ -333,6 +333,36 @@ def test_points_behind_the_camera_are_no_inliers():
     assert fit.ok.all() and not fit.inlier[:, :20].any() and fit.inlier[:, 20:].all()
 
 
+def test_a_point_behind_the_camera_and_seen_on_its_axis_holds_nothing():
+    """There the projection of a point held away from the camera's plane is where it was seen."""
+    args, T = pairs(2, 40, noise=0.2)
+    clean = pnp_ransac(*with_points(args, valid=torch.arange(40).expand(2, 40) != 7))
+    xyz, uv_1 = args[0].xyz.clone(), args[1].uv_1.clone()
+    back = torch.tensor([0.0, 0.0, -2.0], dtype=torch.float64).expand(2, 1, 3)
+    for pose in (T, clean.T_1_from_0):
+        xyz[:, 7] = se3.apply(se3.invert(pose), back)[:, 0]
+        uv_1[:, 7] = args[3].c
+        fit = pnp_ransac(*with_points(args, xyz=xyz, uv_1=uv_1))
+        assert fit.ok.all() and not fit.inlier[:, 7].any()
+        torch.testing.assert_close(fit.T_1_from_0.t, clean.T_1_from_0.t, rtol=0, atol=1e-5)
+
+
+def test_inliers_on_a_line_are_degenerate_whatever_stands_beside_it():
+    """A point off the line whose pixel is wrong by a little gives the search a pose, and no refinement keeps it."""
+    args, T = pairs(6, 31)
+    along = torch.linspace(-1, 1, 31, dtype=torch.float64)
+    xyz = torch.stack((along, 0.5 * along, 2 + 0.3 * along), -1).expand(6, 31, 3).clone()
+    xyz[:, 30] = torch.tensor([-0.4, 0.6, 1.7], dtype=torch.float64)
+    Y = se3.apply(T, xyz)
+    uv_1 = Y[..., :2] / Y[..., 2:] * args[3].f[:, None] + args[3].c[:, None]
+    g = torch.Generator().manual_seed(0)
+    uv_1 = uv_1 + 0.3 * torch.randn(uv_1.shape, generator=g, dtype=torch.float64)
+    uv_1[:, 30] += 6 * torch.nn.functional.normalize(torch.randn(6, 2, generator=g, dtype=torch.float64), dim=-1)
+    fit = pnp_ransac(*with_points(args, xyz=xyz, uv_1=uv_1))
+    on_line = fit.n_inlier == 30
+    assert on_line.sum() >= 4 and (fit.code[on_line] == PoseCode.DEGENERATE).all()
+
+
 def test_values_that_cannot_be_used_do_not_matter():
     args, _ = pairs(2, 50, noise=0.3, outliers=0.2, dtype=torch.float32)
     bad = torch.arange(50) % 3 == 0
