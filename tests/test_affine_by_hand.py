@@ -384,3 +384,12 @@ def test_only_valid_tracks_have_a_derivative():
             assert bool((slope != 0).any()) == some
         with torch.no_grad():
             assert torch.equal(call().uv_1, tracks.uv_1) and not call().uv_1.requires_grad
+
+
+def test_a_picture_that_only_changes_along_rows_determines_no_motion():
+    row = 0.5 + 0.3 * torch.sin(torch.arange(W, dtype=torch.float64) / 3)
+    src = row.expand(2, 1, H, W).contiguous()
+    uv = places(2, 6, H, W, margin=14)
+    views, still = pyramids(src, src.roll(1, 3), 1), torch.eye(2, dtype=uv.dtype).expand(2, 6, 2, 2)
+    assert torch.equal(affine.step(*views, uv, uv + 0.3, still, window=WINDOW), uv + 0.3)
+    assert not affine.register(*views, uv, uv + 0.3, window=WINDOW).ok.any()
