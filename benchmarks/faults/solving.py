@@ -235,11 +235,6 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_fit", "torch.where(enough[:, None], inlier, usable)", "usable"),
         ("pnp_ransac", "max(4, min_inlier)", "max(3, min_inlier)"),
         ("_truncated", "usable * (threshold_px * threshold_px)", "usable * threshold_px"),
-        (
-            "_truncated",
-            "torch.where(depth > MIN_DEPTH, torch.minimum(square, limits), limits)",
-            "torch.minimum(square, limits)",
-        ),
         ("_truncated", "weight * (square < limits)", "weight"),
         ("_robust_pose", "options.local_optimisation, step", "options.polish_steps, step"),
         ("_robust_pose", "argmin(1)", "argmax(1)"),
