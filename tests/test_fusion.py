@@ -157,10 +157,9 @@ def still_views(depth, sigma, shared=0.0, gate=0):
 
 
 def test_limits_hold_at_the_limit_itself():
-    """Inverse depths 0.25 and 0.75 with a variance of 1/32 each: the mean is 0.5, two squared differences are 4."""
-    one = (1 / 32) ** 0.5
-    two = still_views([4.0, 4 / 3], [one * 16, one * 16 / 9])
-    gates = [int(inverse_variance(two, max_chi2=x, max_sigma_rel=None).gate) for x in (4.0, 3.999)]
+    """Inverse depths 1/4 and 1/2 with a deviation of 1/8 each: each differs from the mean by as much."""
+    two = still_views([4.0, 2.0], [2.0, 0.5])
+    gates = [int(inverse_variance(two, max_chi2=x, max_sigma_rel=None).gate) for x in (2.0, 1.9999)]
     assert gates == [Gate.ANSWER, Gate.INCONSISTENT]
     same = still_views([4.0, 4.0], [0.5, 0.5])
     gates = [int(inverse_variance(same, max_sigma_rel=x).gate) for x in (0.125, 0.1249)]
