@@ -237,12 +237,13 @@ def test_points_of_a_scene_are_pooled_before_the_quantile_is_taken():
 def test_points_takes_any_shape_and_counts_what_may_count():
     nan = math.nan
     depth = torch.tensor([[1.0, 2.0, nan], [4.0, 5.0, 6.0]])
-    true = torch.tensor([[2.0, 0.0, 2.0], [nan, 2.0, -1.0]])
+    true = torch.tensor([[2.0, math.inf, 2.0], [nan, 2.0, -1.0]])
     candidate = torch.tensor([[1, 1, 1], [1, 1, 1]])
     p = errors.points(depth, true, torch.tensor([[nan, 0.2, 0.3], [0.4, 0.5, 0.6]]), sigma=depth / 10)
     assert p.true_depth.tolist() == [2, 2, 2] and p.keep.tolist() == [True, False, True]
     assert p.score.tolist() == pytest.approx([0, 0, 0.5]) and p.sigma.isnan().tolist() == [False, True, False]
     assert {x.dtype for x in (p.true_depth, p.depth, p.score, p.sigma, p.residual_px)} == {torch.float64}
+    assert not errors.points(torch.ones(4), torch.tensor([0.0, nan, math.inf, -math.inf])).keep.numel()
     candidate[0, 0] = 0
     assert errors.points(depth, true, candidate=candidate).true_depth.tolist() == [2, 2]
     refused = errors.points(depth, true, keep=torch.tensor([[0, 1, 1], [1, 1, 1]]))
