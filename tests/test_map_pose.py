@@ -157,6 +157,47 @@ def test_the_answer_is_the_optimum_of_the_problem_that_its_options_describe(isot
         assert newton_step(args, plain, o, isotropic) > 0.2 or o.turn_sigma > 0
 
 
+def test_the_near_cost_may_rise_by_the_share_that_is_allowed():
+    """Far tracks that have moved on their own; how far the near cost rises with them is read from the written-out one."""
+    args, *_ = pairs(1, 12, 60, noise=0.3, depth=0.003, baseline=0.3, seed=4)
+    shift = torch.tensor([3.3, 2.1], dtype=D) * (torch.arange(72) >= 12)[:, None]
+    args = put(args, uv_1=args[1].uv_1 + shift)
+    o = most_probable.Options(far_weight=0.5, turn_sigma=0.0, translation_gain=-9.0, near_steps=12, steps=12)
+    ask = lambda rise: map_pose(*args, **o._replace(max_rise=rise)._asdict())  # noqa: E731
+    problem, start = dense.problem_of(args, 0.1), pnp_ransac(*args).T_1_from_0
+    places = [most_probable.most_probable(problem, start, o._replace(max_rise=x)).at for x in (-9.0, 1e9)]
+    noise = most_probable.noise_scale(problem, places[1])
+    before, after = (
+        dense.cost([x for x in dense.tracks(problem, at, noise) if x.near], 0.0, o.kernel, o.bend) for at in places
+    )
+    rise = (after - 1.0) / before - 1
+    assert 0.1 < rise < 3
+    assert ask(0.95 * rise).code.tolist() == [PoseCode.KEPT_PNP] and ask(1.05 * rise).code.tolist() == [PoseCode.OK]
+
+
+def test_steps_of_the_near_tracks_and_of_all_are_counted_apart():
+    """From a start off the truth, with the near tracks alone answered: only their own steps bring it there."""
+    args, T, *_ = pairs(1, 20, 40, noise=0.0, depth=0.0)
+
+    def off(samples, tracks, *_):
+        zero = torch.zeros(1, dtype=D)
+        start = se3.retract(T, torch.full((1, 6), 0.02, dtype=D))
+        return PoseFit(start, torch.zeros(1, 6, 6, dtype=D), tracks.valid, zero.long(), zero, zero, zero, zero.int())
+
+    miss = [
+        float(
+            errors(
+                map_pose(*args, start=off, max_rise=-9.0, turn_sigma=0.0, translation_gain=-9.0, near_steps=a, steps=b),
+                T,
+            )
+            .abs()
+            .max()
+        )
+        for a, b in ((8, 1), (0, 8))
+    ]
+    assert miss[0] < 1e-9 and miss[1] > 1e-6
+
+
 def test_what_is_said_about_a_pose_follows_from_its_tracks():
     """Inliers, their rms, the noise and the significance of the translation, from numpy, one track at a time."""
     args, *_ = pairs(2, 24, 40, turn=0.004, seed=3)
