@@ -215,7 +215,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ),
         ("step", "_normal(Q)", "Q @ Q.mT"),
         ("step", "permute(3, 2, 0, 1)", "permute(2, 3, 0, 1)"),
-        ("step", "usable & solved", "usable"),
+        ("step", "usable & solved", "usable", "where it is not solved the solution is zero"),
         ("_rows", "_inside(here.detach(), source) & _inside(there, target)", "_inside(there, target)"),
         (
             "_rows",
