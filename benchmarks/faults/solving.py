@@ -271,6 +271,10 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
             "problem.uv, problem.f, problem.c, y, 0 * at.turn",
         ),
         ("_reprojection", "(square * inlier).sum(-1)", "(square * problem.near).sum(-1)"),
-        ("_orthonormal", "torch.stack((x, torch.linalg.cross(z, x), z), 1)", "torch.stack((x, R[:, 1], z), 1)"),
+        (
+            "_orthonormal",
+            "torch.stack((x, torch.linalg.cross(z, x), z), 1)",
+            "torch.stack((x, torch.linalg.cross(x, z), z), 1)",
+        ),
     ],
 }
