@@ -393,3 +393,33 @@ def test_a_picture_that_only_changes_along_rows_determines_no_motion():
     views, still = pyramids(src, src.roll(1, 3), 1), torch.eye(2, dtype=uv.dtype).expand(2, 6, 2, 2)
     assert torch.equal(affine.step(*views, uv, uv + 0.3, still, window=WINDOW), uv + 0.3)
     assert not affine.register(*views, uv, uv + 0.3, window=WINDOW).ok.any()
+
+
+def test_a_search_that_ends_with_more_noise_than_it_began_with_is_rejected():
+    """One step from far away, or in another picture, often makes it worse."""
+    src, dst = two_views()
+    uv = places(2, 20, H, W, margin=14)
+    start = near(uv, spread=4.0)
+    options = {"iterations": 1, "epsilon_px": 0.0, "max_shift_px": 50.0}
+    for image in (dst, waves(2, H, W, seed=9)):
+        found = affine.register(*pyramids(src, image), uv, start, window=WINDOW, **options)
+        agrees(found, by_hand(src, image, uv, start, 1, 0.0, 50.0), rtol=1e-5)
+
+
+def test_a_search_that_ends_outside_is_rejected_however_well_it_fits():
+    """Image 1 goes on beyond its border as its mirror image does."""
+    draw = np.random.default_rng(4)
+    length, phase, turn = (x[:, None, None] for x in (draw.uniform(9, 30, 15), *draw.uniform(0, 6, (2, 15))))
+    v, u = np.mgrid[:H, :W].astype(float)
+
+    def picture(u):
+        waves = np.cos(2 * np.pi / length * np.cos(turn) * u) * np.cos(2 * np.pi / length * np.sin(turn) * v + phase)
+        return torch.from_numpy(0.5 + 0.1 * waves.sum(0))[None, None]
+
+    uv = torch.tensor([[[7.0, 30.0], [7.0, 45.0], [7.0, 60.0], [9.0, 30.0], [9.0, 45.0], [9.0, 60.0]]]).double()
+    truth = uv - torch.tensor([7.9, 0.0])
+    found = affine.register(
+        *pyramids(picture(u - 7.9), picture(u)), uv, truth + torch.tensor([0.6, 0.0]), window=WINDOW
+    )
+    assert found.ok.tolist() == [[False] * 3 + [True] * 3]
+    assert (found.shift_px - 0.6).abs().max() < 0.05, "rejected or not, it went there"

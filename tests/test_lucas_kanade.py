@@ -488,3 +488,12 @@ def test_with_a_graph_valid_tracks_take_one_more_step(normalise, who):
     assert (none == 0).all()
     with torch.no_grad():
         assert torch.equal(lucas_kanade(*leaves, **options).uv_1, plain.uv_1)
+
+
+def test_a_search_that_starts_outside_does_not_begin():
+    src, dst = two_views((0.6, 0.4))
+    uv = torch.tensor([[1.5, 40.0], [60.0, H - 2.5], [60.0, 40.0]], dtype=torch.float64).expand(2, -1, -1)
+    init = torch.tensor([[-0.7, 40.0], [60.0, H - 0.3], [60.5, 40.2]], dtype=torch.float64).expand(2, -1, -1)
+    found = lucas_kanade(src, dst, uv, uv_1_init=init, **OPTIONS | {"levels": 1})
+    torch.testing.assert_close(found.uv_1[:, :2], init[:, :2], rtol=0, atol=1e-12)
+    assert found.valid.tolist() == [[False, False, True]] * 2 and (found.uv_1[:, 2] != init[:, 2]).all()

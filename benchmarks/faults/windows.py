@@ -313,7 +313,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
             "lk.within(x, *source.bounds(0))",
         ),
         ("refine", "start - torch.where", "start + torch.where"),
-        ("refine", "usable & textured", "usable"),
+        ("refine", "usable & textured", "usable", "the inverse is zero without texture: no step"),
         ("refine", "start = _finite(x_1)", "start = x_1"),
         ("_there_and_back", "row(init) - x", "row(init)"),
         ("_there_and_back", "((source, target), (target, source))", "((source, target), (source, target))"),
