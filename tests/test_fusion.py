@@ -179,6 +179,15 @@ def test_a_view_without_a_positive_depth_and_a_finite_sigma_says_nothing():
         assert int(alone.gate) == Gate.INCONSISTENT, "an answer that cannot be weighed gives no better reason"
 
 
+def test_one_view_is_its_own_answer_and_none_is_refused():
+    views = views_of(V=1, N=5)
+    found = inverse_variance(views)
+    for name in (*FIELDS, "gate", "n_views"):
+        assert torch.equal(getattr(found, name).nan_to_num(), getattr(views, name)[0].nan_to_num()), name
+    with pytest.raises(ValueError, match="at least one view"):
+        inverse_variance(views[:0])
+
+
 def test_a_standstill_is_what_more_than_the_share_of_views_say():
     """Even of one point of the anchor; and of each anchor for itself."""
     views = views_of(V=4, B=2, N=5, silent=0.0, spread=0.1)
@@ -436,13 +445,32 @@ def test_five_views_are_used_by_default_and_as_many_as_asked_for_are_not_chosen_
 
 
 def test_the_trace_sums_the_milliseconds_over_the_views(monkeypatch):
-    """By a clock that goes on by a second whenever it is asked: one a stage and view."""
+    """By a clock that goes on by as many seconds as it has been asked."""
+    names = ("sample", "backproject", "classify", "track", "pose", "triangulate", "score")
+    asked, expected = 2, dict.fromkeys(names, 0.0)
+    for _ in range(3):
+        asked += 1  # the view begins
+        for name in names:
+            asked += 1
+            expected[name] += 1e3 * asked
+    expected |= {"samples": 1e3 * 2, "fuse": 1e3 * (asked + 2)}
+    times = itertools.accumulate(itertools.count(1))
+    monkeypatch.setattr(time, "perf_counter", lambda: float(next(times)))
     seats, trace = Seats(), {}
-    ticks = itertools.count()
-    monkeypatch.setattr(time, "perf_counter", lambda: float(next(ticks)))
     extend_window(seats.anchor, seats.others, **seats.seats(), trace=trace)
-    each = dict.fromkeys(("sample", "backproject", "classify", "track", "pose", "triangulate", "score"), 3000.0)
-    assert trace["ms"] == {"samples": 1000.0, **each, "fuse": 1000.0}
+    assert trace["ms"] == expected
+
+
+def test_what_a_window_asks_by_default():
+    """A texture of 1e-5, 200 hypotheses, the draws of seed 0."""
+    seats = Seats()
+    given = {k: v for k, v in seats.seats().items() if k != "hypotheses"}
+    texture = torch.where(torch.arange(seats.n) % 2 == 0, 1.01e-5, 0.99e-5).expand(2, -1)
+    given["classify"] = lambda _, samples: samples.replace(trackability=texture)
+    extend_window(seats.anchor, seats.others, **given)
+    for k, (_, tracks, draws) in enumerate(seats.asked["pose"]):
+        assert torch.equal(tracks.valid, seats.tracks(k, seats.uv).valid & (texture > 1e-5))
+        assert torch.equal(draws, uniform_draws(0, 2, 200).float())
 
 
 def test_a_samples_texture_is_asked_in_every_view():

@@ -98,7 +98,7 @@ def test_the_papers_score_rises_with_parallax_and_falls_with_the_residual(option
 def test_the_papers_score_is_zero_where_parallax_or_residual_is_no_number():
     estimate, *rest = answers()
     parallax, residual = estimate.parallax_deg.clone(), estimate.residual_px.clone()
-    parallax[0, 0], residual[0, 1], parallax[0, 2] = torch.nan, torch.inf, torch.inf
+    parallax[0, 0], residual[0, 1], parallax[0, 2] = torch.nan, torch.nan, torch.inf
     found = rank(estimate.replace(parallax_deg=parallax, residual_px=residual), *rest).score
     assert found[0, :3].tolist() == [0, 0, 0] and (found[0, 3:-2] > 0).all() and found.isfinite().all()
 
@@ -198,6 +198,8 @@ def test_where_no_error_can_be_stated_the_score_is_zero():
         x[1, 0], x[1, 1] = values
         found = rank_by_error(estimate.replace(**{name: x}), samples, tracks, fit)
         assert found.score[1, :2].tolist() == [0, 0] and (found.score[1, 2:-2] > 0).all(), name
+        again = rank_by_error(estimate.replace(**{name: x}), samples, tracks, fit, recalibration=lambda s: 1 - s / 2)
+        assert again.score[1, :2].tolist() == [0, 0] and again.score.isfinite().all(), name
         assert not evidence(estimate.replace(**{name: x}), samples, tracks, fit)[1][1, :2].any(), name
     for name, scale in (("photometric", "photometric_scale"), ("error", "round_trip_scale_px")):
         x = getattr(tracks, name).clone()

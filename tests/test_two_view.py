@@ -168,11 +168,14 @@ def test_the_noise_of_the_sensor_is_that_of_the_returns_that_hold_the_pose():
     relative[0, :4], relative[1, :2] = torch.tensor([0.04, 0.01, 0.02, 0.03]), torch.tensor([0.03, 0.05])
     depth = samples.depth.clone()
     depth[1, 2] = 0
-    sensed = samples.replace(depth=depth, sigma=torch.where(depth > 0, relative * depth, 7.0))
+    sigma = torch.where(depth > 0, relative * depth, 7.0).requires_grad_()
+    sensed = samples.replace(depth=depth, sigma=sigma)
     found = ask(sensed, tracks, fit.replace(inlier=inlier), sensor_share=0.5)
     added = (found.sigma_shared**2 - plain.sigma_shared**2).clamp_min(0).sqrt() / plain.depth
     expected = torch.tensor([[0.5 * 0.02], [0.5 * 0.03], [0.0]]).double().expand(B, N)
-    torch.testing.assert_close(added, expected, atol=1e-9, rtol=1e-9)
+    torch.testing.assert_close(added.detach(), expected, atol=1e-9, rtol=1e-9)
+    found.sigma.sum().backward()
+    assert sigma.grad.isfinite().all() and (sigma.grad > 0).sum(1).tolist() == [1, 1, 0], "to the median alone"
 
 
 def test_a_rolling_shutter_counts_with_all_correlations_of_rotation_translation_and_turn():

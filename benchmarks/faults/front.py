@@ -141,7 +141,12 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_relative_noise", "median(relative, used), 0.0", "median(relative, used), 1.0"),
         ("_fitted", "* (scale * scale)", "* scale"),
         ("_fitted", "noise_shape(cov, tracked, isotropic)", "noise_shape(cov, tracked, 0.1)"),
-        ("_fitted", "noise_shape(cov, tracked, isotropic)", "noise_shape(cov, torch.ones_like(tracked), isotropic)"),
+        (
+            "_fitted",
+            "noise_shape(cov, tracked, isotropic)",
+            "noise_shape(cov, torch.ones_like(tracked), isotropic)",
+            "covariances of lost tracks are zero by then, and such are not used",
+        ),
         ("_doubt", "(sign / scale) ** 2", "sign / scale"),
         ("_doubt", "factor = factor + (sign / scale) ** 2", "factor = 1.0 + (sign / scale) ** 2"),
         ("_above", "~(x <= limit)", "x > limit"),

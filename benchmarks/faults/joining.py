@@ -39,7 +39,12 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("METHODS", "score=_score.rank_by_error", "score=_score.rank"),
         ("merge", "choose(samples.sigma, estimate.sigma)", "choose(samples.sigma, estimate.sigma_shared)"),
         ("merge", "choose(samples.confidence, estimate.score)", "choose(samples.confidence, samples.confidence)"),
-        ("merge", "recovered = estimate.keep & ~sensed", "recovered = estimate.keep"),
+        (
+            "merge",
+            "recovered = estimate.keep & ~sensed",
+            "recovered = estimate.keep",
+            "what the sensor says is taken first in any case",
+        ),
         ("lifted", "camera.f.dtype.itemsize >= 4", "camera.f.dtype.itemsize >= 2"),
         ("lifted", "depth_camera=single(frame.depth_camera)", "depth_camera=frame.depth_camera"),
         (
