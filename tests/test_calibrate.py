@@ -251,6 +251,14 @@ def broken(path, value):
         (("sigmoid", "slope"), True, r"mine\.json\.sigmoid\.slope: found true"),
         (("sigma", "floor"), -1, r"mine\.json\.sigma\.floor: found -1, expected no negative"),
         (("sigma", "scale"), 10**400, r"mine\.json\.sigma\.scale: found 1000"),
+        (("probability", "score", 1), 0.0, r"mine\.json\.probability\.score: found \[0\.0, 0\.0, .*expected rising"),
+        (("thresholds", "100"), 0.5, r"mine\.json\.thresholds\.100: found 100, expected a whole number"),
+        (("thresholds", "0"), 0.5, r"mine\.json\.thresholds\.0: found 0, expected a whole number"),
+        (
+            ("expected_error", "value", 0),
+            1.5,
+            r"mine\.json\.expected_error\.value: found .*falling numbers from 0 to 1",
+        ),
         (("sigma",), {"scale": 1}, r"mine\.json\.sigma\.floor: found nothing"),
         (("thresholds", "ten"), 0.5, r"mine\.json\.thresholds\.ten: found ten, expected a whole number"),
         (("provenance",), [], r"mine\.json\.provenance: found \[\], expected an object"),
@@ -261,6 +269,15 @@ def test_a_damaged_calibration_is_refused_by_file_and_field(path, value, message
     file.write_text(broken(path, value))
     with pytest.raises(ValueError, match=message):
         calibration.load(file)
+
+
+def test_level_tables_and_narrow_ones_are_read():
+    content = json.loads(fitted().to_json())
+    for name in ("probability", "expected_error"):
+        content[name] = {"score": [0.25, 0.5, 3.0], "value": [0.5, 0.5, 0.5]}
+    content["thresholds"] = {"1": 0.5, "99": None}
+    found = recalibrate.from_json(json.dumps(content))
+    assert found.probability(torch.tensor([0.0, 9.0])).tolist() == [0.5, 0.5] and found.thresholds == {1: 0.5, 99: None}
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1]", '{"schema": NaN}', "null"])

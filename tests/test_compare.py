@@ -72,6 +72,19 @@ def test_ratios_equal_plain_loops():
     assert [(row["method"], row["scene"]) for row in found.rows] == [("map", s) for s in "abc"]
 
 
+def test_intervals_are_those_of_2000_draws_unless_asked_otherwise():
+    paper, ours = small(1.0, names="abcde", seeds=1), small(0.6, names="abcde", seeds=1, silent=0.5)
+    found = compare.method_ratios({"paper": paper, "map": ours})
+    assert found == compare.method_ratios({"paper": paper, "map": ours}, draws=2000, seed=0)
+    assert found != compare.method_ratios({"paper": paper, "map": ours}, draws=2000, seed=1)
+
+
+def test_seeds_are_paired_and_a_lone_one_raises():
+    one, two = small(1.0, names="a", seeds=1), small(1.0, names="a", seeds=2)
+    with pytest.raises(ValueError, match="shorter"):
+        compare.equal_coverage(two, one)
+
+
 def test_promises_equal_plain_loops():
     """Every scene with a calibration learnt from the other rooms alone, its seeds joined."""
     ours, room = small(1.0, names="abcd"), {"a": "hall", "b": "hall"}

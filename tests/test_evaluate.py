@@ -165,6 +165,13 @@ def test_scenes_are_drawn_with_replacement_each_as_often_as_another():
     assert torch.equal(bootstrap.resample(7, 9), bootstrap.resample(7, 9, seed=0))
 
 
+def test_an_interval_of_any_number_holds_95_per_cent_of_2000_draws():
+    values = torch.tensor([3.0, 1.0, 4.0, 1.5, 9.0], dtype=torch.float64)
+    found = bootstrap.interval_of(lambda index: values[index].amax(-1) - values[index].mean(-1), 5)
+    expected = loop_interval(values.tolist(), lambda x: max(x) - sum(x) / 5, 0.95, 2000, 0)
+    assert found[:3] == pytest.approx(expected)
+
+
 def test_a_number_that_is_undefined_for_all_scenes_has_no_interval_but_a_count():
     nothing = bootstrap.interval_of(lambda index: index.sum(-1) * math.nan, 3)
     assert nothing == (None, None, None, 3)

@@ -258,7 +258,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("realised", "pooled.score >=", "pooled.score >"),
         ("realised", "pooled.keep & (", "("),
         ("surest", "score > limit", "score >= limit"),
-        ("surest", "sort(descending=True).values[n - 1]", "sort(descending=True).values[n]"),
+        ("surest", "torch.where(keep, pooled.score, 0.0)", "pooled.score"),
         ("surest", "tied[pooled.error[tied].argsort(stable=True)]", "tied"),
         ("capped", "nan=1.0", "nan=0.0"),
         ("_running_sum", "(total / size)[group]", "total[group]"),
