@@ -382,6 +382,13 @@ def test_only_valid_tracks_have_a_derivative():
         for keep, some in ((valid, True), (~valid, False)):
             (slope,) = torch.autograd.grad(tracks.uv_1[keep].sum(), leaf, retain_graph=True, allow_unused=True)
             assert bool((slope != 0).any()) == some
+        linear = affine.register(*pyramids(src, dst), uv.detach(), options["track"]().uv_1, window=WINDOW).linear
+        again = affine.step(
+            *pyramids(src, dst, 1), leaf if leaf is uv else uv.detach(), tracks.uv_1, linear, window=WINDOW
+        )
+        (want,) = torch.autograd.grad(again[valid].sum(), leaf)
+        (slope,) = torch.autograd.grad(tracks.uv_1[valid].sum(), leaf, retain_graph=True)
+        torch.testing.assert_close(slope, want, rtol=1e-6, atol=1e-9)
         with torch.no_grad():
             assert torch.equal(call().uv_1, tracks.uv_1) and not call().uv_1.requires_grad
 

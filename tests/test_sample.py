@@ -111,7 +111,7 @@ def test_the_margin_may_leave_one_pixel_and_no_less(sampler):
     assert sampler((5, 5), 3).tolist() == [[2.0, 2.0]] * 3, "two pixels by default"
     assert sampler((5, 5), 0).shape == (0, 2)
     for n, margin in ((4, 2.01), (4, -0.1)):
-        with pytest.raises(ValueError, match="margin_px.* 5x9 pixels"):
+        with pytest.raises(ValueError, match=r"margin_px.* 5x9 pixels"):
             sampler((5, 9), n, margin_px=margin)
     with pytest.raises(ValueError, match="n is -1"):
         sampler((5, 9), -1)
@@ -125,7 +125,7 @@ def test_the_gaze_may_lie_on_the_margin_and_not_beyond(sampler):
         uv = sampler((50, 90), 9, gaze=gaze)
         assert uv.amin(0).tolist() >= [2.0, 2.0] and (uv <= torch.tensor([87.0, 47.0])).all()
     for gaze in ((1.9, 20.0), (20.0, 1.9), (87.1, 20.0), (20.0, 47.1)):
-        with pytest.raises(ValueError, match="gaze.* 50x90 pixels"):
+        with pytest.raises(ValueError, match=r"gaze.* 50x90 pixels"):
             sampler((50, 90), 9, gaze=gaze)
 
 

@@ -333,7 +333,12 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_there_and_back", "elsewhere = _finite(x) + d", "elsewhere = _finite(x)"),
         ("_check_options", "iterations < 1", "iterations < 0"),
         ("_check_pyramid", "or pyramid.pad != window // 2 + REACH", ""),
-        ("lucas_kanade_affine", "wanted=tracks.valid", "wanted=None"),
+        (
+            "lucas_kanade_affine",
+            "wanted=tracks.valid",
+            "wanted=None",
+            "what is found of tracks that are not valid is not used; it only costs",
+        ),
         ("lucas_kanade_affine", "iterations=iterations", "iterations=7"),
         ("lucas_kanade_affine", "epsilon_px=epsilon_px", "epsilon_px=0.01"),
         ("lucas_kanade_affine", "max_shift_px=max_shift_px,", "max_shift_px=2.0,"),
