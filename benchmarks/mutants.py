@@ -322,8 +322,8 @@ class Bench:
 
 def run(
     faults: Sequence[Fault], tests_of: dict[str, list[str]], tests: Path, jobs: int, quiet: bool
-) -> list[dict[str, Any]]:
-    """Try every fault; rows with what caught it."""
+) -> Iterator[dict[str, Any]]:
+    """Try every fault; rows with what caught it, as they come in order."""
     known = modules()
     named = [(module_of(f.module, known), f) for f in faults]
     for module, fault in named:
@@ -350,7 +350,7 @@ def run(
 
         free = list(benches)
         with ThreadPoolExecutor(jobs) as pool:
-            return list(pool.map(one, range(len(named))))
+            yield from pool.map(one, range(len(named)))
 
 
 def _clean(benches: list[Bench], wanted: list[str], tests_of: dict[str, list[str]]) -> dict[str, float]:
@@ -406,10 +406,12 @@ def main() -> int:
         faults = random.Random(args.seed).sample(drawn, round(args.sweep * len(drawn)))
     else:
         faults = [f for m in wanted for f in [f for f in FAULTS if module_of(f.module, modules()) == m][:: args.every]]
-    rows = run(faults, TESTS, args.tests, args.jobs, args.quiet)
+    rows = []
+    for row in run(faults, TESTS, args.tests, args.jobs, args.quiet):
+        rows.append(row)
+        if args.json:  # at once: what was tried in an hour is not lost with the next
+            args.json.write_text(json.dumps(rows, indent=1) + "\n")
     print(summary(rows))
-    if args.json:
-        args.json.write_text(json.dumps(rows, indent=1) + "\n")
     return int(any(row["verdict"] == "noticed" for row in rows))
 
 

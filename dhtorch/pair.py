@@ -18,7 +18,7 @@ from torch import Tensor
 
 from dhtorch.codes import Gate, Source
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry.shapes import check
+from dhtorch.geometry.shapes import check, is_transformed
 from dhtorch.records import Camera, Estimate, Frame, Map, PoseFit, Samples, Tracks
 from dhtorch.stages import backproject as _backproject
 from dhtorch.stages import holes as _holes
@@ -206,15 +206,22 @@ def uniform_draws(seed: int | Tensor, batch: int, hypotheses: int) -> Tensor:
     return _draws(seed.cpu(), hypotheses)
 
 
-# One operation to torch.compile and vmap: neither can look into a generator, nor needs to, for nothing here is random.
-@torch.library.custom_op("dhtorch::uniform_draws", mutates_args=())
 def _draws(seed: Tensor, hypotheses: int) -> Tensor:
+    return (_draws_op if is_transformed() else _drawn)(seed, hypotheses)
+
+
+def _drawn(seed: Tensor, hypotheses: int) -> Tensor:
     made = [torch.Generator().manual_seed(int(s)) for s in seed.tolist()]
     rows = [torch.rand(hypotheses, 3, generator=g, dtype=torch.float64) for g in made]
     return torch.stack(rows) if rows else torch.zeros(0, hypotheses, 3, dtype=torch.float64)
 
 
-@_draws.register_fake
+# One operation to torch.compile and vmap: neither can look into a generator, nor needs to, for nothing here is random.
+# Others are spared it: its first call imports the compiler.
+_draws_op = torch.library.custom_op("dhtorch::uniform_draws", _drawn, mutates_args=())
+
+
+@_draws_op.register_fake
 def _(seed: Tensor, hypotheses: int) -> Tensor:
     return torch.empty(len(seed), hypotheses, 3, dtype=torch.float64)
 

@@ -20,6 +20,7 @@ from processes import start, stop
 from dhtorch import archive, console, job
 from dhtorch.data import writers
 from dhtorch.data.synthetic import SyntheticRoom
+from dhtorch.experiments.protocol import Outcome
 from dhtorch.run import config_dir, job_name, main
 
 ROOM = ["data.hw=[60,80]", "data.n_frames=3", "data.supersample=1", "data.lidar=exact"]
@@ -243,6 +244,30 @@ def test_changed_data_are_another_question(command, tmp_path):
     image = next((tmp_path / "set").rglob("*.png"))
     image.write_bytes(image.read_bytes() + b"\0")
     assert "wrote" in command(*same)[1] and archive.read(path)["data"]["digest"] != digest
+
+
+def test_files_that_settings_name_count_by_content_not_by_place(tmp_path, capsys):
+    """The same weights elsewhere ask the same, other weights do not."""
+    common = {"threads": None, "resume": True, "figures": False, "device": "cpu", "dtype": "float32", "seed": 0}
+    common |= {"batch": 1, "workers": 0, "holdout": {"cutoff": 1.0, "truth": "full"}}
+    parts = {"data": SyntheticRoom(hw=(8, 8), n_frames=2), "method": None, "pairs": None}
+    asked = []
+
+    def experiment(*_, **__):
+        asked.append(1)
+        return Outcome().decide("Is it asked again?", "only where its files differ", None, "no pair")
+
+    def key(place, words):
+        place.mkdir(exist_ok=True)
+        (place / "net.pt").write_text(words)
+        settings = {**{g: {} for g in job.GROUPS}, **common, "method": {"weights": str(place / "net.pt")}}
+        whole = parts | {"experiment": experiment}
+        job.run(settings, whole, dict.fromkeys(job.GROUPS, "some"), tmp_path / "out", progress=None)
+        return archive.read(tmp_path / "out" / "result.json")["key"]
+
+    one, elsewhere, other = key(tmp_path / "a", "w"), key(tmp_path / "b", "w"), key(tmp_path / "a", "v")
+    assert one == elsewhere != other and len(asked) == 2
+    assert "left untouched" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("asked", [[], ["always"]])

@@ -185,6 +185,24 @@ def test_rows_are_stored_in_groups_of_sixteen(tmp_path):
         assert features.at(0, k)["dhtorch.pose_ok"] == bool(row(k, few)["pose_ok"])
 
 
+def test_halves_and_fewer_columns_are_smaller_files(tmp_path):
+    whole, half = columns.columns(N, P), columns.columns(N, P, half=True)
+    few = columns.choose(half, ["tokens"])
+    size = [
+        sum(
+            p.stat().st_size
+            for p in shards.shard_files(written(tmp_path / name, [[row(k) for k in range(16)]], wanted))
+        )
+        for name, wanted in (("whole", whole), ("half", half), ("few", few))
+    ]
+    numbers = [
+        sum(np.dtype(c.kind).itemsize * int(np.prod(c.shape)) for c in wanted.values() if np.dtype(c.kind).kind == "f")
+        for wanted in (whole, half, few)
+    ]
+    for k in (0, 1):  # noise of double precision cannot be packed: what a narrower row lacks, its file lacks
+        assert size[k] - size[k + 1] > 0.8 * 16 * (numbers[k] - numbers[k + 1]) > 0
+
+
 def test_the_same_rows_are_the_same_bytes(tmp_path):
     one, two = (written(tmp_path / name, [[row(0), row(1)], [row(2)]]) for name in "ab")
     for path in shards.shard_files(one):

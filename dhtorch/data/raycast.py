@@ -10,6 +10,7 @@ not depend on the number of threads.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -124,14 +125,22 @@ class Solids:
         ball, radius, centre = self.ball[index], self.half[index, 0], self.centre[index]
         return [torch.where(ball, (p[k] - centre[:, k]) / radius, flat[:, k]) for k in range(3)]
 
-    def blockers(self, p: Sequence[Tensor], reach: Tensor) -> list[tuple[Solid, Tensor]]:
-        """Solids that cast shadows, each with the points (indices) it could shade: those nearer than ``reach`` (P,)."""
+    def blockers(
+        self, p: Sequence[Tensor], reach: float, way: Sequence[Tensor] | None = None
+    ) -> list[tuple[Solid, Tensor]]:
+        """Solids that cast shadows, each with the points (indices) it could shade.
+
+        Those are the points p (P,) with a part of the solid nearer than ``reach`` (m): to the point itself, or to the
+        straight ``way`` (P,) from it.
+        """
         found = []
         for solid in self.each[1:]:
             if solid.shadow:
-                rel = [p[k] - solid.centre[k] for k in range(3)]
-                limit = reach + sum(h * h for h in solid.half) ** 0.5
-                at = (dot(rel, rel) < limit * limit).nonzero()[:, 0]
+                rel = [solid.centre[k] - p[k] for k in range(3)]
+                if way is not None:
+                    along = (dot(rel, way) / dot(way, way)).clamp(0, 1)
+                    rel = [rel[k] - along * way[k] for k in range(3)]
+                at = (dot(rel, rel) < (reach + math.hypot(*solid.half)) ** 2).nonzero()[:, 0]
                 if at.numel():
                     found.append((solid, at))
         return found

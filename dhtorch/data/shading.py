@@ -10,6 +10,7 @@ Alphabet: as in :mod:`dhtorch.data.raycast`; L nodes, P rays.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -191,16 +192,22 @@ def _direct(solids: Solids, light: Light, p: list[Tensor], normal: list[Tensor])
     square = dot(d, d).clamp(min=0.04)
     shine = -dot(d, light.normal) if any(light.normal) else square.sqrt()
     gain = dot(d, normal).clamp(min=0) * shine.clamp(min=0) / (square * square)
-    clear = torch.ones_like(gain)
-    middle = [(light.centre[k] + p[k]) * 0.5 for k in range(3)]  # the solid must reach into the ball around the ray
-    for solid, at in solids.blockers(middle, dot(d, d).amax(0).sqrt() * 0.5 + 0.1):
-        far = solids.open_distance(solid, [c[at] for c in p], [c[:, at] for c in d])
-        clear[:, at] *= far > 0.98
-    gain = gain * clear
+    lit = gain.any(0).nonzero()[:, 0]  # what faces away from all of the light is dark whatever stands between
+    gain[:, lit] *= _unshaded(solids, light, [c[lit] for c in p], [c[:, lit] for c in d])
     total = torch.zeros_like(gain[0])
     for k in range(len(places)):  # a sum in written order
         total = total + gain[k]
     return (total / len(places))[:, None] * torch.tensor(light.colour)
+
+
+def _unshaded(solids: Solids, light: Light, p: list[Tensor], d: list[Tensor]) -> Tensor:
+    """1 where nothing stands on the ways ``d`` (samples, P) from points ``p`` (P,) to places of a light, else 0."""
+    clear = torch.ones_like(d[0])
+    half = math.hypot(*(abs(light.u[k]) + abs(light.v[k]) for k in range(3)))
+    for solid, at in solids.blockers(p, half + 1e-3, [light.centre[k] - p[k] for k in range(3)]):
+        far = solids.open_distance(solid, [c[at] for c in p], [c[:, at] for c in d])
+        clear[:, at] *= far > 0.98
+    return clear
 
 
 def _ambient(solids: Solids, p: list[Tensor], normal: list[Tensor], *, reach: float = 1.1) -> Tensor:
@@ -210,7 +217,7 @@ def _ambient(solids: Solids, p: list[Tensor], normal: list[Tensor], *, reach: fl
     side = torch.where(dot(d, normal) < 0, -reach, reach)  # the same directions for all, turned to the open side
     d = [c * side for c in d]  # (directions, L)
     clear = solids.open_distance(solids.each[0], p, d)
-    for solid, at in solids.blockers(p, torch.full_like(p[0], reach)):
+    for solid, at in solids.blockers(p, reach):
         far = solids.open_distance(solid, [c[at] for c in p], [c[:, at] for c in d])
         clear[:, at] = torch.minimum(clear[:, at], far)
     weight = 0.35 + dot(d, normal) / reach

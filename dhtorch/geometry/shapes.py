@@ -46,3 +46,8 @@ def check(where: str, **args: tuple[Tensor | None, str]) -> dict[str, int]:
 def is_static(x: Tensor) -> bool:
     """Whether shapes must not depend on values: under ``torch.compile``, and under the transforms of ``torch.func``."""
     return torch.compiler.is_compiling() or torch._C._functorch.is_functorch_wrapped_tensor(x)
+
+
+def is_transformed() -> bool:
+    """Whether this runs inside ``torch.compile`` or a transform of ``torch.func``, whatever it is given."""
+    return torch.compiler.is_compiling() or torch._C._functorch.maybe_current_level() is not None

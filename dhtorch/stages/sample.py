@@ -59,10 +59,13 @@ def spiral(
     return uv.to(device=device, dtype=dtype, copy=True)
 
 
-@torch.compiler.assume_constant_result
 def _kept(*args: Any) -> Tensor:
     """:func:`_arms`, which torch.compile takes as it is and does not look into."""
     return _arms(*args)
+
+
+# All that torch.compiler.assume_constant_result does after it has imported the compiler, for which nobody asked yet.
+_kept._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
 @lru_cache(maxsize=16)
