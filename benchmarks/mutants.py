@@ -15,16 +15,18 @@ from __future__ import annotations
 
 import argparse
 import ast
+import gc
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -36,6 +38,12 @@ ROOT = Path(__file__).resolve().parents[1]
 
 #: Folders and files of the package that faults are planted in.
 PLACES = ("stages", "geometry", "pair", "window", "evaluate", "transform", "archive", "extract")
+
+#: What the tests of a trial leave in its tree.
+FAILURE, TIMES = "first_failure.txt", "seconds.json"
+
+#: pytest's exit code where no test is left.
+NONE = 5
 
 #: What the copy of the tree leaves behind.
 LEFT = (
@@ -216,49 +224,55 @@ def warm() -> None:
     from torch.func import jacfwd  # noqa: F401
 
     torch.set_num_threads(1)
+    gc.freeze()
 
 
-class Only:
-    """Keeps those tests of the contract's table that belong to the module."""
+class Order:
+    """Keeps those tests of the contract's table that belong to the module; quick ones first, as they once were."""
 
-    def __init__(self, module: str) -> None:
-        self.stem = module.rsplit(".", 1)[-1]
+    def __init__(self, module: str, seconds: Mapping[str, float]) -> None:
+        self.stem, self.seconds = module.rsplit(".", 1)[-1], seconds
 
     def pytest_collection_modifyitems(self, items: list) -> None:
-        """Drop the rows of other modules."""
-        items[:] = [
-            x
-            for x in items
-            if "test_contract" not in x.nodeid or f"[{self.stem}." in x.nodeid or f"-{self.stem}." in x.nodeid
-        ]
+        """Drop the rows of other modules, and sort."""
+        mine = [x for x in items if "test_contract" not in x.nodeid or re.search(rf"[\[-]{self.stem}\.", x.nodeid)]
+        items[:] = sorted(mine, key=lambda x: self.seconds.get(x.nodeid, 0.0))
 
 
-class First:
-    """Remembers the first test that failed, and why."""
+class Record:
+    """Writes down the seconds of every test, and the first test that failed and why."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, tree: Path) -> None:
+        self.failure, self.times = tree / FAILURE, tree / TIMES
+        self.seconds: dict[str, float] = {}
 
     def pytest_runtest_logreport(self, report: Any) -> None:
-        """Write it down at once: the process may not end well."""
-        if report.failed and not self.path.exists():
+        """A failure at once: the process may not end well."""
+        self.seconds[report.nodeid] = self.seconds.get(report.nodeid, 0.0) + getattr(report, "duration", 0.0)
+        if report.failed and not self.failure.exists():
             crash = getattr(report.longrepr, "reprcrash", None)
-            self.path.write_text(f"{report.nodeid}\n{getattr(crash, 'message', report.longrepr)}")
+            self.failure.write_text(f"{report.nodeid}\n{getattr(crash, 'message', report.longrepr)}")
 
     def pytest_collectreport(self, report: Any) -> None:
         """A module that cannot be imported is noticed, too."""
         self.pytest_runtest_logreport(report)
 
+    def pytest_sessionfinish(self) -> None:
+        """What the next run is ordered by."""
+        self.times.write_text(json.dumps(self.seconds))
 
-def trial(tree: Path, module: str, tests: Sequence[str], limit_s: float) -> tuple[bool, str, float]:
+
+def trial(
+    tree: Path, module: str, tests: Sequence[str], limit_s: float, order: Mapping[str, float]
+) -> tuple[bool, str, float]:
     """Run the module's tests over the tree in a fork: (a test failed, which and why, seconds)."""
-    said = tree / "first_failure.txt"
+    said = tree / FAILURE
     said.unlink(missing_ok=True)
     start = time.perf_counter()
     child = os.fork()
     if child == 0:
         os.setsid()
-        _run_tests(tree, module, tests, said)
+        _run_tests(tree, module, tests, order)
     while True:
         done, status = os.waitpid(child, os.WNOHANG)
         if done or time.perf_counter() - start > limit_s:
@@ -269,14 +283,14 @@ def trial(tree: Path, module: str, tests: Sequence[str], limit_s: float) -> tupl
         os.waitpid(child, 0)
         return True, f"did not end in {limit_s:.0f} s", time.perf_counter() - start
     code = os.waitstatus_to_exitcode(status)
-    if code not in (0, 1) and not said.exists():
+    if code not in (0, 1, NONE) and not said.exists():
         raise RuntimeError(
             f"mutants: the tests of {module} could not be run (exit code {code}): {(tree / 'log').read_text()[-2000:]}"
         )
-    return code != 0, said.read_text() if said.exists() else "", time.perf_counter() - start
+    return code not in (0, NONE), said.read_text() if said.exists() else "", time.perf_counter() - start
 
 
-def _run_tests(tree: Path, module: str, tests: Sequence[str], said: Path) -> None:
+def _run_tests(tree: Path, module: str, tests: Sequence[str], order: Mapping[str, float]) -> None:
     """In the fork: the package and its tests come from the tree, also for processes that the tests start."""
     code = 2
     try:
@@ -284,13 +298,12 @@ def _run_tests(tree: Path, module: str, tests: Sequence[str], said: Path) -> Non
         os.dup2(log, 1)
         os.dup2(log, 2)
         os.chdir(tree)
-        sys.dont_write_bytecode = True
-        os.environ |= {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
+        os.environ |= {"PYTHONPATH": str(tree), "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
         sys.path[:0] = [str(tree)]
         import pytest
 
-        options = ["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "-p", "no:randomly"]
-        code = int(pytest.main([*options, *tests], plugins=[Only(module), First(said)]))
+        options = ["-x", "-q", "-p", "no:cacheprovider", "-o", "addopts=", "-m", "not slow"]
+        code = int(pytest.main([*options, *tests], plugins=[Order(module, order), Record(tree)]))
     finally:
         sys.stdout.flush()
         os._exit(code)
@@ -300,24 +313,44 @@ class Bench:
     """A copy of the tree that faults are planted in, one after the other."""
 
     def __init__(self, folder: Path, tests: Path) -> None:
-        self.tree = folder
+        self.tree, self.second = folder, 1_000_000_000
+        self.seconds: dict[str, float] = {}  # of every test of the last run
         shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(*LEFT), dirs_exist_ok=True)
         shutil.rmtree(folder / "tests")
         shutil.copytree(tests, folder / "tests", ignore=shutil.ignore_patterns("__pycache__"))
 
-    def run(self, fault: Fault | None, module: str, tests: Sequence[str], limit_s: float) -> tuple[bool, str, float]:
+    def run(
+        self, fault: Fault | None, module: str, tests: Sequence[str], limit_s: float, order: Mapping[str, float]
+    ) -> tuple[bool, str, float]:
         """Plant, run, take out again."""
         path = modules(self.tree)[module]
         source = path.read_text()
         tests = [t for t in tests if (self.tree / t.split("::")[0]).exists()]
-        if not tests:
-            return False, "no test", 0.0
+        table = [t for t in tests if t.endswith("test_contract.py")]  # long to collect, and seldom needed
+        failed, why, total = False, "no test", 0.0
+        self.seconds.clear()
         try:
             if fault is not None:
-                path.write_text(planted(source, fault))
-            return trial(self.tree, module, tests, limit_s)
+                self._write(path, planted(source, fault))
+            for some in ([t for t in tests if t not in table], table):
+                if some and not failed:
+                    failed, why, seconds = trial(self.tree, module, some, limit_s, order)
+                    self.seconds |= _times(self.tree)
+                    total += seconds
+            return failed, why, total
         finally:
-            path.write_text(source)
+            self._write(path, source)
+
+    def _write(self, path: Path, source: str) -> None:
+        """Each version has a second of its own: what is compiled of one is not taken for another of the same length."""
+        path.write_text(source)
+        self.second += 1
+        os.utime(path, (self.second, self.second))
+
+
+def _times(tree: Path) -> dict[str, float]:
+    path = tree / TIMES
+    return json.loads(path.read_text()) if path.exists() else {}
 
 
 def run(
@@ -332,12 +365,13 @@ def run(
     with tempfile.TemporaryDirectory(prefix="mutants") as folder:
         benches = [Bench(Path(folder) / str(k), tests) for k in range(jobs)]
         clean = _clean(benches, sorted({m for m, _ in named}), tests_of)
+        whole = {module: sum(of.values()) for module, of in clean.items()}
 
         def one(k: int) -> dict[str, Any]:
             bench = free.pop()
             module, fault = named[k]
             try:
-                failed, why, seconds = bench.run(fault, module, tests_of[module], 30 + 4 * clean[module])
+                failed, why, seconds = bench.run(fault, module, tests_of[module], 60 + 4 * whole[module], clean[module])
             finally:
                 free.append(bench)
             row = row_of(module, fault, failed, why, seconds)
@@ -353,16 +387,24 @@ def run(
             yield from pool.map(one, range(len(named)))
 
 
-def _clean(benches: list[Bench], wanted: list[str], tests_of: dict[str, list[str]]) -> dict[str, float]:
-    """Seconds that the tests of every module take as they are; they must pass."""
-    seconds = {}
-    for module in wanted:
+def _clean(benches: list[Bench], wanted: list[str], tests_of: dict[str, list[str]]) -> dict[str, dict[str, float]]:
+    """Seconds that each test of every module takes as it is; they must pass."""
+    free = list(benches)
+
+    def one(module: str) -> dict[str, float]:
         if module not in tests_of:
             raise ValueError(f"mutants: no tests are named for {module}, add them to benchmarks/faults/")
-        failed, why, seconds[module] = benches[0].run(None, module, tests_of[module], 600)
-        if failed:
-            raise RuntimeError(f"mutants: the tests of {module} fail without a fault: {why}")
-    return seconds
+        bench = free.pop()
+        try:
+            failed, why, _ = bench.run(None, module, tests_of[module], 600, {})
+            if failed:
+                raise RuntimeError(f"mutants: the tests of {module} fail without a fault: {why}")
+            return dict(bench.seconds)
+        finally:
+            free.append(bench)
+
+    with ThreadPoolExecutor(len(benches)) as pool:
+        return dict(zip(wanted, pool.map(one, wanted), strict=True))
 
 
 def row_of(module: str, fault: Fault, failed: bool, why: str, seconds: float) -> dict[str, Any]:

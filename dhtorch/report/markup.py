@@ -9,6 +9,9 @@ from collections.abc import Iterable
 #: What XML cannot hold at all.
 _FORBIDDEN = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff]")
 
+#: What cannot stand in markup as it is: that, halves of surrogate pairs, and markup's own signs.
+_UNSAFE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff\ud800-\udfff&<>\"']")
+
 
 class Markup(str):
     """Text that is markup already and is not escaped again."""
@@ -20,7 +23,10 @@ def escape(text: object) -> Markup:
     """Text as it stands in markup; markup stays as it is."""
     if isinstance(text, Markup):
         return text
-    plain = str(text).encode("utf-8", "replace").decode()  # half a surrogate pair cannot be written to a file
+    plain = str(text)
+    if not _UNSAFE.search(plain):
+        return Markup(plain)
+    plain = plain.encode("utf-8", "replace").decode()  # half a surrogate pair cannot be written to a file
     return Markup(html.escape(_FORBIDDEN.sub("\ufffd", plain)))
 
 

@@ -25,8 +25,12 @@ def cohorts(result: Result) -> list[str | None]:
 def last_cohort(result: Result) -> str | None:
     """The cohort that decides: the one whose name the summary leaves out."""
     found = cohorts(result) or [None]
-    named = [t for t in found if any(f"{v}.{t}." in name for v in variants(result) for name in result["summary"])]
-    return next((t for t in reversed(found) if t not in named), found[-1])
+    if len(found) == 1:
+        return found[0]
+    named = {t: [name for name in result["summary"] if f".{t}." in name] for t in found}
+    known = variants(result)
+    free = (t for t in reversed(found) if not any(f"{v}.{t}." in name for name in named[t] for v in known))
+    return next(free, found[-1])
 
 
 def scene_rows(result: Result, truth: str | None = None, variant: str | None = None) -> list[Row]:
@@ -46,7 +50,7 @@ def value(row: Row, metric: str) -> Any:
 
 def entry(result: Result, variant: str, metric: str, truth: str | None = None) -> Mapping[str, Any]:
     """Summary of a metric; it bears no variant's name where there is but one, and no cohort's for the last."""
-    last = truth in (None, last_cohort(result))
+    last = truth is None or truth == last_cohort(result)
     names = [f"{variant}.{metric}"] if last else [f"{variant}.{truth}.{metric}"]
     names += [metric] if last and len(variants(result)) == 1 else []
     return next((result["summary"][n] for n in names if n in result["summary"]), {})
