@@ -28,6 +28,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +85,7 @@ def module_of(name: str, known: Iterable[str]) -> str:
 
 def span(source: str, function: str) -> tuple[int, int]:
     """Where the definition of ``function`` begins and ends, in characters."""
-    body: Sequence[ast.stmt] = ast.parse(source).body
+    body: Sequence[ast.stmt] = _parsed(source).body
     lines = source.splitlines(keepends=True)
     offset = [0]
     for line in lines:
@@ -99,6 +100,11 @@ def span(source: str, function: str) -> tuple[int, int]:
     return offset[first - 1], offset[node.end_lineno]
 
 
+@lru_cache(maxsize=4)
+def _parsed(source: str) -> ast.Module:
+    return ast.parse(source)
+
+
 def _names(node: ast.stmt) -> list[str]:
     if isinstance(node, ast.FunctionDef | ast.ClassDef):
         return [node.name]
@@ -109,14 +115,21 @@ def _names(node: ast.stmt) -> list[str]:
     return []
 
 
-def planted(source: str, fault: Fault) -> str:
-    """The source with the fault in it."""
+def placed(source: str, fault: Fault) -> tuple[int, int]:
+    """Where the function of a fault begins and ends; the text to be replaced must be there once."""
     first, last = span(source, fault.function)
     inside = source[first:last]
     if inside.count(fault.old) != 1:
         raise ValueError(
             f"mutants: {fault.module}.{fault.function} holds {fault.old!r} {inside.count(fault.old)} times, expected 1"
         )
+    return first, last
+
+
+def planted(source: str, fault: Fault) -> str:
+    """The source with the fault in it."""
+    first, last = placed(source, fault)
+    inside = source[first:last]
     changed = source[:first] + inside.replace(fault.old, fault.new) + source[last:]
     ast.parse(changed)
     return changed
@@ -360,7 +373,7 @@ def run(
     known = modules()
     named = [(module_of(f.module, known), f) for f in faults]
     for module, fault in named:
-        planted(known[module].read_text(), fault)  # said before anything runs
+        placed(known[module].read_text(), fault)  # said before anything runs
     warm()
     with tempfile.TemporaryDirectory(prefix="mutants") as folder:
         benches = [Bench(Path(folder) / str(k), tests) for k in range(jobs)]
@@ -371,13 +384,13 @@ def run(
             bench = free.pop()
             module, fault = named[k]
             try:
-                failed, why, seconds = bench.run(fault, module, tests_of[module], 60 + 4 * whole[module], clean[module])
+                failed, why, _ = bench.run(fault, module, tests_of[module], 60 + 4 * whole[module], clean[module])
             finally:
                 free.append(bench)
-            row = row_of(module, fault, failed, why, seconds)
+            row = row_of(module, fault, failed, why)
             if not quiet or row["verdict"] in ("missed", "noticed"):
                 print(
-                    f"{row['verdict']:10} {module}.{fault.function}: {fault.old!r} -> {fault.new!r}  {row['by']}",
+                    f"{row['verdict']:10} {module}.{fault.function}: {fault.old!r} -> {fault.new!r}  {row.get('by', '')}",
                     flush=True,
                 )
             return row
@@ -407,12 +420,13 @@ def _clean(benches: list[Bench], wanted: list[str], tests_of: dict[str, list[str
         return dict(zip(wanted, pool.map(one, wanted), strict=True))
 
 
-def row_of(module: str, fault: Fault, failed: bool, why: str, seconds: float) -> dict[str, Any]:
+def row_of(module: str, fault: Fault, failed: bool, why: str) -> dict[str, Any]:
     """What became of one fault. ``noticed``: said to change no answer, and yet a test failed."""
     verdict = ("noticed" if failed else "equivalent") if fault.equivalent else ("caught" if failed else "missed")
-    by, _, reason = why.partition("\n")
+    by = why.partition("\n")[0]
     row = {"module": module, "function": fault.function, "old": fault.old, "new": fault.new, "verdict": verdict}
-    return row | {"by": by, "reason": (fault.equivalent or reason).split("\n")[0][:200], "seconds": round(seconds, 1)}
+    told = {"reason": fault.equivalent} if fault.equivalent else {"by": by}
+    return row | told
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> str:
@@ -442,12 +456,14 @@ def main() -> int:
     parser.add_argument("--quiet", action="store_true", help="print only what was missed")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
-    wanted = [m for m in modules() if not args.modules or any(f"{m}.".startswith(f"{w}.") for w in args.modules)]
+    known = modules()
+    wanted = [m for m in known if not args.modules or any(f"{m}.".startswith(f"{w}.") for w in args.modules)]
     if args.sweep:
-        drawn = [f for m in wanted for f in by_rule(modules()[m].read_text(), m)]
+        drawn = [f for m in wanted for f in by_rule(known[m].read_text(), m)]
         faults = random.Random(args.seed).sample(drawn, round(args.sweep * len(drawn)))
     else:
-        faults = [f for m in wanted for f in [f for f in FAULTS if module_of(f.module, modules()) == m][:: args.every]]
+        home = [(module_of(f.module, known), f) for f in FAULTS]
+        faults = [f for m in wanted for f in [f for place, f in home if place == m][:: args.every]]
     rows = []
     for row in run(faults, TESTS, args.tests, args.jobs, args.quiet):
         rows.append(row)

@@ -11,6 +11,7 @@ import argparse
 import json
 import re
 import sys
+from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -188,6 +189,18 @@ def picture(path: Path) -> None:
     figure.savefig(path, dpi=80, bbox_inches="tight")
 
 
+def mutants() -> str:
+    """Planted faults that a test of their module caught, of those that change an answer."""
+    rows = json.loads((RESULTS / "mutants.json").read_text())
+    count = Counter((row["module"], row["verdict"]) for row in rows) + Counter(("all", row["verdict"]) for row in rows)
+    cells = []
+    for module in [*sorted({row["module"] for row in rows}), "all"]:
+        caught, missed = count[module, "caught"], count[module, "missed"]
+        same = count[module, "equivalent"] or ""
+        cells.append([f"`{module}`" if module != "all" else module, f"{caught} of {caught + missed}", f"{same}"])
+    return table(["faults planted in", "caught", "change no answer"], cells)
+
+
 TABLES = {"room": room, "room seeds": room_by_seed, "shared": shared, "truths": truths, "comparison": comparison}
 TABLES |= {"comparison scenes": partial(by_scene, "method_comparison"), "stress": partial(by_scene, "stress")}
 TABLES |= {"bars": speed_tables.bars, "speed": speed_tables.stages}
@@ -217,7 +230,7 @@ TABLES |= {"verdicts": partial(verdicts, ASKED), "negative": partial(verdicts, N
 TABLES |= {"pipelines": partial(verdicts, PIPELINES), "map": partial(verdicts, ("global_map",))}
 
 #: Pages and their tables.
-PAGES = {README: TABLES, HERE / "README.md": speed_tables.TABLES}
+PAGES = {README: TABLES, HERE / "README.md": speed_tables.TABLES | {"mutants": mutants}}
 
 
 def in_layout(name: str) -> str:

@@ -65,7 +65,7 @@ EXPERIMENTS = {
 
 #: Result of a script of this folder → its arguments.
 SCRIPTS = dict.fromkeys(("frontend", "lk", "pnp", "triangulate", "pair", "loader", "scaling", "readers"), "")
-SCRIPTS |= {"degenerate": ""}
+SCRIPTS |= {"degenerate": "", "mutants": "--quiet"}
 
 #: Options that change no number, and which a file may hold otherwise.
 ASIDE = {"figures", "traceback", "root"}

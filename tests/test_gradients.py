@@ -378,8 +378,9 @@ class Task:
     rooms = (2, 3, 4, 5)
 
     def __init__(self, n=512):
-        pairs = [views(room(seed, hw=(180, 240)), 0, 16, dtype=torch.float32) for seed in self.rooms]
-        whole = tree.collate([room(seed, hw=(180, 240))[0] for seed in self.rooms])
+        rooms = [room(seed, hw=(180, 240)) for seed in self.rooms]
+        pairs = [views(each, 0, 16, dtype=torch.float32) for each in rooms]
+        whole = tree.collate([each[0] for each in rooms])
         self.near, self.other = (tree.collate(frames) for frames in zip(*pairs, strict=True))
         self.method = partial(METHODS["map"], n=n, pose=partial(pose.map_pose, turn_sigma=0.0))  # a global shutter
         trace = {}

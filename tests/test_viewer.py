@@ -47,10 +47,7 @@ def scene():
 def job(tmp_path_factory):
     """A result of the main job, with its pictures and points."""
     folder = tmp_path_factory.mktemp("job")
-    done = subprocess.run(
-        [sys.executable, "-m", "dhtorch", *TINY, f"output={folder}"], check=False, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
+    assert run.main([*TINY, f"output={folder}"]) == 0
     return folder
 
 

@@ -61,7 +61,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ),
         ("undistort_tracks", "valid=tracks.valid & fine", "valid=tracks.valid"),
         ("uniform_draws", "torch.tensor([seed])", "torch.tensor([0])"),
-        ("_draws", "manual_seed(int(s)) for s in seed.tolist()", "manual_seed(k) for k, s in enumerate(seed.tolist())"),
+        ("_drawn", "manual_seed(int(s)) for s in seed.tolist()", "manual_seed(k) for k, s in enumerate(seed.tolist())"),
         ("_Clock.__call__", "self.ms.get(name, 0.0) + 1e3", "1e3"),
     ],
     "window": [
