@@ -46,7 +46,12 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("summarise", "(grey and _product_is_exact(image))", "_product_is_exact(image)"),
         ("_must_fit", "size > min(H, W)", "size >= min(H, W)"),
         ("_must_fit", "size > min(H, W)", "size > max(H, W)"),
-        ("_flat", "image.stride(1) == 1 and image.stride(3) == C", "image.stride(1) == 1"),
+        (
+            "_flat",
+            "image.stride(1) == 1 and image.stride(3) == C",
+            "image.stride(1) == 1",
+            "both orders hold the same numbers, the wrong one costs a copy",
+        ),
         ("_read_rows", "div_(255 * 1000)", "div_(256 * 1000)"),
         ("_read_rows", ".transpose(0, 1)", ""),
         ("_product_is_exact", "return _view_is_safe(image) and not reduced", "return _view_is_safe(image)"),
