@@ -562,6 +562,11 @@ def test_code_counts_by_name_and_content(tmp_path):
     assert here == archive.result_key({}, "d", code_dir=Path(archive.__file__).parent) != first
 
 
+def test_a_result_names_no_place_of_this_machine(tmp_path):
+    kept = result(config={"data": {"root": str(tmp_path / "sets" / "desk")}, "holdout": {"cutoff": 2.0}})
+    assert kept["config"] == {"data": {"root": "desk"}, "holdout": {"cutoff": 2.0}}
+
+
 def test_the_digest_tells_what_is_joined_from_what_is_apart(tmp_path):
     def digest(**texts):
         for name, text in texts.items():
@@ -573,6 +578,8 @@ def test_the_digest_tells_what_is_joined_from_what_is_apart(tmp_path):
     whole = {digest(a=b"one", b=b"two"), digest(a=b"two", b=b"one"), digest(a=b"one"), digest(b=b"one"), digest()}
     whole |= {digest(a=b"on", b=b"etwo"), digest(a=b""), digest(a=b"\0" * (edge + 1)), digest(a=b"\0" * edge)}
     assert len(whole) == 9
+    # Written one after the other, names, sizes and contents of these one and two files are the same bytes.
+    assert digest(a=b"0b 3xyzxyz") != digest(**{"a": b"0", "b 3xyzxyz0b": b"xyz"})
     big = bytearray(3 * edge)
     first = digest(a=bytes(big))
     for place, counts in ((edge - 1, True), (edge, False), (2 * edge - 1, False), (2 * edge, True)):

@@ -56,6 +56,13 @@ def test_every_frame_is_a_row(made):
     assert done.shown == [("6 frames", 6)]
 
 
+def test_what_a_killed_run_left_is_gone(made, tmp_path):
+    (tmp_path / "out").mkdir()
+    left = tmp_path / "out" / ".shard-00007.parquet.tmp"
+    left.write_bytes(b"PAR1")
+    assert made().code == 0 and not left.exists()
+
+
 def test_one_recording_need_not_be_a_list(made):
     done = made(recording(3), options={"gap": 0})
     assert done.said.startswith(f"{done.folder}: 1 shard, 3 rows") and "3 no second view" in done.said

@@ -430,6 +430,15 @@ def test_answers_come_in_the_order_of_their_positions():
     assert all(type(a) is Answer and a.features is None and a.complaint == str(a.place["at"]) for a in answers)
 
 
+def test_arrays_of_an_answer_come_as_they_are():
+    class Arrays(Counted):
+        def __getitem__(self, i):
+            return super().__getitem__(i)._replace(features={"depth": np.full(3, i)})
+
+    (answer,) = engines.here(Arrays(), [2], 0)
+    assert type(answer.features["depth"]) is np.ndarray and answer.features["depth"].tolist() == [2, 2, 2]
+
+
 def test_an_error_that_is_no_dead_worker_stays_what_it_is():
     class Broken(Counted):
         def __getitem__(self, i):

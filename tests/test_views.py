@@ -535,7 +535,8 @@ def test_a_frame_that_pads_is_no_view_of_its_own():
         for given in (np.array(pad), torch.tensor(pad), [int(p) for p in pad]):
             found = read(sample(image=images, image_is_pad=given))
             assert found.paired.tolist() == [paired] and found.other is not None
-    refused(sample(image=images, image_is_pad=[False] * 2), "image_is_pad: found 2 values, expected 3")
+    for n in (2, 4):
+        refused(sample(image=images, image_is_pad=[False] * n), f"image_is_pad: found {n} values, expected 3")
     for pad in (True, False):
         found = read(
             sample(right=picture(1), right_is_pad=np.array([pad]), image_is_pad=[not pad]), other_image="right"
