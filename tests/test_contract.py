@@ -408,7 +408,7 @@ ROWS = [
 #: tested where they are at home (test_front_end.py, test_pose.py, test_evaluate.py, test_integrate.py).
 ELSEWHERE = {
     *(f"dhtorch.stages.sample.{name}" for name in ("spiral", "vogel", "grid")),
-    *(f"dhtorch.geometry.shapes.{name}" for name in ("check", "is_static")),
+    *(f"dhtorch.geometry.shapes.{name}" for name in ("check", "is_static", "is_transformed")),
     *(f"dhtorch.geometry.cells.{name}" for name in ("occupied", "components")),
     *(f"dhtorch.integrate.volume.{name}" for name in ("empty", "fuse", "splat")),
     *(f"dhtorch.integrate.surface.{name}" for name in ("points", "mesh")),

@@ -26,6 +26,8 @@ Vector = Sequence[Tensor] | Sequence[float] | Sequence[Tensor | float]  # three 
 ORDINARY, MIRROR, WINDOW, DARK = 0, 1, 2, 3  #: kinds of surface
 NOWHERE = 1e9  #: distance of what is not met
 
+_STRIP = 1 << 8  # rays cast at all solids at a time: few enough to stay in the cache
+
 
 @dataclass(frozen=True)
 class Surface:
@@ -61,6 +63,7 @@ class Solids:
         self.half = torch.tensor([s.half for s in solids])
         self.R = torch.tensor([s.R for s in solids])
         self.ball = torch.tensor([s.ball for s in solids])
+        self._square = torch.tensor([s.half[0] ** 2 for s in solids])
 
     def view(self, camera: Camera, T_world_from_cam: Pose, hw: tuple[int, int]) -> tuple[Tensor, Tensor]:
         """z-depth (H·W,) and solid index (H·W,) at the pixel centres of one camera (B = 1).
@@ -70,8 +73,9 @@ class Solids:
         x, y = _plane(camera, hw)
         R, o = T_world_from_cam.R[0].double(), T_world_from_cam.t[0].double()
         t, index = torch.full(hw, NOWHERE), torch.zeros(hw, dtype=torch.int64)
-        for i, solid in enumerate(self.each):
-            rows, columns = _rectangle(solid, R, o, x, y) if i else (slice(None), slice(None))
+        rectangles = _rectangles(self, R, o, x, y)
+        rectangles[0] = (slice(None), slice(None))
+        for i, (solid, (rows, columns)) in enumerate(zip(self.each, rectangles, strict=True)):
             xs, ys = x[None, columns], y[rows, None]
             if xs.numel() and ys.numel():
                 local = torch.tensor(solid.R, dtype=torch.float64).T
@@ -83,10 +87,23 @@ class Solids:
 
     def cast(self, o: Sequence[Tensor], d: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
         """Distance (P,) and solid index (P,) along arbitrary rays."""
-        t, index = torch.full_like(o[0], NOWHERE), torch.zeros_like(o[0], dtype=torch.int64)
-        for i, solid in enumerate(self.each):
-            _nearer(t, index, i, *_span(solid, *_to_local(solid, o, d)))
-        return t, index
+        parts = [slice(k, k + _STRIP) for k in range(0, max(o[0].numel(), 1), _STRIP)]
+        strips = [self._cast([c[s] for c in o], [c[s] for c in d]) for s in parts]
+        return torch.cat([t for t, _ in strips]), torch.cat([index for _, index in strips])
+
+    def _cast(self, o: list[Tensor], d: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """All solids against all rays at once; of solids that are met at the same place, the first."""
+        rel = [o[k] - self.centre[:, k, None] for k in range(3)]
+        columns = [self.R[:, :, k, None].unbind(1) for k in range(3)]
+        o, d = [dot(rel, c) for c in columns], [dot(d, c) for c in columns]
+        half = self.half[..., None].unbind(1)
+        spans = zip(_ball_span(self._square[:, None], o, d), _box_span(half, o, d), strict=True)
+        enter, leave, met = (torch.where(self.ball[:, None], one, other) for one, other in spans)
+        at = torch.cat((leave[:1], enter[1:]))  # the room is met on leaving it
+        at = torch.where(met & (at >= 0), at, NOWHERE)
+        t = at.amin(0).clamp(max=NOWHERE)
+        first = torch.where(at == t, torch.arange(len(at))[:, None], len(at)).amin(0)
+        return t, torch.where(t < NOWHERE, first, 0)
 
     def locate(self, index: Tensor, p: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """Face (P,) of points on solids, and their place (P,), (P,) across and down it in [-1, 1].
@@ -168,15 +185,21 @@ def world_rays(camera: Camera, T_world_from_cam: Pose, hw: tuple[int, int]) -> t
 
 def _span(solid: Solid, o: Vector, d: Vector) -> tuple[Tensor, Tensor, Tensor]:
     """Distances at which rays in the solid's own axes enter and leave it, and whether they meet it at all."""
-    if solid.ball:
-        a, b = dot(d, d), dot(o, d)
-        under = b * b - a * (dot(o, o) - solid.half[0] ** 2)
-        root = under.clamp(min=0).sqrt()
-        return (-b - root) / a, (-b + root) / a, under > 0
+    return _ball_span(solid.half[0] ** 2, o, d) if solid.ball else _box_span(solid.half, o, d)
+
+
+def _ball_span(square: float | Tensor, o: Vector, d: Vector) -> tuple[Tensor, Tensor, Tensor]:
+    a, b = dot(d, d), dot(o, d)
+    under = b * b - a * (dot(o, o) - square)
+    root = under.clamp(min=0).sqrt()
+    return (-b - root) / a, (-b + root) / a, under > 0
+
+
+def _box_span(half: Vector, o: Vector, d: Vector) -> tuple[Tensor, Tensor, Tensor]:
     enters, leaves = [], []
     for k in range(3):
         inverse = 1 / torch.as_tensor(d[k])
-        a, b = (-solid.half[k] - o[k]) * inverse, (solid.half[k] - o[k]) * inverse
+        a, b = (-half[k] - o[k]) * inverse, (half[k] - o[k]) * inverse
         enters.append(torch.minimum(a, b))
         leaves.append(torch.maximum(a, b))
     enter = torch.maximum(torch.maximum(enters[0], enters[1]), enters[2])
@@ -206,17 +229,16 @@ def _plane(camera: Camera, hw: tuple[int, int]) -> tuple[Tensor, Tensor]:
     return x.float(), y.float()
 
 
-def _rectangle(solid: Solid, R: Tensor, o: Tensor, x: Tensor, y: Tensor) -> tuple[slice, slice]:
-    """Rows and columns whose rays can meet the solid; all of them if it reaches behind the camera."""
+def _rectangles(solids: Solids, R: Tensor, o: Tensor, x: Tensor, y: Tensor) -> list[tuple[slice, slice]]:
+    """Of each solid, rows and columns whose rays can meet it; all of them if it reaches behind the camera."""
     signs = torch.tensor([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)], dtype=torch.float64)
-    local = signs * torch.tensor(solid.half, dtype=torch.float64)
-    world = local @ torch.tensor(solid.R, dtype=torch.float64).T + torch.tensor(solid.centre, dtype=torch.float64)
-    cam = (world - o) @ R
-    if float(cam[:, 2].max()) <= 0:
-        return slice(0, 0), slice(0, 0)
-    if float(cam[:, 2].min()) < 0.02:
-        return slice(None), slice(None)
-    xy = cam[:, :2] / cam[:, 2:]
-    (x0, y0), (x1, y1) = (xy.amin(0) - 1e-4).tolist(), (xy.amax(0) + 1e-4).tolist()
-    bounds = [int(torch.searchsorted(axis, value)) for axis, value in ((y, y0), (y, y1), (x, x0), (x, x1))]
-    return slice(bounds[0], bounds[1]), slice(bounds[2], bounds[3])
+    half, turn, centre = solids.half.double(), solids.R.double(), solids.centre.double()
+    cam = ((signs * half[:, None]) @ turn.mT + centre[:, None] - o) @ R  # (solids, 8 corners, 3)
+    z = cam[..., 2]
+    xy = cam[..., :2] / z[..., None]
+    low, high = (xy.amin(1) - 1e-4).float(), (xy.amax(1) + 1e-4).float()
+    bounds = [torch.searchsorted(axis, edge[:, k].contiguous()) for k, axis in ((1, y), (0, x)) for edge in (low, high)]
+    found = [(slice(a, b), slice(c, e)) for a, b, c, e in torch.stack(bounds, 1).tolist()]
+    for i in (z.amin(1) < 0.02).nonzero()[:, 0].tolist():
+        found[i] = (slice(0, 0), slice(0, 0)) if float(z[i].amax()) <= 0 else (slice(None), slice(None))
+    return found
