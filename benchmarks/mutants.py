@@ -389,10 +389,8 @@ def run(
                 free.append(bench)
             row = row_of(module, fault, failed, why)
             if not quiet or row["verdict"] in ("missed", "noticed"):
-                print(
-                    f"{row['verdict']:10} {module}.{fault.function}: {fault.old!r} -> {fault.new!r}  {row.get('by', '')}",
-                    flush=True,
-                )
+                place = f"{module}.{fault.function}"
+                print(f"{row['verdict']:10} {place}: {fault.old!r} -> {fault.new!r}  {row.get('by', '')}", flush=True)
             return row
 
         free = list(benches)

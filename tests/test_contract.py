@@ -386,10 +386,10 @@ ROWS = [
     Row(thin_lens.spot_gain, lambda b, n, d: (lenses(b, d), uniform(b, 3, dtype=d, low=1, high=4)), POINTLESS + " raises", grad=(0, 1), bad=lambda a: (a[0], a[1][:, 0])),
     Row(thin_lens.spot_diameter, lambda b, n, d: (lenses(b, d), uniform(b, n, dtype=d, low=1, high=4), uniform(b, dtype=d, low=1, high=4, seed=1)), ALL, (1,), (0, 1, 2), bad=lambda a: (a[0], a[1], a[2][None])),
     Row(thin_lens.depth_of_spot, lambda b, n, d: (lenses(b, d), uniform(b, n, dtype=d, low=-2, high=0.5), uniform(b, dtype=d, low=1, high=2, seed=1)), ALL, (1,), (0, 1, 2), bad=lambda a: (a[0], a[1], a[2][None]), leaks=True),
-    Row(defocus.local_blur, lambda b, n, d: (shifted(b, n, d)[0],), "dtype batch vmap capture raises", bad=lambda a: (a[0][0],)),
+    Row(defocus.local_blur, lambda b, n, d: (shifted(b, n, d)[0],), "dtype batch vmap capture raises", bad=lambda a: (a[0][0],), slow="capture"),
     Row(defocus.inverse_depth, lambda b, n, d: (blurs(b, n, d), torch.ones(b, *HW, dtype=d), lenses(b, d), uniform(b, dtype=d, low=1, high=2)), "dtype batch vmap capture raises", bad=wrong_last_axis(1)),
     Row(defocus.side_by_height, lambda b, n, d: (blurs(b, n, d),), "dtype vmap capture"),
-    Row(defocus.side_by_colour, lambda b, n, d: (frames(b, n, d)[0].image,), "dtype batch vmap capture raises", bad=lambda a: (a[0][:, :2],)),
+    Row(defocus.side_by_colour, lambda b, n, d: (frames(b, n, d)[0].image,), "dtype batch vmap capture raises", bad=lambda a: (a[0][:, :2],), slow="capture"),
     Row(focus_stack.sharpness, lambda b, n, d: (stacks(b, n, d),), POINTLESS + " raises", grad=(0,), bad=lambda a: (a[0][0],)),
     Row(focus_stack.sharpest, lambda b, n, d: (focus_stack.sharpness(stacks(b, n, d)),), "dtype batch vmap capture raises", bad=lambda a: (a[0][0],)),
     Row(focus_stack.depth_at, lambda b, n, d: (uniform(b, *HW, dtype=d, high=3), torch.tensor([0.5, 1.0, 2.0, 4.0], dtype=d).expand(b, 4)), "dtype batch gradcheck raises", grad=(0, 1), bad=lambda a: (a[0][0], a[1])),
@@ -399,9 +399,9 @@ ROWS = [
     Row(probe.ridge, lambda b, n, d: (probe.moments(*probed(b, n, d)), torch.tensor([0.1, 1.0], dtype=d)), "capture gradcheck empty raises", grad=(1,), bad=lambda a: (a[0], torch.ones(2, 3))),
     Row(probe.predict, solved, "vmap capture gradcheck empty raises", grad=(0, 1), bad=wrong_last_axis(1)),
     Row(defocus_fusion.bilinear, lambda b, n, d: (sensed(b, n, d)[0], HW), "dtype batch vmap capture raises", bad=lambda a: (a[0][0], a[1])),
-    Row(defocus_fusion.joint_bilateral, sensed, "dtype vmap capture gradcheck raises", grad=(1,), bad=lambda a: (a[0][0], a[1])),
+    Row(defocus_fusion.joint_bilateral, sensed, "dtype vmap capture gradcheck raises", grad=(1,), bad=lambda a: (a[0][0], a[1]), slow="capture"),
     Row(defocus_fusion.guided_filter, sensed, "dtype batch vmap capture gradcheck raises", grad=(1,), bad=lambda a: (a[0][0], a[1])),
-    Row(defocus_fusion.defocus_guided, filled, "dtype vmap capture raises", bad=wrong_last_axis(0)),
+    Row(defocus_fusion.defocus_guided, filled, "dtype vmap capture raises", bad=wrong_last_axis(0), slow="capture"),
 ]  # fmt: skip
 
 #: Functions without a batch of points: samplers, loops over a callable, flat lists of pooled points. Their promises are
