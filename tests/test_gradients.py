@@ -437,7 +437,7 @@ def relative(estimate, truth, counts):
     return r.flatten(), (counts.flatten(), r.detach().flatten())
 
 
-@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("sign", [1, pytest.param(-1, marks=pytest.mark.slow)])
 def test_intrinsics_five_per_cent_wrong_are_recovered_from_far_depth(task, sign):
     f, c = task.near.camera.f, task.near.camera.c
 
