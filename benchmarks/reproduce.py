@@ -71,17 +71,7 @@ SCRIPTS |= {"degenerate": "", "mutants": "--quiet"}
 ASIDE = {"figures", "traceback", "root"}
 
 #: Files that were made with other settings than today's or do not say on which processor, and wait for a quiet machine.
-OUTDATED = {
-    "part_ablation",
-    "stress",
-    "ablation",
-    "latency",
-    "global_map",
-    "icp",
-    "learned_score",
-    "rh20t_probe",
-    "vo_probe",
-}
+OUTDATED = {"ablation", "latency", "icp", "rh20t_probe"}
 UNNAMED = {"frontend", "lk", "pnp", "triangulate", "pair", "loader", "scaling", "readers", "latency"}
 
 

@@ -286,10 +286,7 @@ def test_blocks_share_no_frame_and_pairs_keep_their_distance():
 
 def test_visual_odometry_within_the_room():
     pytest.importorskip("transformers")
-    room, short = (
-        SyntheticRoom(hw=(120, 160), n_frames=12, step_m=0.04, supersample=1),
-        SyntheticRoom(hw=(60, 80), n_frames=6),
-    )
+    room, short = SyntheticRoom(hw=(120, 160), n_frames=12, step_m=0.04), SyntheticRoom(hw=(60, 80), n_frames=6)
     short.name = "short"
     outcome = vo_probe.run(
         [room, short], {"map": small()}, None, Settings(), dinov2=NETWORK, blocks=3, min_pairs=6, penalties=(0.01, 1.0)

@@ -159,7 +159,7 @@ def test_another_question_in_the_same_folder_is_done_again(command, tmp_path):
     assert command("output=here", *TINY)[0] == 0
     (path,) = results(tmp_path)
     keys = {archive.read(path)["key"]}
-    for n, other in enumerate(("seed=1", "holdout.truth=raw", "data.seed=3"), start=2):
+    for n, other in enumerate(("seed=1", "holdout.truth=raw", "data.depth_noise=2"), start=2):
         code, out, _ = command("output=here", "resume=true", *TINY, other)
         keys.add(archive.read(path)["key"])
         assert code == 0 and "wrote" in out and len(keys) == n and results(tmp_path) == [path]
