@@ -71,7 +71,7 @@ SCRIPTS |= {"degenerate": "", "mutants": "--quiet"}
 ASIDE = {"figures", "traceback", "root"}
 
 #: Files that were made with other settings than today's or do not say on which processor, and wait for a quiet machine.
-OUTDATED = {"ablation", "latency", "icp", "rh20t_probe"}
+OUTDATED = {"latency"}
 UNNAMED = {"frontend", "lk", "pnp", "triangulate", "pair", "loader", "scaling", "readers", "latency"}
 
 
