@@ -199,15 +199,12 @@ def uniform_draws(seed: int | Tensor, batch: int, hypotheses: int) -> Tensor:
     Raises:
         ValueError: ``seed`` is a tensor of another shape than (batch,).
     """
+    draws = _draws_op if is_transformed() else _drawn
     if isinstance(seed, int):
-        return _draws(torch.tensor([seed]), hypotheses).expand(batch, -1, -1)
+        return draws(torch.tensor([seed]), hypotheses).expand(batch, -1, -1)
     if seed.shape != (batch,):
         raise ValueError(f"extend: seed has shape {tuple(seed.shape)}, expected an int or ({batch},) int64")
-    return _draws(seed.cpu(), hypotheses)
-
-
-def _draws(seed: Tensor, hypotheses: int) -> Tensor:
-    return (_draws_op if is_transformed() else _drawn)(seed, hypotheses)
+    return draws(seed.cpu(), hypotheses)
 
 
 def _drawn(seed: Tensor, hypotheses: int) -> Tensor:

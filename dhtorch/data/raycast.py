@@ -63,7 +63,7 @@ class Solids:
         self.half = torch.tensor([s.half for s in solids])
         self.R = torch.tensor([s.R for s in solids])
         self.ball = torch.tensor([s.ball for s in solids])
-        self._square = torch.tensor([s.half[0] ** 2 for s in solids])
+        self._square = torch.tensor([s.half[0] ** 2 for s in solids])  # of a ball's radius, rounded once
 
     def view(self, camera: Camera, T_world_from_cam: Pose, hw: tuple[int, int]) -> tuple[Tensor, Tensor]:
         """z-depth (H·W,) and solid index (H·W,) at the pixel centres of one camera (B = 1).
@@ -93,10 +93,8 @@ class Solids:
 
     def _cast(self, o: list[Tensor], d: list[Tensor]) -> tuple[Tensor, Tensor]:
         """All solids against all rays at once; of solids that are met at the same place, the first."""
-        rel = [o[k] - self.centre[:, k, None] for k in range(3)]
-        columns = [self.R[:, :, k, None].unbind(1) for k in range(3)]
-        o, d = [dot(rel, c) for c in columns], [dot(d, c) for c in columns]
-        half = self.half[..., None].unbind(1)
+        centre, half = self.centre[..., None].unbind(1), self.half[..., None].unbind(1)
+        o, d = _to_local(centre, [c.unbind(1) for c in self.R[..., None].unbind(2)], o, d)
         spans = zip(_ball_span(self._square[:, None], o, d), _box_span(half, o, d), strict=True)
         enter, leave, met = (torch.where(self.ball[:, None], one, other) for one, other in spans)
         at = torch.cat((leave[:1], enter[1:]))  # the room is met on leaving it
@@ -164,7 +162,7 @@ class Solids:
 
     def open_distance(self, solid: Solid, o: Sequence[Tensor], d: Sequence[Tensor]) -> Tensor:
         """Distance (…) that rays travel before they enter ``solid``, at most 1; 0 for rays that start inside."""
-        enter, leave, met = _span(solid, *_to_local(solid, o, d))
+        enter, leave, met = _span(solid, *_to_local(solid.centre, [*zip(*solid.R, strict=True)], o, d))
         if solid is self.each[0]:
             return leave.clamp(0, 1)
         return torch.where(met & (leave > 0), enter, 1.0).clamp(0, 1)
@@ -215,9 +213,8 @@ def _nearer(t: Tensor, index: Tensor, i: int, enter: Tensor, leave: Tensor, met:
     index.masked_fill_(first, i)
 
 
-def _to_local(solid: Solid, o: Vector, d: Vector) -> tuple[list[Tensor], list[Tensor]]:
-    rel = [o[k] - solid.centre[k] for k in range(3)]
-    columns = list(zip(*solid.R, strict=True))
+def _to_local(centre: Vector, columns: Sequence[Vector], o: Vector, d: Vector) -> tuple[list[Tensor], list[Tensor]]:
+    rel = [o[k] - centre[k] for k in range(3)]
     return [dot(rel, c) for c in columns], [dot(d, c) for c in columns]
 
 

@@ -6,11 +6,13 @@ import html
 import re
 from collections.abc import Iterable
 
+_CONTROL = "\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff"
+
 #: What XML cannot hold at all.
-_FORBIDDEN = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff]")
+_FORBIDDEN = re.compile(f"[{_CONTROL}]")
 
 #: What cannot stand in markup as it is: that, halves of surrogate pairs, and markup's own signs.
-_UNSAFE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff\ud800-\udfff&<>\"']")
+_UNSAFE = re.compile(f"[{_CONTROL}\ud800-\udfff&<>\"']")
 
 
 class Markup(str):

@@ -27,10 +27,9 @@ def last_cohort(result: Result) -> str | None:
     found = cohorts(result) or [None]
     if len(found) == 1:
         return found[0]
-    named = {t: [name for name in result["summary"] if f".{t}." in name] for t in found}
-    known = variants(result)
-    free = (t for t in reversed(found) if not any(f"{v}.{t}." in name for name in named[t] for v in known))
-    return next(free, found[-1])
+    known, names = variants(result), list(result["summary"])
+    unnamed = (t for t in reversed(found) if not any(f"{v}.{t}." in name for v in known for name in names))
+    return next(unnamed, found[-1])
 
 
 def scene_rows(result: Result, truth: str | None = None, variant: str | None = None) -> list[Row]:
