@@ -20,7 +20,7 @@ from typing import Any
 
 import harness
 import torch
-from degenerate_pairs import KINDS, make
+from degenerate_pairs import KINDS, Pair, make
 from torch import Tensor
 
 from dhtorch import tree
@@ -61,20 +61,23 @@ class Batch:
 
 def batches(n: int, *, seed: int = 0, size: int = BATCH) -> Iterator[Batch]:
     """Pairs 0 … n - 1; those whose camera has a lens apart, because a batch has one for all or none."""
-    waiting: dict[bool, list[Any]] = {True: [], False: []}
+    waiting: dict[bool, list[tuple[int, str, Pair]]] = {True: [], False: []}
     for number in range(n):
         kind, pair = make(number, seed=seed)
         same = waiting[pair.lens is not None]
-        same.append((number, kind, *pair.frames(), pair.uv, pair.truth))
+        same.append((number, kind, pair))
         if len(same) == size:
             yield join(same)
             same.clear()
     yield from (join(rest) for rest in waiting.values() if rest)
 
 
-def join(pairs: list[Any]) -> Batch:
-    numbers, kinds, anchors, others, uv, truth = zip(*pairs, strict=True)
-    return Batch([*numbers], [*kinds], tree.collate(anchors), tree.collate(others), torch.stack(uv), torch.stack(truth))
+def join(made: list[tuple[int, str, Pair]]) -> Batch:
+    """A batch of numbers, kinds and pairs."""
+    numbers, kinds, pairs = zip(*made, strict=True)
+    anchors, others = zip(*(pair.frames() for pair in pairs), strict=True)
+    uv, truth = torch.stack([pair.uv for pair in pairs]), torch.stack([pair.truth for pair in pairs])
+    return Batch([*numbers], [*kinds], tree.collate(anchors), tree.collate(others), uv, truth)
 
 
 def broken(estimate: Estimate, trace: Trace) -> dict[str, Tensor]:
@@ -216,7 +219,7 @@ def main() -> None:
 def explain(number: int, seed: int) -> None:
     """One pair, alone: its traceback, or its gates and broken promises."""
     kind, pair = make(number, seed=seed)
-    batch = join([(number, kind, *pair.frames(), pair.uv, pair.truth)])
+    batch = join([(number, kind, pair)])
     for method in ("map", "paper"):
         estimate, trace = batch.ask(method)
         gates = Counter(names(Gate)[g] for g in estimate.gate.flatten().tolist())

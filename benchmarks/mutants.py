@@ -30,7 +30,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 from faults import FAULTS, TESTS
 from faults.rows import Fault
@@ -42,6 +43,9 @@ PLACES = ("stages", "geometry", "pair", "window", "evaluate", "transform", "arch
 
 #: What the tests of a trial leave in its tree.
 FAILURE, TIMES = "first_failure.txt", "seconds.json"
+
+#: The last line of a table.
+ALL = "all"
 
 #: pytest's exit code where no test is left.
 NONE = 5
@@ -237,7 +241,7 @@ def warm() -> None:
     from torch.func import jacfwd  # noqa: F401
 
     torch.set_num_threads(1)
-    gc.freeze()
+    gc.freeze()  # a fork's collections leave alone what it shares with its parent
 
 
 class Order:
@@ -275,12 +279,19 @@ class Record:
         self.times.write_text(json.dumps(self.seconds))
 
 
-def trial(
-    tree: Path, module: str, tests: Sequence[str], limit_s: float, order: Mapping[str, float]
-) -> tuple[bool, str, float]:
-    """Run the module's tests over the tree in a fork: (a test failed, which and why, seconds)."""
-    said = tree / FAILURE
-    said.unlink(missing_ok=True)
+class Tried(NamedTuple):
+    """What became of some tests."""
+
+    failed: bool
+    why: str = ""  # which test first, and its reason
+    seconds: Mapping[str, float] = MappingProxyType({})  # of every test that ended
+
+
+def trial(tree: Path, module: str, tests: Sequence[str], limit_s: float, order: Mapping[str, float]) -> Tried:
+    """Run the module's tests over the tree in a fork."""
+    said, times = tree / FAILURE, tree / TIMES
+    for path in (said, times):
+        path.unlink(missing_ok=True)
     start = time.perf_counter()
     child = os.fork()
     if child == 0:
@@ -294,13 +305,14 @@ def trial(
     if not done:
         os.killpg(child, signal.SIGKILL)
         os.waitpid(child, 0)
-        return True, f"did not end in {limit_s:.0f} s", time.perf_counter() - start
+        return Tried(True, f"did not end in {limit_s:.0f} s")
     code = os.waitstatus_to_exitcode(status)
     if code not in (0, 1, NONE) and not said.exists():
         raise RuntimeError(
             f"mutants: the tests of {module} could not be run (exit code {code}): {(tree / 'log').read_text()[-2000:]}"
         )
-    return code not in (0, NONE), said.read_text() if said.exists() else "", time.perf_counter() - start
+    why, seconds = said.read_text() if said.exists() else "", json.loads(times.read_text()) if times.exists() else {}
+    return Tried(code not in (0, NONE), why, seconds)
 
 
 def _run_tests(tree: Path, module: str, tests: Sequence[str], order: Mapping[str, float]) -> None:
@@ -327,30 +339,27 @@ class Bench:
 
     def __init__(self, folder: Path, tests: Path) -> None:
         self.tree, self.second = folder, 1_000_000_000
-        self.seconds: dict[str, float] = {}  # of every test of the last run
         shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(*LEFT), dirs_exist_ok=True)
         shutil.rmtree(folder / "tests")
         shutil.copytree(tests, folder / "tests", ignore=shutil.ignore_patterns("__pycache__"))
 
     def run(
         self, fault: Fault | None, module: str, tests: Sequence[str], limit_s: float, order: Mapping[str, float]
-    ) -> tuple[bool, str, float]:
+    ) -> Tried:
         """Plant, run, take out again."""
         path = modules(self.tree)[module]
         source = path.read_text()
         tests = [t for t in tests if (self.tree / t.split("::")[0]).exists()]
         table = [t for t in tests if t.endswith("test_contract.py")]  # long to collect, and seldom needed
-        failed, why, total = False, "no test", 0.0
-        self.seconds.clear()
+        found = Tried(False)
         try:
             if fault is not None:
                 self._write(path, planted(source, fault))
             for some in ([t for t in tests if t not in table], table):
-                if some and not failed:
-                    failed, why, seconds = trial(self.tree, module, some, limit_s, order)
-                    self.seconds |= _times(self.tree)
-                    total += seconds
-            return failed, why, total
+                if some and not found.failed:
+                    more = trial(self.tree, module, some, limit_s, order)
+                    found = more._replace(seconds={**found.seconds, **more.seconds})
+            return found
         finally:
             self._write(path, source)
 
@@ -359,11 +368,6 @@ class Bench:
         path.write_text(source)
         self.second += 1
         os.utime(path, (self.second, self.second))
-
-
-def _times(tree: Path) -> dict[str, float]:
-    path = tree / TIMES
-    return json.loads(path.read_text()) if path.exists() else {}
 
 
 def run(
@@ -384,10 +388,10 @@ def run(
             bench = free.pop()
             module, fault = named[k]
             try:
-                failed, why, _ = bench.run(fault, module, tests_of[module], 60 + 4 * whole[module], clean[module])
+                found = bench.run(fault, module, tests_of[module], 60 + 4 * whole[module], clean[module])
             finally:
                 free.append(bench)
-            row = row_of(module, fault, failed, why)
+            row = row_of(module, fault, found)
             if not quiet or row["verdict"] in ("missed", "noticed"):
                 place = f"{module}.{fault.function}"
                 print(f"{row['verdict']:10} {place}: {fault.old!r} -> {fault.new!r}  {row.get('by', '')}", flush=True)
@@ -398,19 +402,19 @@ def run(
             yield from pool.map(one, range(len(named)))
 
 
-def _clean(benches: list[Bench], wanted: list[str], tests_of: dict[str, list[str]]) -> dict[str, dict[str, float]]:
+def _clean(benches: list[Bench], wanted: list[str], tests_of: dict[str, list[str]]) -> dict[str, Mapping[str, float]]:
     """Seconds that each test of every module takes as it is; they must pass."""
     free = list(benches)
 
-    def one(module: str) -> dict[str, float]:
+    def one(module: str) -> Mapping[str, float]:
         if module not in tests_of:
             raise ValueError(f"mutants: no tests are named for {module}, add them to benchmarks/faults/")
         bench = free.pop()
         try:
-            failed, why, _ = bench.run(None, module, tests_of[module], 600, {})
-            if failed:
-                raise RuntimeError(f"mutants: the tests of {module} fail without a fault: {why}")
-            return dict(bench.seconds)
+            found = bench.run(None, module, tests_of[module], 600, {})
+            if found.failed:
+                raise RuntimeError(f"mutants: the tests of {module} fail without a fault: {found.why}")
+            return found.seconds
         finally:
             free.append(bench)
 
@@ -418,26 +422,30 @@ def _clean(benches: list[Bench], wanted: list[str], tests_of: dict[str, list[str
         return dict(zip(wanted, pool.map(one, wanted), strict=True))
 
 
-def row_of(module: str, fault: Fault, failed: bool, why: str) -> dict[str, Any]:
+def row_of(module: str, fault: Fault, found: Tried) -> dict[str, Any]:
     """What became of one fault. ``noticed``: said to change no answer, and yet a test failed."""
-    verdict = ("noticed" if failed else "equivalent") if fault.equivalent else ("caught" if failed else "missed")
-    by = why.partition("\n")[0]
-    row = {"module": module, "function": fault.function, "old": fault.old, "new": fault.new, "verdict": verdict}
-    told = {"reason": fault.equivalent} if fault.equivalent else {"by": by}
-    return row | told
+    right, wrong = ("noticed", "equivalent") if fault.equivalent else ("caught", "missed")
+    row = {"module": module, "function": fault.function, "old": fault.old, "new": fault.new}
+    told = {"reason": fault.equivalent} if fault.equivalent else {"by": found.why.partition("\n")[0]}
+    return row | {"verdict": right if found.failed else wrong} | told
+
+
+def by_module(rows: Sequence[dict[str, Any]]) -> list[tuple[str, int, int, int]]:
+    """Module, faults caught, how many change an answer, and how many change none; then the same of all."""
+    count = Counter((name, row["verdict"]) for row in rows for name in (row["module"], ALL))
+    return [
+        (name, count[name, "caught"], count[name, "caught"] + count[name, "missed"], count[name, "equivalent"])
+        for name in [*sorted({row["module"] for row in rows}), ALL]
+    ]
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> str:
     """Caught of those that change an answer, by module."""
-    count = Counter((row["module"], row["verdict"]) for row in rows)
-    lines = [f"{'module':28} caught  of  equivalent"]
-    total = Counter(row["verdict"] for row in rows)
-    for module in sorted({row["module"] for row in rows}):
-        caught, missed = count[module, "caught"], count[module, "missed"]
-        lines.append(f"{module:28} {caught:6} {caught + missed:3} {count[module, 'equivalent'] or '':>6}")
-    of = total["caught"] + total["missed"]
-    share = f" = {total['caught'] / of:.1%}" if of else ""
-    return "\n".join([*lines, f"{'all':28} {total['caught']:6} {of:3} {total['equivalent'] or '':>6}{share}"])
+    found = by_module(rows)
+    lines = [f"{name:28} {caught:6} {of:3} {same or '':>6}" for name, caught, of, same in found]
+    _, caught, of, _ = found[-1]
+    share = f" = {caught / of:.1%}" if of else ""
+    return "\n".join([f"{'module':28} caught  of  equivalent", *lines]) + share
 
 
 def main() -> int:

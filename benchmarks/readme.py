@@ -11,12 +11,12 @@ import argparse
 import json
 import re
 import sys
-from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import mutants
 import speed_tables
 
 from dhtorch import archive
@@ -189,15 +189,12 @@ def picture(path: Path) -> None:
     figure.savefig(path, dpi=80, bbox_inches="tight")
 
 
-def mutants() -> str:
+def caught() -> str:
     """Planted faults that a test of their module caught, of those that change an answer."""
-    rows = json.loads((RESULTS / "mutants.json").read_text())
-    count = Counter((row["module"], row["verdict"]) for row in rows) + Counter(("all", row["verdict"]) for row in rows)
-    cells = []
-    for module in [*sorted({row["module"] for row in rows}), "all"]:
-        caught, missed = count[module, "caught"], count[module, "missed"]
-        same = count[module, "equivalent"] or ""
-        cells.append([f"`{module}`" if module != "all" else module, f"{caught} of {caught + missed}", f"{same}"])
+    found = mutants.by_module(json.loads((RESULTS / "mutants.json").read_text()))
+    cells = [
+        [name if name == mutants.ALL else f"`{name}`", f"{n} of {of}", f"{same or ''}"] for name, n, of, same in found
+    ]
     return table(["faults planted in", "caught", "change no answer"], cells)
 
 
@@ -230,7 +227,7 @@ TABLES |= {"verdicts": partial(verdicts, ASKED), "negative": partial(verdicts, N
 TABLES |= {"pipelines": partial(verdicts, PIPELINES), "map": partial(verdicts, ("global_map",))}
 
 #: Pages and their tables.
-PAGES = {README: TABLES, HERE / "README.md": speed_tables.TABLES | {"mutants": mutants}}
+PAGES = {README: TABLES, HERE / "README.md": speed_tables.TABLES | {"mutants": caught}}
 
 
 def in_layout(name: str) -> str:

@@ -20,12 +20,7 @@ def alone(number, pair=None):
     """One pair as a batch of its own; ``pair`` in place of its own content."""
     kind, own = make(number)
     pair = pair or own
-    return together([(number, kind, pair)])
-
-
-def together(pairs):
-    """A batch of (number, kind, pair)."""
-    return degenerate.join([(number, kind, *pair.frames(), pair.uv, pair.truth) for number, kind, pair in pairs])
+    return degenerate.join([(number, kind, pair)])
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +43,7 @@ def test_the_hopeless_stay_silent_and_the_healthy_answer(rows):
     assert all(answered[kind, method] == 0 for kind in hopeless for method in ("map", "paper"))
     still = ("identical frames", "pure rotation", "unrelated images", "upside down", "noise images", "random depth")
     assert all(answered[kind, "map"] <= 0.02 for kind in still)
-    healthy = together([(number, *make(number)) for number in range(0, 5 * len(KINDS), len(KINDS))])
+    healthy = degenerate.join([(number, *make(number)) for number in range(0, 5 * len(KINDS), len(KINDS))])
     assert set(healthy.kinds) == {"nothing wrong"}
     share = {method: float(healthy.ask(method)[0].keep.float().mean()) for method in ("map", "paper")}
     assert share["map"] > 0.2 and share["paper"] > 0.5
