@@ -70,9 +70,8 @@ SCRIPTS |= {"degenerate": "", "mutants": "--quiet"}
 #: Options that change no number, and which a file may hold otherwise.
 ASIDE = {"figures", "traceback", "root"}
 
-#: Files that were made with other settings than today's or do not say on which processor, and wait for a quiet machine.
-OUTDATED = {"latency"}
-UNNAMED = {"frontend", "lk", "pnp", "triangulate", "pair", "loader", "scaling", "readers", "latency"}
+#: Files that were made with other settings than today's, and wait for a quiet machine.
+OUTDATED: set[str] = set()
 
 
 def command(name: str) -> str:
