@@ -6,7 +6,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: run test test-all everything lint clean
+.PHONY: run test test-all everything lint conf clean
 
 run: $(VENV)/.installed
 	@echo "== dhtorch on the built-in scene"
@@ -31,6 +31,10 @@ lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# The settings of the methods, written from their records.
+conf: $(VENV)/.installed
+	$(BIN)/python docs/settings.py
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	@echo "== installing into $(VENV)"

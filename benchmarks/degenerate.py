@@ -26,7 +26,9 @@ from torch import Tensor
 from dhtorch import tree
 from dhtorch.codes import Gate, PoseCode, names
 from dhtorch.geometry.lookup import nearest
-from dhtorch.pair import METHODS, Trace, merge
+from dhtorch.method import Trace
+from dhtorch.methods import METHODS
+from dhtorch.pair import merge
 from dhtorch.records import Estimate, Frame, PoseFit
 
 BATCH = 64

@@ -26,7 +26,8 @@ from frontend import front_end
 
 from dhtorch import tree
 from dhtorch.geometry import epipolar
-from dhtorch.pair import METHODS, uniform_draws
+from dhtorch.methods import METHODS
+from dhtorch.pair import uniform_draws
 from dhtorch.records import Frame
 from dhtorch.stages.pose import pnp_ransac
 

@@ -34,7 +34,8 @@ from dhtorch.data.pairs import by_gap
 from dhtorch.data.synthetic import SyntheticRoom
 from dhtorch.geometry import lucas_kanade as lk
 from dhtorch.geometry.lookup import luma
-from dhtorch.geometry.pyramid import Pyramid, build_pyramid
+from dhtorch.geometry.pyramid import Pyramid, Pyramids, build_pyramid
+from dhtorch.records import TrackHint
 from dhtorch.stages import track
 from dhtorch.stages.sample import spiral
 
@@ -138,14 +139,15 @@ def measure(n: int, batch: int, window: int, repeats: int) -> list[dict[str, Any
     image_0, image_1 = pairs(batch)
     uv = spiral(tuple(image_0.shape[-2:]), n).float().expand(batch, n, 2).contiguous()
     views, suffix = (image_0, image_1, uv), f"_w{window}_n{n}" + (f"_b{batch}" if batch > 1 else "")
-    anchor = build_pyramid(image_0, LEVELS, window)
+    kept = Pyramids(image_0)
+    anchor = kept(LEVELS, window)
     options: Any = {"window": window, "levels": LEVELS}
     calls = [
         partial(forward, *views, window),
         partial(forward, *views, window, anchor),
         partial(forward_opencv, *views, window),
         partial(track.lucas_kanade, *views, **options),
-        partial(track.lucas_kanade, *views, pyramid_0=anchor, **options),
+        partial(track.lucas_kanade, *views, hint=TrackHint(pyramid=kept), **options),
         partial(opencv.lucas_kanade, *views, **options),
         partial(forward_compiled, *views, window),
     ]

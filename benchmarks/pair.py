@@ -19,14 +19,17 @@ from typing import Any
 import harness
 import torch
 
-from dhtorch import data, tree
+from dhtorch import data, extend, tree
 from dhtorch.baselines import opencv
 from dhtorch.data.pairs import by_gap
 from dhtorch.data.synthetic import SyntheticRoom
 from dhtorch.evaluate import errors, holdout
-from dhtorch.pair import METHODS, extend
+from dhtorch.methods import MAP, PAPER
 from dhtorch.records import Frame
 from dhtorch.stages import triangulate
+
+#: Ours, by name.
+OURS = {"paper": PAPER, "map": MAP}
 
 PEER = partial(
     extend,
@@ -63,7 +66,7 @@ def measure(batch: int, threads: int, options: Any, n: int = 2048) -> list[dict[
     """Rows for one batch size and thread count: for each method the whole pair, then each stage."""
     harness.set_threads(threads)
     pair = load(batch)
-    methods: dict[str, Callable[..., Any]] = {**METHODS, "opencv": PEER}
+    methods: dict[str, Callable[..., Any]] = {**OURS, "opencv": PEER}
     traces: dict[str, list[dict[str, float]]] = {name: [] for name in methods}
 
     def call(name: str) -> None:
@@ -76,7 +79,7 @@ def measure(batch: int, threads: int, options: Any, n: int = 2048) -> list[dict[
     times = {name: [t / batch for t in side] for name, side in zip(methods, sides, strict=True)}
     found = {name: median_error(method, pair) for name, method in methods.items()}
     rows = []
-    for method in METHODS:
+    for method in OURS:
         name, common = f"pair_{method}_b{batch}", {"n": n, "batch": batch}
         errors_of = {"ours_error": found[method], "peer_error": found["opencv"]}
         rows.append(harness.row(name, times[method], "opencv", times["opencv"], **common, **errors_of, bar=True))
@@ -95,7 +98,7 @@ def main() -> None:
             rows += measure(batch, threads, options)
     print(f"{load(1)[0]}: milliseconds per pair, medians of {options.repeats}; errors are median relative depth errors")
     harness.report(rows, options.json)
-    for method in METHODS:
+    for method in OURS:
         whole = [r["ratio"] for r in rows if r["bar"] and r["name"].startswith(f"pair_{method}_")]
         print(f"{method} / opencv: {min(whole):.2f} to {max(whole):.2f}, median {statistics.median(whole):.2f}")
 

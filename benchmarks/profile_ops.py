@@ -20,22 +20,22 @@ import pair as pairs
 import torch
 from torch.profiler import ProfilerActivity, profile
 
-from dhtorch.pair import METHODS, extend
+from dhtorch.method import Method
+from dhtorch.methods import METHODS
 
 STAGES = ("sample", "backproject", "classify", "track", "pose", "triangulate", "score")
 
 
-def seat_call(method: Callable[..., Any], stage: str, frames: tuple[Any, Any], n: int) -> Callable[[], Any]:
+def seat_call(method: Method, stage: str, frames: tuple[Any, Any], n: int) -> Callable[[], Any]:
     """One seat of a method with the arguments that the method gives it."""
     seen: dict[str, Callable[[], Any]] = {}
-    options: dict[str, Any] = {**(extend.__kwdefaults__ or {}), **getattr(method, "keywords", {})}
-    seat = options[stage]
+    seat = getattr(method, stage)
 
     def watched(*args: Any, **kwargs: Any) -> Any:
         seen[stage] = partial(seat, *args, **kwargs)
         return seat(*args, **kwargs)
 
-    method(*frames, n=n, **{stage: watched})
+    method.replace(n=n, **{stage: watched})(*frames)
     return seen[stage]
 
 

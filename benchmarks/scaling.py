@@ -26,10 +26,10 @@ from dhtorch.data.synthetic import SyntheticRoom
 from dhtorch.evaluate import holdout
 from dhtorch.experiments.memory import peak_mib
 from dhtorch.geometry import camera as cam
-from dhtorch.pair import METHODS, uniform_draws
+from dhtorch.methods import METHODS, PAPER
+from dhtorch.pair import uniform_draws
 from dhtorch.records import Frame
 from dhtorch.stages.pose import pnp_ransac
-from dhtorch.window import extend_window
 
 #: The largest exponent that counts as proportional.
 MOST = 1.05
@@ -73,7 +73,7 @@ def series(full: bool) -> dict[str, list[tuple[int, Callable[[], Any]]]]:
     shown = [(hw, partial(METHODS["paper"], resized(anchor, hw), resized(other, hw), n=512)) for hw in sizes]
     found["paper.pixels"] = [(hw[0] * hw[1], call) for hw, call in shown]
     counts = [1 << k for k in doublings]
-    windows = [partial(extend_window, anchor, tree.stack(views(v)[1:]), n=512, views=v) for v in counts]
+    windows = [partial(PAPER.replace(views=v), anchor, tree.stack(views(v)[1:]), n=512) for v in counts]
     found["window.views"] = [*zip(counts, windows, strict=True)]
     return found
 
@@ -84,7 +84,7 @@ def small_calls() -> None:
     anchor, other = frame, frame.replace(image=frame.image.roll(2, -1))
     for method in METHODS.values():
         method(anchor, other, n=64)
-    extend_window(anchor, tree.stack([other]), n=64, views=1)
+    PAPER(anchor, tree.stack([other]), n=64)
 
 
 def exponent(sizes: Sequence[float], values: Sequence[float]) -> float:

@@ -1,27 +1,61 @@
 """dhtorch: a short-range depth sensor as a metric ruler.
 
 Near returns fix the metric relative pose of two views; what can be tracked beyond the sensor's reach is triangulated
-under that pose; weak geometry stays a hole that says why. ``extend`` is the method, ``merge`` the map it gives.
+under that pose; weak geometry stays a hole that says why. ``extend`` is the paper's method, ``merge`` the map it gives.
+
+Names are imported when they are first asked for: ``dhtorch --help`` answers before torch is loaded.
 """
 
-from dhtorch.pair import extend, merge
-from dhtorch.records import Camera, Estimate, Frame, Map, Pose, PoseFit, Samples, Tracks
-from dhtorch.transform import ExtendDepth
-from dhtorch.tree import collate
+from __future__ import annotations
+
+import importlib.util
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from dhtorch.method import Method
+    from dhtorch.methods import MAP, PAPER, WINDOW, extend
+    from dhtorch.pair import merge
+    from dhtorch.records import Camera, Estimate, Frame, Map, Pose, PoseFit, Samples, TrackHint, Tracks
+    from dhtorch.transform import ExtendDepth
+    from dhtorch.tree import collate
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "MAP",
+    "PAPER",
+    "WINDOW",
     "Camera",
     "Estimate",
     "ExtendDepth",
     "Frame",
     "Map",
+    "Method",
     "Pose",
     "PoseFit",
     "Samples",
+    "TrackHint",
     "Tracks",
     "collate",
     "extend",
     "merge",
 ]
+
+#: Where a public name lives, if not among the records.
+_HOMES = {"MAP": "methods", "PAPER": "methods", "WINDOW": "methods", "extend": "methods", "Method": "method"}
+_HOMES |= {"ExtendDepth": "transform", "collate": "tree", "merge": "pair"}
+
+
+def __getattr__(name: str) -> Any:
+    if name in __all__:
+        found = getattr(importlib.import_module(f"dhtorch.{_HOMES.get(name, 'records')}"), name)
+    elif not name.startswith("_") and importlib.util.find_spec(f"dhtorch.{name}") is not None:
+        found = importlib.import_module(f"dhtorch.{name}")
+    else:
+        raise AttributeError(f"module 'dhtorch' has no attribute {name!r}")
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -37,6 +37,26 @@ EDGE_BYTES = 64 * 1024
 #: Options that say nothing about a result to its reader.
 _PLACES = ("hydra", "output")
 
+#: Function that an older result names → where it is found now.
+ALIASES = {
+    "dhtorch.pair.extend": "dhtorch.method.Method",
+    "dhtorch.window.extend_window": "dhtorch.method.Method",
+    "dhtorch.window.inverse_variance": "dhtorch.stages.fuse.inverse_variance",
+}
+
+#: Function → options that older results do not name, as they were.
+IMPLIED: dict[str, dict[str, Any]] = {
+    "dhtorch.method.Method": {
+        "views": 1,
+        "chain": True,
+        "fuse": {
+            **{"_target_": "dhtorch.stages.fuse.inverse_variance", "_partial_": True, "min_views": 2, "max_chi2": 9.0},
+            **{"correlation": 1.0, "max_sigma_rel": 0.1, "max_still": 0.5},
+        },
+    },
+    "dhtorch.experiments.helix_correlation.run": {"turns": None, "foveation": 1.0, "gaze": None},
+}
+
 #: Ends the name of a file that is being written.
 _UNFINISHED = ".tmp"
 
@@ -119,6 +139,22 @@ def validate(result: Any, where: str = "result") -> None:
         pairs = pair is None or (len(pair) == 2 and all(_is(v, int) for v in pair))
         _expect(pairs, f"{where}.rows.{k}.pair", pair, "[i, j] or null")
     _finite(result, where)
+
+
+def today(settings: Any) -> Any:
+    """Settings of an older result in today's words: functions where they are now, with what was left unsaid then."""
+    if isinstance(settings, list):
+        return [today(value) for value in settings]
+    if not isinstance(settings, Mapping):
+        return settings
+    said = {key: today(value) for key, value in settings.items()}
+    name = said.get("_target_")
+    said |= {"_target_": ALIASES[name]} if name in ALIASES else {}
+    if said.get("_target_") == "dhtorch.method.Method":
+        said.pop("_partial_", None)  # a method was a function with its options bound, and is a record
+    if name == "dhtorch.stages.backproject.backproject" and said.get("search_px") == 0:
+        said["search_px"] = None  # as far as the frame asks for
+    return {**IMPLIED.get(str(said.get("_target_")), {}), **said}
 
 
 def strict(value: Any) -> Any:

@@ -1,16 +1,8 @@
-"""The method: two RGB-D views in, far depth with abstention out. Seven seats in a straight line.
-
-    anchor view ─ sample ─ backproject ─ classify ─┬─ near, with depth ──── pose ────┐
-                                                   └─ trackable, without ─ track ────┴─ triangulate ─ score
-
-Every seat is a function with keyword options; another method is the same line with other functions in its seats.
-"""
+"""The line that joins the seats of a method: two RGB-D views in, far depth with abstention out; and their map."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import torch
@@ -19,118 +11,52 @@ from torch import Tensor
 from dhtorch.codes import Gate, Source
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.shapes import check, is_transformed
-from dhtorch.records import Camera, Estimate, Frame, Map, PoseFit, Samples, Tracks
-from dhtorch.stages import backproject as _backproject
-from dhtorch.stages import holes as _holes
-from dhtorch.stages import pose as _pose
-from dhtorch.stages import sample as _sample
-from dhtorch.stages import score as _score
-from dhtorch.stages import track as _track
-from dhtorch.stages import triangulate as _triangulate
+from dhtorch.method import Method, Trace
+from dhtorch.records import NO_HINT, Camera, Estimate, Frame, Map, PoseFit, Samples, TrackHint, Tracks
 from dhtorch.tree import in_pieces
 
 #: Pairs tracked at once: more are no faster, and their pyramids cost memory.
 PAIRS = 8
 
-#: Intermediates and milliseconds by stage name; fill one with ``extend(..., trace=trace)``.
-Trace = dict[str, Any]
 
-
-def extend(
+def ask_pair(
+    method: Method,
     frame_0: Frame,
     frame_1: Frame,
     *,
-    sample: Callable[..., Tensor] = _sample.spiral,
-    backproject: Callable[..., Samples] = _backproject.backproject,
-    classify: Callable[..., Samples] = _holes.classify,
-    track: Callable[..., Tracks] = _track.lucas_kanade,
-    pose: Callable[..., PoseFit] = _pose.pnp_ransac,
-    triangulate: Callable[..., Estimate] = _triangulate.two_view,
-    score: Callable[..., Estimate] = _score.rank,
-    n: int = 2048,
-    hypotheses: int = 200,
-    min_trackability: float = 1e-5,
     seed: int | Tensor = 0,
     fit: PoseFit | None = None,
+    hint: TrackHint = NO_HINT,
     trace: Trace | None = None,
 ) -> Estimate:
-    """Extend the depth sensor of ``frame_0`` with the parallax between two views.
+    """The method's answer for B anchors with one other view each; what ``method(frame_0, frame_1)`` calls.
 
-    Near returns fix the metric relative pose of the two views; every tracked sample, those without a return above
-    all, is triangulated under that pose; gates leave a hole with a reason where the geometry is weak.
-
-    Args:
-        frame_0: B anchor views; answers are depths along their samples.
-        frame_1: B other views. Their depth is not read. Cameras may differ.
-        sample, backproject, classify, track, pose, triangulate, score: the seven seats.
-        n: samples per pair.
-        hypotheses: minimal samples drawn by the pose search.
-        min_trackability: samples below it are not used (gate NO_TEXTURE).
-        seed: an int gives every pair the same draws; a (B,) int64 tensor gives each pair its own.
-        fit: a pose from elsewhere; seat 5 is then skipped.
-        trace: a dict that receives ``samples``, ``tracks`` (as tracked), ``tracks_ideal`` (undistorted), ``fit``,
-            ``estimate`` and ``ms`` (milliseconds by stage).
-
-    Returns:
-        Estimate for the B × n samples of view 0, silent ones with their reason; in the dtype of the intrinsics, float32
-        where these are half precision. Images and depth may be of any floating dtype.
-
-    Raises:
-        ValueError: wrong shapes, or different batch sizes.
-
-    Memory: grows with the answers; pyramids are held of eight pairs at most, unless a graph keeps them.
-    Gradient: recovered depth to both images, to the near depth and to intrinsics; choices (flags, inliers, gates)
-    carry none.
-    Source: paper, section "Method".
+    Arguments, answer and errors are those of :class:`dhtorch.method.Method`.
     """
     check("extend", image_0=(frame_0.image, "B C H W"), f_0=(frame_0.camera.f, "B 2"), t=(frame_1.camera.f, "B 2"))
     check("extend", image_0=(frame_0.image, "B C H W"), image_1=(frame_1.image, "B c h w"))
     frame_0, frame_1 = lifted(frame_0), lifted(frame_1)
     clock = _Clock(trace)
     like = frame_0.camera.f
-    uv = clock("sample", sample(frame_0.hw, n, device=like.device, dtype=like.dtype))
-    samples = clock("backproject", backproject(frame_0, uv))
-    samples = clock("classify", classify(frame_0, samples))
-    tracks = clock("track", in_pieces(track, PAIRS, frame_0.image, frame_1.image, samples.uv))
-    textured = samples.trackability >= min_trackability
+    uv = clock("sample", method.sample(frame_0.hw, method.n, device=like.device, dtype=like.dtype))
+    samples = clock("backproject", method.backproject(frame_0, uv))
+    samples = clock("classify", method.classify(frame_0, samples))
+    tracks = clock("track", _tracked(method, frame_0.image, frame_1.image, samples.uv, hint))
+    textured = samples.trackability >= method.min_trackability
     usable = tracks.replace(valid=tracks.valid & textured)
     usable = undistort_tracks(usable, frame_0.camera, frame_1.camera)
     camera_0, camera_1 = cam.ideal(frame_0.camera), cam.ideal(frame_1.camera)
     if fit is None:
-        draws = uniform_draws(seed, like.shape[0], hypotheses).to(like)
-        fit = pose(samples, usable, camera_0, camera_1, draws)
+        draws = uniform_draws(seed, like.shape[0], method.hypotheses).to(like)
+        fit = method.pose(samples, usable, camera_0, camera_1, draws)
     clock("pose", fit)
-    estimate = clock("triangulate", triangulate(samples, usable, fit, camera_0, camera_1))
+    estimate = clock("triangulate", method.triangulate(samples, usable, fit, camera_0, camera_1))
     untextured = (estimate.gate == Gate.NO_TRACK) & tracks.valid & ~textured
     gate = torch.where(untextured, torch.full_like(estimate.gate, Gate.NO_TEXTURE), estimate.gate)
-    estimate = clock("score", score(estimate.replace(gate=gate), samples, usable, fit))
+    estimate = clock("score", method.score(estimate.replace(gate=gate), samples, usable, fit))
     if trace is not None:
         trace.update(samples=samples, tracks=tracks, tracks_ideal=usable, fit=fit, estimate=estimate)
     return estimate
-
-
-#: Methods by name, each called as :func:`extend`: the paper's, and pose and abstention by what the errors must be.
-METHODS: dict[str, Callable[..., Estimate]] = {
-    "paper": extend,
-    "map": partial(
-        extend,
-        track=partial(_track.lucas_kanade_affine, levels=5),
-        pose=_pose.map_pose,
-        triangulate=partial(
-            _triangulate.two_view,
-            min_parallax_deg=None,
-            max_sigma_rel=0.2,
-            min_t_snr=30.0,
-            max_mismatch_px=10.0,
-            fitted_noise=True,
-            mismatch_px=2.0,
-            residual_px=0.5,
-            round_trip_px=0.4,
-            sensor_share=1.0,
-        ),
-        score=_score.rank_by_error,
-    ),
-}
 
 
 def merge(samples: Samples, estimate: Estimate) -> Map:
@@ -189,6 +115,13 @@ def undistort_tracks(tracks: Tracks, camera_0: Camera, camera_1: Camera) -> Trac
     half = (J[..., :, :, None] * torch.where(known, tracks.cov, 0)[..., None, :, :]).sum(-2)
     cov = torch.where(known, (half[..., :, None, :] * J[..., None, :, :]).sum(-1), tracks.cov)
     return tracks.replace(uv_0=uv_0, uv_1=uv_1, cov=cov, valid=tracks.valid & fine)
+
+
+def _tracked(method: Method, image_0: Tensor, image_1: Tensor, uv: Tensor, hint: TrackHint) -> Tracks:
+    def some(image_0: Tensor, image_1: Tensor, uv: Tensor, hint: TrackHint) -> Tracks:
+        return method.track(image_0, image_1, uv, hint=hint)
+
+    return in_pieces(some, PAIRS, image_0, image_1, uv, hint)
 
 
 def uniform_draws(seed: int | Tensor, batch: int, hypotheses: int) -> Tensor:

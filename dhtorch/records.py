@@ -6,16 +6,18 @@ a return is 0 and its ``xyz`` NaN; ``depth`` and ``sigma`` of an unanswered esti
 
 from __future__ import annotations
 
-from dataclasses import field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 from torch import Tensor
 
 from dhtorch.codes import Gate, PoseCode
 from dhtorch.geometry.camera import Camera
+from dhtorch.geometry.pyramid import Pyramids
 from dhtorch.geometry.se3 import Pose
 from dhtorch.tree import KEEP_DTYPE, Record, record
 
-__all__ = ["Camera", "Estimate", "Frame", "Map", "Pose", "PoseFit", "Samples", "Shutter", "Tracks"]
+__all__ = ["Camera", "Estimate", "Frame", "Map", "Pose", "PoseFit", "Samples", "Shutter", "TrackHint", "Tracks"]
 
 
 @record
@@ -29,6 +31,7 @@ class Frame(Record):
     conf: Tensor | None = None  # (B, h, w) uint8 sensor confidence 0 low, 1 medium, 2 high
     time: Tensor | None = field(default=None, metadata=KEEP_DTYPE)  # (B,) s, float64
     T_world_from_cam: Pose | None = None  # where the data set has one; stages never read it
+    sparse: Tensor | None = None  # (B,) bool: depth is a projected LiDAR sweep, mostly empty between returns
 
     @property
     def hw(self) -> tuple[int, int]:
@@ -65,6 +68,28 @@ class Tracks(Record):
     photometric: Tensor  # (B, N) rms grey residual of the patch, image in [0, 1]
     cov: Tensor  # (B, N, 2, 2) px², of uv_1
     valid: Tensor  # (B, N) bool
+
+
+@dataclass(frozen=True, eq=False)
+class TrackHint:
+    """What the caller of a tracker knows beforehand. Every tracker takes one and may ignore it."""
+
+    start: Tensor | None = None  # (B, N, 2) px, where to look first in image 1; None or not finite = at ``uv_0``
+    pyramid: Pyramids | None = None  # of image 0, shared by all who search in it
+    levels: int | None = None  # pyramid levels that the motion in this scene asks for; None = the tracker's own
+
+    def replace(self, **changes: Any) -> TrackHint:
+        """A copy with some fields replaced."""
+        return replace(self, **changes)
+
+    def __getitem__(self, part: slice) -> TrackHint:
+        """The hint for some of the pairs."""
+        start = None if self.start is None else self.start[part]
+        return TrackHint(start, None if self.pyramid is None else self.pyramid[part], self.levels)
+
+
+#: Nothing is known beforehand.
+NO_HINT = TrackHint()
 
 
 @record

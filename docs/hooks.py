@@ -95,11 +95,18 @@ def api_page(part: str) -> str:
     if part == "dhtorch":
         head = ["| name | |", "| :-- | :-- |"]
         names = [(name, getattr(dhtorch, name)) for name in dhtorch.__all__]
-        public = [f"| [`{n}`][{x.__module__}.{x.__qualname__}] | {_first(x.__doc__)} |" for n, x in names]
+        public = [f"| [`{n}`][{_home(n, x)}] | {_first(x.__doc__)} |" for n, x in names]
         others = [f"| [`{p}`]({p}.md) | {_first(_doc(p))} |" for p in parts()]
         return "\n".join(["# dhtorch", "", module("dhtorch"), "", *head, *public, "", *head, *others])
     files = sorted((PACKAGE / part).rglob("*.py")) if (PACKAGE / part).is_dir() else [PACKAGE / f"{part}.py"]
     return "\n\n".join([f"# {part}", *(_module(file) for file in files)])
+
+
+def _home(name: str, value: Any) -> str:
+    """The dotted name under which a public name is described."""
+    return (
+        f"dhtorch.methods.{name}" if isinstance(value, dhtorch.Method) else f"{value.__module__}.{value.__qualname__}"
+    )
 
 
 def _module(file: Path) -> str:

@@ -8,8 +8,8 @@ import torch
 from by_hand import REACH, levels, places, waves
 
 from dhtorch.geometry import affine
-from dhtorch.geometry.pyramid import build_pyramid
-from dhtorch.records import Tracks
+from dhtorch.geometry.pyramid import Pyramids, build_pyramid
+from dhtorch.records import TrackHint, Tracks
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 
 H, W, WINDOW = 90, 106, 11
@@ -317,7 +317,7 @@ def test_valid_tracks_are_registered_and_rejected_ones_say_how_far_they_went(lin
     valid = torch.arange(20).view(2, 10) % 4 != 1
     options = {"window": WINDOW, "iterations": 9, "epsilon_px": 0.05, "max_shift_px": 0.9}
     images = (torch.zeros_like(src) if made else src, dst)
-    extra = {"pyramid_0": build_pyramid(src, 1, WINDOW)} if made else {}
+    extra = {"hint": TrackHint(pyramid=Pyramids(src))} if made else {}
     tracks = lucas_kanade_affine(*images, uv, track=given(uv, start, valid), **options, **extra)
     found, _, rms, cov, shift, ok = (torch.from_numpy(x) for x in by_hand(src, dst, uv, start, 9, 0.05, 0.9))
     old = given(uv, start, valid)()
@@ -333,7 +333,7 @@ def test_valid_tracks_are_registered_and_rejected_ones_say_how_far_they_went(lin
     assert (valid & ok).sum() > 2 and (error > old.error).any() and (valid & ~ok & (error == old.error)).any()
 
 
-def test_the_search_before_it_is_given_the_start_the_pyramid_and_the_sizes():
+def test_the_search_before_it_is_given_the_start_the_pyramid_and_the_levels():
     src, dst = two_views()
     uv, seen = places(2, 5, H, W, margin=14), []
 
@@ -341,17 +341,16 @@ def test_the_search_before_it_is_given_the_start_the_pyramid_and_the_sizes():
         seen.append((*images, options))
         return lucas_kanade(*images, **options)
 
-    made = build_pyramid(src, 2, WINDOW)
+    made = Pyramids(src)
     run = lambda **options: lucas_kanade_affine(src, dst, uv, track=track, **options)  # noqa: E731
-    run(uv_1_init=uv + 1, pyramid_0=made, window=WINDOW, levels=2)
-    run(window=7, levels=3)
+    run(hint=TrackHint(uv + 1, made), window=WINDOW, levels=2)
+    run(hint=TrackHint(levels=1), levels=3)
     run()
     (a, b, x, first), (*_, second), (*_, usual) = seen
-    assert a is src and b is dst and x is uv and set(first) == {"uv_1_init", "pyramid_0", "window", "levels"}
-    assert torch.equal(first["uv_1_init"], uv + 1) and first["pyramid_0"] is made
-    assert (first["window"], first["levels"]) == (WINDOW, 2) and (second["window"], second["levels"]) == (7, 3)
-    assert len(second["pyramid_0"].levels) == 3 and second["pyramid_0"].pad == build_pyramid(src, 1, 7).pad
-    assert (usual["window"], usual["levels"], usual["uv_1_init"]) == (21, 4, None)
+    assert a is src and b is dst and x is uv and set(first) == {"hint"}
+    assert torch.equal(first["hint"].start, uv + 1) and first["hint"].pyramid is made and first["hint"].levels == 2
+    assert second["hint"].levels == 1 and torch.equal(second["hint"].pyramid.image, src)
+    assert usual["hint"].levels == 4 and usual["hint"].start is None
 
 
 def test_the_usual_registration_takes_seven_steps_of_a_window_of_21_px_and_2_px_at_most():

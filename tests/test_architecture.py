@@ -1,6 +1,7 @@
 """The floor plan: imports go down only, cv2 and hydra live where they should, and importing costs little."""
 
 import ast
+import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -14,9 +15,10 @@ LEVELS = [
     {"tree", "codes", "archive", "console"},
     {"geometry"},
     {"records"},
-    {"stages", "negative", "data", "evaluate", "baselines"},
-    {"pair", "window", "integrate", "export", "calibration", "seats"},
-    {"transform", "extract", "experiments", "figures"},
+    {"stages", "negative", "data", "evaluate"},
+    {"method"},
+    {"pair", "window", "integrate", "export", "calibration", "methods"},
+    {"transform", "extract", "experiments", "figures", "baselines"},
     {"run", "job", "mapping", "report", "viewer", "capture", "__main__"},
 ]
 LEVEL = {name: level for level, group in enumerate(LEVELS) for name in group}
@@ -24,10 +26,12 @@ SIDEWAYS = {
     ("window", "pair"),
     ("extract", "transform"),
     ("experiments", "transform"),
+    ("experiments", "baselines"),
     ("run", "job"),
     ("run", "report"),
     ("job", "report"),
-    ("integrate", "seats"),
+    ("method", "pair"),  # when it is called
+    ("method", "window"),
     ("run", "capture"),
     ("run", "viewer"),
     ("__main__", "run"),
@@ -87,6 +91,29 @@ def test_heavy_libraries_are_not_imported_with_the_package():
     code += f"print([m for m in {heavy} if m in sys.modules])"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    "words", [["--version"], ["--help"], ["sede=1"], ["view", "--help"], ["extract", "mehtod=map"]]
+)
+def test_help_and_misspelt_options_are_answered_before_torch_is_loaded(words):
+    code = "import atexit, sys\nfrom dhtorch import run\n"
+    code += "atexit.register(lambda: print('torch' in sys.modules, 'kornia' in sys.modules))\n"
+    code += f"run.main({words})"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.splitlines()[-1] == "False False", out
+
+
+def test_public_names_are_found_where_they_live():
+    source = ast.parse((ROOT / "__init__.py").read_text())
+    (shown,) = (n for n in source.body if isinstance(n, ast.If))
+    homes = {alias.name: node.module for node in shown.body for alias in node.names}
+    assert sorted(homes) == sorted(dhtorch.__all__) and set(dhtorch.__all__) <= set(dir(dhtorch))
+    for name, home in homes.items():
+        assert getattr(dhtorch, name) is getattr(importlib.import_module(home), name)
+    assert dhtorch.geometry.camera.Camera is dhtorch.Camera
+    with pytest.raises(AttributeError, match="no attribute 'extnd'"):
+        dhtorch.extnd  # noqa: B018
 
 
 def test_no_module_shadows_the_standard_library_or_its_own_function():

@@ -9,7 +9,7 @@ import pytest
 import torch
 from contract import PROMISES, Row, equal, leaves, reorder, take, tensor_map
 
-from dhtorch import window
+from dhtorch import method, pair, window
 from dhtorch.baselines.device_pose import given_pose
 from dhtorch.evaluate import holdout, probe
 from dhtorch.geometry import (
@@ -417,7 +417,10 @@ ELSEWHERE = {
         for name in ("ask", "place", "chain", "build", "coverage", "sensed", "recovered")
     ),
     "dhtorch.geometry.filters.gaussian_taps",
-    *(f"dhtorch.window.{name}" for name in ("inverse_variance", "key_views", "extend_window")),
+    *(f"dhtorch.window.{name}" for name in ("key_views", "ask_window")),
+    *(f"dhtorch.pair.{name}" for name in ("ask_pair", "merge", "lifted", "undistort_tracks", "uniform_draws")),
+    "dhtorch.method.networks",
+    "dhtorch.stages.fuse.inverse_variance",
     "dhtorch.geometry.least_squares.minimise",
     *(f"dhtorch.geometry.lucas_kanade.{n}" for n in ("search", "step", "squares", "covariance", "for_some", "within")),
     *(f"dhtorch.geometry.ransac.{name}" for name in ("msac_cost", "search")),
@@ -603,11 +606,10 @@ def public_functions():
             for name, fn in inspect.getmembers(part, inspect.isfunction):
                 if not name.startswith("_") and fn.__module__ == info.name:
                     yield f"{info.name}.{name}"
-    yield from (
-        f"dhtorch.window.{n}"
-        for n, f in inspect.getmembers(window, inspect.isfunction)
-        if n[0] != "_" and f.__module__ == "dhtorch.window"
-    )
+    for part in (method, pair, window):
+        for name, fn in inspect.getmembers(part, inspect.isfunction):
+            if not name.startswith("_") and fn.__module__ == part.__name__:
+                yield f"{part.__name__}.{name}"
 
 
 def test_every_public_function_has_a_row():

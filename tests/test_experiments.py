@@ -107,14 +107,14 @@ def test_a_rotation_scene_never_enters_the_summary():
 def test_variants_share_tracks_and_pay_for_them():
     asked = []
 
-    def track(*args):
+    def track(*args, hint):
         asked.append(args)
-        return lucas_kanade(*args)
+        return lucas_kanade(*args, hint=hint)
 
     base = method("paper")
     variants = {
-        "gated": protocol.Variant(protocol.refill(base, track=track)),
-        "other_seed": protocol.Variant(protocol.refill(base, track=track), seed=7),
+        "gated": protocol.Variant(base.replace(track=track)),
+        "other_seed": protocol.Variant(base.replace(track=track), seed=7),
         "own": protocol.Variant(base),
     }
     outcome = protocol.run([small()], protocol.Protocol(variants), partial(by_gap, gap=3), protocol.Settings())
@@ -129,24 +129,16 @@ def test_variants_share_tracks_and_pay_for_them():
 def test_views_of_a_window_are_shared_too():
     asked = []
 
-    def track(image_0, image_1, uv_0, *, uv_1_init=None, pyramid_0=None):
-        asked.append(uv_1_init)
-        return lucas_kanade(image_0, image_1, uv_0, uv_1_init=uv_1_init)
+    def track(image_0, image_1, uv_0, *, hint):
+        asked.append(hint.start)
+        return lucas_kanade(image_0, image_1, uv_0, hint=hint)
 
-    base = protocol.refill(method("window"), track=track, views=3)
+    base = method("window").replace(track=track, views=3)
     variants = {name: protocol.Variant(base, seed=k) for k, name in enumerate(("first", "second"))}
     outcome = protocol.run([small()], protocol.Protocol(variants), partial(by_gap, gap=3), protocol.Settings())
     assert len(asked) == 3 and asked[0] is None and asked[2] is not None, "one search for each view, not for each seed"
     first, second = (scene_row(outcome, method=name) for name in variants)
     assert first["ms"]["track"] == pytest.approx(second["ms"]["track"], rel=0.5)
-
-
-def test_refill_changes_a_seat_or_its_options_and_nothing_else():
-    base = method("paper")
-    changed = protocol.refill(base, n=64, track={"levels": 6}, score=len)
-    assert changed.func is base.func and changed.keywords["n"] == 64 and changed.keywords["score"] is len
-    assert changed.keywords["track"].keywords == base.keywords["track"].keywords | {"levels": 6}
-    assert changed.keywords["pose"] is base.keywords["pose"] and base.keywords["track"].keywords["levels"] == 4
 
 
 def test_a_scene_without_pairs_keeps_a_row_that_says_so():

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from tiny_dicts import H, K, N, Told, W, added, pose, sample, tiny
+from tiny_dicts import H, K, N, Stub, Told, W, added, pose, sample, tiny
 from torch.utils.data import default_collate
 
 import dhtorch
@@ -121,14 +121,10 @@ def test_the_method_is_given_both_views_number_and_seed():
 
 
 def test_the_number_of_samples_is_that_of_the_method():
-    assert tiny().n == N and tiny(partial(Told(), n=9)).n == 9 and tiny(partial(Told(), n=9), n=4).n == 4
-    assert added(tiny(partial(Told(), n=9))(sample()))["depth"].shape == (9,)
-    assert ExtendDepth(depth_unit="m").n == 2048, "dhtorch.extend's own"
-    with pytest.raises(ValueError, match="the method has no default for n: give n"):
-        tiny(lambda a, b, **_: None)
-    with pytest.raises(ValueError, match="give n"):
-        tiny(lambda a, b, n, **_: None)
-    assert tiny(lambda a, b, **_: None, n=3).n == 3
+    for options, n in (({}, 9), ({"n": 4}, 4)):
+        transform = tiny(Stub(answer=Told(), n=9), **options)
+        assert transform.method.n == n and added(transform(sample()))["depth"].shape == (n,)
+    assert ExtendDepth(depth_unit="m").method.n == 2048, "dhtorch.extend's own"
 
 
 def test_seeds_of_samples_are_told_apart_by_their_index():
@@ -150,10 +146,10 @@ def test_seeds_of_samples_are_told_apart_by_their_index():
         tiny(index_key="place")(sample())
 
 
-def test_a_method_is_a_name_or_a_function():
-    assert ExtendDepth(depth_unit="m", method="paper").method is dhtorch.pair.METHODS["paper"]
-    assert ExtendDepth(depth_unit="m", method="map").method is dhtorch.pair.METHODS["map"]
-    with pytest.raises(ValueError, match=r"method is 'mapp', expected one of \['map', .*'paper'.*\] or a function"):
+def test_a_method_is_a_name_or_a_record():
+    assert ExtendDepth(depth_unit="m", method="paper").method is dhtorch.methods.METHODS["paper"]
+    assert ExtendDepth(depth_unit="m", method="map").method is dhtorch.methods.METHODS["map"]
+    with pytest.raises(ValueError, match=r"method is 'mapp', expected one of \['map', 'paper', 'window'\] or a Method"):
         ExtendDepth(depth_unit="m", method="mapp")
 
 
@@ -163,19 +159,9 @@ def test_networks_in_the_seats_of_a_method_are_parts_of_the_module():
             super().__init__()
             self.weight = torch.nn.Parameter(torch.zeros(size))
 
-    def method(a, b, n=2, **_):
-        return None
-
-    nested = partial(partial(method, Net(1), score=Net(2)), track=partial(method, net=Net(3)))
-    sizes = sorted(p.numel() for p in tiny(nested).parameters())
-    assert sizes == [1, 2, 3] and not list(tiny(method).parameters())
-
-    class Whole(Net):
-        def forward(self, a, b, n=3, **_):
-            return None
-
-    assert [p.numel() for p in tiny(Whole(5), n=2).parameters()] == [5]
-    assert [p.numel() for p in tiny(partial(Whole(6), n=4), n=2).parameters()] == [6]
+    seats = {"score": Net(2), "track": partial(print, Net(1), net=partial(print, net=Net(3))), "pose": print}
+    sizes = sorted(p.numel() for p in tiny(dhtorch.PAPER.replace(**seats)).parameters())
+    assert sizes == [1, 2, 3] and not list(tiny(dhtorch.PAPER).parameters())
 
 
 # ---------------------------------------------------------------------------------------------------- one view
@@ -223,9 +209,10 @@ def test_the_front_end_has_the_seats_of_the_method():
     def dark(frame, samples):
         return samples.replace(hole=samples.hole * 0 + 4)
 
-    def method(a, b, n=3, sample=few, backproject=far, classify=dark, **_):
+    def track(*_, **__):
         raise AssertionError("there is one view")
 
+    method = dhtorch.PAPER.replace(n=3, sample=few, backproject=far, classify=dark, track=track)
     mine = added(tiny(method, other_image=None)(sample()))
     assert calls == [((H, W), 3, torch.float32)] and (mine["uv"] == 5).all()
     assert (mine["sigma"] == 0.125).all() and (mine["hole"] == 4).all()

@@ -15,11 +15,11 @@ pytest.importorskip("pyarrow")
 pytest.importorskip("av")
 
 import pyarrow
-from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from processes import start, stop
 from pyarrow import parquet
 
+import dhtorch
 from dhtorch import data, extract
 from dhtorch.data import writers
 from dhtorch.data.synthetic import SyntheticRoom
@@ -108,7 +108,7 @@ class Items(torch.utils.data.Dataset):
 
 def live(root, **options):
     """The transform in a loader over the same frames."""
-    method = instantiate(OmegaConf.create({"_target_": "dhtorch.pair.extend", "_partial_": True, "hypotheses": 20}))
+    method = dhtorch.PAPER.replace(hypotheses=20)
     views = {"image": CAMERA, "other_image": "other", "depth_unit": "m", "tokens_hw": (224, 224)}
     return ExtendedDataset(Items(root), ExtendDepth(method=method, n=N, **views, **options), gap=GAP)
 

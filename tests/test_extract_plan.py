@@ -1,7 +1,6 @@
 """Which rows an extraction has, and what each is made of: recordings of a few pixels, a method that is told what to say."""
 
 import pickle
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import ClassVar
@@ -9,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import torch
-from tiny_dicts import H, K, N, Told, W, added, tiny
+from tiny_dicts import H, K, N, Stub, Told, W, added, tiny
 
 from dhtorch import extract
 from dhtorch.data import Recording
@@ -53,7 +52,7 @@ def recording(n=4, numbers=None, name="one", load=None, **options):
 
 
 def rows(recordings, gap, method=None, wanted=None, **options):
-    method = partial(Told()) if method is None else method
+    method = Stub(answer=method or Told(), n=N)
     found = columns.columns(N, P)
     made = plan.make(recordings, gap, 1)
     return Rows(recordings, made, wanted or found, method=method, gap=gap, tokens_hw=(H, W), **options)
@@ -64,7 +63,7 @@ class Seen:
 
     calls: ClassVar[list] = []
 
-    def __call__(self, anchor, other, *, n=N, seed=0, trace=None, views=1):
+    def __call__(self, anchor, other, *, n=N, seed=0, trace=None):
         Seen.calls.append((anchor, other, seed))
         return Told()(anchor, other, n=n, seed=seed, trace=trace)
 
@@ -140,7 +139,7 @@ def test_steps_go_back_by_the_gap_evenly_for_many_views():
 def test_a_row_looks_back_by_frame_number_inside_its_episode():
     first = recording(numbers=[0, 1, 2, 5, 6, 7], load=Load(10), episode=3)
     second = recording(3, name="two", load=Load(50), episode=1)
-    made = rows([first, second], 2, partial(Seen()))
+    made = rows([first, second], 2, Seen())
     pairs = {}
     for position in range(len(made)):
         Seen.calls = []
@@ -164,7 +163,7 @@ def test_a_row_says_where_it_belongs():
 
 def test_features_are_those_of_the_transform_in_the_types_of_the_columns():
     one = recording(load=Load(confidence=True))
-    made = rows([one], 1, partial(Told()), seed=4)
+    made = rows([one], 1, Told(), seed=4)
     answer = made[2]
     before, now = frame(1, confidence=True), frame(2, confidence=True)
     given = {"image": now.image[0], "before": before.image[0], "depth": now.depth[0], "conf": now.conf[0]}
@@ -181,7 +180,7 @@ def test_features_are_those_of_the_transform_in_the_types_of_the_columns():
 
 def test_a_method_is_given_what_the_frames_know():
     one = recording(load=Load(20, confidence=True, bent=True, own=True))
-    answer = rows([one], 2, partial(Seen()), seed=9)[3]
+    answer = rows([one], 2, Seen(), seed=9)[3]
     ((anchor, other, seed),) = Seen.calls
     before, now = frame(21, True, True, True), frame(23, True, True, True)
     assert seed == 9 and answer.features["problem"] == 0
@@ -192,7 +191,7 @@ def test_a_method_is_given_what_the_frames_know():
     assert torch.equal(anchor.depth, now.depth) and torch.equal(anchor.conf, now.conf)
     assert torch.equal(anchor.depth_camera.f, now.depth_camera.f)
     mixed = recording(load=lambda i: frame(i, bent=i == 3))
-    rows([mixed], 1, partial(Seen()))[3]
+    rows([mixed], 1, Seen())[3]
     anchor, other, _ = Seen.calls[-1]
     assert (
         torch.allclose(anchor.camera.distortion, torch.tensor([[0.03, 0, 0, 0]])) and not other.camera.distortion.any()
@@ -223,7 +222,7 @@ def test_a_frame_that_cannot_be_read_says_so_and_is_no_other_view():
 
 
 def test_many_views_are_the_nearest_first_and_the_anchor_pads():
-    method = partial(Seen(), views=2)
+    method = Stub(answer=Seen(), n=N, views=2)
     one = recording(6)
     made = Rows([one], plan.make([one], 4, 2), columns.columns(N, P), method=method, gap=4, tokens_hw=(H, W))
     for position, views in ((5, (3, 1)), (3, (1, 3))):

@@ -1,6 +1,5 @@
 """Several views of the same samples: fusion and key views against loops, and the window with seats that only look."""
 
-import inspect
 import itertools
 import math
 import time
@@ -9,15 +8,19 @@ import numpy as np
 import pytest
 import torch
 
+from dhtorch import PAPER
 from dhtorch.baselines.device_pose import given_pose
 from dhtorch.codes import Gate
 from dhtorch.geometry import se3
 from dhtorch.geometry.pyramid import build_pyramid
 from dhtorch.pair import uniform_draws
-from dhtorch.records import Camera, Estimate, Frame, Samples, Tracks
+from dhtorch.records import Camera, Estimate, Frame, Samples, TrackHint, Tracks
+from dhtorch.stages.fuse import inverse_variance
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 from dhtorch.tree import stack
-from dhtorch.window import extend_window, inverse_variance, key_views
+from dhtorch.window import key_views
+
+extend_window = PAPER.replace(views=5)
 
 HW = (64, 80)
 FIELDS = ("depth", "sigma", "sigma_shared", "parallax_deg", "residual_px", "score")
@@ -263,9 +266,9 @@ def frame(batch=2, seed=0):
 class Seats:
     """Seats that remember what they were given; view k of the window is known by its picture."""
 
-    def __init__(self, V=3, n=8, takes=("uv_1_init", "pyramid_0")):
+    def __init__(self, V=3, n=8):
         self.anchor, self.others = frame(), stack([frame(seed=10 + k) for k in range(V)])
-        self.n, self.takes, self.calls, self.asked = n, takes, [], {"track": [], "pose": [], "triangulate": []}
+        self.n, self.calls, self.asked = n, [], {"track": [], "pose": [], "triangulate": []}
         self.uv = 10 + rand(2, n, 2, seed=30, high=40).float()
         self.answers = views_of(V=V, N=n, silent=0.2, spread=0.2).to(torch.float32)
         self.fits = [given_pose(se3.exp(rand(2, 6, seed=50 + k).float()), n) for k in range(V)]
@@ -284,11 +287,11 @@ class Seats:
         return Samples(self.uv, one, one, one[..., None].expand(2, self.n, 3), one, one.int(), one, one.int())
 
     def seats(self):
-        """Options of ``extend_window``."""
+        """Seats and options of a method."""
 
-        def track(image_0, image_1, uv, **options):
+        def track(image_0, image_1, uv, *, hint):
             k = self.number(image_1)
-            self.asked["track"].append((k, image_0, uv, options))
+            self.asked["track"].append((k, image_0, uv, hint))
             return self.tracks(k, uv)
 
         def pose(samples, tracks, camera_0, camera_1, draws):
@@ -318,11 +321,6 @@ class Seats:
             self.calls.append(("classify", frame, samples))
             return samples.replace(hole=samples.hole + 2)
 
-        parameters = [inspect.Parameter(x, inspect.Parameter.POSITIONAL_ONLY) for x in ("a", "b", "c")]
-        defaults = {"levels": 2, "window": 7} | dict.fromkeys(self.takes)
-        for name, value in defaults.items():
-            parameters.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=value))
-        track.__signature__ = inspect.Signature(parameters)
         names = {"sample": sample, "backproject": backproject, "classify": classify, "track": track, "pose": pose}
         return names | {"triangulate": triangulate, "score": score, "n": self.n, "hypotheses": 5}
 
@@ -354,7 +352,7 @@ def test_the_anchor_is_sampled_once_and_every_view_is_a_pair_with_it():
 def test_a_search_begins_where_the_last_view_was_found_further_on_at_the_same_pace():
     seats = Seats(V=4)
     extend_window(seats.anchor, seats.others, **seats.seats())
-    starts = [options.get("uv_1_init") for *_, options in seats.asked["track"]]
+    starts = [hint.start for *_, hint in seats.asked["track"]]
     assert starts[0] is None
     for k in (1, 2, 3):
         last = seats.tracks(k - 1, seats.uv)
@@ -365,25 +363,21 @@ def test_a_search_begins_where_the_last_view_was_found_further_on_at_the_same_pa
     assert not last.valid.all() and last.valid.any()
     alone = Seats(V=4)
     extend_window(alone.anchor, alone.others, **alone.seats(), chain=False)
-    assert all("uv_1_init" not in options for *_, options in alone.asked["track"])
+    assert all(hint.start is None for *_, hint in alone.asked["track"])
 
 
-def test_the_anchors_pyramid_is_built_as_the_tracker_would_and_given_to_every_view():
+def test_the_anchors_pyramid_is_built_once_for_every_view():
     seats = Seats()
-    extend_window(seats.anchor, seats.others, **seats.seats())
-    expected = build_pyramid(seats.anchor.image, 2, 7)
-    first = seats.asked["track"][0][3]["pyramid_0"]
-    assert all(options["pyramid_0"] is first for *_, options in seats.asked["track"])
-    leaves = [torch.utils._pytree.tree_leaves(x) for x in (first, expected)]
+    extend_window(seats.anchor, seats.others, **seats.seats(), hint=TrackHint(levels=3))
+    first, *others = (hint for *_, hint in seats.asked["track"])
+    assert all(hint.pyramid is first.pyramid and hint.levels == 3 for hint in others)
+    made, expected = first.pyramid(2, 7), build_pyramid(seats.anchor.image, 2, 7)
+    assert first.pyramid(2, 7) is made and first.pyramid(1, 7) is not made
+    leaves = [torch.utils._pytree.tree_leaves(x) for x in (made, expected)]
     assert len(leaves[0]) == len(leaves[1]) > 2
     assert all(torch.equal(x, y) for x, y in zip(*leaves, strict=True) if isinstance(x, torch.Tensor))
-
-
-@pytest.mark.parametrize("takes", [(), ("uv_1_init",), ("pyramid_0",)])
-def test_a_tracker_is_given_what_it_takes(takes):
-    seats = Seats(takes=takes)
-    extend_window(seats.anchor, seats.others, **seats.seats())
-    assert [set(options) for *_, options in seats.asked["track"]] == [set(takes) - {"uv_1_init"}] + [set(takes)] * 2
+    part = first.pyramid[1:2]
+    assert part is first.pyramid[1:2] and torch.equal(part(1, 7).levels[0], expected.levels[0][1:2])
 
 
 @pytest.mark.parametrize("track", [lucas_kanade, lucas_kanade_affine])
@@ -411,7 +405,7 @@ def test_of_more_views_the_key_views_are_asked_again_with_their_own_poses():
     fits = stack(seats.fits)
     known = key_views(seats.answers[:, :, ::2], 2)
     assert not torch.equal(known[:, 0], known[:, 1]), "the two anchors choose otherwise"
-    options = seats.seats() | {"track": lambda image_0, image_1, uv: seats.tracks(0, uv)}
+    options = seats.seats() | {"track": lambda image_0, image_1, uv, hint: seats.tracks(0, uv)}
     asked = []
 
     def triangulate(samples, tracks, fit, camera_0, camera_1):
@@ -437,7 +431,7 @@ def test_five_views_are_used_by_default_and_as_many_as_asked_for_are_not_chosen_
         seats = Seats(V=V)
         count = []
         given = seats.seats() | {
-            "track": lambda image_0, image_1, uv, count=count: count.append(1) or Seats().tracks(0, uv)
+            "track": lambda image_0, image_1, uv, hint, count=count: count.append(1) or Seats().tracks(0, uv)
         }
         given["triangulate"] = lambda samples, *_, seats=seats: seats.answers[0][:, : samples.uv.shape[1]]
         extend_window(seats.anchor, seats.others, **given, **options)

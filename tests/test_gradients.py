@@ -11,14 +11,16 @@ from test_contract import shifted, tracked
 from torch.func import jacfwd, jacrev, vmap
 from torch.utils import _pytree as pytree
 
-from dhtorch import tree
+from dhtorch import PAPER, extend, tree
 from dhtorch.data.synthetic import SyntheticRoom
 from dhtorch.evaluate import holdout
 from dhtorch.geometry.lookup import nearest
-from dhtorch.pair import METHODS, extend, merge, undistort_tracks, uniform_draws
+from dhtorch.methods import METHODS
+from dhtorch.pair import merge, undistort_tracks, uniform_draws
 from dhtorch.records import Camera
 from dhtorch.stages import backproject, holes, pose, sample, score, track, triangulate
-from dhtorch.window import extend_window
+
+extend_window = PAPER.replace(views=5)
 
 D = torch.float64
 N = 256
@@ -70,7 +72,7 @@ def stages(pair, trace):
         "pnp_ransac": (pose.pnp_ransac, posing),
         "map_pose": (pose.map_pose, posing),
         "two_view": (triangulate.two_view, geometry),
-        "two_view of map": (METHODS["map"].keywords["triangulate"], geometry),
+        "two_view of map": (METHODS["map"].triangulate, geometry),
         "rank": (score.rank, (estimate, samples, tracks, fit)),
         "rank_by_error": (score.rank_by_error, (estimate, samples, tracks, fit)),
         "learned_score": (scorer, (estimate, samples, tracks, fit)),
@@ -382,7 +384,7 @@ class Task:
         pairs = [views(each, 0, 16, dtype=torch.float32) for each in rooms]
         whole = tree.collate([each[0] for each in rooms])
         self.near, self.other = (tree.collate(frames) for frames in zip(*pairs, strict=True))
-        self.method = partial(METHODS["map"], n=n, pose=partial(pose.map_pose, turn_sigma=0.0))  # a global shutter
+        self.method = METHODS["map"].replace(n=n, pose={"turn_sigma": 0.0})  # a global shutter
         trace = {}
         self.method(self.near, self.other, trace=trace)
         self.tracks, self.samples = trace["tracks"], trace["samples"]

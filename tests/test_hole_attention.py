@@ -5,7 +5,7 @@ import torch
 from test_protocols import Changed, method, room, rows
 
 from dhtorch.experiments import hole_attention as experiment
-from dhtorch.experiments.protocol import Settings, refill
+from dhtorch.experiments.protocol import Settings
 from dhtorch.negative.hole_attention import largest_cluster
 from dhtorch.stages.sample import grid, spiral
 
@@ -149,8 +149,8 @@ def test_classes_and_routes_are_shares_of_the_holes():
 def test_a_scene_without_holes_and_a_sampler_without_a_gaze():
     full = asked(room(lidar="exact", hw=(96, 128)), stride=5)
     assert full.verdict == "undecided" and shown(full)["attention"]["note"] == "nothing to ask"
-    with pytest.raises(ValueError, match="expected a foveated sampler"):
-        asked(room(), base=refill(method(), sample=grid))
+    with pytest.raises(ValueError, match="expected a sampler with an option gaze"):
+        asked(room(), base=method().replace(sample=grid))
     with pytest.raises(ValueError, match="stride is 0"):
         asked(room(), stride=0)
 

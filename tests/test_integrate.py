@@ -1,6 +1,5 @@
 """Global integration: on scenes that are known exactly, against Open3D, and by what must never happen."""
 
-import functools
 import math
 
 import numpy as np
@@ -9,13 +8,13 @@ import torch
 from box import BOX, HW, off_wall, walk
 from room_truth import room_distance
 
+from dhtorch import extend
 from dhtorch.baselines.device_pose import given_pose
 from dhtorch.codes import Source
 from dhtorch.data.synthetic import SyntheticRoom
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import cells, se3
 from dhtorch.integrate import View, empty, fuse, mesh, points, recording, splat
-from dhtorch.pair import extend
 from dhtorch.records import Camera, Estimate, Pose, Samples, Tracks
 from dhtorch.tree import collate
 
@@ -446,7 +445,7 @@ def test_coverage_counts_cells_and_islands():
 def walked():
     """A small recording of the built-in room, its pairs and what the method says about them."""
     room = SyntheticRoom(hw=(240, 320), n_frames=5, gap=4, supersample=1, step_m=0.03)
-    method = functools.partial(extend, n=1024)
+    method = extend.replace(n=1024)
     return room, list(recording.ask(room, method, [(0, 4)], cutoff=2.0))
 
 

@@ -7,17 +7,16 @@ import pytest
 import torch
 from rooms import room as rendered
 
-from dhtorch import archive
+from dhtorch import archive, extend
 from dhtorch.baselines import dinov2
 from dhtorch.data.pairs import by_gap
 from dhtorch.experiments import latency, memory
 from dhtorch.experiments.protocol import Settings
-from dhtorch.pair import extend
-from dhtorch.stages import backproject, holes, sample, score
+from dhtorch.stages import score
 
 TINY = {"hidden": 32, "layers": 2, "heads": 2, "side": 56}
 SIZES = ((48, 64), (96, 128))
-PAPER = partial(extend, sample=sample.spiral, backproject=backproject.backproject, classify=holes.classify)
+PAPER = extend
 
 
 def measured(**options):

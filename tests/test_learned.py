@@ -8,7 +8,7 @@ from functools import partial
 import pytest
 import torch
 
-from dhtorch import archive
+from dhtorch import archive, extend
 from dhtorch.baselines import dust3r, relative, vggt
 from dhtorch.codes import Gate
 from dhtorch.data.pairs import by_gap
@@ -16,11 +16,10 @@ from dhtorch.data.synthetic import SyntheticRoom
 from dhtorch.evaluate import holdout
 from dhtorch.experiments import learned
 from dhtorch.experiments.protocol import Settings
-from dhtorch.pair import extend
 from dhtorch.records import Camera, Frame
-from dhtorch.stages import backproject, holes, sample
+from dhtorch.stages import sample
 
-PAPER = partial(extend, sample=sample.spiral, backproject=backproject.backproject, classify=holes.classify, n=512)
+PAPER = extend.replace(n=512)
 UNIT = 7.3  # metres per unit of the fake networks
 DEEPEST = 16.0  # m, of a picture whose blue tells the depth
 

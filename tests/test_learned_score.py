@@ -1,7 +1,5 @@
 """Seat 7 with weights learns which answers err, and is judged on rooms it has not seen; the seat alone: test_score.py."""
 
-from functools import partial
-
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
@@ -15,7 +13,6 @@ from dhtorch.experiments import learned_score
 from dhtorch.experiments.learned_score import Lesson, train
 from dhtorch.experiments.protocol import Settings
 from dhtorch.run import config_dir
-from dhtorch.seats import refill
 from dhtorch.stages.score import EVIDENCE, LearnedScore
 
 with initialize_config_dir(str(config_dir()), version_base="1.3"):
@@ -110,7 +107,7 @@ def test_the_experiment_scores_the_same_answers_three_ways(tmp_path, monkeypatch
     for_first, for_second, for_all = taught
     assert len(for_first) == len(for_second) == 1 and len(for_all) == 2
     assert torch.equal(for_all[0].x, for_second[0].x) and torch.equal(for_all[1].x, for_first[0].x)
-    trace, _ = held_out(rooms[0], refill(MAP, score=train(for_first, steps=20)))
+    trace, _ = held_out(rooms[0], MAP.replace(score=train(for_first, steps=20)))
     scores = outcome.points["room0", "learned", "full"].answered().score
     assert torch.isin(scores, trace["estimate"].score.double()).all(), "the other room's scorer sat in the seat"
     saved = LearnedScore.read(target)
@@ -124,7 +121,7 @@ def test_one_room_is_not_enough_and_several_views_are_refused(rooms):
     (row,) = outcome.scenes("learned").values()
     assert row["note"] == "no other room to learn from"
     with pytest.raises(ValueError, match="two views"):
-        learned_score.run(rooms[:1], {"window": partial(MAP, views=3)}, by_gap, Settings())
+        learned_score.run(rooms[:1], {"window": MAP.replace(views=3)}, by_gap, Settings())
 
 
 def test_the_verdict_goes_either_way():

@@ -9,7 +9,8 @@ import torch
 from by_hand import Level, levels, places, waves
 
 from dhtorch.geometry import lucas_kanade as lk
-from dhtorch.geometry.pyramid import build_pyramid
+from dhtorch.geometry.pyramid import Pyramids, build_pyramid
+from dhtorch.records import TrackHint
 from dhtorch.stages.track import MIN_EIGENVALUE, lucas_kanade, refine
 
 H, W, WINDOW = 100, 122, 7
@@ -184,7 +185,7 @@ def test_a_given_start_is_used_there_and_its_opposite_back(start):
     uv = places(2, 8, H, W, margin=14)
     init = uv + torch.tensor(start, dtype=uv.dtype) + 0.3 * (places(2, 8, 2, 2, 0) - 0.5)
     options = OPTIONS | {"iterations": 4}
-    tracks = lucas_kanade(src, dst, uv, uv_1_init=init, **options)
+    tracks = lucas_kanade(src, dst, uv, hint=TrackHint(start=init), **options)
     expected, stayed = twin(src, dst, uv, init=init, **options)
     agrees(tracks, expected, stayed, share=0.7 if start[0] else 0.0)
     if start[0]:
@@ -313,9 +314,15 @@ def test_where_nothing_is_known_the_start_comes_back():
         2, -1, -1
     )
     init = torch.tensor([[5.0, 6.0], [7.0, 8.0], [9.0, 9.0], [math.nan, 51.0]], dtype=torch.float64).expand(2, -1, -1)
-    for run in (lucas_kanade(src, dst, uv, uv_1_init=init, **OPTIONS), lucas_kanade(src, dst, uv, **OPTIONS)):
+    for run in (
+        lucas_kanade(src, dst, uv, hint=TrackHint(start=init), **OPTIONS),
+        lucas_kanade(src, dst, uv, **OPTIONS),
+    ):
         assert run.valid.tolist() == [[False, False, False, True]] * 2
-    started, plain = lucas_kanade(src, dst, uv, uv_1_init=init, **OPTIONS), lucas_kanade(src, dst, uv, **OPTIONS)
+    started, plain = (
+        lucas_kanade(src, dst, uv, hint=TrackHint(start=init), **OPTIONS),
+        lucas_kanade(src, dst, uv, **OPTIONS),
+    )
     assert started.uv_1[:, :2].tolist() == [[[5.0, 6.0], [0.0, 20.0]]] * 2, "the start, 0 for what is not finite"
     assert plain.uv_1[:, :3].tolist() == [[[-3.0, 20.0], [0.0, 20.0], [40.0, 1e30]]] * 2
     torch.testing.assert_close(started.uv_1[:, 3], plain.uv_1[:, 3], atol=0.02, rtol=0)
@@ -324,12 +331,12 @@ def test_where_nothing_is_known_the_start_comes_back():
 def test_a_pyramid_made_before_is_used_in_the_images_place():
     src, dst = two_views()
     uv = places(2, 8, H, W, margin=12)
-    made, other = build_pyramid(src, 3, WINDOW), waves(2, H, W, seed=9)
-    found = lucas_kanade(other, dst, uv, pyramid_0=made, **OPTIONS)
+    other = waves(2, H, W, seed=9)
+    found = lucas_kanade(other, dst, uv, hint=TrackHint(pyramid=Pyramids(src)), **OPTIONS)
     want = lucas_kanade(src, dst, uv, **OPTIONS)
     assert all(torch.equal(getattr(found, f), getattr(want, f)) for f in FIELDS)
-    two = lucas_kanade(src, dst, uv, pyramid_0=build_pyramid(src, 2, WINDOW), **OPTIONS)
-    assert torch.equal(two.uv_1, lucas_kanade(src, dst, uv, **OPTIONS | {"levels": 2}).uv_1), "as many as both have"
+    two = lucas_kanade(src, dst, uv, hint=TrackHint(levels=2), **OPTIONS)
+    assert torch.equal(two.uv_1, lucas_kanade(src, dst, uv, **OPTIONS | {"levels": 2}).uv_1), "as many as are asked for"
 
 
 # --- one step, residual, covariance ----------------------------------------------------------------------------------
@@ -494,6 +501,6 @@ def test_a_search_that_starts_outside_does_not_begin():
     src, dst = two_views((0.6, 0.4))
     uv = torch.tensor([[1.5, 40.0], [60.0, H - 2.5], [60.0, 40.0]], dtype=torch.float64).expand(2, -1, -1)
     init = torch.tensor([[-0.7, 40.0], [60.0, H - 0.3], [60.5, 40.2]], dtype=torch.float64).expand(2, -1, -1)
-    found = lucas_kanade(src, dst, uv, uv_1_init=init, **OPTIONS | {"levels": 1})
+    found = lucas_kanade(src, dst, uv, hint=TrackHint(start=init), **OPTIONS | {"levels": 1})
     torch.testing.assert_close(found.uv_1[:, :2], init[:, :2], rtol=0, atol=1e-12)
     assert found.valid.tolist() == [[False, False, True]] * 2 and (found.uv_1[:, 2] != init[:, 2]).all()

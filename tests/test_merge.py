@@ -9,11 +9,13 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
+from dhtorch import extend
 from dhtorch.baselines.device_pose import given_pose
 from dhtorch.codes import Gate, Source
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
-from dhtorch.pair import METHODS, extend, lifted, merge, undistort_tracks, uniform_draws
+from dhtorch.methods import METHODS
+from dhtorch.pair import lifted, merge, undistort_tracks, uniform_draws
 from dhtorch.records import Camera, Estimate, Frame, Samples, Tracks
 from dhtorch.run import config_dir
 from dhtorch.stages import pose, score, triangulate
@@ -165,7 +167,7 @@ def test_the_draws_have_the_numbers_of_the_intrinsics_and_number_two_hundred():
 def test_pairs_are_tracked_eight_at_a_time():
     seats, sizes = Seats(batch=11), []
 
-    def track(image_0, image_1, uv):
+    def track(image_0, image_1, uv, *, hint):
         sizes.append(len(image_0))
         assert len(image_0) == len(image_1) == len(uv)
         return tracks_of(uv)
@@ -344,7 +346,7 @@ def told(n=40, noise_px=0.4):
     samples = samples_of(uv)
     samples = samples.replace(trackability=0.01 + 0.3 * samples.trackability, sigma=0.05 * samples.depth)
     given = {"sample": lambda *_, **__: uv, "backproject": lambda *_: samples, "classify": lambda *_: samples}
-    return (frame_0, frame_1), given | {"track": lambda *_: tracks, "pose": lambda *_: fit}, fit
+    return (frame_0, frame_1), given | {"track": lambda *_, hint: tracks, "pose": lambda *_: fit}, fit
 
 
 WRITTEN_OUT = {
@@ -388,12 +390,11 @@ def test_the_method_has_the_seats_that_its_configuration_names():
     with initialize_config_dir(str(config_dir()), version_base="1.3"):
         configured = instantiate(compose("run", ["method=map"]).method, _convert_="all")
     method = METHODS["map"]
-    assert METHODS["paper"] is extend and method.func is configured.func is extend
-    seats = method.keywords
-    assert seats["pose"] is pose.map_pose is configured.keywords["pose"].func
-    assert seats["score"] is score.rank_by_error is configured.keywords["score"].func
-    options = configured.keywords["triangulate"].keywords
+    assert METHODS["paper"] is extend and type(method) is type(configured)
+    assert method.pose is pose.map_pose is configured.pose.func
+    assert method.score is score.rank_by_error is configured.score.func
+    options = configured.triangulate.keywords
     assert {k: options[k] for k in WRITTEN_OUT} == WRITTEN_OUT, "what the test above asks for"
-    assert seats["triangulate"].keywords.items() <= WRITTEN_OUT.items()
-    assert seats["track"].func is lucas_kanade_affine is configured.keywords["track"].func
-    assert seats["track"].keywords == {"levels": configured.keywords["track"].keywords["levels"]} == {"levels": 5}
+    assert method.triangulate.keywords.items() <= WRITTEN_OUT.items()
+    assert method.track.func is lucas_kanade_affine is configured.track.func
+    assert method.track.keywords == {"levels": configured.track.keywords["levels"]} == {"levels": 5}

@@ -11,7 +11,7 @@ from dhtorch.data.pairs import by_gap
 from dhtorch.data.synthetic import open_rooms
 from dhtorch.evaluate import compare
 from dhtorch.experiments import method_comparison
-from dhtorch.experiments.protocol import Settings, refill
+from dhtorch.experiments.protocol import Settings
 from dhtorch.run import config_dir
 
 
@@ -23,7 +23,7 @@ def method(name="paper"):
 @pytest.fixture(scope="module")
 def outcome():
     rooms = open_rooms(("walk", "lateral", "rotation"), n_frames=4, hw=(192, 256), gap=3, lidar="exact")
-    methods = {"paper": method(), "strict": refill(method(), triangulate={"max_residual_px": 0.5})}
+    methods = {"paper": method(), "strict": method().replace(triangulate={"max_residual_px": 0.5})}
     methods["opencv"] = method("opencv")
     return method_comparison.run(rooms, {}, by_gap, Settings(), methods=methods, seeds=2)
 

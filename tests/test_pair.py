@@ -9,13 +9,14 @@ import pytest
 import torch
 import walls
 
-from dhtorch import data, tree
+from dhtorch import data, extend, tree
 from dhtorch.baselines import opencv
 from dhtorch.baselines.device_pose import device_pose, given_pose
 from dhtorch.codes import Flag, Gate, PoseCode, Source
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
-from dhtorch.pair import METHODS, extend, merge
+from dhtorch.methods import METHODS
+from dhtorch.pair import merge
 from dhtorch.stages import triangulate
 
 ROOT = os.environ.get("DHTORCH_DATA")

@@ -1,5 +1,6 @@
 """The whole taken apart: every variant differs from its neighbour in what its name says, costs are told, both verdicts."""
 
+from dataclasses import fields
 from functools import partial
 
 import pytest
@@ -10,6 +11,7 @@ from rooms import room
 from dhtorch.data.pairs import by_gap
 from dhtorch.experiments import part_ablation
 from dhtorch.experiments.protocol import Settings
+from dhtorch.method import Method
 from dhtorch.run import config_dir
 
 
@@ -20,12 +22,22 @@ def methods():
     return {m: instantiate(s.method, _convert_="all") for m, s in settings.items()}
 
 
+def flat(seat):
+    """A partial of a partial as one."""
+    while isinstance(seat, partial) and isinstance(seat.func, partial):
+        seat = partial(seat.func.func, **seat.func.keywords | seat.keywords)
+    return seat
+
+
 def differences(a, b, path=""):
-    """Dotted names of what two methods do differently."""
+    """Dotted names of what two methods, or two seats, do differently."""
+    if isinstance(a, Method):
+        return [d for f in fields(a) for d in differences(getattr(a, f.name), getattr(b, f.name), f.name)]
+    a, b = flat(a), flat(b)
     if isinstance(a, partial) and isinstance(b, partial) and a.func is b.func:
         names = dict.fromkeys([*a.keywords, *b.keywords])
         return [d for k in names for d in differences(a.keywords.get(k), b.keywords.get(k), f"{path}.{k}")]
-    return [] if a == b else [path.lstrip(".") or "join"]
+    return [] if a == b else [path.lstrip(".")]
 
 
 @pytest.mark.parametrize(
@@ -35,7 +47,7 @@ def differences(a, b, path=""):
         ("+ weighted near pose", "paper", {"pose"}),
         ("+ near and far pose", "paper", {"pose"}),
         ("+ score by error", "paper", {"score"}),
-        ("+ views", "paper", {"join"}),
+        ("+ views", "paper", {"views"}),
         ("- affine tracks", "map", {"track"}),
         ("- far tracks", "map", {"pose.far_weight"}),
         ("- turn", "map", {"pose.turn_sigma"}),
@@ -51,11 +63,15 @@ def test_a_variant_differs_in_what_it_is_named_after(methods, name, base, change
 def test_gates_and_sigma_are_told_apart(methods):
     variants = part_ablation.taken_apart(*methods.values())
     gates, sigma = (set(differences(methods["map"], variants[f"- {part}"])) for part in ("gates", "sigma"))
-    assert not gates & sigma and {d.rpartition(".")[2] for d in gates} <= set(part_ablation.GATES)
-    seats = [methods[m].keywords["triangulate"] for m in ("map", "paper")]
+    assert not gates & sigma and {d.rpartition(".")[2] for d in gates} <= set(part_ablation.PAPER_GATES)
+    seats = [methods[m].triangulate for m in ("map", "paper")]
     assert gates | sigma == {f"triangulate.{d}" for d in differences(*seats)}
-    assert variants["- gates"].keywords["triangulate"].keywords["min_parallax_deg"] == 0.3
-    assert variants["- sigma"].keywords["triangulate"].keywords["sigma_scale"] == 1.0
+    assert flat(variants["- gates"].triangulate).keywords["min_parallax_deg"] == 0.3
+    assert flat(variants["- sigma"].triangulate).keywords["sigma_scale"] == 1.0
+    paper = methods["paper"].triangulate.keywords
+    for said in (part_ablation.PAPER_GATES, part_ablation.PAPER_SIGMA):
+        assert said == {k: paper[k] for k in said}
+    assert part_ablation.PAPER_GATES.keys() | part_ablation.PAPER_SIGMA.keys() == paper.keys() - {"solver"}
 
 
 def test_every_variant_runs_and_tells_its_cost(methods):

@@ -24,9 +24,8 @@ from dhtorch.experiments import front_ends, probing, rh20t_probe, vo_probe
 from dhtorch.experiments.protocol import Outcome, Settings
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
-from dhtorch.pair import METHODS
+from dhtorch.methods import METHODS
 from dhtorch.report.layouts import in_layout
-from dhtorch.seats import refill
 from dhtorch.transform import CHANNELS, ExtendDepth
 
 ROOT = os.environ.get("DHTORCH_DATA")
@@ -93,7 +92,7 @@ def test_tokens_are_pooled_over_the_patches_that_answer():
 
 
 def small(n=256):
-    return refill(METHODS["map"], n=n)
+    return METHODS["map"].replace(n=n)
 
 
 def test_depth_tokens_are_those_of_the_transform():

@@ -82,13 +82,12 @@ def test_set_b_is_hidden_from_the_method_and_judged_by_its_returns():
 
     def pose(samples, tracks, *rest, **options):
         seen.setdefault("xyz", samples.xyz)
-        return base.keywords["pose"](samples, tracks, *rest, **options)
+        return base.pose(samples, tracks, *rest, **options)
 
     base = method()
     split = HeldOut(base, seed=3)
     trace = {}
-    variant = split.variant().method
-    variant.keywords["pose"] = pose
+    variant = split.variant().method.replace(pose=pose)
     variant(recording[0], recording[3], trace=trace)
     whole = split.whole(batch_of(recording), trace["samples"].uv)
     first, second = holdout.half(whole, 3)

@@ -6,14 +6,13 @@ from functools import partial
 import pytest
 import torch
 
+from dhtorch import extend
 from dhtorch.data import stress
 from dhtorch.data.stress import STRESSES, StressRoom, open_stress
 from dhtorch.data.synthetic import SyntheticRoom
 from dhtorch.experiments import protocol
 from dhtorch.geometry import camera, se3
-from dhtorch.pair import extend
 from dhtorch.stages.backproject import backproject
-from dhtorch.stages.holes import classify
 from dhtorch.stages.sample import spiral
 from dhtorch.stages.track import lucas_kanade
 
@@ -141,7 +140,7 @@ def test_three_in_ten_tracks_end_elsewhere_and_say_nothing_of_it(walk):
 
 
 def test_experiments_ask_the_spoiled_tracker():
-    method = partial(extend, n=256, backproject=backproject, classify=classify, track=lucas_kanade)
+    method = extend.replace(n=256)
     found = []
 
     def columns(answer):

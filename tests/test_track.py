@@ -13,7 +13,8 @@ import torch.nn.functional as F
 from by_hand import levels
 
 from dhtorch.geometry.lucas_kanade import CELL_LEVEL
-from dhtorch.geometry.pyramid import build_pyramid
+from dhtorch.geometry.pyramid import Pyramids, build_pyramid
+from dhtorch.records import TrackHint
 from dhtorch.stages.track import lucas_kanade, refine
 
 ROOT = os.environ.get("DHTORCH_DATA")
@@ -181,13 +182,12 @@ def test_wrong_shapes_and_options_raise():
         lambda: lucas_kanade(image, image, uv[..., :1]),
         lambda: lucas_kanade(image[0], image, uv),
         lambda: lucas_kanade(image.expand(2, 2, 50, 60), image.expand(2, 2, 50, 60), uv),
-        lambda: lucas_kanade(image, image, uv, uv_1_init=uv[:, :2]),
+        lambda: lucas_kanade(image, image, uv, hint=TrackHint(start=uv[:, :2])),
         lambda: lucas_kanade(image, image, uv, normalise="both"),
         lambda: lucas_kanade(image, image, uv, iterations=0),
         lambda: lucas_kanade(image, image, uv, window=51),
-        lambda: lucas_kanade(image, image, uv, pyramid_0=build_pyramid(image[..., :-1])),
-        lambda: lucas_kanade(image, image, uv, pyramid_0=build_pyramid(image, window=11)),
-        lambda: lucas_kanade(image, image, uv, pyramid_0=build_pyramid(image, gradients=False)),
+        lambda: lucas_kanade(image, image, uv, hint=TrackHint(pyramid=Pyramids(image[..., :-1]))),
+        lambda: lucas_kanade(image, image, uv, hint=TrackHint(pyramid=Pyramids(image[:1]))),
         lambda: refine(image, image, uv, uv[:, :3]),
         lambda: refine(image, image, uv, uv, normalise="both"),
     ]
@@ -206,11 +206,11 @@ def test_cached_pyramid_initial_positions_sizes_and_dtypes():
     truth = uv + torch.tensor(shift)
     plain = lucas_kanade(src, dst, uv, levels=1)
     assert (plain.uv_1 - truth).norm(dim=-1).median() > 5  # too far for one level
-    started = lucas_kanade(src, dst, uv, levels=1, uv_1_init=truth + 1.0)
+    started = lucas_kanade(src, dst, uv, levels=1, hint=TrackHint(start=truth + 1.0))
     assert (started.uv_1 - truth).norm(dim=-1).median() < 0.02 and started.valid.float().mean() > 0.97
-    nowhere = lucas_kanade(src, dst, uv, levels=1, uv_1_init=torch.full_like(uv, float("nan")))
-    cached = lucas_kanade(src, dst, uv, levels=1, pyramid_0=build_pyramid(src, 1))
-    narrow = lucas_kanade(src[..., :-7], dst[..., :-3, :], uv, levels=1, uv_1_init=truth)
+    nowhere = lucas_kanade(src, dst, uv, levels=1, hint=TrackHint(start=torch.full_like(uv, float("nan"))))
+    cached = lucas_kanade(src, dst, uv, levels=1, hint=TrackHint(pyramid=Pyramids(src)))
+    narrow = lucas_kanade(src[..., :-7], dst[..., :-3, :], uv, levels=1, hint=TrackHint(start=truth))
     assert all(torch.equal(getattr(nowhere, f), getattr(plain, f)) for f in FIELDS)
     assert all(torch.equal(getattr(cached, f), getattr(plain, f)) for f in FIELDS)
     assert (narrow.uv_1 - truth)[narrow.valid].norm(dim=-1).median() < 0.02

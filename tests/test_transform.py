@@ -4,7 +4,6 @@ import copy
 import io
 import pickle
 import warnings
-from functools import partial
 
 import cv2
 import numpy as np
@@ -14,6 +13,7 @@ from sample_dicts import GAP, NEAR, SIDE, Frames, frames, room
 from torch.utils.data import DataLoader, default_collate
 
 import dhtorch
+from dhtorch import PAPER
 from dhtorch.codes import Flag, Gate, Source
 from dhtorch.geometry import camera as cam
 from dhtorch.records import Frame
@@ -27,7 +27,8 @@ from dhtorch.transform import (
     collate_kept,
     one_thread,
 )
-from dhtorch.window import extend_window
+
+extend_window = PAPER.replace(views=5)
 
 N = 256
 P = (SIDE // 14) ** 2
@@ -228,7 +229,7 @@ def test_low_confidence_is_no_return(sample):
 
 
 def test_any_method_will_do(sample):
-    quiet = partial(dhtorch.extend, score=partial(score.rank, min_score=0.9), n=64)
+    quiet = dhtorch.extend.replace(score={"min_score": 0.9}, n=64)
     out = added(ExtendDepth(depth_unit="mm", other_image="before", method=quiet)(sample))
     assert out["depth"].shape == (64,)
     assert not ((out["source"] == Source.RECOVERED) & (out["score"] < 0.9)).any()
@@ -244,7 +245,7 @@ def test_a_learned_part_is_a_part_of_the_module(sample):
             ranked = score.rank(estimate, samples, tracks, fit)
             return ranked.replace(score=ranked.score * self.gain)
 
-    module = transform(method=partial(dhtorch.extend, score=Scorer()))
+    module = transform(method=dhtorch.extend.replace(score=Scorer()))
     assert [p.shape for p in module.parameters()] == [()]
     out = added(module(sample))
     out["score"].sum().backward()

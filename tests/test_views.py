@@ -118,6 +118,11 @@ def test_values_of_a_picture_may_miss_the_unit_range_by_a_thousandth():
 # ---------------------------------------------------------------------------------------------------- depth
 
 
+def test_a_sweep_says_that_it_is_sparse():
+    assert read(sample()).anchor.sparse is None
+    assert read(sample(), sparse=True).anchor.sparse.tolist() == [True]
+
+
 def test_units_are_metres_millimetres_or_metres_per_unit():
     depth = metres()
     for unit, per_metre in (("m", 1), ("mm", 1000), (0.001, 1000), (0.25, 4), (2, 0.5)):

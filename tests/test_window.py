@@ -6,13 +6,15 @@ import pytest
 import torch
 import walls
 
-from dhtorch import tree
+from dhtorch import PAPER, extend, tree
 from dhtorch.baselines import opencv
 from dhtorch.codes import Gate
-from dhtorch.pair import extend
 from dhtorch.records import Estimate
+from dhtorch.stages.fuse import inverse_variance
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
-from dhtorch.window import extend_window, inverse_variance, key_views
+from dhtorch.window import key_views
+
+extend_window = PAPER.replace(views=5)
 
 FLOATS = ("depth", "sigma", "sigma_shared", "parallax_deg", "residual_px", "score")
 PAIR = {"n": 200, "hypotheses": 64}
@@ -238,9 +240,15 @@ def test_of_many_views_the_widest_is_kept_and_copies_of_the_anchor_are_not(room)
 
 def test_wrong_shapes_raise(room):
     anchor, others = room
-    for bad in (others[0], others[:, :1], others[:0]):
-        with pytest.raises(ValueError, match="extend_window"):
+    for bad in (others[:, :1], others[0][:1], others[:0], []):
+        with pytest.raises(ValueError, match=r"extend|method"):
             extend_window(anchor, bad, **PAIR)
+
+
+def test_several_views_come_as_one_record_or_as_a_sequence(room):
+    anchor, others = room
+    one, many = extend_window(anchor, others, **PAIR), extend_window(anchor, [others[k] for k in range(3)], **PAIR)
+    assert torch.equal(one.gate, many.gate) and torch.equal(one.depth.nan_to_num(), many.depth.nan_to_num())
 
 
 def test_gradients_reach_images_and_depth(room):

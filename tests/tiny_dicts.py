@@ -1,9 +1,13 @@
 """Samples of a few pixels, and a method that answers what it was told: what surrounds a method can be tried alone."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 
 from dhtorch.codes import Flag, Gate, Hole
+from dhtorch.method import Method
 from dhtorch.records import Estimate, Pose, PoseFit, Samples
 from dhtorch.transform import ExtendDepth
 
@@ -65,9 +69,20 @@ class Told:
         return estimate
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Stub(Method):
+    """A method in which another function answers; its front end is the paper's."""
+
+    answer: Callable[..., Estimate] = None
+
+    def __call__(self, anchor, other, *, seed=0, hint=None, trace=None):
+        return self.answer(anchor, other, n=self.n, seed=seed, trace=trace)
+
+
 def tiny(method=None, **options):
     """The transform of such samples."""
-    return ExtendDepth(**{"depth_unit": "mm", "other_image": "before", "method": method or Told(), **options})
+    method = method if isinstance(method, Method) else Stub(answer=method or Told(), n=N)
+    return ExtendDepth(**{"depth_unit": "mm", "other_image": "before", "method": method, **options})
 
 
 def added(out, prefix="dhtorch."):

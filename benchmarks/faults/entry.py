@@ -29,6 +29,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("Views.read", "conf[:, at if conf.shape[1] > 1 else 0]", "conf[:, -1]"),
         ("Views.read", "conf.clamp(0, 2)", "conf.clamp(0, 1)"),
         ("Views.read", ".any(0)", ".all(0)"),
+        ("Views.read", "torch.ones(len(depth), dtype=torch.bool", "torch.zeros(len(depth), dtype=torch.bool"),
         ("Views.image_hw", "images.shape[-2], images.shape[-1]", "images.shape[-1], images.shape[-2]"),
         ("Views._other", "images = leaves.images(key, self.layout)", "images = leaves.images(key, None)"),
         ("Views._other", "set(places) == {at}", "at in places"),
@@ -134,7 +135,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_shared", "counts.share_memory_()", "counts"),
     ],
     "transform.extend_depth": [
-        ("ExtendDepth.__init__", "if n is None else n", "if n is None else int(n) + 1"),
+        ("ExtendDepth.__init__", "method if n is None else method.replace(n=n)", "method"),
         ("ExtendDepth.forward", "torch.is_grad_enabled() and get_worker_info() is None", "torch.is_grad_enabled()"),
         (
             "ExtendDepth.left_out",
@@ -157,7 +158,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
             "torch.where(bad.view(-1, *[1] * (x.ndim - 1)), 0, x)",
         ),
         ("ExtendDepth._answer", "problem = torch.where(bad, Problem.UNREADABLE, problem)", "pass"),
-        ("ExtendDepth._front_end", 'self.seats["classify"](frame', "classify(frame"),
+        ("ExtendDepth._answer", "hint=self.hint, ", ""),
         ("ExtendDepth._seeds", "index.long().cpu() + self.seed", "index.long().cpu()"),
         ("ExtendDepth._seeds", "index.shape[0] != batch or index.is_floating_point()", "index.shape[0] != batch"),
         ("ExtendDepth._blank", '"pose_ok": (), "tokens_valid": (p,)', '"pose_ok": (1,), "tokens_valid": (p,)'),
@@ -165,7 +166,6 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_pose", "[[0.0, 0.0, 0.0, 1.0]]", "[[0.0, 0.0, 0.0, 0.0]]"),
         ("_pose", "torch.where(paired, fit.code, torch.zeros_like(fit.code))", "fit.code"),
         ("_silent", "code + Gate.NO_TRACK", "code"),
-        ("_modules", "*method.args, ", ""),
     ],
     "archive": [
         ("SCHEMA", "1", "2"),

@@ -35,6 +35,13 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("backproject", "(sigma_m**2 + ", "(sigma_m + "),
         ("backproject", "if sigma_m > 0", "if sigma_m > 1"),
         ("backproject", "depth > near_limit", "depth >= near_limit"),
+        ("backproject", "search_px is None and frame.sparse is not None", "frame.sparse is not None"),
+        (
+            "backproject",
+            "_read_depth(frame, uv, SPARSE_SEARCH_PX, edge_rel), (",
+            "_read_depth(frame, uv, 2, edge_rel), (",
+        ),
+        ("backproject", "torch.where(frame.sparse[:, None], a, b)", "a"),
         ("backproject", "level < min_conf", "level <= min_conf"),
         ("backproject", "edge.int().add_(shine).add_(white)", "edge.int().add_(shine)"),
         ("backproject", "edge.int().add_(shine).add_(white)", "edge.int().add_(shine).add_(dim)"),

@@ -16,7 +16,8 @@ from dhtorch.codes import PoseCode
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import covariance, epipolar, se3
 from dhtorch.geometry.lookup import luma
-from dhtorch.records import Camera, Pose, PoseFit, Samples, Tracks
+from dhtorch.methods import PAPER
+from dhtorch.records import NO_HINT, Camera, Pose, PoseFit, Samples, TrackHint, Tracks
 
 
 def lucas_kanade(
@@ -24,6 +25,7 @@ def lucas_kanade(
     image_1: Tensor,
     uv_0: Tensor,  # (B, N, 2) px
     *,
+    hint: TrackHint = NO_HINT,
     window: int = 21,
     levels: int = 4,
     iterations: int = 30,
@@ -32,9 +34,12 @@ def lucas_kanade(
 ) -> Tracks:
     """Seat 4 with ``cv2.calcOpticalFlowPyrLK`` forward and back; ``levels`` includes full resolution.
 
+    Of a hint it takes the levels, and neither start nor pyramid.
+
     OpenCV reports no covariance: ``cov`` is NaN, and so is every sigma that would follow from it.
     """
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, iterations, epsilon_px)
+    levels = levels if hint.levels is None else hint.levels
     options = {"winSize": (window, window), "maxLevel": levels - 1, "criteria": criteria}
     images = zip(_grey(image_0), _grey(image_1), _array(uv_0, np.float32), strict=True)
     columns = zip(*(_track(*views, options, max_round_trip_px) for views in images), strict=True)
@@ -166,3 +171,10 @@ def _grey(image: Tensor) -> list[np.ndarray]:
 
 def _array(x: Tensor, dtype: type) -> np.ndarray:
     return np.ascontiguousarray(x.detach().cpu().numpy(), dtype=dtype)
+
+
+#: The same seats filled by OpenCV: LK forward and back, EPnP-RANSAC with LM refinement, triangulatePoints.
+OPENCV = PAPER.replace(track=lucas_kanade, pose=pnp_ransac, triangulate={"solver": triangulate})
+
+#: ``PAPER`` with OpenCV's linear triangulation: the residual is shared by both views instead of resting on the second.
+PAPER_DLT = PAPER.replace(triangulate={"solver": triangulate})

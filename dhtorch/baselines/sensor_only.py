@@ -3,39 +3,30 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from dhtorch.baselines.device_pose import given_pose
 from dhtorch.codes import Gate
 from dhtorch.geometry import se3
-from dhtorch.records import Estimate, Frame, Samples
+from dhtorch.method import Method, Trace
+from dhtorch.records import Estimate, Frame
 
 
 def sensor_only(
-    frame_0: Frame,
-    frame_1: Frame,
-    *,
-    sample: Callable[..., Tensor],
-    backproject: Callable[..., Samples],
-    classify: Callable[..., Samples],
-    n: int = 2048,
-    trace: dict[str, Any] | None = None,
-    **_other_seats: Any,
+    method: Method, frame_0: Frame, _frame_1: Frame, *, trace: Trace | None = None, **_told: Any
 ) -> Estimate:
     """The front end's usable returns as answers; every other sample is silent (gate NO_TRACK).
 
-    Takes the place of ``dhtorch.pair.extend`` in a method: it reads seats 1 to 3 and nothing of the second view.
+    Takes the place of a method's line: it asks seats 1 to 3 and reads nothing of the second view.
 
     Returns:
         Estimate whose ``depth`` and ``sigma`` are the sensor's.
     """
     start = time.perf_counter()
     like = frame_0.camera.f
-    samples = classify(frame_0, backproject(frame_0, sample(frame_0.hw, n, device=like.device, dtype=like.dtype)))
+    samples = method.look(frame_0)
     keep = samples.usable
     nan, zero = torch.full_like(samples.depth, torch.nan), torch.zeros_like(samples.depth)
     estimate = Estimate(

@@ -6,7 +6,6 @@ places that are shown elsewhere, tracks that end elsewhere. Recordings bear the 
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import pairwise
@@ -75,9 +74,7 @@ class StressRoom(SyntheticRoom):
         """A method's tracker as it works in this room: under ``mistracks`` many of its tracks end elsewhere."""
         if self.stress != "mistracks":
             return track
-        spoiled = partial(_mistrack, track)
-        spoiled.__signature__ = inspect.signature(track)  # type: ignore[attr-defined]  # what it may be asked for is seen
-        return spoiled
+        return partial(_mistrack, track)
 
     def _picture(self, i: int) -> Tensor:
         if not self.bands:

@@ -14,7 +14,7 @@ from dataclasses import replace
 from typing import Any
 
 from dhtorch.experiments import protocol
-from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant, refill
+from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
 from dhtorch.stages.sample import grid, vogel
 
 QUESTION = "Which part of the method does the result hang on?"
@@ -48,10 +48,10 @@ def run(
     name, method = next(iter(methods.items()))
     changed: dict[str, Method] = {
         name: method,
-        "sampler grid": refill(method, sample=grid),
-        "sampler vogel": refill(method, sample=vogel),
-        **{f"n {count}": refill(method, n=count) for count in n},
-        **{f"window {side}": refill(method, track={"window": side}) for side in windows},
+        "sampler grid": method.replace(sample=grid),
+        "sampler vogel": method.replace(sample=vogel),
+        **{f"n {count}": method.replace(n=count) for count in n},
+        **{f"window {side}": method.replace(track={"window": side}) for side in windows},
         **{other: m for other, m in (others or {}).items() if other != name},
     }
     variants = {k: Variant(m) for k, m in changed.items()}

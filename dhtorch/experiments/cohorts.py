@@ -9,9 +9,9 @@ from torch import Tensor
 
 from dhtorch.baselines.device_pose import given_pose
 from dhtorch.evaluate import holdout
-from dhtorch.experiments.protocol import Batch, Method, Variant, adapt, refill
+from dhtorch.experiments.protocol import Batch, Method, Variant
 from dhtorch.geometry import se3
-from dhtorch.pair import Trace
+from dhtorch.method import Trace
 from dhtorch.records import Frame, Pose, PoseFit, Samples
 
 
@@ -41,20 +41,17 @@ class HeldOut:
 
     def variant(self, **more: Any) -> Variant:
         """The method with set B hidden from it."""
-        seats = self.method.keywords
-        half = PoseHalf(seats["classify"], self.seed, seats["min_trackability"])
-        return Variant(refill(self.method, classify=half), **more)
+        half = PoseHalf(self.method.classify, self.seed, self.method.min_trackability)
+        return Variant(self.method.replace(classify=half), **more)
 
     def whole(self, batch: Batch, uv: Tensor) -> Samples:
         """The samples with every return."""
-        seats = adapt(self.method, batch.recording).keywords
-        found: Samples = seats["classify"](batch.anchor, seats["backproject"](batch.anchor, uv))
-        return found
+        return self.method.look_at(batch.anchor, uv)
 
     def heldout(self, batch: Batch, trace: Trace) -> holdout.Truth:
         """Set B: trackable samples whose return never took part in the pose."""
         whole, truth = self._truth(batch, trace)
-        _, second = holdout.half(whole, self.seed, min_trackability=self.method.keywords["min_trackability"])
+        _, second = holdout.half(whole, self.seed, min_trackability=self.method.min_trackability)
         return _only(truth, second)
 
     def cyclic(self, batch: Batch, trace: Trace) -> holdout.Truth:

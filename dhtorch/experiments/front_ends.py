@@ -15,8 +15,8 @@ from torch import Tensor
 from dhtorch.baselines import dinov2
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.shapes import check
-from dhtorch.records import Frame
-from dhtorch.seats import Method, adapt
+from dhtorch.method import Method
+from dhtorch.records import NO_HINT, Frame, TrackHint
 from dhtorch.transform import CHANNELS, ExtendDepth, grid
 
 #: Channels of a depth token that say something only where the patch has an answer.
@@ -74,7 +74,16 @@ class DepthTokens:
     """Depth tokens of :class:`dhtorch.transform.ExtendDepth`, pooled; with ``views=1`` of the front end alone."""
 
     def __init__(
-        self, method: Method, *, views: int = 2, cells: int = 4, side: int = 224, patch: int = 14, seed: int = 0
+        self,
+        method: Method,
+        *,
+        views: int = 2,
+        cells: int = 4,
+        side: int = 224,
+        patch: int = 14,
+        seed: int = 0,
+        hint: TrackHint = NO_HINT,
+        sparse: bool = False,
     ) -> None:
         self.views, self.cells = views, cells
         self.patches = grid((side, side), patch=patch)
@@ -84,6 +93,8 @@ class DepthTokens:
             patch=patch,
             tokens_hw=(side, side),
             seed=seed,
+            hint=hint,
+            sparse=sparse,
             depth_unit="m",
             distortion="distortion",
         )
@@ -146,7 +157,7 @@ def visual(build: Callable[..., torch.nn.Module] | None, *, cells: int, device: 
 
 def adapted(method: Method, recording: Any, **options: Any) -> DepthTokens:
     """Depth tokens of a method with what a recording asks for."""
-    return DepthTokens(adapt(method, recording), **options)
+    return DepthTokens(method, hint=TrackHint(levels=recording.levels), sparse=recording.sparse, **options)
 
 
 def _as_sample(frames: list[Frame]) -> dict[str, Tensor]:

@@ -15,7 +15,7 @@ from typing import Any
 from dhtorch.data.pairs import by_gap, by_scaled_gap
 from dhtorch.experiments import protocol
 from dhtorch.experiments.cohorts import HeldOut, everything
-from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, refill
+from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings
 
 QUESTION = "Which gate carries the abstention, and how does the frame gap trade error for coverage?"
 EXPECTATION = "Without the parallax gate correlation falls by more than without the reprojection gate."
@@ -56,7 +56,7 @@ def run(
     variants = {}
     for name, off in ways.items():
         whole = split.variant()
-        variants[name] = protocol.Variant(refill(whole.method, triangulate=off))
+        variants[name] = protocol.Variant(whole.method.replace(triangulate=off))
     main = protocol.run(
         recordings, Protocol(variants, {"heldout": split.heldout}, everything), pairs, settings, progress=progress
     )

@@ -22,7 +22,7 @@ from torch import Tensor
 from dhtorch import integrate
 from dhtorch.codes import Source
 from dhtorch.evaluate import bootstrap
-from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, quiet, refill
+from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
 from dhtorch.experiments.rows import Row
 from dhtorch.experiments.screening import Item, paired, screen
 from dhtorch.geometry import cells
@@ -63,7 +63,7 @@ def run(
 
     Source: paper, "Global integration (scope note)" and the limitation "map fragmentation".
     """
-    method = refill(next(iter(methods.values())), n=n)
+    method = next(iter(methods.values())).replace(n=n)
     answers: dict[str, dict[Item, Answer]] = {}
 
     def items(recording: Any) -> list[Item]:

@@ -25,11 +25,12 @@ from torch import Tensor
 
 from dhtorch.evaluate import bootstrap, holdout
 from dhtorch.evaluate.correlation import pearson, spearman
-from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, adapt, quiet
+from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, quiet, scene_hint
 from dhtorch.experiments.rows import Row, median
 from dhtorch.experiments.screening import Item, paired, screen
 from dhtorch.negative.helix_correlation import Shift, correlate, read_arm
 from dhtorch.records import Frame
+from dhtorch.stages.sample import spiral
 
 QUESTION = "Does correlating the two spiral signals in time squeeze out parallax?"
 EXPECTATION = "No: its shifts hardly correlate with inverse depth, plain 2-D flow does; forward motion is not seen."
@@ -67,6 +68,9 @@ def run(
     max_lag_share: float = 0.0625,
     min_peak: float = 0.5,
     blur_px: float = 1.5,
+    turns: float | None = None,
+    foveation: float = 1.0,
+    gaze: tuple[float, float] | None = None,
     round_arms: bool = False,
     progress: Progress = quiet,
 ) -> Outcome:
@@ -81,11 +85,12 @@ def run(
 
     Args:
         recordings, pairs, settings, progress: as :func:`dhtorch.experiments.protocol.run`.
-        methods: name → method; of the first the seats 1 to 4 are asked. Its sampler must have arms (``turns``).
+        methods: name → method; of the first the seats 2 to 4 are asked, at as many places as it has samples.
         window: of the correlation, px along the arm.
         max_lag_share: farthest shift looked for, share of the image width.
         min_peak: least correlation that counts as found.
         blur_px: of the picture, before the arms are read.
+        turns, foveation, gaze: of the helix, see :func:`dhtorch.stages.sample.spiral`.
         round_arms: wind in circles, as far as they fit into the picture. The sampler's own arms wind into its corners;
             there they run partly along the radius, and see a part of forward motion that circles do not.
 
@@ -96,8 +101,9 @@ def run(
     def ask(recording: Any, item: Item) -> dict[str, Row]:
         views = [recording[k].to(settings.dtype).to(settings.device) for k in item]
         lag = max(2, round(max_lag_share * views[0].hw[1]))
+        arms = partial(arms_of, turns=turns, foveation=foveation, gaze=gaze, round_arms=round_arms)
         correlated = partial(correlate, window=window, max_lag=lag, min_peak=min_peak)
-        return _pair(recording, adapt(method, recording), views[0], views[1], correlated, blur_px, round_arms)
+        return _pair(recording, method, views[0], views[1], correlated, blur_px, arms)
 
     outcome = screen(recordings, pairs, ask, VARIANTS, truth="full", progress=progress)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
@@ -120,23 +126,25 @@ def verdict(outcome: Outcome) -> tuple[bool | None, str]:
     return helix.value < 0.5 * flow.value and lower > len(both) / 2, why
 
 
-def arms_of(sample: Any, hw: tuple[int, int], n: int, like: Tensor, round_arms: bool = False) -> tuple[Arm, Arm]:
-    """The two arms of the sampler's ``n`` points as curves of even steps, or the same wound in circles.
-
-    Raises:
-        ValueError: the sampler has no arms.
-    """
-    keywords = getattr(sample, "keywords", {})
-    if "turns" not in keywords:
-        raise ValueError("helix_correlation: method.sample has no option turns, expected the spiral with its two arms")
-    turns = keywords["turns"] or math.sqrt(keywords["foveation"] * n / (2 * math.pi))
+def arms_of(
+    hw: tuple[int, int],
+    n: int,
+    like: Tensor,
+    *,
+    turns: float | None = None,
+    foveation: float = 1.0,
+    gaze: tuple[float, float] | None = None,
+    round_arms: bool = False,
+) -> tuple[Arm, Arm]:
+    """The two arms of a spiral of ``n`` points as curves of even steps, or the same wound in circles."""
+    turns = turns or math.sqrt(foveation * n / (2 * math.pi))
     total = int(DENSE * turns * math.pi * math.hypot(*hw)) & ~1
-    uv = sample(hw, total, turns=turns, dtype=torch.float64)
+    uv = spiral(hw, total, turns=turns, foveation=foveation, gaze=gaze, dtype=torch.float64)
     s = (torch.arange(total // 2, dtype=torch.float64) + 0.5) / (total / 2)
     if round_arms:
         limit = torch.tensor([hw[1] - 1.0, hw[0] - 1.0], dtype=torch.float64)
-        centre = limit / 2 if keywords["gaze"] is None else torch.tensor(keywords["gaze"], dtype=torch.float64)
-        radius = torch.minimum(centre, limit - centre).min() * s ** keywords["foveation"]
+        centre = limit / 2 if gaze is None else torch.tensor(gaze, dtype=torch.float64)
+        radius = torch.minimum(centre, limit - centre).min() * s**foveation
         uv = centre + radius.repeat_interleave(2)[:, None] * torch.nn.functional.normalize(uv - centre, dim=-1)
     return _even(uv[0::2], 2 * turns * s.sqrt(), like), _even(uv[1::2], 2 * turns * s.sqrt(), like)
 
@@ -154,20 +162,20 @@ def _even(uv: Tensor, turn: Tensor, like: Tensor) -> Arm:
 
 
 def _pair(
-    recording: Any, method: Method, frame_0: Frame, frame_1: Frame, correlated: Any, blur_px: float, round_arms: bool
+    recording: Any, method: Method, frame_0: Frame, frame_1: Frame, correlated: Any, blur_px: float, wind: Any
 ) -> dict[str, Row]:
     """Variant → numbers of one pair."""
-    seats, n = method.keywords, method.keywords["n"]
-    arms = arms_of(seats["sample"], frame_0.hw, n, frame_0.camera.f, round_arms)
+    n = method.n
+    arms = wind(frame_0.hw, n, frame_0.camera.f)
     sites = [torch.linspace(0, len(a.uv) - 1, n // 2, device=a.uv.device).round().long() for a in arms]
     uv = torch.cat([a.uv[s] for a, s in zip(arms, sites, strict=True)])
     tangent = torch.cat([a.tangent[s] for a, s in zip(arms, sites, strict=True)])
     signals = [[read_arm(f.image, a.uv, blur_px=blur_px) for a in arms] for f in (frame_0, frame_1)]
 
-    samples = seats["classify"](frame_0, seats["backproject"](frame_0, uv))
+    samples = method.look_at(frame_0, uv)
     truth = holdout.truth_at(frame_0, samples.uv, sparse=recording.sparse)
     candidate = holdout.candidates(samples, truth, 0.0).ok[0]
-    tracks = seats["track"](frame_0.image, frame_1.image, samples.uv)
+    tracks = method.track(frame_0.image, frame_1.image, samples.uv, hint=scene_hint(recording))
     flow = (tracks.uv_1 - tracks.uv_0)[0]
 
     own = [_against(signals, arms, sites, k, k, 0.0, correlated) for k in (0, 1)]

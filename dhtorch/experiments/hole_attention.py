@@ -21,7 +21,7 @@ from torch import Tensor
 from dhtorch.codes import Hole
 from dhtorch.evaluate import bootstrap
 from dhtorch.experiments.hole_census import census, look
-from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, adapt, quiet, refill
+from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
 from dhtorch.experiments.rows import Row
 from dhtorch.experiments.screening import Item, paired, screen
 from dhtorch.negative.hole_attention import Cluster, largest_cluster
@@ -66,8 +66,10 @@ def run(
     Source: paper, "What Does Not Work", attention-to-holes resampling.
     """
     method = next(iter(methods.values()))
-    if "gaze" not in getattr(method.keywords["sample"], "keywords", {}):
-        raise ValueError("hole_attention: method.sample has no option gaze, expected a foveated sampler")
+    try:
+        _gazing(method, torch.full((2,), 50.0)).sample((100, 100), 1)
+    except TypeError as error:
+        raise ValueError(f"hole_attention: expected a sampler with an option gaze in method.sample: {error}") from error
     if stride < 1:
         raise ValueError(f"hole_attention: stride is {stride}, expected at least 1")
 
@@ -76,14 +78,13 @@ def run(
 
     def ask(recording: Any, item: Item) -> dict[str, Row]:
         frame = recording[item[0]].to(settings.dtype).to(settings.device)
-        mine = adapt(method, recording)
-        before = look(mine, frame)
+        before = look(method, frame)
         hole = before.hole != Hole.NONE
         cluster = largest_cluster(before.uv, hole, neighbours=neighbours)
-        looked = {"centre": before, "random": look(_gazing(mine, _anywhere(frame.hw, settings.seed, item[0])), frame)}
-        looked["even"] = look(refill(mine, sample=vogel), frame)
+        looked = {"centre": before, "random": look(_gazing(method, _anywhere(frame.hw, settings.seed, item[0])), frame)}
+        looked["even"] = look(method.replace(sample=vogel), frame)
         if bool(hole.any()):
-            looked["attention"] = look(_gazing(mine, cluster.gaze[0]), frame)
+            looked["attention"] = look(_gazing(method, cluster.gaze[0]), frame)
         return {v: _count(looked[v], before, cluster, frame.hw) for v in VARIANTS if v in looked}
 
     outcome = screen(recordings, items, ask, VARIANTS, truth=TRUTH, progress=progress)
@@ -110,7 +111,7 @@ def verdict(outcome: Outcome) -> tuple[bool | None, str]:
 def _gazing(method: Method, gaze: Tensor) -> Method:
     """The method with its sampler looking at a pixel."""
     u, v = gaze.tolist()
-    return refill(method, sample={"gaze": (u, v)})
+    return method.replace(sample={"gaze": (u, v)})
 
 
 def _anywhere(hw: tuple[int, int], seed: int, i: int) -> Tensor:

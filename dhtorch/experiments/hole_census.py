@@ -15,7 +15,7 @@ import torch
 
 from dhtorch.codes import ROUTE_OF_HOLE, Hole, Route, names
 from dhtorch.evaluate import errors
-from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, adapt, quiet
+from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
 from dhtorch.experiments.rows import Row, mean, median
 from dhtorch.records import Samples
 
@@ -53,7 +53,7 @@ def run(
         rows = []
         for i in progress(frames, recording.name, len(frames)):
             rows.append({"scene": recording.name, "pair": [i, i], "method": name, "truth": None})
-            rows[-1] |= census(look(adapt(method, recording), recording[i].to(settings.dtype).to(settings.device)))
+            rows[-1] |= census(look(method, recording[i].to(settings.dtype).to(settings.device)))
         outcome.rows += [*rows, _scene(rows, recording)]
         outcome.n_pairs += len(rows)
     scenes = [r for r in outcome.rows if r["pair"] is None and r["role"] is None]
@@ -73,11 +73,8 @@ def verdict(summary: Mapping[str, Any]) -> tuple[bool | None, str]:
 
 def look(method: Method, frame: Any) -> Samples:
     """Seats 1 to 3 of a method: what its samples find in a frame."""
-    seats, like = method.keywords, frame.camera.f
     with torch.no_grad():
-        uv = seats["sample"](frame.hw, seats["n"], device=like.device, dtype=like.dtype)
-        samples: Samples = seats["classify"](frame, seats["backproject"](frame, uv))
-    return samples
+        return method.look(frame)
 
 
 def census(samples: Samples) -> Row:

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.evaluate import bootstrap
-from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, adapt, quiet, refill
+from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
 from dhtorch.experiments.rows import Row
 from dhtorch.experiments.screening import Item, paired, screen
 from dhtorch.geometry import cells, se3
@@ -82,11 +82,11 @@ def run(
 
     Source: paper, "What Does Not Work", point-to-point ICP over a good VIO track.
     """
-    method = refill(next(iter(methods.values())), n=n)
+    method = next(iter(methods.values())).replace(n=n)
     worlds: dict[str, _Chain] = {}
 
     def ask(recording: Any, item: Item) -> dict[str, Row]:
-        chain = worlds.setdefault(recording.name, _Chain(recording, adapt(method, recording), settings, voxel))
+        chain = worlds.setdefault(recording.name, _Chain(recording, method, settings, voxel))
         if not all(chain.cloud(k)[0].isfinite().all(-1).sum() >= MIN_POINTS for k in item):
             return {}
         starts = {"good": chain.relative(item), "none": se3.identity(1, chain.cloud(item[0]).double())}
@@ -169,9 +169,9 @@ class _Chain:
             generator = torch.Generator().manual_seed(self.settings.seed + 1000 * (i + 1))
             share = 0.4 + 0.2 * torch.rand(2, generator=generator)
             gaze = (float(share[0]) * frame.hw[1], float(share[1]) * frame.hw[0])
-            seats, like = refill(self.method, sample={"gaze": gaze}).keywords, frame.camera.f
-            uv = seats["sample"](frame.hw, seats["n"], device=like.device, dtype=like.dtype)
-            self.clouds[i] = seats["backproject"](frame, uv).xyz
+            seats, like = self.method.replace(sample={"gaze": gaze}), frame.camera.f
+            uv = seats.sample(frame.hw, seats.n, device=like.device, dtype=like.dtype)
+            self.clouds[i] = seats.backproject(frame, uv).xyz
         return self.clouds[i]
 
     def relative(self, item: Item, true: bool = False) -> Pose:

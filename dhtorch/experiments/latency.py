@@ -28,14 +28,14 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from dhtorch import pair
 from dhtorch.baselines import dinov2 as visual
 from dhtorch.evaluate import holdout
 from dhtorch.experiments import memory
-from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, adapt, quiet
+from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, quiet, scene_hint
 from dhtorch.experiments.rows import Row
 from dhtorch.geometry import camera as cam
-from dhtorch.records import Frame, Samples
+from dhtorch.method import Trace
+from dhtorch.records import Estimate, Frame, Samples
 
 QUESTION = "What does the method cost beside a DINOv2-L forward pass, and how does it grow with the image?"
 EXPECTATION = (
@@ -120,14 +120,14 @@ def run(
             raise ValueError(f"experiment.{name}: found {count}, expected at least 1")
     name, method = next(iter(chosen.items()))
     recording = recordings[0]
-    method = partial(adapt(method, recording), seed=settings.seed)
+    told: dict[str, Any] = {"seed": settings.seed, "hint": scene_hint(recording)}
     views = _views(recording, pairs, settings)
     branches: list[Branch] = []
     for hw in sizes:
         frame_0, frame_1 = (_resampled(view, (hw[0], hw[1])) for view in views)
         timed: list[tuple[str, Callable[[], Any], int]] = [
             ("front_end", partial(front_end, method, frame_0, n), front_end_repeats),
-            ("pair", partial(whole_pair, method, frame_0, frame_1, n), pair_repeats),
+            ("pair", partial(whole_pair, partial(method, n=n, **told), frame_0, frame_1), pair_repeats),
         ]
         for stage, call, repeats in timed:
             more = memory.weights(method) | {"peak_mib": _peak_mib(call, settings, peak)}
@@ -146,16 +146,13 @@ def run(
 
 def front_end(method: Method, frame: Frame, n: int) -> Samples:
     """Seats 1 to 3 of a method: what the paper times."""
-    seats, like = method.keywords, frame.camera.f
-    uv = seats["sample"](frame.hw, n, device=like.device, dtype=like.dtype)
-    samples: Samples = seats["classify"](frame, seats["backproject"](frame, uv))
-    return samples
+    return method.replace(n=n).look(frame)
 
 
-def whole_pair(method: Method, frame_0: Frame, frame_1: Frame, n: int) -> dict[str, float]:
+def whole_pair(method: Callable[..., Estimate], frame_0: Frame, frame_1: Frame) -> dict[str, float]:
     """All seven seats; returns the milliseconds of each."""
-    trace: pair.Trace = {}
-    method(frame_0, frame_1, n=n, trace=trace)
+    trace: Trace = {}
+    method(frame_0, frame_1, trace=trace)
     return dict(trace["ms"])
 
 

@@ -30,8 +30,8 @@ from dhtorch.experiments.protocol import Batch, Method, Outcome, Pairs, Progress
 from dhtorch.experiments.rows import Row, median, summarise
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.lookup import round_half_up
-from dhtorch.pair import Trace
-from dhtorch.records import Estimate, Frame, Pose, Samples
+from dhtorch.method import Trace
+from dhtorch.records import Estimate, Frame, Pose
 from dhtorch.tree import Record, record
 
 QUESTION = "What do feed-forward networks give on the same points, once somebody tells them the scale?"
@@ -103,13 +103,14 @@ def run(
     for name, network in networks.items():
         once = Once(network)
         for scale in scales:
+            asked = partial(ask, network=once, scale_pixels=scale_pixels)
             given = partial(_given, scale=scale, seed=settings.seed)
-            variants[f"{name}_{scale}"] = Variant(_as_method(once, method, scale_pixels), given=given)
+            variants[f"{name}_{scale}"] = Variant(method, ask=asked, given=given)
             labels[f"{name}_{scale}"] = {"scale": scale, "metric": SCALES[scale], **_described(network)}
-    asked = Protocol(variants, columns=_columns)
-    outcome = protocol.run(recordings, asked, pairs, settings, progress=progress)
+    whole = Protocol(variants, columns=_columns)
+    outcome = protocol.run(recordings, whole, pairs, settings, progress=progress)
     _complete(outcome, ours, labels, settings.device)
-    outcome.summary = summarise(outcome.rows, list(variants), list(asked.cohorts))
+    outcome.summary = summarise(outcome.rows, list(variants), list(whole.cohorts))
     return outcome.decide(QUESTION, EXPECTATION, *judge(outcome, ours, f"{JUDGED}_oracle"))
 
 
@@ -133,29 +134,27 @@ class Once:
 
 
 def ask(
+    method: Method,
     near: Frame,
     other: Frame,
     *,
     network: Once,
-    sample: Callable[..., Tensor],
-    backproject: Callable[..., Samples],
-    classify: Callable[..., Samples],
-    n: int,
     scale_pixels: int,
     known: Frame,
     sparse: bool,
     seed: int,
     trace: Trace,
+    **_told: Any,
 ) -> Estimate:
     """A network in the place of a method: our samples, its depth, a scale from ``known``."""
     like = near.camera.f
-    samples = classify(near, backproject(near, sample(near.hw, n, device=like.device, dtype=like.dtype)))
+    samples = method.look(near)
     relative, ms = network(near, other)
     scale = fit_scale(relative, known, samples.uv, n_pixels=scale_pixels, sparse=sparse, seed=seed)
     nowhere = Pose(
         torch.full_like(like, torch.nan)[:, :1, None].expand(-1, 3, 3), like.new_full((len(like), 3), torch.nan)
     )
-    trace.update(samples=samples, fit=given_pose(nowhere, n), scale=scale, ms={"network": ms})
+    trace.update(samples=samples, fit=given_pose(nowhere, method.n), scale=scale, ms={"network": ms})
     return to_estimate(relative, samples.uv, scale.factor)
 
 
@@ -208,12 +207,6 @@ def judge(outcome: Outcome, ours: str, theirs: str) -> tuple[bool | None, str]:
 
 def _has_weights(build: Callable[..., Network]) -> bool:
     return getattr(build, "keywords", {}).get("weights", "none asked for") is not None
-
-
-def _as_method(once: Once, method: Method, scale_pixels: int) -> Method:
-    """The network with the sampling seats of a method."""
-    front = {k: method.keywords[k] for k in ("sample", "backproject", "classify", "n")}
-    return partial(ask, network=once, scale_pixels=scale_pixels, **front)
 
 
 def _given(batch: Batch, *, scale: str, seed: int) -> dict[str, Any]:

@@ -19,9 +19,8 @@ from torch import Tensor
 from dhtorch.evaluate import bootstrap, compare, risk
 from dhtorch.experiments import protocol
 from dhtorch.experiments.protocol import Batch, Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
-from dhtorch.pair import Trace
+from dhtorch.method import Trace
 from dhtorch.records import PoseFit, Tracks
-from dhtorch.seats import n_views, refill
 from dhtorch.stages.score import LearnedScore, evidence, expected_error_loss, rank, rank_by_error
 from dhtorch.tree import Record, collate, record
 
@@ -73,7 +72,7 @@ def run(
         ValueError: a method of several views; else as the main job.
     """
     name, method = next(iter(methods.items()))
-    if n_views(method) > 1:
+    if method.views > 1:
         raise ValueError(f"experiment.method: found {name}, which looks at several views, expected one of two views")
     answers = _Answers()
     protocol.run(
@@ -93,7 +92,7 @@ def run(
     given = {score: partial(answers.again, score=fn) for score, fn in BY_HAND.items()} | given
     needs = {"learned": lambda recording: None if _room(recording) in learned else "no other room to learn from"}
     variants = {
-        score: Variant(refill(method), fit=answers.fit, given=of, needs=needs.get(score, Variant.needs))
+        score: Variant(method, fit=answers.fit, given=of, needs=needs.get(score, Variant.needs))
         for score, of in given.items()
     }
     outcome = protocol.run(recordings, Protocol(variants), pairs, settings, progress=progress)

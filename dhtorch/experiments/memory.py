@@ -16,6 +16,7 @@ from typing import Any
 import torch
 
 from dhtorch.data.files import set_opencv_threads
+from dhtorch.method import networks
 from dhtorch.tree import Record
 
 _MIB = 2**20
@@ -23,8 +24,7 @@ _MIB = 2**20
 
 def weights(*parts: Any) -> dict[str, int]:
     """``parameters`` and ``weight_bytes`` of all networks among ``parts`` and in the options of partials."""
-    networks = [m for part in parts for m in _networks(part)]
-    tensors = {id(p): p for m in networks for p in m.parameters()}.values()
+    tensors = {id(p): p for network in networks(*parts) for p in network.parameters()}.values()
     return {
         "parameters": sum(p.numel() for p in tensors),
         "weight_bytes": sum(p.numel() * p.element_size() for p in tensors),
@@ -70,14 +70,6 @@ def _own(call: Any) -> Any:
         copies = [a.map(torch.clone) if isinstance(a, Record) else _own(a) for a in call.args]
         return partial(call.func, *copies, **call.keywords)
     return call.clone() if isinstance(call, torch.Tensor) else call
-
-
-def _networks(part: Any) -> list[torch.nn.Module]:
-    if isinstance(part, torch.nn.Module):
-        return [part]
-    if isinstance(part, partial):
-        return [m for inner in (part.func, *part.args, *part.keywords.values()) for m in _networks(inner)]
-    return []
 
 
 def _resident() -> int | None:

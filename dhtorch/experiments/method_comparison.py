@@ -16,7 +16,7 @@ from typing import Any
 
 from dhtorch.evaluate import compare
 from dhtorch.experiments import protocol
-from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant, n_views
+from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
 from dhtorch.experiments.rows import Row
 
 QUESTION = "Is the method more accurate than the paper's, and does it know what it does not know?"
@@ -74,7 +74,7 @@ def run(
     if reference not in methods or not compared:
         raise ValueError(f"experiment.methods: found {', '.join(methods)}, expected {reference} and one more")
     variants = {
-        _named(name, k): Variant(method, seed=settings.seed + k, needs=partial(_views, pairs, n_views(method)))
+        _named(name, k): Variant(method, seed=settings.seed + k, needs=partial(_views, pairs, method.views))
         for name, method in methods.items()
         for k in range(1 if name in once else seeds)
     }
@@ -82,14 +82,14 @@ def run(
     rooms = {r.name: getattr(r, "room", None) or r.name for r in recordings}
     apart = {r.name for r in recordings if r.role is not None}
     found = {name: _by_scene(outcome, name, seeds, apart) for name in (reference, *compared)}
-    fallback = stand_ins or {name: compared[0] for name in compared if n_views(methods[name]) > 1}
+    fallback = stand_ins or {name: compared[0] for name in compared if methods[name].views > 1}
     judged = compare.method_ratios(found, reference=reference, rooms=rooms, fallback=fallback)
     later = {_named(name, k) for name in methods for k in range(1, seeds)}
     outcome.rows = [r for r in outcome.rows if r["method"] not in later]
     outcome.summary = {k: v for k, v in outcome.summary.items() if not any(k.startswith(f"{m}.") for m in later)}
     outcome.summary |= judged.summary
     _annotate(outcome.rows, judged.rows, f"against_{reference}")
-    several = {name for name in compared if n_views(methods[name]) > 1}
+    several = {name for name in compared if methods[name].views > 1}
     return outcome.decide(QUESTION, EXPECTATION, *verdict(judged, compared, several))
 
 

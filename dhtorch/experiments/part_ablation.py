@@ -11,10 +11,11 @@ more than a twentieth.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from dhtorch.experiments import method_comparison, protocol
-from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, refill
+from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings
 from dhtorch.experiments.rows import median
 
 QUESTION = "Which part of the method carries its gain over the paper's, and what does each cost?"
@@ -27,11 +28,26 @@ TELLING = 1.05
 NEAR_ONLY: dict[str, Any] = {"far_weight": 0.0}
 NO_TURN: dict[str, Any] = {"turn_sigma": 0.0}
 
-#: Gates of seat 6; the paper's and the whole's set them differently. What else differs there is how sigma is made.
-GATES = ("min_parallax_deg", "max_residual_px", "max_sigma_rel", "min_t_snr", "max_mismatch_px")
+#: Seat 6 as the paper has it: its gates, and how its sigma is made. The whole sets both differently.
+PAPER_GATES: dict[str, Any] = {
+    "min_parallax_deg": 0.3,
+    "max_residual_px": 3.0,
+    "max_sigma_rel": None,
+    "min_t_snr": None,
+    "max_mismatch_px": None,
+}
+PAPER_SIGMA: dict[str, Any] = {
+    "fitted_noise": False,
+    "isotropic": 0.1,
+    "mismatch_px": None,
+    "residual_px": None,
+    "round_trip_px": None,
+    "sigma_scale": 1.0,
+    "sensor_share": 0.0,
+}
 
-#: Options by which several views of one anchor are joined.
-VIEWS = ("views", "chain", "fuse")
+#: Pyramid levels of the whole's tracker, which the paper's takes where the affine registration is left out.
+LEVELS = {"levels": 5}
 
 #: What several views are replaced by on scenes that have too few.
 STAND_INS = {"+ views": "paper", "window": "map"}
@@ -78,29 +94,23 @@ def run(
 
 def taken_apart(paper: Method, whole: Method, window: Method) -> dict[str, Method]:
     """Variant → method: the paper's, with one part of the whole (``+ …``), the whole, without one (``- …``)."""
-    own, base = whole.keywords, paper.keywords
-    near = refill(own["pose"], **NEAR_ONLY, **NO_TURN)
-    gates = {k: base["triangulate"].keywords[k] for k in GATES}
-    sigma = {k: v for k, v in base["triangulate"].keywords.items() if k not in (*GATES, "solver")}
-    plain = refill(base["track"], levels=own["track"].keywords["levels"])
-    several = {k: window.keywords[k] for k in VIEWS}
     return {
         "paper": paper,
-        "+ affine tracks": refill(paper, track=own["track"]),
-        "+ weighted near pose": refill(paper, pose=near),
-        "+ near and far pose": refill(paper, pose=refill(own["pose"], **NO_TURN)),
-        "+ pose with turn": refill(paper, pose=own["pose"]),
-        "+ sigma and gates": refill(paper, triangulate=own["triangulate"]),
-        "+ score by error": refill(paper, score=own["score"]),
-        "+ views": refill(paper, window.func, **several),
+        "+ affine tracks": paper.replace(track=whole.track),
+        "+ weighted near pose": paper.replace(pose=partial(whole.pose, **NEAR_ONLY, **NO_TURN)),
+        "+ near and far pose": paper.replace(pose=partial(whole.pose, **NO_TURN)),
+        "+ pose with turn": paper.replace(pose=whole.pose),
+        "+ sigma and gates": paper.replace(triangulate=whole.triangulate),
+        "+ score by error": paper.replace(score=whole.score),
+        "+ views": paper.replace(views=window.views, chain=window.chain, fuse=window.fuse),
         "map": whole,
-        "- affine tracks": refill(whole, track=plain),
-        "- far tracks": refill(whole, pose=NEAR_ONLY),
-        "- turn": refill(whole, pose=NO_TURN),
-        "- pose": refill(whole, pose=base["pose"]),
-        "- gates": refill(whole, triangulate=gates),
-        "- sigma": refill(whole, triangulate=sigma),
-        "- score by error": refill(whole, score=base["score"]),
+        "- affine tracks": whole.replace(track=partial(paper.track, **LEVELS)),
+        "- far tracks": whole.replace(pose=NEAR_ONLY),
+        "- turn": whole.replace(pose=NO_TURN),
+        "- pose": whole.replace(pose=paper.pose),
+        "- gates": whole.replace(triangulate=PAPER_GATES),
+        "- sigma": whole.replace(triangulate=PAPER_SIGMA),
+        "- score by error": whole.replace(score=paper.score),
         "window": window,
     }
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -24,9 +25,8 @@ from dhtorch.evaluate import errors, holdout
 from dhtorch.experiments.rows import Row, overlay, scene_row, summarise
 from dhtorch.experiments.shared_tracks import SharedTracks
 from dhtorch.geometry.lookup import nearest, patches, round_half_up
-from dhtorch.pair import Trace
-from dhtorch.records import Estimate, Frame, PoseFit, Samples
-from dhtorch.seats import Method, adapt, n_views, refill  # noqa: F401  (experiments take refill from here)
+from dhtorch.method import Method, Trace
+from dhtorch.records import Estimate, Frame, PoseFit, Samples, TrackHint
 
 Pairs = Callable[[Any], Sequence[tuple[int, int]]]
 Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
@@ -36,6 +36,11 @@ MIN_CANDIDATES = 20
 
 #: A track looks at this many pixels across (LK window and a margin): what lies within may pull at it.
 REACH_PX = 25
+
+
+def scene_hint(recording: Any) -> TrackHint:
+    """What a recording knows of the motion in it."""
+    return TrackHint(levels=recording.levels)
 
 
 def quiet(items: Iterable[Any], _text: str, _total: int) -> Iterable[Any]:
@@ -100,6 +105,7 @@ class Variant:
     """A method as an experiment runs it."""
 
     method: Method
+    ask: Callable[..., Estimate] | None = None  # in the place of the method's line: (method, anchor, others, *, …)
     fit: Callable[[Batch, int], PoseFit] | None = None  # a pose from elsewhere: (batch, number of samples) → fit
     seed: int | None = None  # None = the job's
     given: Callable[[Batch], Mapping[str, Any]] = lambda _batch: {}  # further options: an oracle may see it all
@@ -290,8 +296,8 @@ class _Scene:
         self.recording, self.protocol, self.settings = recording, protocol, settings
         self.cutoff = settings.cutoff_of(recording)
         self.missing = {k: reason for k, v in protocol.variants.items() if (reason := v.needs(recording))}
-        able = {k: v for k, v in protocol.variants.items() if k not in self.missing}
-        self.variants = {k: replace(v, method=adapt(v.method, recording)) for k, v in able.items()}
+        self.variants = {k: v for k, v in protocol.variants.items() if k not in self.missing}
+        self.hint = scene_hint(recording)
         self.last = list(protocol.cohorts)[-1]
         blind = protocol.hide is holdout.range_split and not _is_cut(self.cutoff)
         self.least = 0 if blind else protocol.min_candidates
@@ -308,10 +314,11 @@ class _Scene:
         """Run all variants on one batch of pairs."""
         near = self.protocol.hide(batch.anchor, self.cutoff)
         views = tuple(self.protocol.hide(view, self.cutoff) for view in batch.others)
-        seen = {n: tree.stack(views[-n:]) if n > 1 else views[-1] for n in map(n_views, self._methods())}
+        several = {variant.method.views for variant in self.variants.values()}
+        seen = {n: tree.stack(views[-n:]) if n > 1 else views[-1] for n in several}
         shared, enough = SharedTracks(), [True] * len(batch.pairs)
         for k, (name, variant) in enumerate(self.variants.items()):
-            estimate, trace = self._ask(variant, batch, near, seen[n_views(variant.method)], shared)
+            estimate, trace = self._ask(variant, batch, near, seen[variant.method.views], shared)
             truths = {cohort: of(batch, trace) for cohort, of in self.protocol.cohorts.items()}
             answer = Answer(batch, name, estimate, trace, truths)
             if k == 0:
@@ -349,30 +356,26 @@ class _Scene:
                 rows.append(row)
         return rows
 
-    def _methods(self) -> list[Method]:
-        return [variant.method for variant in self.variants.values()]
-
     def _ask(
         self, variant: Variant, batch: Batch, near: Frame, seen: Frame, shared: SharedTracks
     ) -> tuple[Estimate, Trace]:
         method = variant.method
         trace: Trace = {}
-        options: dict[str, Any] = {"seed": self.settings.seed if variant.seed is None else variant.seed}
-        if "track" in method.keywords:
-            spoil = getattr(self.recording, "spoil_track", lambda track: track)  # some recordings lead trackers astray
-            options["track"] = spoil(shared.seat(method.keywords["track"]))
+        spoil = getattr(self.recording, "spoil_track", lambda track: track)  # some recordings lead trackers astray
+        seed = self.settings.seed if variant.seed is None else variant.seed
+        told: dict[str, Any] = {"seed": seed, "hint": self.hint, "track": spoil(shared.seat(method.track))}
         if variant.fit is not None:
-            options["fit"] = variant.fit(batch, method.keywords["n"])
-        options |= variant.given(batch)
+            told["fit"] = variant.fit(batch, method.n)
+        told |= variant.given(batch)
         with torch.no_grad():
-            estimate = method(near, seen, trace=trace, **options)
+            ask = method if variant.ask is None else partial(variant.ask, method)
+            estimate = ask(near, seen, trace=trace, **told)
         shared.charge(trace["ms"])
         return estimate, trace
 
     def _count_holes(self, method: Method, anchor: Frame, uv: Tensor) -> None:
         """The sensor's own holes, before anything is held back."""
-        samples = method.keywords["classify"](anchor, method.keywords["backproject"](anchor, uv))
-        for hole in samples.hole:
+        for hole in method.look_at(anchor, uv).hole:
             total = max(int((hole != Hole.NONE).sum()), 1)
             self.census.append({k: float((hole == k).sum()) / total for k in names(Hole)})
 
@@ -397,7 +400,7 @@ class _Scene:
 
 
 def _load(recording: Any, pairs: list[tuple[int, int]], protocol: Protocol, settings: Settings) -> DataLoader[Loaded]:
-    wanted = max(n_views(v.method) for v in protocol.variants.values())
+    wanted = max(v.method.views for v in protocol.variants.values())
     views = min([wanted, *(j - i for i, j in pairs)])  # a short gap holds fewer frames
     return DataLoader(
         PairData(recording, pairs, settings.dtype, views),

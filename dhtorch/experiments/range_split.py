@@ -17,7 +17,7 @@ from typing import Any
 from dhtorch.baselines.sensor_only import sensor_only
 from dhtorch.experiments import protocol
 from dhtorch.experiments.cohorts import device_fit, has_trajectory
-from dhtorch.experiments.protocol import Answer, Method, Outcome, Pairs, Progress, Protocol, Settings, Variant, refill
+from dhtorch.experiments.protocol import Answer, Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
 from dhtorch.experiments.rows import Row
 
 QUESTION = "Can near returns alone recover far depth, and is it the anchored pose that does it?"
@@ -58,9 +58,9 @@ def run(
     method = next(iter(methods.values()))
     device = {name: partial(device_fit, raw=raw) for name, raw in (("device_raw", True), ("device_gl_to_cv", False))}
     variants = {
-        "sensor_only": Variant(refill(method, func=sensor_only)),
+        "sensor_only": Variant(method, ask=sensor_only),
         **{name: Variant(method, fit=fit, needs=has_trajectory) for name, fit in device.items()},
-        "no_gates": Variant(refill(method, triangulate=NO_GATES)),
+        "no_gates": Variant(method.replace(triangulate=NO_GATES)),
         "gated": Variant(method),
     }
     main = protocol.run(recordings, Protocol(variants, columns=_truth), pairs, settings, progress=progress)

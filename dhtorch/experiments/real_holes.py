@@ -12,7 +12,7 @@ from typing import Any
 
 from dhtorch.experiments import protocol
 from dhtorch.experiments.cohorts import has_truth, real_holes
-from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant, refill
+from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
 from dhtorch.experiments.range_split import NO_GATES
 
 QUESTION = "Are the sensor's real holes recovered as well as returns that were merely hidden?"
@@ -38,7 +38,7 @@ def run(
     """
     method = next(iter(methods.values()))
     variants = {
-        "no_gates": Variant(refill(method, triangulate=NO_GATES), needs=has_truth),
+        "no_gates": Variant(method.replace(triangulate=NO_GATES), needs=has_truth),
         "gated": Variant(method, needs=has_truth),
     }
     cohorts = {"full": protocol.held_back, "real_holes": real_holes}

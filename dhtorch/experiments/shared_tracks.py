@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import time
 from collections.abc import Callable
 from functools import partial
@@ -11,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dhtorch.records import Tracks
+from dhtorch.records import NO_HINT, TrackHint, Tracks
 
 Track = Callable[..., Tracks]
 
@@ -30,9 +29,7 @@ class SharedTracks:
     def seat(self, track: Track) -> Track:
         """The track seat of one variant."""
         self._owed = 0.0
-        seat = partial(self._track, track)
-        seat.__signature__ = inspect.signature(track)  # type: ignore[attr-defined]  # what it may be asked for is seen
-        return seat
+        return partial(self._track, track)
 
     def charge(self, ms: dict[str, float]) -> None:
         """Add to ``ms["track"]`` what the tracks that were remembered had cost."""
@@ -47,17 +44,16 @@ class SharedTracks:
         image_1: Tensor,
         uv_0: Tensor,
         *,
-        uv_1_init: Tensor | None = None,
-        **options: Any,  # a pyramid of image_0: says nothing that the image does not
+        hint: TrackHint = NO_HINT,  # its pyramid says nothing that the image does not
     ) -> Tracks:
         start = time.perf_counter()
-        key, question = _key(track), (image_0, image_1, uv_0, uv_0 if uv_1_init is None else uv_1_init)
+        key = _key(track), hint.levels
+        question = (image_0, image_1, uv_0, uv_0 if hint.start is None else hint.start)
         for known, asked, tracks, ms in self._known:
             if known == key and all(map(_same, asked, question)):
                 self._owed += ms
                 return tracks
-        given = options if uv_1_init is None else {**options, "uv_1_init": uv_1_init}
-        tracks = track(image_0, image_1, uv_0, **given)
+        tracks = track(image_0, image_1, uv_0, hint=hint)
         self._known.append((key, question, tracks, 1e3 * (time.perf_counter() - start)))
         return tracks
 

@@ -23,8 +23,8 @@ from dhtorch.data.files import need
 from dhtorch.extract import columns, engines, plan, shards
 from dhtorch.extract.features import Features, JoinedDataset
 from dhtorch.extract.rows import Answer, Rows
-from dhtorch.seats import n_views
-from dhtorch.transform import CHANNELS, ExtendDepth, SampleError, grid
+from dhtorch.method import Method
+from dhtorch.transform import CHANNELS, SampleError, grid
 from dhtorch.transform.extend_depth import ON_ERROR
 from dhtorch.transform.tokens import FITS
 
@@ -89,7 +89,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Call
     if not isinstance(settings["workers"], int) or settings["workers"] < 0:
         raise ValueError(f"workers: found {settings['workers']!r}, expected a whole number of at least 0")
     recordings = parts["data"] if isinstance(parts["data"], list | Recordings) else [parts["data"]]
-    whole = plan.make(recordings, options.gap, n_views(parts["method"]))
+    whole = plan.make(recordings, options.gap, parts["method"].views)
     rows = _rows(recordings, whole, parts["method"], settings["seed"], options)
     shared = _shared(settings, options, whole, rows)
     folder = _folder(settings["out"])
@@ -112,11 +112,10 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Call
     return 0
 
 
-def _rows(recordings: Sequence[Any], whole: plan.Plan, method: Any, seed: int, options: Options) -> Rows:
+def _rows(recordings: Sequence[Any], whole: plan.Plan, method: Method, seed: int, options: Options) -> Rows:
     hw = (int(options.tokens_hw[0]), int(options.tokens_hw[1]))
     rows, across = grid(hw, patch=options.patch, tokens_hw=hw)
-    n = ExtendDepth(method=method, depth_unit="m").n
-    every = columns.columns(n, rows * across, half=options.half)
+    every = columns.columns(method.n, rows * across, half=options.half)
     return Rows(
         recordings,
         whole,

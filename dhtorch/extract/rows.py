@@ -13,8 +13,8 @@ from torch.utils.data import Dataset
 from dhtorch.extract.columns import PLACE, Column, Row
 from dhtorch.extract.plan import Plan, steps_back
 from dhtorch.geometry import camera as cam
-from dhtorch.records import Camera, Frame
-from dhtorch.seats import Method, adapt, n_views
+from dhtorch.method import Method
+from dhtorch.records import Camera, Frame, TrackHint
 from dhtorch.transform import ExtendDepth
 
 #: Readers give metres, and the camera of these very pixels: there is no unit that could be wrong.
@@ -40,7 +40,7 @@ class Rows(Dataset[Answer]):
         recordings: of the data set.
         plan: from :func:`dhtorch.extract.plan.make`.
         wanted: columns of the rows.
-        method: a partial of :func:`dhtorch.extend`, adapted to each recording.
+        method: of one other view or several.
         gap: frames back to the other view; None = the recording's own, 0 = no other view.
         options: of :class:`dhtorch.transform.ExtendDepth`.
     """
@@ -89,8 +89,8 @@ class _Opened:
     """One recording, and the transforms that fit its frames."""
 
     def __init__(self, recording: Any, method: Method, gap: int | None, options: dict[str, Any]) -> None:
-        self.recording, self.method, self.options = recording, adapt(method, recording), options
-        self.steps = steps_back(recording, gap, n_views(method))
+        self.recording, self.method, self.options = recording, method, options
+        self.steps = steps_back(recording, gap, method.views)
         self.position = {int(number): i for i, number in enumerate(recording.number)} if self.steps else {}
         self.transforms: dict[tuple[str, ...], ExtendDepth] = {}
 
@@ -116,6 +116,7 @@ class _Opened:
 
     def _transform(self, optional: tuple[str, ...]) -> ExtendDepth:
         options: dict[str, Any] = {**_TRUSTED, **self.options, **{key: key for key in optional}}
+        options |= {"sparse": self.recording.sparse, "hint": TrackHint(levels=self.recording.levels)}
         other_at = list(range(len(self.steps))) if len(self.steps) > 1 else 0
         return ExtendDepth(method=self.method, other_at=other_at, **options)
 

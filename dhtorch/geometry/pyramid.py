@@ -82,6 +82,31 @@ class Pyramid(NamedTuple):
         return self.read(level, first, size, fraction)
 
 
+class Pyramids:
+    """The pyramids of a batch of images, each built when it is first asked for: of an anchor tracked into many views.
+
+    Carries no graph. ``pyramids[i:j]`` are those of some of the images.
+    """
+
+    def __init__(self, image: Tensor) -> None:
+        self.image = image  # (B, C, H, W), as build_pyramid takes it
+        self._built: dict[tuple[int, int], Pyramid] = {}
+        self._parts: dict[tuple[int, int], Pyramids] = {}
+
+    def __call__(self, levels: int, window: int) -> Pyramid:
+        """``build_pyramid(image, levels, window)``, made once."""
+        if (levels, window) not in self._built:
+            with torch.no_grad():
+                self._built[levels, window] = build_pyramid(self.image, levels, window)
+        return self._built[levels, window]
+
+    def __getitem__(self, part: slice) -> Pyramids:
+        start, stop, _ = part.indices(len(self.image))
+        if (start, stop) not in self._parts:
+            self._parts[start, stop] = Pyramids(self.image[start:stop])
+        return self._parts[start, stop]
+
+
 def build_pyramid(
     image: Tensor,  # (B, C, H, W) C 1 or 3; float in [0, 1] or uint8
     levels: int = 4,

@@ -23,8 +23,8 @@ from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import cells, se3
 from dhtorch.geometry.lookup import nearest
 from dhtorch.integrate.volume import View, Volume, fuse, splat
-from dhtorch.records import Camera, Estimate, Frame, Pose, PoseFit, Samples, Tracks
-from dhtorch.seats import Method, adapt, n_views
+from dhtorch.method import Method
+from dhtorch.records import Camera, Estimate, Frame, Pose, PoseFit, Samples, TrackHint, Tracks
 from dhtorch.tree import stack
 
 POSES = ("device", "anchored")
@@ -81,19 +81,19 @@ def ask(
 
     Args:
         recording, pairs: see ``dhtorch.data``.
-        method: ``dhtorch.pair.extend`` or ``dhtorch.window.extend_window`` with its seats.
+        method: of one view or several; the others lie between the two of the pair.
         cutoff: m; returns beyond it are hidden from the method. None hides nothing.
         seed, device, dtype: of the method's run; answers come back on the CPU.
 
     Raises:
         ValueError: as the method, the readers and the hold-out raise it.
     """
-    method, views = adapt(method, recording), n_views(method)
+    views, hint = method.views, TrackHint(levels=recording.levels)
     for i, j in pairs:
         shown = [range_split(recording[k].to(dtype).to(device), cutoff) for k in (i, *between(i, j, views))]
         trace: dict[str, Any] = {}
         with torch.no_grad():
-            estimate = method(shown[0], stack(shown[1:]) if views > 1 else shown[-1], seed=seed, trace=trace)
+            estimate = method(shown[0], stack(shown[1:]) if views > 1 else shown[-1], seed=seed, hint=hint, trace=trace)
             samples, rgb = trace["samples"].to("cpu"), _colour(shown[0], trace["samples"].uv)
         tracks, fit = (trace[k].to("cpu") for k in ("tracks", "fit"))
         camera = shown[0].camera.to("cpu")

@@ -14,6 +14,9 @@ from dhtorch.geometry.lookup import fits, luma, nearest_index, patches, pixels, 
 from dhtorch.geometry.shapes import check
 from dhtorch.records import Frame, Samples
 
+#: Search radius in a sparse depth map, px: the truth test reads sparse returns in 7×7 windows, so do the samples.
+SPARSE_SEARCH_PX = 3
+
 #: Side of the neighbourhood that appearance and depth edges are judged on, px.
 NEIGHBOURHOOD = 5
 
@@ -22,11 +25,11 @@ def backproject(
     frame: Frame,
     uv: Tensor,  # (N, 2) or (B, N, 2) px
     *,
-    near_limit: float = float("inf"),
+    near_limit: float | None = None,
     min_conf: int = 1,
     sigma_m: float = 0.0,
     sigma_rel: float = 0.01,
-    search_px: int = 0,
+    search_px: int | None = None,
     edge_rel: float = 0.1,
     dark: float = 0.05,
     saturated: float = 0.99,
@@ -34,16 +37,17 @@ def backproject(
 ) -> Samples:
     """Read the depth at sample pixels and lift it to camera-frame points.
 
-    The nearest depth pixel is read, so values are never mixed across an edge. For a sparse map (projected LiDAR),
-    ``search_px`` lets a sample take the nearest return within that many depth pixels instead.
+    The nearest depth pixel is read, so values are never mixed across an edge. In a sparse map (projected LiDAR) a
+    sample takes the nearest return within ``search_px`` depth pixels instead.
 
     Args:
         frame: B views; depth of any resolution, see ``Frame.depth_camera``.
         uv: sample pixels, shared by the batch or per view.
-        near_limit: returns beyond it (m) stay in ``depth`` but get NaN in ``xyz`` and BEYOND_NEAR.
+        near_limit: m, None = none; returns beyond it stay in ``depth`` but get NaN in ``xyz`` and BEYOND_NEAR.
         min_conf: lowest accepted sensor confidence (0, 1, 2) where the frame has a confidence map.
         sigma_m, sigma_rel: sensor noise, sigma² = sigma_m² + (sigma_rel · z)².
-        search_px: radius of the search for a return, depth pixels.
+        search_px: radius of the search for a return, depth pixels; None = :data:`SPARSE_SEARCH_PX` in frames that are
+            ``sparse``, else 0.
         edge_rel: max / min − 1 of the returns in the 5×5 neighbourhood (or as far as is searched, where that is
             farther) above which DEPTH_EDGE is set.
         dark, saturated: mean grey of the neighbourhood below / above which UNDEREXPOSED / SATURATED is set.
@@ -69,10 +73,14 @@ def backproject(
     if uv.dim() == 2:
         uv = uv.expand(sizes["B"], *uv.shape)
     check("backproject", uv=(uv, "B N 2"), f=(frame.camera.f, "B 2"))
-    depth, level, edge = _read_depth(frame, uv, search_px, edge_rel)
+    depth, level, edge = _read_depth(frame, uv, search_px or 0, edge_rel)
+    if search_px is None and frame.sparse is not None:
+        found = zip(_read_depth(frame, uv, SPARSE_SEARCH_PX, edge_rel), (depth, level, edge), strict=True)
+        depth, level, edge = (torch.where(frame.sparse[:, None], a, b) for a, b in found)
     border, dim, white, shine = _appearance(frame.image, uv, dark, saturated, highlight)
     returned = depth > 0
-    unsure, beyond = returned & (level < min_conf), depth > near_limit
+    beyond = torch.zeros_like(returned) if near_limit is None else depth > near_limit
+    unsure = returned & (level < min_conf)
     xyz = cam.unproject(frame.camera, uv.nan_to_num(0.0, 0.0, 0.0), depth)  # no gradient to what is no number
     usable = returned & ~(unsure | beyond)
     usable = usable & (xyz.detach().abs().amax(-1) < torch.inf)  # a pixel outside the lens model has no ray

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from dhtorch.geometry import affine
 from dhtorch.geometry import lucas_kanade as lk
-from dhtorch.geometry.pyramid import REACH, Pyramid, build_pyramid
+from dhtorch.geometry.pyramid import Pyramid, Pyramids, build_pyramid
 from dhtorch.geometry.shapes import check
-from dhtorch.records import Tracks
+from dhtorch.records import NO_HINT, TrackHint, Tracks
 
 #: Smallest eigenvalue of A per pixel of the window below which it is not tracked: 1e-4 of cv2, which sums gradients
 #: of 8-bit images scaled by 2^-5.
@@ -29,8 +29,7 @@ def lucas_kanade(
     image_1: Tensor,  # (B, C, H', W')
     uv_0: Tensor,  # (B, N, 2) px
     *,
-    uv_1_init: Tensor | None = None,  # (B, N, 2) px
-    pyramid_0: Pyramid | None = None,
+    hint: TrackHint = NO_HINT,
     window: int = 21,
     levels: int = 4,
     iterations: int = 30,
@@ -42,13 +41,12 @@ def lucas_kanade(
     """Track points from image 0 to image 1 and back; a track that does not return to its start is not valid.
 
     From coarse to fine, every window takes Gauss-Newton steps towards the smallest squared grey difference to its
-    template. The way back starts from the point found as if nothing were known of the way there (with ``uv_1_init``:
-    from the opposite displacement), so that it is a test. A window that still runs away at the end of the way there is
-    lost and not tested.
+    template. The way back starts from the point found as if nothing were known of the way there (with a start that was
+    hinted: from the opposite displacement), so that it is a test. A window that still runs away at the end of the way
+    there is lost and not tested.
 
     Args:
-        uv_1_init: where to start in image 1; at ``uv_0`` by default and where it is not finite.
-        pyramid_0: ``build_pyramid(image_0, levels, window)``, made once for an anchor tracked into many views.
+        hint: where to start in image 1, pyramids of image 0 made once for many views, and ``levels`` for this scene.
         window: width in pixels, odd.
         levels: pyramid levels, full resolution included; fewer where a level would be no larger than the window.
         iterations: most Gauss-Newton steps per level. A point that is not at rest after eight goes on only as far as
@@ -67,7 +65,7 @@ def lucas_kanade(
         outside the image the start of the search, with 0 for what is not finite.
 
     Raises:
-        ValueError: wrong shapes or options, an image no larger than the window, a pyramid of another image or window.
+        ValueError: wrong shapes or options, an image no larger than the window, pyramids of another image.
 
     Gradient: the search has none. When an image or ``uv_0`` requires it, valid points take one more, differentiable
     step (:func:`refine`); all other fields are detached.
@@ -75,15 +73,15 @@ def lucas_kanade(
     Source: Lucas and Kanade 1981; Bouguet 2000 (pyramid); Baker and Matthews 2004 (inverse composition); checked
     against ``cv2.calcOpticalFlowPyrLK`` (``tests/test_track.py``).
     """
-    check("lucas_kanade", image_0=(image_0, "B C H W"), uv_0=(uv_0, "B N 2"), uv_1_init=(uv_1_init, "B N 2"))
+    check("lucas_kanade", image_0=(image_0, "B C H W"), uv_0=(uv_0, "B N 2"), start=(hint.start, "B N 2"))
     check("lucas_kanade", image_1=(image_1, "B C H W"), uv_0=(uv_0, "B N 2"))
     _check_options(iterations, normalise)
     o = lk.Options(window, iterations, epsilon_px, min_eigenvalue, normalise)
+    levels = levels if hint.levels is None else hint.levels
     with torch.no_grad():
-        source = build_pyramid(image_0, levels, window) if pyramid_0 is None else pyramid_0
-        _check_pyramid(source, image_0, window)
+        source = _source(hint, image_0, levels, window)
         target = build_pyramid(image_1, levels, window)
-        tracks = _there_and_back(source, target, uv_0.detach(), uv_1_init, max_round_trip_px, o)
+        tracks = _there_and_back(source, target, uv_0.detach(), hint.start, max_round_trip_px, o)
     if torch.is_grad_enabled() and (image_0.requires_grad or image_1.requires_grad or uv_0.requires_grad):
         uv_1 = refine(
             image_0, image_1, uv_0, tracks.uv_1, window=window, normalise=normalise, min_eigenvalue=min_eigenvalue
@@ -178,13 +176,14 @@ def _check_options(iterations: int, normalise: str) -> None:
         raise ValueError(f"lucas_kanade: iterations is {iterations}, expected at least 1")
 
 
-def _check_pyramid(pyramid: Pyramid, image: Tensor, window: int) -> None:
-    found, expected = (len(pyramid.levels[0]), *pyramid.hw()), (image.shape[0], *image.shape[-2:])
-    if found != expected or pyramid.pad != window // 2 + REACH or pyramid.levels[0].shape[1] == 1:
-        raise ValueError(
-            f"lucas_kanade: pyramid_0 is of (B, H, W) {found} with padding {pyramid.pad}, "
-            f"expected {expected} with {window // 2 + REACH}, and gradients"
-        )
+def _source(hint: TrackHint, image: Tensor, levels: int, window: int) -> Pyramid:
+    """The pyramid of image 0: the caller's, where it has one."""
+    if hint.pyramid is None:
+        return build_pyramid(image, levels, window)
+    found, expected = (tuple(x.shape) for x in (hint.pyramid.image, image))
+    if found != expected:
+        raise ValueError(f"lucas_kanade: hint.pyramid is of an image of shape {found}, expected {expected}")
+    return hint.pyramid(levels, window)
 
 
 def lucas_kanade_affine(
@@ -192,8 +191,7 @@ def lucas_kanade_affine(
     image_1: Tensor,  # (B, C, H', W')
     uv_0: Tensor,  # (B, N, 2) px
     *,
-    uv_1_init: Tensor | None = None,  # (B, N, 2) px
-    pyramid_0: Pyramid | None = None,
+    hint: TrackHint = NO_HINT,
     track: Callable[..., Tracks] = lucas_kanade,
     window: int = 21,
     levels: int = 4,
@@ -204,9 +202,10 @@ def lucas_kanade_affine(
     """Track as ``track`` does, then register every window once more, free to shear and to change its brightness.
 
     Args:
-        uv_1_init, pyramid_0: as in :func:`lucas_kanade`.
-        track: the search that finds the windows, a seat-4 function; it is given ``window`` and ``levels``.
-        window, levels: of both searches.
+        hint: as in :func:`lucas_kanade`; handed on to ``track``.
+        track: the search that finds the windows, any tracker; it is told the ``levels`` and shares the pyramid.
+        window: of the registration; the search has its own.
+        levels: of the search, where it follows hints.
         iterations, epsilon_px, max_shift_px: of the registration, see :func:`dhtorch.geometry.affine.register`.
 
     Returns:
@@ -221,11 +220,13 @@ def lucas_kanade_affine(
     Gradient: as :func:`lucas_kanade`, by one more step of the registration; all other fields are detached.
     Source: Baker and Matthews 2004, "Lucas-Kanade 20 years on", inverse composition with appearance variation.
     """
-    check("lucas_kanade_affine", image_0=(image_0, "B C H W"), uv_0=(uv_0, "B N 2"), uv_1_init=(uv_1_init, "B N 2"))
+    check("lucas_kanade_affine", image_0=(image_0, "B C H W"), uv_0=(uv_0, "B N 2"), start=(hint.start, "B N 2"))
     check("lucas_kanade_affine", image_1=(image_1, "B C H W"), uv_0=(uv_0, "B N 2"))
     with torch.no_grad():
-        source = build_pyramid(image_0, levels, window) if pyramid_0 is None else pyramid_0
-        tracks = track(image_0, image_1, uv_0, uv_1_init=uv_1_init, pyramid_0=source, window=window, levels=levels)
+        known = Pyramids(image_0) if hint.pyramid is None else hint.pyramid
+        levels = levels if hint.levels is None else hint.levels
+        source = _source(hint.replace(pyramid=known), image_0, levels, window)
+        tracks = track(image_0, image_1, uv_0, hint=TrackHint(hint.start, known, levels))
         target = build_pyramid(image_1, 2, window, gradients=False)
         found = affine.register(
             source,

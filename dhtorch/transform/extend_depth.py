@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import inspect
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from functools import partial
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -14,18 +12,14 @@ from torch.utils.data import get_worker_info
 
 from dhtorch.codes import Gate, Source
 from dhtorch.geometry import camera as cam
-from dhtorch.pair import METHODS, merge
-from dhtorch.records import Estimate, Frame, PoseFit, Samples
-from dhtorch.stages.backproject import backproject
-from dhtorch.stages.holes import classify
-from dhtorch.stages.sample import spiral
+from dhtorch.method import Method, networks
+from dhtorch.methods import METHODS
+from dhtorch.pair import merge
+from dhtorch.records import NO_HINT, Estimate, PoseFit, Samples, TrackHint
 from dhtorch.transform.leaves import SampleError, find, to_tensor
 from dhtorch.transform.problems import Problem, Tally
 from dhtorch.transform.tokens import CHANNELS, FITS, grid, patch_tokens
 from dhtorch.transform.views import Read, Views
-
-#: Seats of the front end: what a method that does not name its own is given.
-FRONT_END: dict[str, Callable[..., Any]] = {"sample": spiral, "backproject": backproject, "classify": classify}
 
 ON_ERROR = ("raise", "skip", "flag")
 
@@ -38,9 +32,9 @@ class ExtendDepth(torch.nn.Module):
     on the batch. Without a second view only the front end runs: the sensor's own returns, flags and hole classes.
 
     Args:
-        method: a name (:data:`dhtorch.pair.METHODS`), or a function called as :func:`dhtorch.extend`, such as a
-            partial of it.
-        n: samples per image; None = the method's own default.
+        method: a name (:data:`dhtorch.methods.METHODS`) or a :class:`dhtorch.method.Method`.
+        n: samples per image; None = the method's own number.
+        hint: what is known of the motion between the views, for the tracker.
         seed: of the pose search. With ``index_key`` each sample has the seed ``seed + sample[index_key]``.
         index_key: key of a whole number that tells samples apart; None = the same draws for all.
         patch, tokens_hw, fit: the network's patches, see :func:`dhtorch.transform.patch_tokens`.
@@ -60,7 +54,7 @@ class ExtendDepth(torch.nn.Module):
         :data:`dhtorch.transform.CHANNELS` and ``tokens_valid`` (P,); ``problem``. What is not valid is 0.
 
     Raises:
-        ValueError: options that cannot be, or a method that takes no ``n`` where none is given.
+        ValueError: options that cannot be.
         SampleError: a bad sample, where ``on_error`` says so.
 
     Gradient: points, tokens and pose to images, depth and intrinsics, as ``dhtorch.extend``; none in a worker, whose
@@ -72,8 +66,9 @@ class ExtendDepth(torch.nn.Module):
     def __init__(
         self,
         *,
-        method: str | Callable[..., Estimate] = "paper",
+        method: str | Method = "paper",
         n: int | None = None,
+        hint: TrackHint = NO_HINT,
         seed: int = 0,
         index_key: str | None = None,
         patch: int = 14,
@@ -85,8 +80,8 @@ class ExtendDepth(torch.nn.Module):
         **views: Any,
     ) -> None:
         super().__init__()
-        if isinstance(method, str) and method not in METHODS:
-            raise ValueError(f"method is {method!r}, expected one of {sorted(METHODS)} or a function")
+        if method not in METHODS if isinstance(method, str) else not isinstance(method, Method):
+            raise ValueError(f"method is {method!r}, expected one of {sorted(METHODS)} or a Method")
         if on_error not in ON_ERROR or (batched and on_error == "skip"):
             expected = ("raise", "flag") if batched else ON_ERROR
             raise ValueError(f"on_error is {on_error!r}, expected one of {', '.join(expected)}")
@@ -94,10 +89,9 @@ class ExtendDepth(torch.nn.Module):
             raise ValueError(f"fit is {fit!r}, expected one of {', '.join(FITS)}")
         grid((max(patch, 1),) * 2, patch=patch, tokens_hw=tokens_hw)  # raises where no patch fits
         self.views = Views(**views)
-        self.method = METHODS[method] if isinstance(method, str) else method
-        self.seats = {name: _option(self.method, name, default) for name, default in FRONT_END.items()}
-        self.learned = torch.nn.ModuleList(_modules(self.method))  # so that .to() and .parameters() find them
-        self.n = int(_option(self.method, "n") if n is None else n)
+        method = METHODS[method] if isinstance(method, str) else method
+        self.method, self.hint = method if n is None else method.replace(n=n), hint
+        self.learned = torch.nn.ModuleList(networks(self.method))  # so that .to() and .parameters() find them
         self.seed, self.index_key = seed, index_key
         self.patch, self.tokens_hw, self.fit = patch, tokens_hw, fit
         self.on_error, self.batched, self.prefix = on_error, batched, prefix
@@ -144,11 +138,11 @@ class ExtendDepth(torch.nn.Module):
         frame, paired, bad = read.anchor, read.paired, read.bad
         if read.other is not None and bool(paired.any()):
             trace: dict[str, Any] = {}
-            estimate = self.method(frame, read.other, n=self.n, seed=seed, trace=trace)
+            estimate = self.method(frame, read.other, seed=seed, hint=self.hint, trace=trace)
             samples, fit = trace["samples"], trace["fit"]
             estimate = estimate.replace(gate=torch.where(paired[:, None], estimate.gate, Gate.NO_TRACK))
         else:
-            samples = self._front_end(frame)
+            samples = self.method.look(frame)
             estimate, fit = _silent(samples), None
         found = merge(samples, estimate)
         tokens, known = patch_tokens(
@@ -178,12 +172,6 @@ class ExtendDepth(torch.nn.Module):
             problem = torch.where(bad, Problem.UNREADABLE, problem)
         return {**added, "problem": problem}
 
-    def _front_end(self, frame: Frame) -> Samples:
-        like = frame.camera.f
-        uv = self.seats["sample"](frame.hw, self.n, device=like.device, dtype=like.dtype)
-        samples: Samples = self.seats["classify"](frame, self.seats["backproject"](frame, uv))
-        return samples
-
     def _seeds(self, sample: Mapping[str, Any], batch: int) -> int | Tensor:
         if self.index_key is None:
             return self.seed
@@ -198,7 +186,7 @@ class ExtendDepth(torch.nn.Module):
     def _blank(self, hw: tuple[int, int]) -> dict[str, Tensor]:
         """What is added to a sample that cannot be read: zeros of the usual shapes."""
         rows, columns = grid(hw, patch=self.patch, tokens_hw=self.tokens_hw)
-        n, p = self.n, rows * columns
+        n, p = self.method.n, rows * columns
         sizes = {"uv": (n, 2), "xyz": (n, 3), "depth": (n,), "sigma": (n,), "score": (n,), "T_1_from_0": (4, 4)}
         sizes |= {"pose_cov": (6, 6), "tokens": (p, len(CHANNELS))}
         out = {key: torch.zeros(1, *size) for key, size in sizes.items()}
@@ -234,21 +222,3 @@ def _silent(samples: Samples) -> Estimate:
     nan = torch.full_like(samples.depth, torch.nan)
     zero, code = torch.zeros_like(samples.depth), torch.zeros_like(samples.flag)
     return Estimate(samples.uv, nan, nan, nan, zero, zero, code, zero, code + Gate.NO_TRACK)
-
-
-def _option(method: Callable[..., Any], name: str, default: Any = None) -> Any:
-    """The value a method has for an option, that of a partial included."""
-    known = inspect.signature(method).parameters.get(name)
-    found = default if known is None or known.default is inspect.Parameter.empty else known.default
-    if found is None:
-        raise ValueError(f"the method has no default for {name}: give {name}")
-    return found
-
-
-def _modules(method: Any) -> Iterator[torch.nn.Module]:
-    """The networks in the seats of a method."""
-    if isinstance(method, torch.nn.Module):
-        yield method
-    elif isinstance(method, partial):
-        for part in (method.func, *method.args, *method.keywords.values()):
-            yield from _modules(part)

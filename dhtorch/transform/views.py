@@ -68,6 +68,7 @@ class Views:
     confidence: str | None = None  # key of the sensor's confidence: 0 low, 1 medium, 2 high
     other_image: str | None = None  # key of the other view's image; None = another frame along time
     other_intrinsics: Numbers | None = None  # None = those of the anchor
+    sparse: bool = False  # the depth map is a projected LiDAR sweep, mostly empty between returns
     at: int = -1  # the anchor's place along time
     other_at: int | Sequence[int] = 0  # the other view's; several are for a method of many views
     layout: str | None = None  # "hwc" or "chw"; None = the axis of 1 or 3 is C, an error where that fits both
@@ -110,6 +111,8 @@ class Views:
                 raise SampleError(f"{self.confidence}: found {_size(conf)}, expected {_size(depth)} as {self.depth}")
         camera = self._camera(leaves, self.intrinsics, hw, T, at, checks)
         anchor = Frame(images[:, at], depth, camera, self._depth_camera(leaves, depth, hw, T, at), conf)
+        if self.sparse:
+            anchor = anchor.replace(sparse=torch.ones(len(depth), dtype=torch.bool, device=depth.device))
         other, paired = self._other(leaves, images, depths, anchor, checks)
         if other is not None:  # tracking reads all pixels, the front end alone a few where they lie
             anchor = anchor.replace(image=anchor.image.contiguous())

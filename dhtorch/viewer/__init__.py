@@ -93,7 +93,7 @@ def _looked(
     scene = look(recording, parts["method"], parts["pairs"], common, most=settings["most"], progress=progress)
     limit = common.cutoff_of(recording)
     hidden = limit is not None and limit != float("inf")
-    facts = {"samples": f"{parts['method'].keywords.get('n', '?')} in each pair"}
+    facts = {"samples": f"{parts['method'].n} in each pair"}
     facts["sensor"] = f"returns beyond {limit:g} m were held back" if hidden else "all returns were used"
     return replace(scene, facts={**facts, **scene.facts})
 

@@ -15,6 +15,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from dhtorch import archive
+
 #: Group of the settings → modules whose public functions it may name.
 NAMED = {
     "data": (
@@ -23,10 +25,10 @@ NAMED = {
     ),
     "pairs": ("dhtorch.data.pairs",),
     "method": (
-        *("dhtorch.pair", "dhtorch.window", "dhtorch.geometry.epipolar", "dhtorch.baselines.opencv"),
+        *("dhtorch.method", "dhtorch.geometry.epipolar", "dhtorch.baselines.opencv"),
         *(
             f"dhtorch.stages.{name}"
-            for name in ("sample", "backproject", "holes", "track", "pose", "triangulate", "score")
+            for name in ("sample", "backproject", "holes", "track", "pose", "triangulate", "score", "fuse")
         ),
     ),
 }
@@ -43,7 +45,7 @@ def parts(result: Mapping[str, Any], root: str | Path | None = None) -> dict[str
         ValueError: the settings name a function that is none of :data:`NAMED`, or one that takes other options.
         OSError: its data are not there.
     """
-    config = result["config"]
+    config = archive.today(result["config"])
     for group in NAMED:
         if not isinstance(config.get(group), Mapping):
             raise ValueError(f"result.config.{group}: found {config.get(group)!r}, expected settings with a _target_")
@@ -79,13 +81,10 @@ def _built(node: Any, group: str, where: str) -> Any:
     if "_target_" not in node:
         return options
     function = _function(node["_target_"], group, where)
-    try:
-        known = inspect.signature(function).bind_partial(**options).signature.parameters
+    try:  # an option that the function has not would be seen only when it is called, with another message
+        inspect.signature(function).bind_partial(**options)
     except TypeError as error:
         raise ValueError(f"result.config.{where}: {error}") from error
-    # A result file holds null for what is infinite: where null is no option the default is meant.
-    unlimited = [k for k, v in options.items() if v is None and k in known and known[k].default == math.inf]
-    options = {k: v for k, v in options.items() if k not in unlimited}
     return partial(function, **options) if node.get("_partial_") else function(**options)
 
 

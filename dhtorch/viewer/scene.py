@@ -6,11 +6,9 @@ can show it without torch.
 
 from __future__ import annotations
 
-import inspect
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,7 +21,7 @@ from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.lookup import nearest
 from dhtorch.pair import merge
-from dhtorch.records import Camera, Estimate, Frame, Pose
+from dhtorch.records import Camera, Frame, Pose
 
 #: Points of a depth map that are shown, drawn at random: enough to know the place, few enough for a page.
 DENSE = 12_000
@@ -113,7 +111,7 @@ class Scene:
 
 def look(
     recording: Any,
-    method: Callable[..., Estimate],
+    method: Method,
     pairs: Pairs,
     settings: Settings,
     *,
@@ -124,7 +122,7 @@ def look(
 
     Args:
         recording: one scene, see ``dhtorch.data``.
-        method: :func:`dhtorch.pair.extend` or :func:`dhtorch.window.extend_window`, or a partial of one.
+        method: of one other view or several.
         pairs: recording → list of (anchor, other).
         settings: cutoff, seed, device, batch, workers.
         most: pairs that are shown; of more, as many spread evenly.
@@ -144,21 +142,10 @@ def look(
         shots.append(_shot(answer, list(views)))
         return {}
 
-    seen = Protocol({"view": Variant(_explicit(method))}, columns=keep, min_candidates=0)
+    seen = Protocol({"view": Variant(method)}, columns=keep, min_candidates=0)
     protocol.run([recording], seen, lambda r: _spread(pairs(r), most), settings, progress=progress)
     path = None if recording.poses is None else recording.poses.t.detach().cpu().numpy()
     return Scene(recording.name, shots, list(views.values()), path)
-
-
-def _explicit(method: Callable[..., Estimate]) -> Method:
-    """The method as settings name it: a partial in which every option and every seat can be read and changed."""
-    given = method if isinstance(method, partial) else partial(method)
-    known = inspect.signature(given.func).parameters.values()
-    options = {p.name: p.default for p in known if p.default is not p.empty} | given.keywords
-    for unset in ("fit", "trace", "seed"):
-        options.pop(unset, None)
-    seats = {k: partial(v) if inspect.isfunction(v) else v for k, v in options.items()}
-    return partial(given.func, *given.args, **seats)
 
 
 def _shot(answer: Answer, shown: Sequence[int]) -> Shot:

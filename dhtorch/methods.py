@@ -1,0 +1,43 @@
+"""Methods by name: the paper's, and pose and abstention by what the errors must be."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from dhtorch.method import Method
+from dhtorch.stages.pose import map_pose
+from dhtorch.stages.score import rank_by_error
+from dhtorch.stages.track import lucas_kanade_affine
+from dhtorch.stages.triangulate import two_view
+
+#: The paper's method and parameters; P3P instead of EPnP as the minimal solver is the one stated difference.
+PAPER = Method()
+
+#: The paper's method as a function of two frames.
+extend = PAPER
+
+#: Pose from near and far tracks together, a sigma in metres for every answer, and silence where that is too large.
+#: Tracks are registered once more with an affine window; the pose starts from the paper's. Its constants were chosen on
+#: ``data=shared_scenes`` and on the built-in rooms: figures on these are not figures on scenes that it has not seen.
+MAP = PAPER.replace(
+    track=partial(lucas_kanade_affine, levels=5),  # one more than the paper: motions are larger than 30 px
+    pose=map_pose,
+    triangulate=partial(
+        two_view,
+        min_parallax_deg=None,  # sigma says it
+        max_sigma_rel=0.2,
+        min_t_snr=30.0,
+        max_mismatch_px=10.0,
+        fitted_noise=True,
+        mismatch_px=2.0,
+        residual_px=0.5,
+        round_trip_px=0.4,
+        sensor_share=1.0,
+    ),
+    score=rank_by_error,
+)
+
+#: ``MAP`` for several views of one anchor: each view a pair, their inverse depths fused where they agree.
+WINDOW = MAP.replace(views=5)
+
+METHODS = {"paper": PAPER, "map": MAP, "window": WINDOW}

@@ -1,0 +1,123 @@
+"""The seat beside the line: what several views of one anchor say about its samples, joined into one answer."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dhtorch.codes import Gate, first_reason
+from dhtorch.geometry.shapes import check
+from dhtorch.records import Estimate
+
+#: Least share of a variance that is put down to the point's own track, whatever the pose's part.
+OWN_SHARE = 1e-3
+
+
+def inverse_variance(
+    estimates: Estimate,  # (V, B, N), one per view
+    *,
+    min_views: int = 2,
+    max_chi2: float = 9.0,
+    correlation: float = 1.0,
+    max_sigma_rel: float | None = 0.1,
+    max_still: float = 0.5,
+) -> Estimate:
+    """Join the answers of several views of the same samples; where they contradict each other, say nothing.
+
+    Errors of triangulation are even in inverse depth, not in depth, so inverse depths are averaged, each by its own
+    inverse variance. What the views disagree by is asked twice: more than ``max_chi2`` variances per degree of freedom
+    silences the point, and a smaller excess over one widens its sigma.
+
+    Args:
+        min_views: fewer answering views (or all, where there are not so many) make no answer.
+        max_chi2: sum of squared differences from the mean, in variances, per view beyond the first.
+        correlation: of the views' own errors, which share the anchor's window. At 1 sigma is the weighted mean of the
+            views', at 0 it shrinks with the root of their number. The poses' parts are always taken to be common to the
+            views: all poses rest on the same near returns.
+        max_sigma_rel: sigma / depth of the fused answer above which it is withheld; None asks nothing. Views may answer
+            far less surely than that.
+        max_still: share of the views without a baseline above which none is believed: the few that found one where the
+            camera hardly moved have most likely taken something else for it.
+
+    Returns:
+        Estimate (B, N); a single view's as it is. ``n_views`` counts the anchor; ``parallax_deg`` is the largest of
+        all views, ``residual_px`` the weighted rms of those that answered (of none: the last view's); ``score`` is 1
+        where answered.
+
+    Gates: NO_BASELINE for all points of an anchor whose views mostly have none; with too few views, the reason of the
+    last view that is silent; INCONSISTENT, UNCERTAIN.
+
+    Raises:
+        ValueError: wrong shapes, or no view.
+
+    Gradient: depth and sigma to those of the views; gates carry none.
+    Cost: linear in views.
+    """
+    V = check("inverse_variance", gate=(estimates.gate, "V B N"), depth=(estimates.depth, "V B N"))["V"]
+    if V < 1:
+        raise ValueError("inverse_variance: expected at least one view")
+    if V == 1:
+        return estimates[0]
+    said = estimates.keep & (estimates.depth > 0) & (estimates.sigma > 0) & estimates.sigma.isfinite()
+    inverse, own, shared = _inverse_depth(estimates, said)
+    variance = own * own + shared * shared
+    weight = torch.where(said, 1 / variance, torch.zeros_like(variance))
+    total = weight.sum(0)
+    weight = weight / torch.where(total > 0, total, torch.ones_like(total))
+    n = said.sum(0)
+    mean = (weight * inverse).sum(0)
+    mean = torch.where(n > 0, mean, torch.ones_like(mean))
+    chi2 = torch.where(said, (inverse - mean).square() / variance, torch.zeros_like(variance)).sum(0)
+    chi2 = chi2 / (n - 1).clamp_min(1)
+    widening = chi2.clamp_min(1)
+    own_2 = correlation * (weight * own).sum(0).square() + (1 - correlation) * (weight * own).square().sum(0)
+    shared_2 = (weight * shared).sum(0).square() * widening
+    depth = 1 / mean
+    sigma = depth * depth * (own_2 * widening + shared_2).sqrt()
+    unsure = torch.zeros_like(n, dtype=torch.bool) if max_sigma_rel is None else sigma > max_sigma_rel * depth
+    gate = first_reason((~(chi2 <= max_chi2), Gate.INCONSISTENT), (unsure, Gate.UNCERTAIN))
+    gate = torch.where(n < min(max(min_views, 1), V), _last_reason(estimates.gate, said), gate)
+    still = (estimates.gate == Gate.NO_BASELINE).any(-1).sum(0) > max_still * V
+    gate = torch.where(still[:, None], Gate.NO_BASELINE, gate).to(torch.int32)
+    keep = gate == Gate.ANSWER
+    residual_px = torch.where(said, estimates.residual_px, torch.zeros_like(estimates.residual_px))
+    residual_px = _root((weight * residual_px.square()).sum(0)).to(estimates.depth.dtype)
+
+    def answer(x: Tensor) -> Tensor:
+        return torch.where(keep, x, torch.full_like(x, torch.nan)).to(estimates.depth.dtype)
+
+    return Estimate(
+        uv=estimates.uv[-1],
+        depth=answer(depth),
+        sigma=answer(sigma),
+        sigma_shared=answer(depth * depth * _root(shared_2)),
+        parallax_deg=estimates.parallax_deg.amax(0),
+        residual_px=torch.where(n > 0, residual_px, estimates.residual_px[-1]),
+        n_views=(n + 1).to(torch.int32),
+        score=keep.to(estimates.depth.dtype),
+        gate=gate,
+    )
+
+
+def _inverse_depth(estimates: Estimate, said: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Inverse depth and the own and shared parts of its standard deviation, float64; 1 where nothing was said."""
+    one = torch.ones_like(estimates.depth)
+    inverse = 1 / torch.where(said, estimates.depth, one).double()
+    whole = torch.where(said, estimates.sigma, one).double() * inverse * inverse
+    shared = torch.where(said, estimates.sigma_shared, 0 * one).double() * inverse * inverse
+    own = (whole.square() - shared.square()).clamp_min(OWN_SHARE * whole.square()).sqrt()
+    return inverse, own, shared
+
+
+def _last_reason(gate: Tensor, said: Tensor) -> Tensor:
+    """Gate (B, N) of the last of the views (V, B, N) that did not answer."""
+    reason = torch.full_like(gate[0], Gate.INCONSISTENT)
+    for code, answered in zip(gate, said, strict=True):
+        reason = torch.where(answered | (code == Gate.ANSWER), reason, code)
+    return reason
+
+
+def _root(x: Tensor) -> Tensor:
+    """Square root with a finite gradient at zero."""
+    positive = x > 0
+    return torch.where(positive, torch.where(positive, x, torch.ones_like(x)).sqrt(), torch.zeros_like(x))
