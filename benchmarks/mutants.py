@@ -39,7 +39,19 @@ from faults.rows import Fault
 ROOT = Path(__file__).resolve().parents[1]
 
 #: Folders and files of the package that faults are planted in.
-PLACES = ("stages", "geometry", "method", "methods", "pair", "window", "evaluate", "transform", "archive", "extract")
+PLACES = (
+    "stages",
+    "geometry",
+    "method",
+    "methods",
+    "pair",
+    "window",
+    "evaluate",
+    "transform",
+    "closure",
+    "archive",
+    "extract",
+)
 
 #: What the tests of a trial leave in its tree.
 FAILURE, TIMES = "first_failure.txt", "seconds.json"

@@ -19,6 +19,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from dhtorch import closure
+
 SCHEMA = 1
 
 VERDICTS = ("supported", "refuted", "undecided")
@@ -261,23 +263,24 @@ def finished(path: str | Path, key: str) -> bool:
         return False
 
 
-def result_key(config: Mapping[str, Any], digest: str, *, code_dir: str | Path | None = None) -> str:
-    """SHA-256 over everything that decides a result: the settings, the code and the data.
+def result_key(
+    config: Mapping[str, Any], digest: str, *, roots: Iterable[str] = (), code_dir: str | Path | None = None
+) -> str:
+    """SHA-256 over everything that decides a result: the settings, the code that they reach, and the data.
 
     Args:
         config: resolved settings; the options in ``UNKEYED`` are left out at every depth, and of an absolute file
             name only what :func:`portable` keeps counts.
         digest: of the data, from :func:`data_digest`.
-        code_dir: the folder whose ``**/*.py`` and ``calibration/*.json`` count; None = this package.
+        roots: modules that take part beside those that the settings name.
+        code_dir: the folder of this package; None = where this file lies.
     """
     settings = json.dumps(_keyed(portable(config)), sort_keys=True, default=str)
     total = hashlib.sha256()
     for text in (settings, digest):
         _add(total, text.encode())
-    folder = Path(__file__).parent if code_dir is None else Path(code_dir)
-    parts = [*folder.rglob("*.py"), *folder.glob("calibration/*.json")]
-    for file in sorted(parts, key=lambda f: f.relative_to(folder).as_posix()):
-        _add(total, file.relative_to(folder).as_posix().encode())
+    for name, file in closure.reached([*closure.targets(config), *roots], code_dir).items():
+        _add(total, name.encode())
         _add(total, file.read_bytes())
     return total.hexdigest()
 

@@ -224,7 +224,7 @@ def _result(settings: Mapping[str, Any], sources: Sequence[Any], rows: list[Row]
     threads = torch.get_num_threads()
     return archive.build(
         experiment="integrate",
-        key=archive.result_key({**config, "choices": choices}, digest),
+        key=archive.result_key({**config, "choices": choices}, digest, roots=[__name__]),
         meta=archive.meta(device=settings["device"], dtype=settings["dtype"], threads=threads, seed=settings["seed"]),
         config=config,
         data={

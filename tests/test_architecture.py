@@ -12,7 +12,7 @@ import dhtorch
 
 ROOT = Path(dhtorch.__file__).parent
 LEVELS = [
-    {"tree", "codes", "archive", "console"},
+    {"tree", "codes", "closure", "archive", "console"},
     {"geometry"},
     {"records"},
     {"stages", "negative", "data", "evaluate"},
@@ -30,6 +30,7 @@ SIDEWAYS = {
     ("run", "job"),
     ("run", "report"),
     ("job", "report"),
+    ("archive", "closure"),
     ("method", "pair"),  # when it is called
     ("method", "window"),
     ("run", "capture"),

@@ -192,9 +192,11 @@ def test_rows_may_hold_what_an_experiment_needs(tmp_path):
 def test_the_key_is_of_settings_code_and_data(tmp_path):
     code = tmp_path / "code"
     (code / "sub").mkdir(parents=True)
-    (code / "a.py").write_text("x = 1\n")
+    (code / "a.py").write_text("from dhtorch.sub import b\n")
+    (code / "sub" / "__init__.py").write_text("")
     (code / "sub" / "b.py").write_text("y = 1\n")
     config = {"seed": 0, "device": "cpu", "data": {"root": "/data/a", "gap": 2}, "resume": False, "limit": math.inf}
+    config |= {"method": {"_target_": "dhtorch.a.function"}}
     key = lambda c=config, d="digest": archive.result_key(c, d, code_dir=code)  # noqa: E731
     first = key()
     assert first == key({**config, "device": "cuda", "resume": True, "data": {"gap": 2, "root": "/data/b"}})
@@ -207,16 +209,13 @@ def test_the_key_is_of_settings_code_and_data(tmp_path):
         key({**config, "limit": None}),
         key(d="x"),
     }
-    (code / "note.txt").write_text("not code")
+    (code / "c.py").write_text("nobody asks for it")
     assert first == key()
     (code / "sub" / "b.py").write_text("y = 2\n")
     others.add(key())
-    (code / "sub" / "b.py").rename(code / "sub" / "c.py")
+    (code / "sub" / "table.json").write_text("{}")
     others.add(key())
-    (code / "calibration").mkdir()
-    (code / "calibration" / "map.json").write_text("{}")
-    others.add(key())
-    assert first not in others and len(others) == 7, "a table that scores are read from decides a result as code does"
+    assert first not in others and len(others) == 6, "a table that scores are read from decides a result as code does"
     archive.validate({**result(), "key": archive.result_key(config, "")})
 
 
@@ -538,28 +537,25 @@ def test_code_counts_by_name_and_content(tmp_path):
     def key(**files):
         folder = tmp_path / str(len(list(tmp_path.iterdir())))
         folder.mkdir()
-        for name, text in files.items():
-            path = folder / name.replace("__", "/").replace("_", ".")
+        for name, text in {"sub____init___py": "", **files}.items():
+            path = folder / name.replace("__init__", "@").replace("__", "/").replace("_", ".").replace("@", "__init__")
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text)
-        return archive.result_key({}, "d", code_dir=folder)
+        return archive.result_key({}, "d", roots=["dhtorch.a", "dhtorch.sub.b", "dhtorch.c"], code_dir=folder)
 
-    first = key(a_py="1", sub__b_py="2", calibration__m_json="3")
-    assert first == key(sub__b_py="2", calibration__m_json="3", a_py="1"), "the folder's own place does not count"
-    assert first == key(a_py="1", sub__b_py="2", calibration__m_json="3", x_json="4", sub__y_txt="5", sub__z_json="6")
+    first = key(a_py="1", sub__b_py="2", sub__m_json="3")
+    assert first == key(sub__b_py="2", sub__m_json="3", a_py="1"), "the folder's own place does not count"
+    assert first == key(a_py="1", sub__b_py="2", sub__m_json="3", x_json="4", other__y_json="5", d_py="6")
     others = [
-        key(a_py="0", sub__b_py="2", calibration__m_json="3"),
-        key(a_py="1", sub__b_py="0", calibration__m_json="3"),
-        key(a_py="1", sub__b_py="2", calibration__m_json="0"),
-        key(a_py="1", b_py="2", calibration__m_json="3"),
-        key(c_py="1", sub__b_py="2", calibration__m_json="3"),
-        key(a_py="1", sub__b_py="2", calibration__n_json="3"),
+        key(a_py="0", sub__b_py="2", sub__m_json="3"),
+        key(a_py="1", sub__b_py="0", sub__m_json="3"),
+        key(a_py="1", sub__b_py="2", sub__m_json="0"),
+        key(c_py="1", sub__b_py="2", sub__m_json="3"),
+        key(a_py="1", sub__b_py="2", sub__n_json="3"),
         key(a_py="1", sub__b_py="2"),
-        key(a_py="2", sub__b_py="1", calibration__m_json="3"),
+        key(a_py="2", sub__b_py="1", sub__m_json="3"),
     ]
-    assert len({first, *others}) == 9
-    here = archive.result_key({}, "d")
-    assert here == archive.result_key({}, "d", code_dir=Path(archive.__file__).parent) != first
+    assert len({first, *others}) == 8
 
 
 def test_a_result_names_no_place_of_this_machine(tmp_path):

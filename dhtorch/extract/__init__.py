@@ -159,7 +159,7 @@ def _shared(settings: Mapping[str, Any], options: Options, whole: plan.Plan, row
             "version": made["versions"]["dhtorch"],
             "git": made["git"],
             "versions": made["versions"],
-            "key": archive.result_key({**config, "name": name, "format": FORMAT}, digest),
+            "key": archive.result_key({**config, "name": name, "format": FORMAT}, digest, roots=[Rows.__module__]),
             "config": archive.portable(config),
             "data": {"name": name, "digest": digest, "recordings": len(whole.episodes), "frames": len(whole)},
             "columns": {k: c._asdict() for k, c in rows.wanted.items()},

@@ -1,0 +1,144 @@
+"""Which code a job can reach: editing that makes its result another one, editing anything else does not."""
+
+import ast
+import shutil
+import sys
+from pathlib import Path
+
+import hydra
+import pytest
+from omegaconf import OmegaConf
+
+import dhtorch
+from dhtorch import archive, closure
+from dhtorch.run import config_dir, job_name
+
+ROOT = Path(dhtorch.__file__).parent
+FILES = sorted(ROOT.rglob("*.py"))
+
+
+def settings(*overrides):
+    OmegaConf.register_new_resolver("dhtorch.job_name", job_name, replace=True)
+    with hydra.initialize_config_dir(str(config_dir()), version_base="1.3", job_name="dhtorch"):
+        return OmegaConf.to_container(hydra.compose("run", list(overrides)), resolve=True)
+
+
+@pytest.fixture
+def package(tmp_path):
+    """A copy of the package that may be edited."""
+    return Path(shutil.copytree(ROOT, tmp_path / "dhtorch", ignore=shutil.ignore_patterns("__pycache__")))
+
+
+def edit(path):
+    assert path.is_file()
+    path.write_bytes(path.read_bytes() + b"\n# edited\n")
+
+
+MAIN = ("data=synthetic",)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "path", "counts"),
+    [
+        (MAIN, "stages/track.py", True),
+        (MAIN, "stages/fuse.py", True),
+        (MAIN, "geometry/se3.py", True),
+        (MAIN, "pair.py", True),  # imported when a method is called
+        (MAIN, "data/room.py", True),
+        (MAIN, "experiments/protocol.py", True),
+        (MAIN, "evaluate/risk.py", True),
+        (MAIN, "viewer/scene.py", False),
+        (MAIN, "viewer/html.py", False),
+        (MAIN, "experiments/icp.py", False),
+        (MAIN, "negative/icp.py", False),
+        (MAIN, "extract/rows.py", False),
+        (MAIN, "report/page.py", False),
+        (MAIN, "run.py", False),
+        (MAIN, "calibration/map.json", False),
+        ((*MAIN, "experiment=icp"), "experiments/icp.py", True),
+        ((*MAIN, "experiment=icp"), "negative/icp.py", True),
+        ((*MAIN, "experiment=icp"), "experiments/heldout.py", False),
+        ((*MAIN, "method=opencv"), "baselines/opencv.py", True),
+        (MAIN, "baselines/opencv.py", False),
+    ],
+)
+def test_a_result_is_another_one_when_what_it_reaches_is_edited(package, overrides, path, counts):
+    config = settings(*overrides)
+    before = archive.result_key(config, "d", code_dir=package)
+    edit(package / path)
+    assert (archive.result_key(config, "d", code_dir=package) != before) == counts
+
+
+def test_tables_that_travel_with_a_module_count_with_it(package):
+    config = settings(*MAIN)
+    node = {"_target_": "dhtorch.calibration.probability", "name": "map"}
+    config["method"]["score"]["recalibration"] = node
+    before = archive.result_key(config, "d", code_dir=package)
+    edit(package / "calibration" / "map.json")
+    assert archive.result_key(config, "d", code_dir=package) != before
+    assert not any(name.endswith((".pyc", ".css")) for name in closure.reached(closure.targets(config), package))
+
+
+def test_further_roots_count(package):
+    config = {"method": {"_target_": "dhtorch.method.Method"}}
+    roots = {"roots": ["dhtorch.extract.rows"], "code_dir": package}
+    before = archive.result_key(config, "d", **roots)
+    assert before != archive.result_key(config, "d", code_dir=package)
+    edit(package / "extract" / "rows.py")
+    assert before != archive.result_key(config, "d", **roots)
+
+
+def test_names_are_those_of_modules_functions_and_packages():
+    reach = lambda *names: set(closure.reached(names))  # noqa: E731
+    assert reach("dhtorch.codes.Gate") == reach("dhtorch.codes") == {"__init__.py", "codes.py"}
+    assert {"geometry/__init__.py", "geometry/se3.py", "tree.py"} <= reach("dhtorch.geometry.se3.exp")
+    assert reach("dhtorch.nothing", "dhtorch.nowhere.at.all") == {"__init__.py"} and reach("nobody.knows") == set()
+    assert reach() == set() and list(closure.reached(["dhtorch.records"])) == sorted(
+        closure.reached(["dhtorch.records"])
+    )
+
+
+def test_somebody_elses_function_counts_and_what_it_takes_from_here(tmp_path, monkeypatch):
+    (tmp_path / "their_tracker.py").write_text("from dhtorch.stages import track\n\ndef follow(): ...\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    found = closure.reached(["their_tracker.follow"])
+    assert found["elsewhere:their_tracker"] == tmp_path / "their_tracker.py"
+    assert {"stages/track.py", "geometry/lucas_kanade.py"} <= set(found) and "window.py" not in found
+    config = {"track": {"_target_": "their_tracker.follow"}}
+    before = archive.result_key(config, "d")
+    edit(tmp_path / "their_tracker.py")
+    assert archive.result_key(config, "d") != before
+    sys.modules.pop("their_tracker", None)
+
+
+def written(path):
+    """Names that a file imports of the package, read with the grammar."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name.split(".")[0] == "dhtorch")
+        elif isinstance(node, ast.ImportFrom) and node.module.split(".")[0] == "dhtorch":
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def test_no_import_of_the_package_is_missed():
+    for path in FILES:
+        found, expected = set(closure.imported(path.read_text(encoding="utf-8"))), set(written(path))
+        assert expected <= found, path
+        assert not found - expected or '"""' in path.read_text(encoding="utf-8"), "an example in a docstring"
+    told = "from dhtorch.a import (\n    b,  # a note\n    c as d,\n)\n\ndef f():\n    import dhtorch.e\n    from dhtorch import g\n"
+    assert list(closure.imported(told)) == [
+        "dhtorch.a",
+        "dhtorch.a.b",
+        "dhtorch.a.c",
+        "dhtorch.e",
+        "dhtorch",
+        "dhtorch.g",
+    ]
+
+
+def test_nothing_is_imported_by_a_name_that_is_made_at_run_time():
+    """Such an import would be out of reach: but of the package's own doors, and of modules that settings name."""
+    allowed = {"__init__.py", "run.py", "viewer/again.py", "data/files.py"}
+    users = {p.relative_to(ROOT).as_posix() for p in FILES if "import_module(" in p.read_text(encoding="utf-8")}
+    assert users <= allowed
