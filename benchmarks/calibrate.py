@@ -20,10 +20,10 @@ import torch
 from hydra.utils import instantiate
 
 from dhtorch import calibration, tree
+from dhtorch.commands.run import config_dir
 from dhtorch.data.pairs import by_gap
 from dhtorch.evaluate import recalibrate
-from dhtorch.experiments import protocol
-from dhtorch.run import config_dir
+from dhtorch.studies import protocol
 
 HERE = Path(__file__).resolve().parent
 

@@ -24,9 +24,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from dhtorch.baselines import dinov2
 from dhtorch.codes import Flag, Hole
-from dhtorch.data.synthetic import SyntheticRoom
 from dhtorch.evaluate import holdout
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.lookup import luma
@@ -34,6 +32,8 @@ from dhtorch.records import Frame, Samples
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.holes import classify
 from dhtorch.stages.sample import spiral
+from dhtorch.studies.baselines import dinov2
+from dhtorch.synthetic.recording import SyntheticRoom
 
 SIZES = {"224": (224, 224), "1440": (1440, 1920)}
 

@@ -29,15 +29,15 @@ import torch
 from torch import Tensor
 
 from dhtorch import data
-from dhtorch.baselines import opencv
 from dhtorch.data.pairs import by_gap
-from dhtorch.data.synthetic import SyntheticRoom
 from dhtorch.geometry import lucas_kanade as lk
 from dhtorch.geometry.lookup import luma
 from dhtorch.geometry.pyramid import Pyramid, Pyramids, build_pyramid
 from dhtorch.records import TrackHint
 from dhtorch.stages import track
 from dhtorch.stages.sample import spiral
+from dhtorch.studies.baselines import opencv
+from dhtorch.synthetic.recording import SyntheticRoom
 
 #: Real pairs: folder, near limit, gap; all 640x480.
 SCENES = (

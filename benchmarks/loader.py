@@ -29,10 +29,10 @@ import torch
 from torch.utils.data import DataLoader, Dataset, default_collate
 
 from dhtorch import data, extend
-from dhtorch.baselines import dinov2, opencv
-from dhtorch.data.synthetic import SyntheticRoom
 from dhtorch.geometry import camera as cam
 from dhtorch.stages import triangulate
+from dhtorch.studies.baselines import dinov2, opencv
+from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.transform import ExtendDepth, one_thread
 
 SIDE = 224

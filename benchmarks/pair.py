@@ -20,13 +20,13 @@ import harness
 import torch
 
 from dhtorch import data, extend, tree
-from dhtorch.baselines import opencv
 from dhtorch.data.pairs import by_gap
-from dhtorch.data.synthetic import SyntheticRoom
 from dhtorch.evaluate import errors, holdout
 from dhtorch.methods import MAP, PAPER
 from dhtorch.records import Frame
 from dhtorch.stages import triangulate
+from dhtorch.studies.baselines import opencv
+from dhtorch.synthetic.recording import SyntheticRoom
 
 #: Ours, by name.
 OURS = {"paper": PAPER, "map": MAP}

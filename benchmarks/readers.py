@@ -26,7 +26,7 @@ from typing import Any
 import torch
 
 from dhtorch import archive, data
-from dhtorch.data import writers
+from dhtorch import testing as writers
 from dhtorch.data.stacks import FocalStack
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3

@@ -20,8 +20,8 @@ import mutants
 import speed_tables
 
 from dhtorch import archive
-from dhtorch.experiments import method_comparison
-from dhtorch.report import Table, layouts, text
+from dhtorch.studies.compare import method_comparison
+from dhtorch.studies.report import Table, layouts, text
 
 HERE = Path(__file__).resolve().parent
 README = HERE.parent / "README.md"
@@ -157,8 +157,8 @@ def picture(path: Path) -> None:
 
     from dhtorch import extend, merge
     from dhtorch.codes import Source
-    from dhtorch.data.synthetic import SyntheticRoom
     from dhtorch.evaluate import holdout
+    from dhtorch.synthetic.recording import SyntheticRoom
 
     torch.set_num_threads(1)
     recording = SyntheticRoom()

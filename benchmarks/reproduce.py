@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from dhtorch import archive
-from dhtorch.run import config_dir, job_name
+from dhtorch.commands.run import config_dir, job_name
 
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results"

@@ -22,14 +22,14 @@ import torch
 from torch.nn.functional import interpolate
 
 from dhtorch import tree
-from dhtorch.data.synthetic import SyntheticRoom
 from dhtorch.evaluate import holdout
-from dhtorch.experiments.memory import peak_mib
 from dhtorch.geometry import camera as cam
 from dhtorch.methods import METHODS, PAPER
 from dhtorch.pair import uniform_draws
 from dhtorch.records import Frame
 from dhtorch.stages.pose import pnp_ransac
+from dhtorch.studies.memory import peak_mib
+from dhtorch.synthetic.recording import SyntheticRoom
 
 #: The largest exponent that counts as proportional.
 MOST = 1.05

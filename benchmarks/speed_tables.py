@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from dhtorch.report import Table, text
+from dhtorch.studies.report import Table, text
 
 RESULTS = Path(__file__).resolve().parent / "results"
 

@@ -2,6 +2,6 @@
 
 import sys
 
-from dhtorch.run import main
+from dhtorch.commands.run import main
 
 sys.exit(main())

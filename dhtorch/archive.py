@@ -39,11 +39,34 @@ EDGE_BYTES = 64 * 1024
 #: Options that say nothing about a result to its reader.
 _PLACES = ("hydra", "output")
 
-#: Function that an older result names → where it is found now.
+#: Function or module that an older result names → where it is found now.
 ALIASES = {
     "dhtorch.pair.extend": "dhtorch.method.Method",
     "dhtorch.window.extend_window": "dhtorch.method.Method",
     "dhtorch.window.inverse_variance": "dhtorch.stages.fuse.inverse_variance",
+    "dhtorch.data.synthetic": "dhtorch.synthetic.recording",
+    "dhtorch.data.synthetic_robot": "dhtorch.synthetic.robot",
+    "dhtorch.data.stress": "dhtorch.synthetic.stress",
+    "dhtorch.data.viewpoints": "dhtorch.synthetic.viewpoints",
+    "dhtorch.experiments.pair": "dhtorch.studies.pair",
+    **{
+        f"dhtorch.experiments.{study}": f"dhtorch.studies.{wing}.{study}"
+        for wing, studies in {
+            "paper": (
+                *("ablation", "calibration", "device_pose", "gate_ablation", "global_map", "heldout", "hole_census"),
+                *("latency", "motion", "range_split", "real_holes"),
+            ),
+            "compare": ("learned", "method_comparison", "opencv_twin", "part_ablation"),
+            "negative": ("helix_correlation", "hole_attention", "icp"),
+            "focal": ("defocus", "defocus_fusion", "focus_stack"),
+            "probes": ("learned_score", "rh20t_probe", "vo_probe"),
+        }.items()
+        for study in studies
+    },
+    **{
+        f"dhtorch.baselines.{name}": f"dhtorch.studies.baselines.{name}"
+        for name in ("dinov2", "dust3r", "opencv", "vggt")
+    },
 }
 
 #: Function → options that older results do not name, as they were.
@@ -56,7 +79,7 @@ IMPLIED: dict[str, dict[str, Any]] = {
             **{"correlation": 1.0, "max_sigma_rel": 0.1, "max_still": 0.5},
         },
     },
-    "dhtorch.experiments.helix_correlation.run": {"turns": None, "foveation": 1.0, "gaze": None},
+    "dhtorch.studies.negative.helix_correlation.run": {"turns": None, "foveation": 1.0, "gaze": None},
 }
 
 #: Ends the name of a file that is being written.
@@ -150,13 +173,16 @@ def today(settings: Any) -> Any:
     if not isinstance(settings, Mapping):
         return settings
     said = {key: today(value) for key, value in settings.items()}
-    name = said.get("_target_")
-    said |= {"_target_": ALIASES[name]} if name in ALIASES else {}
-    if said.get("_target_") == "dhtorch.method.Method":
+    if not isinstance(said.get("_target_"), str):
+        return said
+    name = said["_target_"]
+    home, _, last = name.rpartition(".")
+    said["_target_"] = ALIASES.get(name) or f"{ALIASES.get(home, home)}.{last}"
+    if said["_target_"] == "dhtorch.method.Method":
         said.pop("_partial_", None)  # a method was a function with its options bound, and is a record
     if name == "dhtorch.stages.backproject.backproject" and said.get("search_px") == 0:
         said["search_px"] = None  # as far as the frame asks for
-    return {**IMPLIED.get(str(said.get("_target_")), {}), **said}
+    return {**IMPLIED.get(said["_target_"], {}), **said}
 
 
 def strict(value: Any) -> Any:

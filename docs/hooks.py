@@ -27,7 +27,7 @@ import readme as tables  # noqa: E402
 from docstrings import markdown as as_markdown  # noqa: E402
 
 import dhtorch  # noqa: E402
-from dhtorch import run  # noqa: E402
+from dhtorch.commands import run  # noqa: E402
 
 #: Words of the command with a help text of their own.
 WORDS = ("", "inspect", "report", "extract", "integrate", "view")
@@ -111,9 +111,13 @@ def _home(name: str, value: Any) -> str:
 
 def _module(file: Path) -> str:
     """mkdocstrings' block for a module: what is defined in it and is public, not what it imports."""
-    dotted = ".".join(file.relative_to(REPO).with_suffix("").parts).removesuffix(".__init__")
+    dotted = _dotted(file)
     members = json.dumps(list(_public(_tree(file))))
     return f"::: {dotted}\n    options:\n      members: {members}\n"
+
+
+def _dotted(file: Path) -> str:
+    return ".".join(file.relative_to(REPO).with_suffix("").parts).removesuffix(".__init__")
 
 
 def _public(tree: ast.Module) -> Iterator[str]:
@@ -243,13 +247,13 @@ def codes() -> str:
 def asked() -> dict[str, dict[str, str]]:
     """Experiment → question, idea, expectation and refutation, as its docstring has them."""
     found = {}
-    for file in sorted((PACKAGE / "experiments").glob("*.py")):
+    for file in sorted((PACKAGE / "studies").rglob("*.py"), key=lambda p: p.stem):
         text = ast.get_docstring(_tree(file)) or ""
         if text.startswith("Question:"):
             said = _ASKED.fullmatch(text)
             if not said:
                 raise ValueError(f"{file}: expected a question, an expectation and what would refute it")
-            found[file.stem] = {k: v.strip() for k, v in said.groupdict().items()}
+            found[file.stem] = {k: v.strip() for k, v in said.groupdict().items()} | {"module": _dotted(file)}
     return found
 
 
@@ -268,7 +272,7 @@ def experiments() -> str:
         texts.append(
             f"## {name}\n\n**{question}**\n\n{idea}**{said['when']}.** {said['expectation']}\n\n"
             f"**What would refute it.** {said['refutation']}\n\nArchived answers: {answer}. "
-            f"Code: [`dhtorch.experiments.{name}`][dhtorch.experiments.{name}]."
+            f"Code: [`{said['module']}`][{said['module']}]."
         )
     return "\n".join(rows) + "\n\n" + as_markdown("\n\n".join(texts))
 

@@ -23,9 +23,9 @@ from typing import Any
 
 import torch
 
-from dhtorch.baselines import opencv
 from dhtorch.method import Method
 from dhtorch.methods import METHODS
+from dhtorch.studies.baselines import opencv
 
 FOLDER = Path(__file__).resolve().parent.parent / "conf" / "method"
 

@@ -5,7 +5,7 @@ import random
 from dhtorch import archive
 from dhtorch.codes import Gate, Hole, names
 from dhtorch.evaluate import errors
-from dhtorch.experiments.rows import summarise
+from dhtorch.studies.rows import summarise
 
 SCENES = ("kitchen_000", "office_desk", "terrace/CAMERA_01", "lab_rotation")
 ROLES = {"lab_rotation": "rotation"}

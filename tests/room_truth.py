@@ -2,7 +2,7 @@
 
 import torch
 
-from dhtorch.data.room import furnished_room
+from dhtorch.synthetic.room import furnished_room
 
 
 def room_distance(xyz):

@@ -2,7 +2,7 @@
 
 from functools import cache
 
-from dhtorch.data.synthetic import SyntheticRoom
+from dhtorch.synthetic.recording import SyntheticRoom
 
 
 @cache

@@ -5,8 +5,8 @@ from functools import cache
 import numpy as np
 import torch
 
-from dhtorch.data.synthetic import SyntheticRoom
 from dhtorch.geometry import camera as cam
+from dhtorch.synthetic.recording import SyntheticRoom
 
 GAP = 6
 SIDE = 112

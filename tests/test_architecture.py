@@ -15,27 +15,27 @@ LEVELS = [
     {"tree", "codes", "closure", "archive", "console"},
     {"geometry"},
     {"records"},
-    {"stages", "negative", "data", "evaluate"},
+    {"stages", "data", "evaluate", "export", "synthetic", "testing", "calibration"},
     {"method"},
-    {"pair", "window", "integrate", "export", "calibration", "methods"},
-    {"transform", "extract", "experiments", "figures", "baselines"},
-    {"run", "job", "mapping", "report", "viewer", "capture", "__main__"},
+    {"pair", "window", "methods", "drawing"},
+    {"transform", "integrate", "extract"},
+    {"studies", "viewer"},
+    {"commands", "__main__"},
 ]
 LEVEL = {name: level for level, group in enumerate(LEVELS) for name in group}
 SIDEWAYS = {
-    ("window", "pair"),
-    ("extract", "transform"),
-    ("experiments", "transform"),
-    ("experiments", "baselines"),
-    ("run", "job"),
-    ("run", "report"),
-    ("job", "report"),
     ("archive", "closure"),
+    ("synthetic", "data"),
+    ("synthetic", "testing"),
+    ("testing", "data"),
+    ("calibration", "evaluate"),
     ("method", "pair"),  # when it is called
     ("method", "window"),
-    ("run", "capture"),
-    ("run", "viewer"),
-    ("__main__", "run"),
+    ("window", "pair"),
+    ("drawing", "pair"),
+    ("extract", "transform"),
+    ("viewer", "studies"),  # it shows what a protocol answers
+    ("__main__", "commands"),
 }
 FILES = sorted(ROOT.rglob("*.py"))
 
@@ -70,8 +70,8 @@ def test_imports_go_down_only(path):
         there = pieces[1]
         assert there in LEVEL, f"{path}: imports {name}, which has no floor"
         if there == here:
-            same_file = here in {"stages", "negative", "baselines", "experiments"} and len(pieces) > 2
-            assert not (same_file and here == "stages" and pieces[2] != path.stem), f"{path}: a stage imports a stage"
+            alike = here != "stages" or len(pieces) == 2 or pieces[2] == path.stem
+            assert alike, f"{path}: a stage imports a stage"
             continue
         allowed = LEVEL[there] < LEVEL[here] or (here, there) in SIDEWAYS
         assert allowed, f"{path}: imports {name} from floor {LEVEL[there]}, stands on {LEVEL[here]}"
@@ -79,7 +79,11 @@ def test_imports_go_down_only(path):
 
 @pytest.mark.parametrize(
     ("library", "homes"),
-    [("cv2", {"data/files.py", "baselines/opencv.py"}), ("hydra", {"run.py"}), ("omegaconf", {"run.py"})],
+    [
+        ("cv2", {"data/files.py", "studies/baselines/opencv.py"}),
+        ("hydra", {"commands/run.py"}),
+        ("omegaconf", {"commands/run.py"}),
+    ],
 )
 def test_libraries_stay_at_home(library, homes):
     users = {str(p.relative_to(ROOT)) for p in FILES if any(n.split(".")[0] == library for n, _ in imported(p))}
@@ -98,7 +102,7 @@ def test_heavy_libraries_are_not_imported_with_the_package():
     "words", [["--version"], ["--help"], ["sede=1"], ["view", "--help"], ["extract", "mehtod=map"]]
 )
 def test_help_and_misspelt_options_are_answered_before_torch_is_loaded(words):
-    code = "import atexit, sys\nfrom dhtorch import run\n"
+    code = "import atexit, sys\nfrom dhtorch.commands import run\n"
     code += "atexit.register(lambda: print('torch' in sys.modules, 'kornia' in sys.modules))\n"
     code += f"run.main({words})"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

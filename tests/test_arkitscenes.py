@@ -15,14 +15,15 @@ from box import CAMERA, HW, check_same, disagreement, off_wall, render, world_po
 from omegaconf import OmegaConf
 
 from dhtorch import data
-from dhtorch.data import FormatError, arkitscenes, ca1m, clocks, convert, writers
-from dhtorch.data.writers import parts
+from dhtorch import testing as writers
+from dhtorch.commands.run import config_dir
+from dhtorch.data import FormatError, arkitscenes, ca1m, clocks, convert
 from dhtorch.evaluate import holdout
-from dhtorch.experiments.protocol import PairData
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame, Pose
-from dhtorch.run import config_dir
+from dhtorch.studies.protocol import PairData
+from dhtorch.testing import parts
 
 VGA_HW = (96, 128)
 VGA = Camera(torch.tensor([[124.0, 115.5]]), torch.tensor([[68.25, 43.25]]))  # not quite the small camera, scaled

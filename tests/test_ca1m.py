@@ -17,10 +17,13 @@ from box import CAMERA, HW, check_same, disagreement, off_wall, render, world_po
 from test_arkitscenes import VGA, VGA_HW, shots
 
 from dhtorch import data
-from dhtorch.data import FormatError, ca1m, codec_tar, codec_tiff, writers
-from dhtorch.data.writers.ca1m import float_tiff
+from dhtorch import testing as writers
+from dhtorch.data import FormatError, ca1m
+from dhtorch.data.codecs import tarballs as codec_tar
+from dhtorch.data.codecs import tiff as codec_tiff
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame
+from dhtorch.testing.ca1m import float_tiff
 
 LASER_HW = (72, 96)
 LASER = Camera(torch.tensor([[92.0, 86.0]]), torch.tensor([[50.5, 31.0]]))

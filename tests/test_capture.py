@@ -19,8 +19,11 @@ from box import HW, pose, render
 from rich.console import Console
 from test_focal_stacks import stack
 
-from dhtorch import capture, data, run
-from dhtorch.data import FormatError, writers
+from dhtorch import data
+from dhtorch import testing as writers
+from dhtorch.commands import inspect as capture
+from dhtorch.commands import run
+from dhtorch.data import FormatError
 from dhtorch.data.recording import Recording
 from dhtorch.data.survey import Survey, survey_recording, survey_stacks
 from dhtorch.geometry import se3

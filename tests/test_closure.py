@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 
 import dhtorch
 from dhtorch import archive, closure
-from dhtorch.run import config_dir, job_name
+from dhtorch.commands.run import config_dir, job_name
 
 ROOT = Path(dhtorch.__file__).parent
 FILES = sorted(ROOT.rglob("*.py"))
@@ -44,22 +44,22 @@ MAIN = ("data=synthetic",)
         (MAIN, "stages/fuse.py", True),
         (MAIN, "geometry/se3.py", True),
         (MAIN, "pair.py", True),  # imported when a method is called
-        (MAIN, "data/room.py", True),
-        (MAIN, "experiments/protocol.py", True),
+        (MAIN, "synthetic/room.py", True),
+        (MAIN, "studies/protocol.py", True),
         (MAIN, "evaluate/risk.py", True),
         (MAIN, "viewer/scene.py", False),
         (MAIN, "viewer/html.py", False),
-        (MAIN, "experiments/icp.py", False),
-        (MAIN, "negative/icp.py", False),
+        (MAIN, "studies/negative/icp.py", False),
+        (MAIN, "studies/negative/registration.py", False),
         (MAIN, "extract/rows.py", False),
-        (MAIN, "report/page.py", False),
-        (MAIN, "run.py", False),
+        (MAIN, "studies/report/page.py", False),
+        (MAIN, "commands/run.py", False),
         (MAIN, "calibration/map.json", False),
-        ((*MAIN, "experiment=icp"), "experiments/icp.py", True),
-        ((*MAIN, "experiment=icp"), "negative/icp.py", True),
-        ((*MAIN, "experiment=icp"), "experiments/heldout.py", False),
-        ((*MAIN, "method=opencv"), "baselines/opencv.py", True),
-        (MAIN, "baselines/opencv.py", False),
+        ((*MAIN, "experiment=icp"), "studies/negative/icp.py", True),
+        ((*MAIN, "experiment=icp"), "studies/negative/registration.py", True),
+        ((*MAIN, "experiment=icp"), "studies/paper/heldout.py", False),
+        ((*MAIN, "method=opencv"), "studies/baselines/opencv.py", True),
+        (MAIN, "studies/baselines/opencv.py", False),
     ],
 )
 def test_a_result_is_another_one_when_what_it_reaches_is_edited(package, overrides, path, counts):
@@ -139,6 +139,6 @@ def test_no_import_of_the_package_is_missed():
 
 def test_nothing_is_imported_by_a_name_that_is_made_at_run_time():
     """Such an import would be out of reach: but of the package's own doors, and of modules that settings name."""
-    allowed = {"__init__.py", "run.py", "viewer/again.py", "data/files.py"}
+    allowed = {"__init__.py", "viewer/again.py", "data/files.py", "commands/run.py"}
     users = {p.relative_to(ROOT).as_posix() for p in FILES if "import_module(" in p.read_text(encoding="utf-8")}
     assert users <= allowed

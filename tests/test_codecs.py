@@ -12,9 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dhtorch.data import codec_exr, codec_lzfse, codec_video, files
+from dhtorch.data import files
+from dhtorch.data.codecs import exr as codec_exr
+from dhtorch.data.codecs import lzfse as codec_lzfse
+from dhtorch.data.codecs import video as codec_video
 from dhtorch.data.files import FormatError
-from dhtorch.data.writers.mp4 import write_video
+from dhtorch.testing.mp4 import write_video
 
 lzfse = pytest.importorskip("lzfse")
 OpenEXR = pytest.importorskip("OpenEXR")

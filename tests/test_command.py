@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from dhtorch import archive
-from dhtorch.data import writers
-from dhtorch.data.synthetic import SyntheticRoom
-from dhtorch.run import main
+from dhtorch import testing as writers
+from dhtorch.commands.run import main
+from dhtorch.synthetic.recording import SyntheticRoom
 
 TINY = ["data.hw=[120,160]", "data.n_frames=3", "pairs.gap=2", "method.n=1024"]
 

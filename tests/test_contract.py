@@ -10,7 +10,6 @@ import torch
 from contract import PROMISES, Row, equal, leaves, reorder, take, tensor_map
 
 from dhtorch import method, pair, window
-from dhtorch.baselines.device_pose import given_pose
 from dhtorch.evaluate import holdout, probe
 from dhtorch.geometry import (
     affine,
@@ -30,9 +29,11 @@ from dhtorch.geometry import (
     steady,
     thin_lens,
 )
-from dhtorch.negative import defocus, defocus_fusion, focus_stack, helix_correlation, hole_attention, icp
 from dhtorch.records import Camera, Frame, Samples, Tracks
 from dhtorch.stages import backproject, holes, pose, score, track, triangulate
+from dhtorch.studies.baselines.device_pose import given_pose
+from dhtorch.studies.focal import blur, filling, sharpness
+from dhtorch.studies.negative import arms, clusters, registration
 
 HW = (48, 64)
 FEW = 11  # points; no other axis of any answer is as long
@@ -256,7 +257,7 @@ def stacks(batch, n, dtype):
 
 def blurs(batch, n, dtype):
     image = uniform(batch, 1, *HW, dtype=torch.float64, seed=7).round().to(dtype)
-    return defocus.local_blur(filters.gaussian(torch.nn.functional.avg_pool2d(image, 5, 1, 2), 1.0))
+    return blur.local_blur(filters.gaussian(torch.nn.functional.avg_pool2d(image, 5, 1, 2), 1.0))
 
 
 def sensed(batch, n, dtype):
@@ -267,7 +268,7 @@ def sensed(batch, n, dtype):
 
 def filled(batch, n, dtype):
     coarse, _ = sensed(batch, n, dtype)
-    return defocus_fusion.bilinear(coarse, HW), coarse, blurs(batch, n, dtype)
+    return filling.bilinear(coarse, HW), coarse, blurs(batch, n, dtype)
 
 
 def wrong_last_axis(position):
@@ -374,11 +375,11 @@ ROWS = [
     Row(holdout.half, lambda b, n, d: (sampled(b, n, d)[1], 3), "dtype batch empty raises", (0,), bad=lambda a: (a[0].replace(trackability=a[0].trackability[:, 1:]), a[1])),
     Row(holdout.without_returns, lambda b, n, d: (sampled(b, n, d)[1], torch.rand(b, n, generator=generator(3)) < 0.5), ALL, (0, 1), (0,), bad=lambda a: (a[0], a[1][:, 1:])),
     Row(holdout.drop_outs, lambda b, n, d: (*sampled(b, n, d), holdout.truth_at(*frames(b, n, d))), "dtype batch vmap capture empty raises", (1, 2), bad=lambda a: (a[0], a[1], a[2].replace(depth=a[2].depth[:, 1:]))),
-    Row(helix_correlation.read_arm, lambda b, n, d: (frames(b, n, d)[0].image, pixels(1, n, d)[0]), "dtype batch capture gradcheck raises", grad=(0, 1), shared=(1,), bad=wrong_last_axis(1)),
-    Row(helix_correlation.correlate, waves, "dtype batch vmap capture gradcheck empty shuffle padding raises", (2, 3), (0, 1), bad=wrong_last_axis(3)),
-    Row(with_options(icp.register, iterations=5), registered, "dtype batch vmap capture shuffle raises", (0,), bad=wrong_last_axis(0)),
-    Row(with_options(icp.normals, neighbours=4), lambda b, n, d: registered(b, n, d)[:1], "dtype batch vmap capture shuffle raises", (0,), bad=wrong_last_axis(0)),
-    Row(hole_attention.largest_cluster, clustered, "dtype batch vmap capture shuffle raises", (0, 1), bad=wrong_last_axis(0)),
+    Row(arms.read_arm, lambda b, n, d: (frames(b, n, d)[0].image, pixels(1, n, d)[0]), "dtype batch capture gradcheck raises", grad=(0, 1), shared=(1,), bad=wrong_last_axis(1)),
+    Row(arms.correlate, waves, "dtype batch vmap capture gradcheck empty shuffle padding raises", (2, 3), (0, 1), bad=wrong_last_axis(3)),
+    Row(with_options(registration.register, iterations=5), registered, "dtype batch vmap capture shuffle raises", (0,), bad=wrong_last_axis(0)),
+    Row(with_options(registration.normals, neighbours=4), lambda b, n, d: registered(b, n, d)[:1], "dtype batch vmap capture shuffle raises", (0,), bad=wrong_last_axis(0)),
+    Row(clusters.largest_cluster, clustered, "dtype batch vmap capture shuffle raises", (0, 1), bad=wrong_last_axis(0)),
     Row(holdout.candidates, judged, "dtype batch vmap capture empty shuffle raises", (0, 1), bad=lambda a: (a[0], a[1].replace(depth=a[1].depth[:, 1:]), a[2])),
     Row(filters.separable, lambda b, n, d: (frames(b, n, d)[0].image, [0.25, 0.5, 0.25], [-0.5, 0.0, 0.5]), POINTLESS + " raises", grad=(0,), bad=lambda a: (a[0][0], *a[1:])),
     Row(filters.gaussian, lambda b, n, d: (frames(b, n, d)[0].image, 1.2), POINTLESS + " raises", grad=(0,), bad=lambda a: (a[0][0], a[1])),
@@ -386,22 +387,22 @@ ROWS = [
     Row(thin_lens.spot_gain, lambda b, n, d: (lenses(b, d), uniform(b, 3, dtype=d, low=1, high=4)), POINTLESS + " raises", grad=(0, 1), bad=lambda a: (a[0], a[1][:, 0])),
     Row(thin_lens.spot_diameter, lambda b, n, d: (lenses(b, d), uniform(b, n, dtype=d, low=1, high=4), uniform(b, dtype=d, low=1, high=4, seed=1)), ALL, (1,), (0, 1, 2), bad=lambda a: (a[0], a[1], a[2][None])),
     Row(thin_lens.depth_of_spot, lambda b, n, d: (lenses(b, d), uniform(b, n, dtype=d, low=-2, high=0.5), uniform(b, dtype=d, low=1, high=2, seed=1)), ALL, (1,), (0, 1, 2), bad=lambda a: (a[0], a[1], a[2][None]), leaks=True),
-    Row(defocus.local_blur, lambda b, n, d: (shifted(b, n, d)[0],), "dtype batch vmap capture raises", bad=lambda a: (a[0][0],), slow="capture"),
-    Row(defocus.inverse_depth, lambda b, n, d: (blurs(b, n, d), torch.ones(b, *HW, dtype=d), lenses(b, d), uniform(b, dtype=d, low=1, high=2)), "dtype batch vmap capture raises", bad=wrong_last_axis(1)),
-    Row(defocus.side_by_height, lambda b, n, d: (blurs(b, n, d),), "dtype vmap capture"),
-    Row(defocus.side_by_colour, lambda b, n, d: (frames(b, n, d)[0].image,), "dtype batch vmap capture raises", bad=lambda a: (a[0][:, :2],), slow="capture"),
-    Row(focus_stack.sharpness, lambda b, n, d: (stacks(b, n, d),), POINTLESS + " raises", grad=(0,), bad=lambda a: (a[0][0],)),
-    Row(focus_stack.sharpest, lambda b, n, d: (focus_stack.sharpness(stacks(b, n, d)),), "dtype batch vmap capture raises", bad=lambda a: (a[0][0],)),
-    Row(focus_stack.depth_at, lambda b, n, d: (uniform(b, *HW, dtype=d, high=3), torch.tensor([0.5, 1.0, 2.0, 4.0], dtype=d).expand(b, 4)), "dtype batch gradcheck raises", grad=(0, 1), bad=lambda a: (a[0][0], a[1])),
-    Row(focus_stack.align, lambda b, n, d: (stacks(b, n, d),), "dtype raises", bad=lambda a: (a[0][0],)),
+    Row(blur.local_blur, lambda b, n, d: (shifted(b, n, d)[0],), "dtype batch vmap capture raises", bad=lambda a: (a[0][0],), slow="capture"),
+    Row(blur.inverse_depth, lambda b, n, d: (blurs(b, n, d), torch.ones(b, *HW, dtype=d), lenses(b, d), uniform(b, dtype=d, low=1, high=2)), "dtype batch vmap capture raises", bad=wrong_last_axis(1)),
+    Row(blur.side_by_height, lambda b, n, d: (blurs(b, n, d),), "dtype vmap capture"),
+    Row(blur.side_by_colour, lambda b, n, d: (frames(b, n, d)[0].image,), "dtype batch vmap capture raises", bad=lambda a: (a[0][:, :2],), slow="capture"),
+    Row(sharpness.sharpness, lambda b, n, d: (stacks(b, n, d),), POINTLESS + " raises", grad=(0,), bad=lambda a: (a[0][0],)),
+    Row(sharpness.sharpest, lambda b, n, d: (sharpness.sharpness(stacks(b, n, d)),), "dtype batch vmap capture raises", bad=lambda a: (a[0][0],)),
+    Row(sharpness.depth_at, lambda b, n, d: (uniform(b, *HW, dtype=d, high=3), torch.tensor([0.5, 1.0, 2.0, 4.0], dtype=d).expand(b, 4)), "dtype batch gradcheck raises", grad=(0, 1), bad=lambda a: (a[0][0], a[1])),
+    Row(sharpness.align, lambda b, n, d: (stacks(b, n, d),), "dtype raises", bad=lambda a: (a[0][0],)),
     Row(probe.moments, probed, "vmap capture gradcheck empty raises", grad=(0, 1), bad=lambda a: (a[0][:, 1:], a[1])),
     Row(probe.join, lambda b, n, d: (probe.moments(*probed(b, n, d)), probe.moments(*probed(b, n + 2, d))), "vmap capture gradcheck empty raises", grad=(0, 1), bad=lambda a: (a[0], probe.columns(a[1], torch.tensor([0])))),
     Row(probe.ridge, lambda b, n, d: (probe.moments(*probed(b, n, d)), torch.tensor([0.1, 1.0], dtype=d)), "capture gradcheck empty raises", grad=(1,), bad=lambda a: (a[0], torch.ones(2, 3))),
     Row(probe.predict, solved, "vmap capture gradcheck empty raises", grad=(0, 1), bad=wrong_last_axis(1)),
-    Row(defocus_fusion.bilinear, lambda b, n, d: (sensed(b, n, d)[0], HW), "dtype batch vmap capture raises", bad=lambda a: (a[0][0], a[1])),
-    Row(defocus_fusion.joint_bilateral, sensed, "dtype vmap capture gradcheck raises", grad=(1,), bad=lambda a: (a[0][0], a[1]), slow="capture"),
-    Row(defocus_fusion.guided_filter, sensed, "dtype batch vmap capture gradcheck raises", grad=(1,), bad=lambda a: (a[0][0], a[1])),
-    Row(defocus_fusion.defocus_guided, filled, "dtype vmap capture raises", bad=wrong_last_axis(0), slow="capture"),
+    Row(filling.bilinear, lambda b, n, d: (sensed(b, n, d)[0], HW), "dtype batch vmap capture raises", bad=lambda a: (a[0][0], a[1])),
+    Row(filling.joint_bilateral, sensed, "dtype vmap capture gradcheck raises", grad=(1,), bad=lambda a: (a[0][0], a[1]), slow="capture"),
+    Row(filling.guided_filter, sensed, "dtype batch vmap capture gradcheck raises", grad=(1,), bad=lambda a: (a[0][0], a[1])),
+    Row(filling.defocus_guided, filled, "dtype vmap capture raises", bad=wrong_last_axis(0), slow="capture"),
 ]  # fmt: skip
 
 #: Functions without a batch of points: samplers, loops over a callable, flat lists of pooled points. Their promises are
@@ -412,6 +413,8 @@ ELSEWHERE = {
     *(f"dhtorch.geometry.cells.{name}" for name in ("occupied", "components")),
     *(f"dhtorch.integrate.volume.{name}" for name in ("empty", "fuse", "splat")),
     *(f"dhtorch.integrate.surface.{name}" for name in ("points", "mesh")),
+    "dhtorch.integrate.picture.draw_map",
+    *(f"dhtorch.integrate.mapping.{name}" for name in ("make", "run", "write")),
     *(
         f"dhtorch.integrate.recording.{name}"
         for name in ("ask", "place", "chain", "build", "coverage", "sensed", "recovered")
@@ -598,15 +601,17 @@ def test_wrong_shapes_raise(row):
 # ---------------------------------------------------------------------------------------------------- completeness
 
 
+#: Estimators of the laboratory that keep the promises of a stage.
+ESTIMATORS = (arms, clusters, registration, blur, filling, sharpness)
+
+
 def public_functions():
-    for package in ("geometry", "stages", "evaluate", "negative", "integrate"):
+    parts = [method, pair, window, *ESTIMATORS]
+    for package in ("geometry", "stages", "evaluate", "integrate"):
         module = importlib.import_module(f"dhtorch.{package}")
-        for info in pkgutil.iter_modules(module.__path__, f"dhtorch.{package}."):
-            part = importlib.import_module(info.name)
-            for name, fn in inspect.getmembers(part, inspect.isfunction):
-                if not name.startswith("_") and fn.__module__ == info.name:
-                    yield f"{info.name}.{name}"
-    for part in (method, pair, window):
+        found = pkgutil.iter_modules(module.__path__, f"dhtorch.{package}.")
+        parts += [importlib.import_module(info.name) for info in found]
+    for part in parts:
         for name, fn in inspect.getmembers(part, inspect.isfunction):
             if not name.startswith("_") and fn.__module__ == part.__name__:
                 yield f"{part.__name__}.{name}"

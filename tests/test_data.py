@@ -19,13 +19,15 @@ from box import BOX, CAMERA, HW, check_same, disagreement, hit, off_wall, pose, 
 from torch.utils.data import DataLoader
 
 from dhtorch import data, tree
-from dhtorch.data import codec_numpy, convert, driving, files, frames_dir, rectified, tum, writers
+from dhtorch import testing as writers
+from dhtorch.data import convert, driving, files, frames_dir, rectified, tum
+from dhtorch.data.codecs import npy as codec_numpy
 from dhtorch.data.files import FormatError
 from dhtorch.data.recording import numbers
-from dhtorch.data.writers import parts
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Pose
+from dhtorch.testing import parts
 
 # ------------------------------------------------------------------------------------------------ written, then read
 

@@ -5,15 +5,15 @@ import math
 import pytest
 import torch
 
-from dhtorch.data.synthetic import SyntheticRoom
-from dhtorch.data.thin_lens import lens_of, photograph
-from dhtorch.data.viewpoints import open_viewpoints
-from dhtorch.experiments import defocus as experiment
-from dhtorch.experiments.protocol import Outcome, Settings
 from dhtorch.geometry.filters import gaussian
 from dhtorch.geometry.thin_lens import depth_of_spot, spot_diameter, spot_gain
-from dhtorch.negative.defocus import Blur, inverse_depth, local_blur, side_by_colour, side_by_height
 from dhtorch.records import Pose
+from dhtorch.studies.focal import defocus as experiment
+from dhtorch.studies.focal.blur import Blur, inverse_depth, local_blur, side_by_colour, side_by_height
+from dhtorch.studies.protocol import Outcome, Settings
+from dhtorch.synthetic.recording import SyntheticRoom
+from dhtorch.synthetic.thin_lens import lens_of, photograph
+from dhtorch.synthetic.viewpoints import open_viewpoints
 
 
 def edge(angle_deg=0.0, contrast=0.8):

@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from dhtorch.data.viewpoints import open_viewpoints
-from dhtorch.experiments import defocus_fusion as experiment
-from dhtorch.experiments.protocol import Outcome, Settings
-from dhtorch.negative.defocus import Blur
-from dhtorch.negative.defocus_fusion import bilinear, defocus_guided, guided_filter, joint_bilateral
+from dhtorch.studies.focal import defocus_fusion as experiment
+from dhtorch.studies.focal.blur import Blur
+from dhtorch.studies.focal.filling import bilinear, defocus_guided, guided_filter, joint_bilateral
+from dhtorch.studies.protocol import Outcome, Settings
+from dhtorch.synthetic.viewpoints import open_viewpoints
 
 
 def plane(h=70, w=84):

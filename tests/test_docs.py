@@ -48,7 +48,7 @@ def text_of(page):
 def test_there_is_a_page_for_every_promise(site):
     _, pages = site
     assert {f"{p.stem}.html" for p in DOCS.glob("*.md")} <= set(pages)
-    for module in ("pair", "stages", "geometry", "transform", "data", "experiments", "report"):
+    for module in ("pair", "stages", "geometry", "transform", "data", "studies", "synthetic"):
         assert f"api/{module}.html" in pages
 
 

@@ -12,11 +12,12 @@ from rooms import room as rendered
 
 from dhtorch import archive, data
 from dhtorch.codes import Gate, names
+from dhtorch.commands.run import config_dir
 from dhtorch.data.pairs import by_gap
-from dhtorch.data.synthetic import SyntheticRoom
-from dhtorch.experiments import opencv_twin, pair, protocol
-from dhtorch.run import config_dir
 from dhtorch.stages.track import lucas_kanade
+from dhtorch.studies import pair, protocol
+from dhtorch.studies.compare import opencv_twin
+from dhtorch.synthetic.recording import SyntheticRoom
 
 ROOT = os.environ.get("DHTORCH_DATA")
 

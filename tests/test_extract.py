@@ -21,11 +21,11 @@ from pyarrow import parquet
 
 import dhtorch
 from dhtorch import data, extract
-from dhtorch.data import writers
-from dhtorch.data.synthetic import SyntheticRoom
+from dhtorch import testing as writers
+from dhtorch.commands.run import config_dir, main
 from dhtorch.extract import Features, JoinedDataset, columns, engines, shards
 from dhtorch.geometry import camera as cam
-from dhtorch.run import config_dir, main
+from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.transform import ExtendDepth, ExtendedDataset, Problem
 
 HW, GAP, N, NEAR = (72, 96), 2, 128, 2.5

@@ -114,8 +114,8 @@ def test_a_killed_driver_resumes_with_another_engine(tmp_path):
 
 
 def test_a_corrupt_frame_and_a_missing_cluster_are_one_line(tmp_path):
-    from dhtorch.data import writers  # noqa: PLC0415
-    from dhtorch.data.synthetic import SyntheticRoom  # noqa: PLC0415
+    from dhtorch import testing as writers  # noqa: PLC0415
+    from dhtorch.synthetic.recording import SyntheticRoom  # noqa: PLC0415
 
     room = SyntheticRoom(hw=(60, 80), n_frames=6, lidar="exact", supersample=1)
     writers.write_counted_frames(tmp_path / "set", [room[i] for i in range(6)])

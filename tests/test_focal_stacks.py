@@ -15,8 +15,13 @@ import tifffile
 import torch
 from torch import Tensor
 
-from dhtorch import data, run
-from dhtorch.data import FormatError, codec_hdf5, codec_numpy, codec_tiff, ddff12, fod500, image_folder, writers
+from dhtorch import data
+from dhtorch import testing as writers
+from dhtorch.commands import run
+from dhtorch.data import FormatError, ddff12, fod500, image_folder
+from dhtorch.data.codecs import hdf5 as codec_hdf5
+from dhtorch.data.codecs import npy as codec_numpy
+from dhtorch.data.codecs import tiff as codec_tiff
 from dhtorch.data.light_field import refocus
 from dhtorch.data.stacks import FocalStack, Stacks
 

@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from dhtorch import data
-from dhtorch.data import writers
+from dhtorch import testing as writers
 from dhtorch.data.stacks import FocalStack
-from dhtorch.data.thin_lens import lens_of, photograph
-from dhtorch.data.viewpoints import open_viewpoints
-from dhtorch.experiments import focus_stack as experiment
-from dhtorch.experiments.protocol import Outcome, Settings
 from dhtorch.geometry.filters import gaussian
-from dhtorch.negative.focus_stack import MEASURES, align, depth_at, sharpest, sharpness
+from dhtorch.studies.focal import focus_stack as experiment
+from dhtorch.studies.focal.sharpness import MEASURES, align, depth_at, sharpest, sharpness
+from dhtorch.studies.protocol import Outcome, Settings
+from dhtorch.synthetic.thin_lens import lens_of, photograph
+from dhtorch.synthetic.viewpoints import open_viewpoints
 
 ROOT = os.environ.get("DHTORCH_DATA")
 

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from dhtorch import PAPER
-from dhtorch.baselines.device_pose import given_pose
 from dhtorch.codes import Gate
 from dhtorch.geometry import se3
 from dhtorch.geometry.pyramid import build_pyramid
@@ -17,6 +16,7 @@ from dhtorch.pair import uniform_draws
 from dhtorch.records import Camera, Estimate, Frame, Samples, TrackHint, Tracks
 from dhtorch.stages.fuse import inverse_variance
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
+from dhtorch.studies.baselines.device_pose import given_pose
 from dhtorch.tree import stack
 from dhtorch.window import key_views
 

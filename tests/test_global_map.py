@@ -4,9 +4,9 @@ import pytest
 from test_protocols import method, rows
 
 from dhtorch.data.pairs import by_gap
-from dhtorch.data.synthetic import SyntheticRoom
-from dhtorch.experiments import global_map as experiment
-from dhtorch.experiments.protocol import Settings
+from dhtorch.studies.paper import global_map as experiment
+from dhtorch.studies.protocol import Settings
+from dhtorch.synthetic.recording import SyntheticRoom
 
 
 def room(**options):

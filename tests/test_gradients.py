@@ -12,13 +12,13 @@ from torch.func import jacfwd, jacrev, vmap
 from torch.utils import _pytree as pytree
 
 from dhtorch import PAPER, extend, tree
-from dhtorch.data.synthetic import SyntheticRoom
 from dhtorch.evaluate import holdout
 from dhtorch.geometry.lookup import nearest
 from dhtorch.methods import METHODS
 from dhtorch.pair import merge, undistort_tracks, uniform_draws
 from dhtorch.records import Camera
 from dhtorch.stages import backproject, holes, pose, sample, score, track, triangulate
+from dhtorch.synthetic.recording import SyntheticRoom
 
 extend_window = PAPER.replace(views=5)
 

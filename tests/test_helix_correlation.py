@@ -7,9 +7,9 @@ import torch
 from test_protocols import method, room, rows
 
 from dhtorch.data.pairs import by_gap
-from dhtorch.experiments import helix_correlation as experiment
-from dhtorch.experiments.protocol import Settings
-from dhtorch.negative.helix_correlation import correlate, read_arm
+from dhtorch.studies.negative import helix_correlation as experiment
+from dhtorch.studies.negative.arms import correlate, read_arm
+from dhtorch.studies.protocol import Settings
 
 HW = (160, 200)
 CENTRE = torch.tensor([99.5, 79.5])

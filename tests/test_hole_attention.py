@@ -4,10 +4,10 @@ import pytest
 import torch
 from test_protocols import Changed, method, room, rows
 
-from dhtorch.experiments import hole_attention as experiment
-from dhtorch.experiments.protocol import Settings
-from dhtorch.negative.hole_attention import largest_cluster
 from dhtorch.stages.sample import grid, spiral
+from dhtorch.studies.negative import hole_attention as experiment
+from dhtorch.studies.negative.clusters import largest_cluster
+from dhtorch.studies.protocol import Settings
 
 HW = (120, 160)
 

@@ -28,7 +28,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dhtorch import data
-from dhtorch.data import FormatError, codec_pickle, codec_tiff, writers
+from dhtorch import testing as writers
+from dhtorch.data import FormatError
+from dhtorch.data.codecs import pickles as codec_pickle
+from dhtorch.data.codecs import tiff as codec_tiff
 from dhtorch.geometry import se3
 from dhtorch.records import Frame, Pose
 

@@ -6,11 +6,11 @@ import pytest
 import torch
 from test_protocols import Changed, method, room, rows
 
-from dhtorch.experiments import icp as experiment
-from dhtorch.experiments.protocol import Settings
 from dhtorch.geometry import se3
-from dhtorch.negative.icp import normals, register
 from dhtorch.records import Pose
+from dhtorch.studies.negative import icp as experiment
+from dhtorch.studies.negative.registration import normals, register
+from dhtorch.studies.protocol import Settings
 
 
 def surface(n, seed=0, noise=0.0):

@@ -9,13 +9,13 @@ from box import BOX, HW, off_wall, walk
 from room_truth import room_distance
 
 from dhtorch import extend
-from dhtorch.baselines.device_pose import given_pose
 from dhtorch.codes import Source
-from dhtorch.data.synthetic import SyntheticRoom
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import cells, se3
 from dhtorch.integrate import View, empty, fuse, mesh, points, recording, splat
 from dhtorch.records import Camera, Estimate, Pose, Samples, Tracks
+from dhtorch.studies.baselines.device_pose import given_pose
+from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.tree import collate
 
 VOXEL = 0.05

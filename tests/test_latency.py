@@ -8,11 +8,12 @@ import torch
 from rooms import room as rendered
 
 from dhtorch import archive, extend
-from dhtorch.baselines import dinov2
 from dhtorch.data.pairs import by_gap
-from dhtorch.experiments import latency, memory
-from dhtorch.experiments.protocol import Settings
 from dhtorch.stages import score
+from dhtorch.studies import memory
+from dhtorch.studies.baselines import dinov2
+from dhtorch.studies.paper import latency
+from dhtorch.studies.protocol import Settings
 
 TINY = {"hidden": 32, "layers": 2, "heads": 2, "side": 56}
 SIZES = ((48, 64), (96, 128))

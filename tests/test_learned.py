@@ -9,15 +9,15 @@ import pytest
 import torch
 
 from dhtorch import archive, extend
-from dhtorch.baselines import dust3r, relative, vggt
 from dhtorch.codes import Gate
 from dhtorch.data.pairs import by_gap
-from dhtorch.data.synthetic import SyntheticRoom
 from dhtorch.evaluate import holdout
-from dhtorch.experiments import learned
-from dhtorch.experiments.protocol import Settings
 from dhtorch.records import Camera, Frame
 from dhtorch.stages import sample
+from dhtorch.studies.baselines import dust3r, relative, vggt
+from dhtorch.studies.compare import learned
+from dhtorch.studies.protocol import Settings
+from dhtorch.synthetic.recording import SyntheticRoom
 
 PAPER = extend.replace(n=512)
 UNIT = 7.3  # metres per unit of the fake networks

@@ -5,15 +5,15 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
+from dhtorch.commands.run import config_dir
 from dhtorch.data.pairs import by_gap
-from dhtorch.data.synthetic import SyntheticRoom
 from dhtorch.evaluate import bootstrap, holdout, risk
 from dhtorch.evaluate.errors import select
-from dhtorch.experiments import learned_score
-from dhtorch.experiments.learned_score import Lesson, train
-from dhtorch.experiments.protocol import Settings
-from dhtorch.run import config_dir
 from dhtorch.stages.score import EVIDENCE, LearnedScore
+from dhtorch.studies.probes import learned_score
+from dhtorch.studies.probes.learned_score import Lesson, train
+from dhtorch.studies.protocol import Settings
+from dhtorch.synthetic.recording import SyntheticRoom
 
 with initialize_config_dir(str(config_dir()), version_base="1.3"):
     MAP = instantiate(compose("run", ["method=map", "method.n=512"]).method, _convert_="all")

@@ -22,13 +22,14 @@ import pyarrow
 from pyarrow import parquet
 
 from dhtorch import data
-from dhtorch.data import codec_parquet, lerobot_depth, lerobot_rows
-from dhtorch.data.codec_video import close_videos
+from dhtorch.data import lerobot_depth, lerobot_rows
+from dhtorch.data.codecs import parquet as codec_parquet
+from dhtorch.data.codecs.video import close_videos
 from dhtorch.data.files import FormatError
 from dhtorch.data.lerobot_meta import Feature
-from dhtorch.data.writers.lerobot import quantise, write_lerobot
-from dhtorch.data.writers.lossless import write_lossless
 from dhtorch.records import Camera, Frame
+from dhtorch.testing.lerobot import quantise, write_lerobot
+from dhtorch.testing.lossless import write_lossless
 
 KEY = "observation.images.front"
 STEP = {"video": 3e-3, "tiff": 1e-6, "png": 1e-3, "array": 1e-3}  # m, up to 5 m (codes: 2.8 mm there)

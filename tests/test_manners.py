@@ -13,11 +13,12 @@ from pathlib import Path
 import pytest
 
 import dhtorch
-from dhtorch import capture, console
-from dhtorch.data import writers
-from dhtorch.data.synthetic import SyntheticRoom
-from dhtorch.report import page
-from dhtorch.run import EXIT_CODES, config_dir, job_name, main
+from dhtorch import console
+from dhtorch import testing as writers
+from dhtorch.commands import inspect as capture
+from dhtorch.commands.run import EXIT_CODES, config_dir, job_name, main
+from dhtorch.studies.report import page
+from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.viewer import html
 
 ROOT = Path(dhtorch.__file__).parent
@@ -71,7 +72,7 @@ def said(frames, tmp_path_factory):
         ["extract", *ROOM[:-1], "data.gap=2", "extract.tokens_hw=[56,70]", "out=features"],
         ["view", "job", "html=view.html"],
     ]
-    code = "import json, sys; from dhtorch.run import main; print('\\x00', [main(a) for a in json.loads(sys.argv[1])])"
+    code = "import json, sys; from dhtorch.commands.run import main; print('\\x00', [main(a) for a in json.loads(sys.argv[1])])"
     env = {k: v for k, v in os.environ.items() if k not in ("DHTORCH_DATA", console.VERBOSITY)}
     run = [sys.executable, "-c", code, json.dumps(calls)]
     done = subprocess.run(run, cwd=folder, env=env, capture_output=True, text=True, timeout=550, check=False)
@@ -164,7 +165,7 @@ def test_no_color(tmp_path):
     (tmp_path / "set/images/00000.png").rename(tmp_path / "pictures/00000.png")
     (tmp_path / "set/depth/00000.png").rename(tmp_path / "pictures/depth.png")
     code = (
-        "import os, sys; from dhtorch.run import main; argv = ['inspect', 'pictures', '--out', 'sheets']; main(argv);"
+        "import os, sys; from dhtorch.commands.run import main; argv = ['inspect', 'pictures', '--out', 'sheets']; main(argv);"
         "print('=' * 9); os.environ['NO_COLOR'] = '1'; main(argv)"
     )
     mine, theirs = pty.openpty()
@@ -219,7 +220,7 @@ def test_exit_codes(command):
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes end otherwise there")
 def test_a_reader_that_leaves_is_no_error(said):
     folder, _ = said
-    code = "import sys; from dhtorch.run import main; sys.exit(main(['report', 'job', '--markdown']))"
+    code = "import sys; from dhtorch.commands.run import main; sys.exit(main(['report', 'job', '--markdown']))"
     read, write = os.pipe()
     os.close(read)
     done = subprocess.run([sys.executable, "-c", code], cwd=folder, stdout=write, stderr=subprocess.PIPE, check=False)
@@ -335,7 +336,7 @@ def test_no_call_that_windows_lacks():
 
 def test_paths_are_not_taken_apart_as_text():
     """``/`` cuts names of recordings and members of archives, never a path of the system."""
-    names_of_ours = {"experiments/learned_score.py"}
+    names_of_ours = {"studies/probes/learned_score.py"}
     for path in FILES:
         for n in nodes(path):
             if isinstance(n, ast.Constant) and isinstance(n.value, str):

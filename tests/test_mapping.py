@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from dhtorch import archive, mapping, report
-from dhtorch.data import writers
-from dhtorch.data.synthetic import SyntheticRoom
-from dhtorch.run import main
+from dhtorch import archive
+from dhtorch import testing as writers
+from dhtorch.commands.run import main
+from dhtorch.integrate import mapping
+from dhtorch.studies import report
+from dhtorch.synthetic.recording import SyntheticRoom
 
 TINY = [
     "data.hw=[240,320]",

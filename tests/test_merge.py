@@ -10,16 +10,16 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
 from dhtorch import extend
-from dhtorch.baselines.device_pose import given_pose
 from dhtorch.codes import Gate, Source
+from dhtorch.commands.run import config_dir
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.methods import METHODS
 from dhtorch.pair import lifted, merge, undistort_tracks, uniform_draws
 from dhtorch.records import Camera, Estimate, Frame, Samples, Tracks
-from dhtorch.run import config_dir
 from dhtorch.stages import pose, score, triangulate
 from dhtorch.stages.track import lucas_kanade_affine
+from dhtorch.studies.baselines.device_pose import given_pose
 
 HW = (20, 30)
 

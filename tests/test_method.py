@@ -12,8 +12,6 @@ from rooms import room as rendered
 import dhtorch
 from dhtorch import MAP, PAPER, WINDOW, TrackHint, tree
 from dhtorch.data.pairs import by_gap
-from dhtorch.experiments import pair as pairs
-from dhtorch.experiments import protocol
 from dhtorch.extract import plan
 from dhtorch.extract.rows import Rows
 from dhtorch.geometry import camera as cam
@@ -26,6 +24,8 @@ from dhtorch.stages.sample import spiral
 from dhtorch.stages.score import rank
 from dhtorch.stages.track import lucas_kanade
 from dhtorch.stages.triangulate import two_view
+from dhtorch.studies import pair as pairs
+from dhtorch.studies import protocol
 from dhtorch.transform import ExtendDepth
 
 N = 512
@@ -115,7 +115,9 @@ def test_it_runs_in_a_transform_and_in_rows_for_a_data_set(room):
 
 
 def test_it_runs_in_the_viewer_and_its_result_in_the_report(room, tmp_path):
-    from dhtorch import archive, job, report, viewer  # noqa: PLC0415
+    from dhtorch import archive, viewer  # noqa: PLC0415
+    from dhtorch.commands import job  # noqa: PLC0415
+    from dhtorch.studies import report  # noqa: PLC0415
 
     shown = viewer.look(room, PLAIN, partial(by_gap, gap=3), protocol.Settings())
     assert len(shown.shots) == 4 and (shown.shots[0].samples["gate"] == 0).sum() > 20

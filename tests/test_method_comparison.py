@@ -7,12 +7,12 @@ from hydra import compose as compose_settings
 from hydra import initialize_config_dir
 from hydra.utils import instantiate
 
+from dhtorch.commands.run import config_dir
 from dhtorch.data.pairs import by_gap
-from dhtorch.data.synthetic import open_rooms
 from dhtorch.evaluate import compare
-from dhtorch.experiments import method_comparison
-from dhtorch.experiments.protocol import Settings
-from dhtorch.run import config_dir
+from dhtorch.studies.compare import method_comparison
+from dhtorch.studies.protocol import Settings
+from dhtorch.synthetic.recording import open_rooms
 
 
 def method(name="paper"):

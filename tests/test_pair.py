@@ -10,14 +10,14 @@ import torch
 import walls
 
 from dhtorch import data, extend, tree
-from dhtorch.baselines import opencv
-from dhtorch.baselines.device_pose import device_pose, given_pose
 from dhtorch.codes import Flag, Gate, PoseCode, Source
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.methods import METHODS
 from dhtorch.pair import merge
 from dhtorch.stages import triangulate
+from dhtorch.studies.baselines import opencv
+from dhtorch.studies.baselines.device_pose import device_pose, given_pose
 
 ROOT = os.environ.get("DHTORCH_DATA")
 real = [pytest.mark.data, pytest.mark.skipif(not ROOT, reason="DHTORCH_DATA is not set")]

@@ -8,11 +8,11 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from rooms import room
 
+from dhtorch.commands.run import config_dir
 from dhtorch.data.pairs import by_gap
-from dhtorch.experiments import part_ablation
-from dhtorch.experiments.protocol import Settings
 from dhtorch.method import Method
-from dhtorch.run import config_dir
+from dhtorch.studies.compare import part_ablation
+from dhtorch.studies.protocol import Settings
 
 
 @pytest.fixture(scope="module")

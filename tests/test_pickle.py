@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dhtorch.data import codec_pickle
+from dhtorch.data.codecs import pickles as codec_pickle
 from dhtorch.data.files import FormatError
 
 FILE = Path("some.npy")

@@ -15,17 +15,18 @@ import torch
 from room_truth import room_distance
 
 from dhtorch import data
-from dhtorch.baselines import dinov2
-from dhtorch.data import rh20t_set, synthetic_robot
-from dhtorch.data.codec_video import close_videos
-from dhtorch.data.synthetic import SyntheticRoom
+from dhtorch.data import rh20t_set
+from dhtorch.data.codecs.video import close_videos
 from dhtorch.evaluate import probe
-from dhtorch.experiments import front_ends, probing, rh20t_probe, vo_probe
-from dhtorch.experiments.protocol import Outcome, Settings
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.methods import METHODS
-from dhtorch.report.layouts import in_layout
+from dhtorch.studies.baselines import dinov2
+from dhtorch.studies.probes import front_ends, probing, rh20t_probe, vo_probe
+from dhtorch.studies.protocol import Outcome, Settings
+from dhtorch.studies.report.layouts import in_layout
+from dhtorch.synthetic import robot as synthetic_robot
+from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.transform import CHANNELS, ExtendDepth
 
 ROOT = os.environ.get("DHTORCH_DATA")

@@ -9,10 +9,14 @@ from hydra.utils import instantiate
 from rooms import room as rendered
 
 from dhtorch import archive
+from dhtorch.commands.run import config_dir, main
 from dhtorch.data.pairs import by_gap
 from dhtorch.evaluate import holdout
 from dhtorch.evaluate.correlation import ranks
-from dhtorch.experiments import (
+from dhtorch.geometry import se3
+from dhtorch.records import Pose
+from dhtorch.studies.cohorts import HeldOut, device_fit, trajectory
+from dhtorch.studies.paper import (
     ablation,
     calibration,
     device_pose,
@@ -23,11 +27,7 @@ from dhtorch.experiments import (
     range_split,
     real_holes,
 )
-from dhtorch.experiments.cohorts import HeldOut, device_fit, trajectory
-from dhtorch.experiments.protocol import Batch, Outcome, Settings
-from dhtorch.geometry import se3
-from dhtorch.records import Pose
-from dhtorch.run import config_dir, main
+from dhtorch.studies.protocol import Batch, Outcome, Settings
 
 
 @cache

@@ -21,7 +21,8 @@ from box import disagreement, off_wall, own_camera, pose, render, turned_over, w
 from scipy.spatial.transform import Rotation
 
 from dhtorch import data, tree
-from dhtorch.data import files, record3d_video, writers
+from dhtorch import testing as writers
+from dhtorch.data import files, record3d_video
 from dhtorch.data.files import FormatError
 from dhtorch.data.record3d_live import LiveFrames
 from dhtorch.geometry import camera as cameras
@@ -343,7 +344,7 @@ def test_names_that_lead_out_of_the_archive_are_not_frames(tmp_path: Path) -> No
 def test_opening_decodes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     archive = r3d(tmp_path, walk(5))
     monkeypatch.setattr(files, "decode_image", lambda *_: pytest.fail("decoded a picture"))
-    monkeypatch.setattr("dhtorch.data.codec_lzfse.unpack", lambda *_: pytest.fail("unpacked depth"))
+    monkeypatch.setattr("dhtorch.data.codecs.lzfse.unpack", lambda *_: pytest.fail("unpacked depth"))
     assert len(data.open(archive)) == 5
 
 

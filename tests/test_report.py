@@ -11,9 +11,10 @@ import pytest
 import torch
 from rich.console import Console
 
-from dhtorch import archive, figures, report
+from dhtorch import archive, drawing
 from dhtorch.codes import Gate, Hole, Source, names
 from dhtorch.evaluate import errors, risk
+from dhtorch.studies import report
 
 
 def make_result(methods=("paper", "opencv"), **changes):
@@ -145,30 +146,30 @@ def test_samples_are_drawn_in_the_colour_of_what_became_of_them(tmp_path):
     image, uv, g = scene()
     source = torch.randint(0, 3, (300,), generator=g)
     gate = torch.where(source == Source.NONE, Gate.PARALLAX, Gate.ANSWER)
-    figures.draw_samples(tmp_path / "a.png", image, uv, source, gate)
+    drawing.draw_samples(tmp_path / "a.png", image, uv, source, gate)
     pixels = picture(tmp_path / "a.png")
-    for colour in (figures.SENSOR, figures.RECOVERED, figures.GATE_COLOURS[Gate.PARALLAX]):
+    for colour in (drawing.SENSOR, drawing.RECOVERED, drawing.GATE_COLOURS[Gate.PARALLAX]):
         assert share_of(pixels, colour) > 4e-4
-    assert share_of(pixels, figures.GATE_COLOURS[Gate.RESIDUAL]) < 1e-4
-    figures.draw_samples(tmp_path / "b.png", (255 * image).to(torch.uint8), uv, 0 * source, 0 * source)
+    assert share_of(pixels, drawing.GATE_COLOURS[Gate.RESIDUAL]) < 1e-4
+    drawing.draw_samples(tmp_path / "b.png", (255 * image).to(torch.uint8), uv, 0 * source, 0 * source)
     without = picture(tmp_path / "b.png")
-    assert share_of(without, figures.SENSOR) < 1e-4
+    assert share_of(without, drawing.SENSOR) < 1e-4
     assert pixels.shape[1] > 1.1 * without.shape[1], "the legend stands beside the picture and is not cut off"
 
 
 def test_holes_are_drawn_by_class(tmp_path):
     image, uv, g = scene()
     hole = torch.randint(0, 3, (300,), generator=g)
-    figures.draw_holes(tmp_path / "a.png", image[:1], uv, hole, title="one channel")
+    drawing.draw_holes(tmp_path / "a.png", image[:1], uv, hole, title="one channel")
     pixels = picture(tmp_path / "a.png")
-    assert share_of(pixels, figures.HOLE_COLOURS[Hole.TRACKABLE_NO_LIDAR]) > 1e-3
-    assert share_of(pixels, figures.HOLE_COLOURS[Hole.AT_BORDER]) < 1e-4
+    assert share_of(pixels, drawing.HOLE_COLOURS[Hole.TRACKABLE_NO_LIDAR]) > 1e-3
+    assert share_of(pixels, drawing.HOLE_COLOURS[Hole.AT_BORDER]) < 1e-4
 
 
 def test_every_code_has_a_colour_of_its_own():
-    assert set(figures.GATE_COLOURS) == set(names(Gate)) - {Gate.ANSWER}
-    assert set(figures.HOLE_COLOURS) == set(names(Hole)) - {Hole.NONE}
-    for table in (figures.GATE_COLOURS, figures.HOLE_COLOURS):
+    assert set(drawing.GATE_COLOURS) == set(names(Gate)) - {Gate.ANSWER}
+    assert set(drawing.HOLE_COLOURS) == set(names(Hole)) - {Hole.NONE}
+    for table in (drawing.GATE_COLOURS, drawing.HOLE_COLOURS):
         assert len(set(table.values())) == len(table)
 
 
@@ -176,18 +177,18 @@ def test_depth_and_risk_figures_also_of_nothing(tmp_path):
     true = 2 + 4 * torch.rand(400, generator=torch.Generator().manual_seed(0))
     depth = torch.where(torch.arange(400) % 4 > 0, true * 1.05, math.nan)
     points = errors.points(depth, true, true / 10)
-    figures.draw_depth(tmp_path / "depth.png", points.true_depth, points.depth, points.score)
-    figures.draw_depth(tmp_path / "plain.png", true, depth)
-    assert share_of(picture(tmp_path / "plain.png"), figures.SENSOR) > 5e-4
+    drawing.draw_depth(tmp_path / "depth.png", points.true_depth, points.depth, points.score)
+    drawing.draw_depth(tmp_path / "plain.png", true, depth)
+    assert share_of(picture(tmp_path / "plain.png"), drawing.SENSOR) > 5e-4
     curves = {"paper": risk.risk_coverage(points), "none": risk.risk_coverage(points[:0])}
-    figures.draw_risk_coverage(tmp_path / "risk.png", curves, oracle=risk.risk_coverage(points, oracle=True))
-    assert share_of(picture(tmp_path / "risk.png"), figures.LINES[0]) > 1e-3
-    figures.draw_depth(tmp_path / "empty.png", true[:0], depth[:0], depth[:0])
-    figures.draw_risk_coverage(tmp_path / "void.png", {})
+    drawing.draw_risk_coverage(tmp_path / "risk.png", curves, oracle=risk.risk_coverage(points, oracle=True))
+    assert share_of(picture(tmp_path / "risk.png"), drawing.LINES[0]) > 1e-3
+    drawing.draw_depth(tmp_path / "empty.png", true[:0], depth[:0], depth[:0])
+    drawing.draw_risk_coverage(tmp_path / "void.png", {})
     picture(tmp_path / "empty.png"), picture(tmp_path / "void.png")
 
 
 def test_tables_need_no_drawing_library():
-    code = "import sys, dhtorch.report, dhtorch.figures; print([m for m in ('matplotlib', 'rich') if m in sys.modules])"
+    code = "import sys, dhtorch.studies.report, dhtorch.drawing; print([m for m in ('matplotlib', 'rich') if m in sys.modules])"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"

@@ -11,12 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dhtorch import archive, report
+from dhtorch import archive
 from dhtorch.codes import Gate, Source
-from dhtorch.report import cells, curves, layouts, page, plots, published, svg, text
-from dhtorch.report.markup import Markup, escape, tag
-from dhtorch.report.reading import flatten, scene_rows
-from dhtorch.report.tables import COLUMNS, every_number
+from dhtorch.studies import report
+from dhtorch.studies.report import cells, curves, layouts, page, plots, published, svg, text
+from dhtorch.studies.report.markup import Markup, escape, tag
+from dhtorch.studies.report.reading import flatten, scene_rows
+from dhtorch.studies.report.tables import COLUMNS, every_number
 
 REPO = Path(__file__).resolve().parents[1]
 RESULTS = [make() for make in archived.ALL]

@@ -17,11 +17,12 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 from processes import start, stop
 
-from dhtorch import archive, console, job
-from dhtorch.data import writers
-from dhtorch.data.synthetic import SyntheticRoom
-from dhtorch.experiments.protocol import Outcome
-from dhtorch.run import config_dir, job_name, main
+from dhtorch import archive, console
+from dhtorch import testing as writers
+from dhtorch.commands import job
+from dhtorch.commands.run import config_dir, job_name, main
+from dhtorch.studies.protocol import Outcome
+from dhtorch.synthetic.recording import SyntheticRoom
 
 ROOM = ["data.hw=[60,80]", "data.n_frames=3", "data.supersample=1", "data.lidar=exact"]
 TINY = [*ROOM, "pairs.gap=2", "method.n=256", "figures=false"]

@@ -20,14 +20,14 @@ from box import off_wall, pose, render, world_points
 
 from dhtorch import data
 from dhtorch.data import rh20t, rh20t_robot
-from dhtorch.data.codec_pickle import read_npy
-from dhtorch.data.codec_video import close_videos
+from dhtorch.data.codecs.pickles import read_npy
+from dhtorch.data.codecs.video import close_videos
 from dhtorch.data.files import FormatError
 from dhtorch.data.rh20t_robot import ARMS, Stream
-from dhtorch.data.writers.lossless import write_lossless
-from dhtorch.data.writers.rh20t import robot_notation, write_rh20t
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame
+from dhtorch.testing.lossless import write_lossless
+from dhtorch.testing.rh20t import robot_notation, write_rh20t
 
 HW = (36, 64)
 CAMERA = Camera(torch.tensor([[50.0, 48.0]]), torch.tensor([[33.5, 16.75]]))

@@ -14,9 +14,9 @@ from hydra.errors import HydraException
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
+from dhtorch.commands.run import config_dir
 from dhtorch.data import FORMATS
 from dhtorch.method import Method
-from dhtorch.run import config_dir
 
 CONF = config_dir()
 REPO = Path(__file__).parents[1]

@@ -15,7 +15,8 @@ import torch
 from box import disagreement, off_wall, own_camera, pose, render, turned_over, world_points
 
 from dhtorch import data, tree
-from dhtorch.data import codec_video, writers
+from dhtorch import testing as writers
+from dhtorch.data.codecs import video as codec_video
 from dhtorch.data.files import FormatError
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
@@ -175,7 +176,7 @@ def test_first_picture_before_time_zero(tmp_path: Path) -> None:
 @pytest.fixture
 def room() -> list[Frame]:
     """A furnished room: edges of depth are edges of the picture."""
-    synthetic = pytest.importorskip("dhtorch.data.synthetic")
+    synthetic = pytest.importorskip("dhtorch.synthetic.recording")
     scene = synthetic.SyntheticRoom(hw=(96, 128), n_frames=9, lidar="exact", supersample=1, step_m=0.12)
     return [scene[i] for i in range(9)]
 

@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from dhtorch import extend
-from dhtorch.data import stress
-from dhtorch.data.stress import STRESSES, StressRoom, open_stress
-from dhtorch.data.synthetic import SyntheticRoom
-from dhtorch.experiments import protocol
 from dhtorch.geometry import camera, se3
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.sample import spiral
 from dhtorch.stages.track import lucas_kanade
+from dhtorch.studies import protocol
+from dhtorch.synthetic import stress
+from dhtorch.synthetic.recording import SyntheticRoom
+from dhtorch.synthetic.stress import STRESSES, StressRoom, open_stress
 
 SMALL = {"hw": (96, 128), "n_frames": 8, "supersample": 1, "depth_hw": (96, 128)}
 NEAR = 2.0

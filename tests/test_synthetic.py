@@ -6,12 +6,12 @@ import cv2
 import pytest
 import torch
 
-from dhtorch.data.paths import PATHS
-from dhtorch.data.raycast import DARK, MIRROR, ORDINARY, WINDOW
-from dhtorch.data.room import BACK, FRONT, HEIGHT, LEFT, RIGHT, furnished_room
-from dhtorch.data.shading import Light, Scene
-from dhtorch.data.synthetic import SURFACES, SyntheticRoom, phone_lidar
 from dhtorch.geometry import camera, se3
+from dhtorch.synthetic.paths import PATHS
+from dhtorch.synthetic.raycast import DARK, MIRROR, ORDINARY, WINDOW
+from dhtorch.synthetic.recording import SURFACES, SyntheticRoom, phone_lidar
+from dhtorch.synthetic.room import BACK, FRONT, HEIGHT, LEFT, RIGHT, furnished_room
+from dhtorch.synthetic.shading import Light, Scene
 from dhtorch.tree import collate
 
 SMALL = {"hw": (120, 160), "depth_hw": (48, 64)}

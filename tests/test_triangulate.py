@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from dhtorch.baselines.device_pose import given_pose
 from dhtorch.codes import Gate, PoseCode
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import epipolar, se3
 from dhtorch.records import Camera, Pose, Samples, Tracks
 from dhtorch.stages.triangulate import two_view
+from dhtorch.studies.baselines.device_pose import given_pose
 
 
 def scene(n=200, batch=2, dtype=torch.float64, seed=0, noise_px=0.0, t=(0.2, -0.05, 0.03)):

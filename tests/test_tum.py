@@ -10,10 +10,11 @@ import torch
 from box import CAMERA, HW, check_same, pose, walk
 
 from dhtorch import data
-from dhtorch.data import tum, writers
-from dhtorch.data.writers import parts
+from dhtorch import testing as writers
+from dhtorch.data import tum
 from dhtorch.geometry import se3
 from dhtorch.records import Frame
+from dhtorch.testing import parts
 
 
 def test_tum_gives_back_the_scene(tmp_path: Path) -> None:

@@ -19,14 +19,15 @@ from omegaconf import OmegaConf
 from PIL import Image
 from rooms import room as rendered
 
-from dhtorch import archive, figures, run, viewer
+from dhtorch import archive, drawing, viewer
 from dhtorch.codes import Gate, Source, names
+from dhtorch.commands import run
 from dhtorch.data.pairs import by_gap
-from dhtorch.data.synthetic import SyntheticRoom
-from dhtorch.experiments.protocol import Settings
 from dhtorch.method import Method
 from dhtorch.methods import METHODS
 from dhtorch.stages.fuse import inverse_variance
+from dhtorch.studies.protocol import Settings
+from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.viewer import again, points, rrd
 from dhtorch.viewer import html as pages
 from dhtorch.viewer.scene import DENSE, look
@@ -376,12 +377,12 @@ def test_data_that_are_gone_leave_the_points(job, command, tmp_path):
         "builtins.eval",
         "dhtorch.archive.os.system",
         "dhtorch.data.files.read_image",
-        "dhtorch.data.writers.write_tum",
+        "dhtorch.testing.write_tum",
         "dhtorch.data.os",
         "dhtorch.data.Path",
-        "dhtorch.figures.write_ply",
-        "dhtorch.data.synthetic._turned",
-        "dhtorch.data.synthetic.phone_lidar.__globals__",
+        "dhtorch.drawing.write_ply",
+        "dhtorch.synthetic.recording._turned",
+        "dhtorch.synthetic.recording.phone_lidar.__globals__",
         7,
         None,
     ],
@@ -448,7 +449,7 @@ def test_points_of_a_file(tmp_path):
     rng = np.random.default_rng(0)
     xyz, sigma, score = rng.normal(size=(50, 3)), rng.random(50), rng.random(50)
     source = rng.integers(1, 3, 50)
-    figures.write_ply(tmp_path / "p.ply", xyz, sigma=sigma, score=score, source=source)
+    drawing.write_ply(tmp_path / "p.ply", xyz, sigma=sigma, score=score, source=source)
     found = points.read(tmp_path / "p.ply").shots[0].samples
     for name, value in {"xyz": xyz, "sigma": sigma, "score": score, "source": source}.items():
         assert np.allclose(found[name], value, atol=1e-6), name

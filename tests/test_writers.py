@@ -11,10 +11,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from dhtorch.data import codec_exr, writers
+from dhtorch import testing as writers
+from dhtorch.data.codecs import exr as codec_exr
 from dhtorch.data.stacks import FocalStack
-from dhtorch.data.writers.lossless import write_lossless
 from dhtorch.records import Camera, Frame, Pose
+from dhtorch.testing.lossless import write_lossless
 
 HW = (16, 24)
 

@@ -21,7 +21,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dhtorch.data import codec_tar, codec_tiff, convert, files
+from dhtorch.data import convert, files
+from dhtorch.data.codecs import tarballs as codec_tar
+from dhtorch.data.codecs import tiff as codec_tiff
 from dhtorch.data.files import FormatError
 from dhtorch.data.laser import judged
 from dhtorch.data.recording import Recording, Recordings, TruthRecording

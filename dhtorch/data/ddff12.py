@@ -20,8 +20,8 @@ import torch
 from torch import Tensor
 
 from dhtorch.data import convert, files
-from dhtorch.data.codec_hdf5 import Hdf5Array, hdf5_arrays
-from dhtorch.data.codec_numpy import real_header
+from dhtorch.data.codecs.hdf5 import Hdf5Array, hdf5_arrays
+from dhtorch.data.codecs.npy import real_header
 from dhtorch.data.files import FormatError
 from dhtorch.data.light_field import refocus
 from dhtorch.data.stacks import FocalStack, Stacks, focus_distances

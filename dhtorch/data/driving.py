@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from dhtorch.data import codec_numpy, convert, files
+from dhtorch.data import convert, files
+from dhtorch.data.codecs import npy as codec_numpy
 from dhtorch.data.files import FormatError
 from dhtorch.data.recording import Recording
 from dhtorch.geometry import se3

@@ -15,7 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dhtorch.data import codec_exr, files
+from dhtorch.data import files
+from dhtorch.data.codecs import exr as codec_exr
 from dhtorch.data.files import FormatError
 from dhtorch.data.stacks import FocalStack, Stacks, focus_distances, read_pictures
 

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from torch import Tensor
 
-from dhtorch.data import codec_tiff, files
+from dhtorch.data import files
+from dhtorch.data.codecs import tiff as codec_tiff
 from dhtorch.data.files import FormatError
 from dhtorch.data.stacks import FocalStack, Stacks, focus_distances, read_pictures
 

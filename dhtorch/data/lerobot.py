@@ -20,8 +20,8 @@ import torch
 from torch import Tensor
 
 from dhtorch.data import convert, files
-from dhtorch.data.codec_parquet import read_cell
-from dhtorch.data.codec_video import read_video_frame, video_times
+from dhtorch.data.codecs.parquet import read_cell
+from dhtorch.data.codecs.video import read_video_frame, video_times
 from dhtorch.data.files import FormatError
 from dhtorch.data.lerobot_depth import decode_codes, decode_picture, depth_of
 from dhtorch.data.lerobot_meta import Episode, Episodes, Feature, Meta, colour_keys, inside, read_episodes, read_meta

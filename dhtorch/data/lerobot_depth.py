@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from dhtorch.data import files
-from dhtorch.data.codec_tiff import decode_tiff
+from dhtorch.data.codecs.tiff import decode_tiff
 from dhtorch.data.files import FormatError
 from dhtorch.data.lerobot_meta import Feature, Meta, colour_keys
 

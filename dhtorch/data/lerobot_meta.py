@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dhtorch.data import files
-from dhtorch.data.codec_parquet import parquet_header, read_columns
+from dhtorch.data.codecs.parquet import parquet_header, read_columns
 from dhtorch.data.files import FormatError
 
 _MAX_EPISODES = 10_000_000

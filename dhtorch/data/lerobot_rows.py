@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from dhtorch.data import files
-from dhtorch.data.codec_parquet import parquet_header, read_columns
+from dhtorch.data.codecs.parquet import parquet_header, read_columns
 from dhtorch.data.files import FormatError
 from dhtorch.data.lerobot_meta import Episode, Meta
 

@@ -23,7 +23,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from dhtorch.data import codec_exr, codec_lzfse, convert, files, record3d_video
+from dhtorch.data import convert, files, record3d_video
+from dhtorch.data.codecs import exr as codec_exr
+from dhtorch.data.codecs import lzfse as codec_lzfse
 from dhtorch.data.files import FormatError
 from dhtorch.data.members import Member, folder_members, member, zip_members
 from dhtorch.data.recording import Recording

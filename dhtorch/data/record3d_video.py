@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from dhtorch.data import codec_video, convert, files
+from dhtorch.data import convert, files
+from dhtorch.data.codecs import video as codec_video
 from dhtorch.data.files import FormatError
 from dhtorch.data.recording import Recording
 from dhtorch.records import Camera, Frame

@@ -18,7 +18,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dhtorch.data import codec_numpy, codec_pfm, convert, files
+from dhtorch.data import convert, files
+from dhtorch.data.codecs import npy as codec_numpy
+from dhtorch.data.codecs import pfm as codec_pfm
 from dhtorch.data.files import FormatError
 from dhtorch.data.recording import Recording, numbers
 from dhtorch.records import Camera, Frame, Pose

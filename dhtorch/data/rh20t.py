@@ -3,7 +3,7 @@
 A scene folder holds ``metadata.json`` and, for each camera, ``cam_<serial>/`` with ``color.mp4``, ``depth.mp4`` (often
 in a parallel tree) and ``timestamps.npy``; beside the scenes lies ``calib/<stamp>/`` with ``intrinsics.npy`` (for
 1280×720), ``extrinsics.npy`` (world → camera; the world is the calibration marker) and ``tcp.npy``. The ``.npy`` files
-are pickles: they are read as data (:mod:`dhtorch.data.codec_pickle`), no code in them runs.
+are pickles: they are read as data (:mod:`dhtorch.data.codecs.pickles`), no code in them runs.
 
 A depth picture is twice as high as the image, the low bytes above the high bytes, in millimetres. A camera on the hand
 moves: its pose follows the tool centre point (:mod:`dhtorch.data.rh20t_robot`). ``streams`` gives the robot's side.
@@ -25,8 +25,8 @@ from torch import Tensor
 
 from dhtorch.data import convert, files
 from dhtorch.data.clocks import nearest
-from dhtorch.data.codec_pickle import read_npy
-from dhtorch.data.codec_video import read_video_frame, video_header
+from dhtorch.data.codecs.pickles import read_npy
+from dhtorch.data.codecs.video import read_video_frame, video_header
 from dhtorch.data.files import FormatError
 from dhtorch.data.recording import Recording
 from dhtorch.data.rh20t_robot import ARMS, Arm, Stream, calibration_tcp, hand_poses, seconds, streams, tcp_base

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dhtorch.data import convert, files
-from dhtorch.data.codec_pickle import read_npy
+from dhtorch.data.codecs.pickles import read_npy
 from dhtorch.data.files import FormatError
 
 _LATEST_MS = 4_102_444_800_000  # the year 2100

@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dhtorch.data import codec_tiff, files
+from dhtorch.data import files
+from dhtorch.data.codecs import tiff as codec_tiff
 from dhtorch.data.files import FormatError
 from dhtorch.records import Camera
 from dhtorch.tree import Record, record

@@ -21,8 +21,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dhtorch.data import codec_pickle, convert, files
-from dhtorch.data.codec_video import read_video_frame, video_header
+from dhtorch.data import convert, files
+from dhtorch.data.codecs import pickles as codec_pickle
+from dhtorch.data.codecs.video import read_video_frame, video_header
 from dhtorch.data.files import FormatError
 from dhtorch.data.recording import Recording
 from dhtorch.geometry import camera as cameras

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from dhtorch.data.codec_parquet import parquet_header, read_columns
+from dhtorch.data.codecs.parquet import parquet_header, read_columns
 from dhtorch.data.files import FormatError, last_change
 from dhtorch.extract.columns import PLACE
 from dhtorch.extract.shards import described, shard_files

@@ -20,7 +20,7 @@ import torch
 
 from dhtorch import archive
 from dhtorch.data import FormatError
-from dhtorch.experiments.protocol import Progress, Settings
+from dhtorch.studies.protocol import Progress, Settings
 from dhtorch.viewer import again, html, points, rrd
 from dhtorch.viewer.scene import Cloud, DepthMap, Scene, Shot, View, look
 

@@ -20,12 +20,12 @@ from dhtorch import archive
 #: Group of the settings → modules whose public functions it may name.
 NAMED = {
     "data": (
-        *("dhtorch.data", "dhtorch.stages.sample"),
-        *(f"dhtorch.data.{name}" for name in ("synthetic", "stress", "viewpoints", "rh20t_set", "synthetic_robot")),
+        *("dhtorch.data", "dhtorch.data.rh20t_set", "dhtorch.stages.sample"),
+        *(f"dhtorch.synthetic.{name}" for name in ("recording", "stress", "viewpoints", "robot")),
     ),
     "pairs": ("dhtorch.data.pairs",),
     "method": (
-        *("dhtorch.method", "dhtorch.geometry.epipolar", "dhtorch.baselines.opencv"),
+        *("dhtorch.method", "dhtorch.geometry.epipolar", "dhtorch.studies.baselines.opencv"),
         *(
             f"dhtorch.stages.{name}"
             for name in ("sample", "backproject", "holes", "track", "pose", "triangulate", "score", "fuse")

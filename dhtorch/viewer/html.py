@@ -17,7 +17,7 @@ import numpy as np
 
 from dhtorch import archive
 from dhtorch.codes import Gate, Hole, names, words
-from dhtorch.figures import GATE_COLOURS, HOLE_COLOURS, RECOVERED, SENSOR, SILENT
+from dhtorch.drawing import GATE_COLOURS, HOLE_COLOURS, RECOVERED, SENSOR, SILENT
 from dhtorch.viewer.scene import Cloud, Scene, Shot, View
 
 ENDINGS = (".html", ".htm")

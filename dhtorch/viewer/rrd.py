@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dhtorch.codes import Gate, Source, names, words
-from dhtorch.figures import GATE_COLOURS, RECOVERED, SENSOR, SILENT
+from dhtorch.drawing import GATE_COLOURS, RECOVERED, SENSOR, SILENT
 from dhtorch.viewer.scene import Cloud, Scene, Shot, View
 
 ENDINGS = (".rrd",)

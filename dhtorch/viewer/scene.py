@@ -15,13 +15,13 @@ import numpy as np
 import torch
 
 from dhtorch.codes import Gate, Source, names
-from dhtorch.experiments import protocol
-from dhtorch.experiments.protocol import Answer, Method, Pairs, Progress, Protocol, Settings, Variant
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.lookup import nearest
 from dhtorch.pair import merge
 from dhtorch.records import Camera, Frame, Pose
+from dhtorch.studies import protocol
+from dhtorch.studies.protocol import Answer, Method, Pairs, Progress, Protocol, Settings, Variant
 
 #: Points of a depth map that are shown, drawn at random: enough to know the place, few enough for a page.
 DENSE = 12_000
@@ -129,7 +129,7 @@ def look(
         progress: wraps the loop over the pairs.
 
     Raises:
-        ValueError: bad data or options, as :func:`dhtorch.experiments.protocol.run` raises them.
+        ValueError: bad data or options, as :func:`dhtorch.studies.protocol.run` raises them.
     """
     shots: list[Shot] = []
     views: dict[int, View] = {}

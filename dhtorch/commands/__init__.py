@@ -1,0 +1,1 @@
+"""The words of the command line. Settings and their composition live here, and nowhere else."""

@@ -1,0 +1,144 @@
+"""One job: from the parts that the settings name to a result file in the job's own folder.
+
+The result is written last, after its pictures: a folder with a valid ``result.json`` holds everything the job makes.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from dhtorch import archive, drawing
+from dhtorch.data import Recordings
+from dhtorch.data import files as data_files
+from dhtorch.studies import report
+from dhtorch.studies.protocol import MIN_CANDIDATES, Outcome, Settings
+
+_LOG = logging.getLogger(__name__)
+
+#: The settings groups; their names enter the key of a result.
+GROUPS = ("method", "data", "pairs", "holdout", "experiment")
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a job ended."""
+
+    folder: str
+    state: str  # finished | untouched | failed
+    error: str = ""  # of a failed job, one line
+
+
+def run(
+    settings: Mapping[str, Any],
+    parts: Mapping[str, Any],
+    choices: Mapping[str, str],
+    folder: Path,
+    *,
+    progress: Callable[[Iterable[Any], str, int], Iterable[Any]],
+) -> Ended:
+    """Run the experiment and write ``folder/result.json``, unless resuming finds the same one there already.
+
+    Args:
+        settings: all options, resolved.
+        parts: ``data``, ``method``, ``pairs`` and ``experiment``, as objects.
+        choices: settings group → name of the chosen settings.
+        folder: of this job alone.
+        progress: wraps a loop, see :func:`dhtorch.studies.protocol.run`.
+
+    Raises:
+        ValueError, OSError, KeyError, ImportError: bad options or data; nothing is written.
+    """
+    if settings["threads"] is not None:
+        torch.set_num_threads(settings["threads"])
+        data_files.set_opencv_threads(settings["threads"])
+    names = {group: choices[group] for group in GROUPS}
+    recordings = parts["data"] if isinstance(parts["data"], list | Recordings) else [parts["data"]]
+    digest = archive.data_digest({**_files(recordings), **_named_files(settings)})
+    key = archive.result_key({**settings, "choices": names}, digest)
+    target = folder / "result.json"
+    for recording in recordings if _LOG.isEnabledFor(logging.DEBUG) else ():
+        _LOG.debug("data: %s, %d of %s", recording.name, len(recording), recording.format)
+    _LOG.debug("digest %s, key %s", digest, key)
+    archive.clear(target)
+    if settings["resume"] and archive.finished(target, key):
+        print(f"{target}: finished and valid, left untouched")
+        return Ended(str(folder), "untouched")
+    methods = {names["method"]: parts["method"]}
+    outcome = parts["experiment"](recordings, methods, parts["pairs"], _common(settings), progress=progress)
+    _LOG.debug("%d pairs answered", outcome.n_pairs)
+    examples = outcome.examples if settings["figures"] else []
+    drawn = [path for example in examples for path in drawing.draw_example(folder / example.scene, example)]
+    scenes = [r.name for r in recordings]
+    data = {"name": names["data"], "scenes": scenes, "n_pairs": outcome.n_pairs, "digest": digest}
+    result = _result(settings, names["experiment"], key, data, outcome)
+    archive.write(target, result)
+    _show(result, [target, *drawn])
+    return Ended(str(folder), "finished")
+
+
+def _result(
+    settings: Mapping[str, Any], experiment: str, key: str, data: Mapping[str, Any], outcome: Outcome
+) -> dict[str, Any]:
+    threads = torch.get_num_threads()
+    return archive.build(
+        experiment=experiment,
+        key=key,
+        meta=archive.meta(device=settings["device"], dtype=settings["dtype"], threads=threads, seed=settings["seed"]),
+        config=settings,
+        data=data,
+        summary=outcome.summary,
+        rows=outcome.rows,
+        question=outcome.question,
+        expectation=outcome.expectation,
+        verdict=outcome.verdict,
+        why=outcome.why,
+    )
+
+
+def _show(result: Mapping[str, Any], written: Iterable[Path]) -> None:
+    report.print_tables(result)
+    few = {r["scene"]: r["n_few"] for r in result["rows"] if r["pair"] is None and r.get("n_few")}
+    for scene, n in few.items():
+        print(f"{scene}: {n} pair{'s' * (n > 1)} dropped, fewer than {MIN_CANDIDATES} candidates each")
+    if result["verdict"]:
+        print(f"{result['verdict']}: {result['why']}")
+    print("\n".join(["wrote", *(f"  {path}" for path in written)]))
+
+
+def _common(settings: Mapping[str, Any]) -> Settings:
+    """The options that every pair of the job shares."""
+    dtype = getattr(torch, str(settings["dtype"]), None)
+    if dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"dtype: found {settings['dtype']!r}, expected float32 or float64")
+    for name, low in (("batch", 1), ("workers", 0)):
+        if not isinstance(settings[name], int) or settings[name] < low:
+            raise ValueError(f"{name}: found {settings[name]!r}, expected a whole number of at least {low}")
+    try:
+        torch.empty(0, device=settings["device"])
+    except (RuntimeError, AssertionError) as error:
+        raise ValueError(f"device: found {settings['device']!r}, expected one that torch can use here") from error
+    return Settings(
+        cutoff=settings["holdout"]["cutoff"],
+        truth=(settings["holdout"]["truth"],),
+        seed=settings["seed"],
+        device=settings["device"],
+        dtype=dtype,
+        batch=settings["batch"],
+        workers=settings["workers"],
+    )
+
+
+def _files(recordings: Iterable[Any]) -> dict[str, Path]:
+    """Name → file of all data below the recordings' folders."""
+    return archive.files_below(r.root for r in recordings)
+
+
+def _named_files(settings: Mapping[str, Any]) -> dict[str, Path]:
+    """Option → file that the settings of a group name."""
+    return archive.files_named({k: settings[k] for k in GROUPS})

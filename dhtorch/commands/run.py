@@ -1,0 +1,319 @@
+"""The ``dhtorch`` command: Hydra turns names into functions, everything else happens in the library.
+
+A first word that names a sub-command goes to that module, which reads its own arguments or is handed what the settings
+of that name compose to; anything else is a list of Hydra overrides for experiments. Each of their jobs has a folder of
+its own, named by its overrides inside a sweep, and reports how it ended instead of raising: one failing job stops no
+other, whichever launcher runs them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib
+import logging
+import os
+import re
+import shlex
+import sys
+import traceback
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from dhtorch import console
+
+#: Sub-command → module with ``main(argv) -> int``.
+COMMANDS = {"inspect": "dhtorch.commands.inspect", "report": "dhtorch.studies.report"}
+
+#: Sub-command with settings of its own, ``conf/<word>.yaml`` → module with ``run(settings, parts, *, progress)``, which
+#: is given all options as plain values, and as objects those that name a function. It returns the exit code.
+CONFIGURED = {"extract": "dhtorch.extract", "integrate": "dhtorch.integrate.mapping", "view": "dhtorch.viewer"}
+
+#: Sub-command → the option that a first word without a name sets.
+FIRST_WORD = {"view": "result"}
+
+DONE, SOME_FAILED, FAILED, INTERRUPTED, UNHEARD = 0, 1, 2, 130, 141
+
+#: Exit codes, as ``dhtorch --help`` lists them.
+EXIT_CODES = {
+    DONE: "all done or left untouched",
+    SOME_FAILED: "some jobs of a sweep failed",
+    FAILED: "bad option, bad data or failed job",
+    INTERRUPTED: "interrupted",
+    UNHEARD: "nobody reads the output any more",
+}
+
+_LOG = logging.getLogger("dhtorch.commands.run")
+
+#: What bad input raises: reported in one line, without a traceback.
+USER_ERRORS = (ValueError, OSError, KeyError, ImportError)
+
+#: Flags of Hydra that show something and run nothing.
+SHOW = {"-h", "--help", "--hydra-help", "-i", "--info", "-sc", "--shell-completion", "-c", "--cfg"}
+SWEEP = {"-m", "--multirun"}
+
+#: How a job may end, and in words.
+STATES = {"finished": "finished", "untouched": "left untouched", "failed": "failed"}
+
+#: Where results lie that are to be resumed, when no ``output`` is given.
+RESUMED = Path("outputs/resumed")
+
+_SEPARATORS = "/\\"
+
+#: A longer folder name is cut and told apart by a hash.
+LONGEST_NAME = 120
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point of the console script; returns the exit code."""
+    argv = sys.argv[1:] if argv is None else argv
+    flags, argv = [a for a in argv if a in console.FLAGS], [a for a in argv if a not in console.FLAGS]
+    with console.speaking(flags), console.hushed():
+        try:
+            code = _run(argv)
+            sys.stdout.flush()
+            return code
+        except BrokenPipeError:  # as of `dhtorch report … | head`
+            console.leave_the_pipe()
+            return UNHEARD
+        except USER_ERRORS as error:
+            return _fail(error, show="--traceback" in argv)
+        except KeyboardInterrupt as stop:  # a sub-command may say how to go on
+            print(": ".join(["dhtorch: interrupted", *map(str, stop.args)]), file=sys.stderr)
+            return INTERRUPTED
+
+
+def _run(argv: list[str]) -> int:
+    if argv == ["--version"]:
+        import dhtorch  # noqa: PLC0415
+
+        print(f"dhtorch {dhtorch.__version__}")
+        return DONE
+    if argv and argv[0] in COMMANDS:
+        return int(importlib.import_module(COMMANDS[argv[0]]).main(argv[1:]) or 0)
+    if argv and argv[0] in CONFIGURED:
+        return _run_configured(argv[0], argv[1:])
+    return _run_hydra(argv)
+
+
+def config_dir() -> Path:
+    """The settings folder: inside an installed package, else beside the package in a checkout."""
+    here = Path(__file__).resolve().parent.parent
+    for folder in (here / "conf", here.parent / "conf"):
+        if (folder / "run.yaml").is_file():
+            return folder
+    raise FileNotFoundError(f"settings folder: found neither {here / 'conf'} nor {here.parent / 'conf'}")
+
+
+def job_name(overrides: str) -> str:
+    """Folder name of a job: its overrides, where they are short and every file system takes them.
+
+    What a file system or a shell would trip over is left out, what is too long is cut; a hash of the whole text then
+    keeps different jobs apart. Data below the environment variable DHTORCH_DATA is named relative to it.
+    """
+    base = os.environ.get("DHTORCH_DATA")
+    text = overrides.replace(base.rstrip(_SEPARATORS) + os.sep, "") if base else overrides
+    plain = re.sub(r"[^\w.,=+~@-]", "", re.sub(r"[/\\]", "-", text), flags=re.ASCII).rstrip(".")
+    if plain == text and len(plain) <= LONGEST_NAME:
+        return plain or "defaults"
+    return f"{plain[: LONGEST_NAME - 9]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+
+
+def _run_configured(word: str, argv: list[str]) -> int:
+    """A sub-command that takes Hydra overrides: one job, in this process."""
+    import hydra  # noqa: PLC0415
+    from hydra.core.hydra_config import HydraConfig  # noqa: PLC0415
+    from hydra.errors import HydraException  # noqa: PLC0415
+    from hydra.utils import instantiate  # noqa: PLC0415
+    from omegaconf import OmegaConf  # noqa: PLC0415
+    from omegaconf.errors import OmegaConfBaseException  # noqa: PLC0415
+
+    if SHOW & {a.split("=")[0] for a in argv}:
+        return _show(word, argv)
+    _refuse_flags(argv, SHOW)
+    if argv and word in FIRST_WORD and ("=" not in argv[0] or Path(argv[0]).exists()):
+        argv = [f"{FIRST_WORD[word]}={_quote(argv[0])}", *argv[1:]]
+    try:
+        with hydra.initialize_config_dir(str(config_dir()), version_base="1.3", job_name="dhtorch"):
+            cfg = hydra.compose(word, argv, return_hydra_config=True)
+            HydraConfig.instance().set_config(cfg)  # for what the settings take from Hydra, as the folder's name
+            groups = {k: v for k, v in cfg.hydra.runtime.choices.items() if k.isidentifier()}
+        OmegaConf.set_struct(cfg, False)
+        del cfg["hydra"]
+        settings: Any = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
+        named = [k for k, v in settings.items() if isinstance(v, dict) and "_target_" in v]
+        parts = {k: instantiate(cfg[k], _convert_="all") for k in named}
+    except (HydraException, OmegaConfBaseException) as error:
+        return _fail(_cause(error), show="traceback=true" in argv)
+    module = importlib.import_module(CONFIGURED[word])
+    _LOG.debug("%s: %s", word, ", ".join(f"{k}={v}" for k, v in groups.items()))
+    try:
+        with console.unsaid():
+            return int(module.run({**settings, "choices": groups}, parts, progress=console.progress) or DONE)
+    except USER_ERRORS as error:
+        return _fail(error, show=settings.get("traceback", False))
+
+
+def _show(name: str, argv: list[str]) -> int:
+    """Hydra's own flags: help, the composed settings, shell completion."""
+    import hydra  # noqa: PLC0415
+
+    sys.argv = [sys.argv[0], *argv]
+    hydra.main(config_path=str(config_dir()), config_name=name, version_base="1.3")(_job)()
+    return DONE
+
+
+def _refuse_flags(argv: Iterable[str], known: set[str]) -> None:
+    for flag in (a for a in argv if a.startswith("-") and a not in known):
+        raise ValueError(f"{flag}: found an unknown flag, expected {', '.join(sorted(known))}")
+
+
+def _run_hydra(argv: list[str]) -> int:
+    import hydra  # noqa: PLC0415  (a sub-command must not pay for it)
+    from hydra.core.global_hydra import GlobalHydra  # noqa: PLC0415
+    from hydra.errors import HydraException  # noqa: PLC0415
+    from hydra.types import RunMode  # noqa: PLC0415
+    from omegaconf import OmegaConf  # noqa: PLC0415
+    from omegaconf.errors import OmegaConfBaseException  # noqa: PLC0415
+
+    OmegaConf.register_new_resolver("dhtorch.job_name", job_name, replace=True)
+    if SHOW & {a.split("=")[0] for a in argv}:
+        return _show("run", argv)
+    _refuse_flags(argv, SWEEP | SHOW)
+    overrides, sweep = [a for a in argv if a not in SWEEP], bool({*SWEEP, "hydra.mode=MULTIRUN"} & set(argv))
+    if console.verbosity() == "quiet":
+        overrides.append("hydra/hydra_logging=disabled")  # what a launcher says of its jobs
+    try:
+        with hydra.initialize_config_dir(str(config_dir()), version_base="1.3", job_name="dhtorch"):
+            engine: Any = GlobalHydra.instance().hydra
+            mode = RunMode.MULTIRUN if sweep else RunMode.RUN
+            # A misspelt option fails here, in one line, before anything is imported or run.
+            cfg = engine.compose_config("run", overrides, run_mode=mode, with_log_configuration=False)
+            folder = _output(cfg, overrides, sweep)
+            overrides = [o for o in overrides if not o.startswith("output=")] + [f"output={_quote(str(folder))}"]
+            again = _again(argv, folder)
+            if sweep:
+                return _sweep(engine, overrides, again, show=cfg.traceback)
+            return _single(engine, overrides, again)
+    except (HydraException, OmegaConfBaseException) as error:
+        return _fail(error)
+
+
+def _single(engine: Any, overrides: Sequence[str], again: str) -> int:
+    try:
+        ended = engine.run("run", _job, list(overrides)).return_value
+    except KeyboardInterrupt:
+        print(f"dhtorch: interrupted, no result written. Once more:\n  {again}", file=sys.stderr)
+        return INTERRUPTED
+    return FAILED if ended.state == "failed" else DONE
+
+
+def _sweep(engine: Any, overrides: Sequence[str], again: str, show: bool) -> int:
+    """Run all jobs, then say how they ended."""
+    from hydra.errors import HydraException  # noqa: PLC0415
+
+    go_on = f"What is finished stays. To do the rest:\n  {again}"
+    try:
+        batches = engine.multirun("run", _job, list(overrides))
+    except KeyboardInterrupt:
+        print(f"\ndhtorch: interrupted. {go_on}", file=sys.stderr)
+        return INTERRUPTED
+    except HydraException:
+        raise
+    except Exception as error:  # the launcher broke, as when a worker process is killed
+        _fail(error, show)
+        print(go_on, file=sys.stderr)
+        return SOME_FAILED
+    jobs = [job for batch in batches for job in batch]
+    counts = Counter(job.return_value.state for job in jobs)
+    shares = ", ".join(f"{counts[state]} {words}" for state, words in STATES.items())
+    with console.unsaid():
+        print(f"{len(jobs)} job{'s' * (len(jobs) != 1)}: {shares}", flush=True)
+    if not counts["failed"]:
+        return DONE
+    common = set.intersection(*(set(job.overrides) for job in jobs))
+    for job in jobs:
+        if job.return_value.state == "failed":
+            name = " ".join(o for o in job.overrides if o not in common) or Path(job.return_value.folder).name
+            print(f"failed: {name}: {job.return_value.error}", file=sys.stderr)
+    print(go_on, file=sys.stderr)
+    return SOME_FAILED
+
+
+def _job(cfg: Any) -> Any:
+    """One job, in whatever process a launcher runs it: build what the settings name and run it. Never raises."""
+    from hydra.core.hydra_config import HydraConfig  # noqa: PLC0415
+    from hydra.errors import InstantiationException  # noqa: PLC0415
+    from hydra.utils import instantiate  # noqa: PLC0415
+    from omegaconf import OmegaConf  # noqa: PLC0415
+    from omegaconf.errors import OmegaConfBaseException  # noqa: PLC0415
+
+    console.hush()
+    console.listen()
+    from dhtorch.commands import job  # noqa: PLC0415
+
+    runtime = HydraConfig.get().runtime
+    alone = runtime.choices["hydra/launcher"] == "basic"
+    try:
+        settings: Any = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
+        parts = {k: instantiate(cfg[k], _convert_="all") for k in ("data", "method", "pairs", "experiment")}
+        progress = console.progress if alone else lambda items, _text, _total: items
+        _LOG.debug("job in %s: %s", runtime.output_dir, HydraConfig.get().job.override_dirname or "defaults")
+        with console.unsaid():
+            ended = job.run(settings, parts, dict(runtime.choices), Path(runtime.output_dir), progress=progress)
+        if console.verbosity() == "quiet":
+            print(Path(ended.folder) / "result.json", flush=True)
+        return ended
+    except Exception as error:
+        cause = _cause(error)
+        expected = isinstance(cause, (*USER_ERRORS, OmegaConfBaseException, InstantiationException))
+        _fail(cause, show=cfg.traceback or not expected)
+        with contextlib.suppress(OSError):
+            Path(runtime.output_dir).rmdir()  # where nothing is in it
+        return job.Ended(runtime.output_dir, "failed", _line(cause))
+
+
+def _output(cfg: Any, overrides: Iterable[str], sweep: bool) -> Path:
+    """Folder of the job, or of the sweep, as an absolute name: workers may start elsewhere."""
+    if not cfg.resume or any(o.startswith("output=") for o in overrides):
+        return Path(str(cfg.output)).absolute()
+    return (RESUMED if sweep else RESUMED / job_name(cfg.hydra.job.override_dirname)).absolute()
+
+
+def _again(argv: Iterable[str], folder: Path) -> str:
+    """The command that goes on where this one ended."""
+    words = [a for a in argv if not a.startswith(("resume=", "output="))]
+    own = any(a.startswith(("hydra.run.dir=", "hydra.sweep.dir=")) for a in words)
+    place = folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
+    return shlex.join(["dhtorch", *words, "resume=true", *([] if own else [f"output={_quote(str(place))}"])])
+
+
+def _quote(text: str) -> str:
+    """A value as Hydra's grammar takes it."""
+    return text if re.fullmatch(r"[\w./-]+", text) else "'" + text.replace("'", r"\'") + "'"
+
+
+def _cause(error: BaseException) -> BaseException:
+    """What a part of the settings raised while Hydra built it."""
+    named = type(error).__name__ == "InstantiationException"
+    return error.__cause__ if named and error.__cause__ else error
+
+
+def _fail(error: BaseException, show: bool = False) -> int:
+    if show:
+        traceback.print_exception(error)
+    print(f"dhtorch: {_line(error)}", file=sys.stderr)
+    return FAILED
+
+
+def _line(error: BaseException) -> str:
+    """An error in one line."""
+    lines = [line for line in str(error).splitlines() if line.strip()]
+    if any("Original Traceback" in line for line in lines):  # a data-loader worker sends its whole traceback along
+        lines = lines[-1:]
+    message = " ".join(" ".join(lines).split())
+    if "hydra/launcher/" in message:
+        message += " (launchers come with the extras: pip install 'dhtorch[scale]', for Ray 'dhtorch[ray-launcher]')"
+    return f"{type(error).__name__}: {message}"

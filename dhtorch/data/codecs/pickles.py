@@ -1,0 +1,288 @@
+"""Pickled ``.npy`` files, read as data: numbers, texts, plain containers and numpy arrays, nothing else.
+
+A pickle is a program for a stack machine whose instructions may call any function of the interpreter. This is another
+machine for the same instructions: a name in the file (``numpy.ndarray``) is never looked up, it stays a token, and
+*call* knows the few tokens that rebuild arrays, with code of our own. So there is nothing to escape to, and no size is
+believed before the bytes for it are there. Protocols 2 to 5, the module paths of numpy 1 and 2.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from dhtorch.data import files
+from dhtorch.data.codecs.npy import npy_header
+from dhtorch.data.files import FormatError
+from dhtorch.data.pickled_arrays import CALLS, NAMES, SCALARS, Name, Shell, built, filled, scalar
+
+MAX_PICKLE_BYTES: Final = 128_000_000
+MAX_STEPS: Final = 10_000_000  # instructions of one pickle
+MAX_DEPTH: Final = 32  # containers inside containers
+
+_MARK = object()
+
+
+def read_npy(file: Path) -> Any:
+    """The content of a ``.npy`` file: an array of numbers, or the pickled object in it.
+
+    A 0-d object array, as ``np.save`` makes of a dict, gives the object itself; a 1-d one gives a list.
+
+    Returns:
+        Arrays (native byte order, read-only), dict, list, tuple, set, str, bytes, int, float, bool, None.
+
+    Raises:
+        FormatError: missing or damaged file, or a pickle that contains or does anything else.
+    """
+    data = files.read_bytes(file, MAX_PICKLE_BYTES)
+    shape, fortran, dtype, start = npy_header(file, "header", data)
+    body = data[start:]
+    if dtype.hasobject:
+        return loads(body, file)
+    try:
+        return filled(dtype, shape, fortran, body)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise FormatError(file, "data", error, f"numbers of type {dtype}") from None
+
+
+def loads(data: bytes, file: Path) -> Any:
+    """The object of a pickle of plain data; ``file`` names it in errors.
+
+    Raises:
+        FormatError: anything that is not plain data, or too large, too deep, truncated.
+    """
+    try:
+        return _Machine(data, file).run()
+    except FormatError:
+        raise
+    except (IndexError, KeyError, TypeError, ValueError, AttributeError, OverflowError, struct.error) as error:
+        found = f"{type(error).__name__} {error}"
+        raise FormatError(file, "pickle", found, "a whole pickle of arrays and plain containers") from None
+
+
+class _Machine:
+    """Runs one pickle: a stack, a memo, and the instructions as methods of one table."""
+
+    def __init__(self, data: bytes, file: Path) -> None:
+        self.data, self.file, self.at = data, file, 0
+        self.stack: list[Any] = []
+        self.memo: dict[int, Any] = {}
+        self.steps = self.nodes = 0
+        self.budget = 4 * len(data) + 4096  # bytes that calls may make of this file; shared values could multiply
+
+    def run(self) -> Any:
+        while True:
+            self.steps += 1
+            if self.steps > MAX_STEPS:
+                raise FormatError(self.file, "pickle", f"more than {MAX_STEPS} instructions", "fewer")
+            code = self.data[self.at]
+            self.at += 1
+            if code == 0x2E:  # STOP
+                return self._plain(self.stack.pop(), 0)
+            step = _STEPS.get(code)
+            if step is None:
+                raise FormatError(self.file, "pickle", f"instruction {bytes([code])!r}", "one that builds plain data")
+            step(self)
+
+    # ------------------------------------------------------------------------------------------------- bytes and stack
+
+    def take(self, n: int) -> bytes:
+        end = self.at + n
+        if n < 0 or end > len(self.data):
+            raise ValueError(f"{n} bytes wanted, {len(self.data) - self.at} left")
+        part, self.at = self.data[self.at : end], end
+        return part
+
+    def unpack(self, form: str) -> Any:
+        return struct.unpack(form, self.take(struct.calcsize(form)))[0]
+
+    def since_mark(self) -> list[Any]:
+        at = len(self.stack) - 1
+        while self.stack[at] is not _MARK:
+            at -= 1
+            if at < 0:
+                raise ValueError("no mark on the stack")
+        items = self.stack[at + 1 :]
+        del self.stack[at:]
+        return items
+
+    def push(self, value: Any) -> None:
+        self.stack.append(value)
+
+    def top(self, kind: type) -> Any:
+        if type(self.stack[-1]) is not kind:
+            raise TypeError(f"{kind.__name__} expected on the stack")
+        return self.stack[-1]
+
+    def pop_n(self, n: int) -> tuple[Any, ...]:
+        if len(self.stack) < n:
+            raise IndexError("empty stack")
+        items = tuple(self.stack[-n:])
+        del self.stack[-n:]
+        return items
+
+    # ---------------------------------------------------------------------------------------------------- instructions
+
+    def set_items(self, items: list[Any]) -> None:
+        target = self.top(dict)
+        if len(items) % 2:
+            raise ValueError("a key without a value")
+        for key, value in zip(items[::2], items[1::2], strict=True):
+            target[scalar(key)] = value
+
+    def integer(self, n: int) -> None:
+        if not 0 <= n <= 16:
+            raise ValueError(f"an integer of {n} bytes")
+        self.push(int.from_bytes(self.take(n), "little", signed=True))
+
+    def name(self, module: Any, attribute: Any) -> None:
+        text = re.sub(r"^numpy\._core\b", "numpy.core", f"{module}.{attribute}")
+        text = re.sub(r"^__builtin__\b", "builtins", text)
+        if text not in NAMES or type(module) is not str or type(attribute) is not str:
+            raise FormatError(self.file, "pickle", f"the name {text}", "numpy arrays and plain containers only")
+        self.push(Name(text))
+
+    def line(self) -> str:
+        end = self.data.index(b"\n", self.at, self.at + 256)
+        return self.take(end - self.at + 1)[:-1].decode()
+
+    def call(self) -> None:
+        function, args = self.pop_n(2)
+        if type(function) is not Name or type(args) is not tuple:
+            raise TypeError("a call of something else than a permitted name")
+        self.push(CALLS[function](self.spend, *args))
+
+    def build(self) -> None:
+        target, state = self.pop_n(2)
+        self.push(built(self.spend, target, state))
+
+    def spend(self, n: int) -> None:
+        self.budget -= n
+        if self.budget < 0:
+            raise FormatError(self.file, "pickle", "arrays larger than the file", "as many bytes as it has")
+
+    # ---------------------------------------------------------------------------------------------------------- result
+
+    def _plain(self, value: Any, depth: int) -> Any:
+        """The finished value: shells replaced by their arrays, a fresh copy of every container.
+
+        A container that holds itself is endlessly deep, and one whose parts are shared over and over (each list ten
+        times the one before) has more nodes than the file has instructions: both end here.
+        """
+        self.nodes += 1
+        if depth > MAX_DEPTH or self.nodes > 8 * self.steps + 64:
+            raise FormatError(self.file, "pickle", "containers nested beyond measure", f"at most {MAX_DEPTH} deep")
+        kind = type(value)
+        if kind in SCALARS or kind is bytearray:
+            return value
+        if kind in (list, tuple, set):
+            return kind(self._plain(item, depth + 1) for item in value)
+        if kind is dict:
+            return {key: self._plain(item, depth + 1) for key, item in value.items()}
+        if kind is Shell and value.value is not None:
+            if isinstance(value.value, np.ndarray):
+                return value.value
+            items = [self._plain(item, depth + 1) for item in value.value]
+            return items if value.shape else items[0]
+        raise TypeError(f"a bare {kind.__name__} is no data")
+
+
+def _pushes(form: str) -> Callable[[_Machine], None]:
+    """A number, stored as ``form`` of the struct module."""
+    return lambda m: m.push(m.unpack(form))
+
+
+def _texts(form: str) -> Callable[[_Machine], None]:
+    return lambda m: m.push(m.take(m.unpack(form)).decode("utf-8", "surrogatepass"))
+
+
+def _bytes(form: str) -> Callable[[_Machine], None]:
+    return lambda m: m.push(m.take(m.unpack(form)))
+
+
+def _stores(form: str) -> Callable[[_Machine], None]:
+    return lambda m: m.memo.__setitem__(m.unpack(form), m.stack[-1])
+
+
+def _recalls(form: str) -> Callable[[_Machine], None]:
+    return lambda m: m.push(m.memo[m.unpack(form)])
+
+
+def _collects(make: Callable[[Any], Any]) -> Callable[[_Machine], None]:
+    return lambda m: m.push(make(m.since_mark()))
+
+
+def _tuples(n: int) -> Callable[[_Machine], None]:
+    return lambda m: m.push(m.pop_n(n))
+
+
+def _append(machine: _Machine) -> None:
+    (value,) = machine.pop_n(1)
+    machine.top(list).append(value)
+
+
+def _extend(machine: _Machine) -> None:
+    items = machine.since_mark()
+    machine.top(list).extend(items)
+
+
+def _add(machine: _Machine) -> None:
+    items = machine.since_mark()
+    machine.top(set).update(map(scalar, items))
+
+
+_STEPS: Final[dict[int, Callable[[_Machine], Any]]] = {
+    ord(code): step
+    for code, step in {
+        "\x80": lambda m: m.take(1),  # PROTO: an instruction we do not know stops us, a number would not
+        "\x95": lambda m: m.take(8),  # FRAME
+        "(": lambda m: m.push(_MARK),
+        "0": lambda m: m.pop_n(1),
+        "1": lambda m: m.since_mark(),
+        "2": lambda m: m.push(m.stack[-1]),
+        "N": lambda m: m.push(None),
+        "\x88": lambda m: m.push(True),
+        "\x89": lambda m: m.push(False),
+        "J": _pushes("<i"),
+        "K": _pushes("<B"),
+        "M": _pushes("<H"),
+        "G": _pushes(">d"),
+        "\x8a": lambda m: m.integer(m.unpack("<B")),
+        "\x8b": lambda m: m.integer(m.unpack("<i")),
+        "X": _texts("<I"),
+        "\x8c": _texts("<B"),
+        "\x8d": _texts("<Q"),
+        "B": _bytes("<I"),
+        "C": _bytes("<B"),
+        "\x8e": _bytes("<Q"),
+        "\x96": _bytes("<Q"),  # a byte array
+        "]": lambda m: m.push([]),
+        "}": lambda m: m.push({}),
+        ")": lambda m: m.push(()),
+        "\x8f": lambda m: m.push(set()),
+        "l": _collects(list),
+        "t": _collects(tuple),
+        "\x85": _tuples(1),
+        "\x86": _tuples(2),
+        "\x87": _tuples(3),
+        "a": _append,
+        "e": _extend,
+        "\x90": _add,
+        "s": lambda m: m.set_items(list(m.pop_n(2))),
+        "u": lambda m: m.set_items(m.since_mark()),
+        "q": _stores("<B"),
+        "r": _stores("<I"),
+        "\x94": lambda m: m.memo.__setitem__(len(m.memo), m.stack[-1]),
+        "h": _recalls("<B"),
+        "j": _recalls("<I"),
+        "c": lambda m: m.name(m.line(), m.line()),
+        "\x93": lambda m: m.name(*m.pop_n(2)),
+        "R": _Machine.call,
+        "b": _Machine.build,
+    }.items()
+}

@@ -1,1 +1,0 @@
-"""One question per file; each ``run(...)`` returns rows, a summary and a verdict."""

@@ -1,0 +1,262 @@
+"""``dhtorch integrate``: one map for every recording, its files, and a result that says how far it reaches."""
+
+from __future__ import annotations
+
+import importlib.util
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dhtorch import archive, export, integrate
+from dhtorch.codes import Source
+from dhtorch.data import Recordings
+from dhtorch.data import files as data_files
+from dhtorch.geometry import camera as cameras
+from dhtorch.geometry import se3
+from dhtorch.integrate import recording as recordings
+from dhtorch.integrate.picture import draw_map
+from dhtorch.integrate.recording import Answer, Places
+from dhtorch.pair import merge
+from dhtorch.records import Camera, Frame
+
+Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
+Row = dict[str, Any]
+
+#: Settings groups whose names are kept with the result.
+GROUPS = ("method", "data", "pairs")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The map of one recording and what it was made of."""
+
+    recording: Any
+    answers: Sequence[Answer]
+    places: Places
+    volume: integrate.Volume
+    surface: integrate.Surface
+    row: Row
+
+
+def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:
+    """``dhtorch integrate``: a folder of files for every scene, and ``result.json`` when all are done.
+
+    Args:
+        settings: the options of ``conf/integrate.yaml``, resolved, with ``choices``.
+        parts: ``data``, ``method`` and ``pairs``, as objects.
+        progress: wraps a loop: (items, text, number of items) → items.
+
+    Returns:
+        Exit code 0.
+
+    Raises:
+        ValueError, OSError, ImportError: bad options or data.
+        KeyboardInterrupt: Ctrl-C; scenes that are finished stay.
+    """
+    _check(settings)
+    if settings["threads"] is not None:
+        torch.set_num_threads(settings["threads"])
+        data_files.set_opencv_threads(settings["threads"])
+    sources = parts["data"] if isinstance(parts["data"], list | Recordings) else [parts["data"]]
+    folder, began = Path(settings["output"]), time.perf_counter()
+    scenes: list[Row] = []
+    rows: list[Row] = []
+    written: list[Path] = []
+    try:
+        for source in sources:
+            scene = make(source, parts["method"], parts["pairs"], settings, progress=progress)
+            written += write(folder / scene.recording.name, scene, settings)
+            scene.row["seconds"] = time.perf_counter() - began - sum(r["seconds"] for r in scenes)
+            scenes.append(scene.row)
+            rows += [*_pair_rows(scene), scene.row]
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"{len(scenes)} of {len(sources)} scenes in {folder} are whole and stay") from None
+    result = _result(settings, sources, rows, scenes)
+    archive.write(folder / "result.json", result)
+    print("\n".join(_said(row, settings["voxel"]) for row in scenes))
+    print("\n".join(["wrote", *(f"  {path}" for path in [folder / "result.json", *written])]))
+    return 0
+
+
+def make(recording: Any, method: Any, pairs: Any, settings: Mapping[str, Any], *, progress: Progress) -> Scene:
+    """Ask the method, place the frames, fuse, and count.
+
+    Raises:
+        ValueError: as the readers, the method and the volume raise it; no frame that could be placed.
+    """
+    chosen = list(pairs(recording))
+    anchored = settings["poses"] == "anchored"
+    links = recordings.chain(chosen) if anchored else []
+    options = {k: settings[k] for k in ("cutoff", "seed", "device")} | {"dtype": getattr(torch, settings["dtype"])}
+    asked = recordings.ask(recording, method, [*chosen, *links], **options)
+    found = list(progress(asked, f"{recording.name}: pairs", len(chosen) + len(links)))
+    places = recordings.place(recording, found, poses=settings["poses"])
+    if not places.poses:
+        raise ValueError(f"{recording.name}: found no frame with a finite pose, expected one at least")
+    answers = found[: len(chosen)]
+    volume = integrate.empty(settings["voxel"], truncation=settings["truncation"])
+    fuse = {"cutoff": settings["cutoff"], "min_conf": settings["min_conf"], "progress": progress}
+    fuse |= {"sigma_m": settings["sensor_sigma_m"], "sigma_rel": settings["sensor_sigma_rel"]}
+    sensor = recordings.build(recording, volume, answers, places, sources=[Source.SENSOR], **fuse)
+    volume = recordings.build(recording, sensor, answers, places, sources=[Source.RECOVERED], **fuse)
+    least = settings["min_weight"]
+    alone, both = (integrate.points(v, min_weight=least) for v in (sensor, volume))
+    surface = integrate.mesh(volume, min_weight=least) if _meshed(settings["mesh"]) else both
+    row: Row = {"scene": recording.name, "pair": None, "method": _name(settings), "truth": settings["poses"]}
+    row |= {"role": recording.role, "n_pairs": len(chosen), "n_frames": len(places.poses)}
+    row |= {"n_fragments": places.n_fragments, "n_unplaced": places.n_unplaced, "n_recovered": _n_recovered(answers)}
+    row |= recordings.coverage(both.xyz, settings["voxel"])
+    row |= {f"{k}_sensor": v for k, v in recordings.coverage(alone.xyz, settings["voxel"]).items()}
+    row["voxels_vs_sensor"] = row["n_voxels"] / row["n_voxels_sensor"] if row["n_voxels_sensor"] else None
+    row |= {"n_points": len(surface.xyz), "n_triangles": None if surface.face is None else len(surface.face)}
+    row |= {"volume_mib": volume.bytes / 2**20}
+    return Scene(recording, answers, places, volume, surface, row)
+
+
+def write(folder: Path, scene: Scene, settings: Mapping[str, Any]) -> list[Path]:
+    """The files of one scene; returns what was written."""
+    surface, voxel = scene.surface, settings["voxel"]
+    rgb, score = surface.features[:, :3], surface.features[:, 3]
+    about = {"sigma": surface.sigma, "score": score, "source": surface.source}
+    world = f"metres; axes of {scene.recording.name}'s world"
+    export.write_ply(
+        folder / "map.ply", surface.xyz, rgb, normal=surface.normal, face=surface.face, comments=[world], **about
+    )
+    cloud = _cloud(scene)
+    recovered = cloud["source"] == Source.RECOVERED
+    shapes = [export.Shape("surface", surface.xyz, rgb, surface.normal, surface.face, values={"sigma": surface.sigma})]
+    points = cloud["xyz"][recovered], cloud["rgb"][recovered]
+    shapes.append(export.Shape("recovered", *points, values={"sigma": cloud["sigma"][recovered]}))
+    export.write_glb(folder / "map.glb", shapes, up=scene.places.up)
+    columns = {k: cloud[k] for k in ("sigma", "score", "hole", "source")}
+    export.write_ply(folder / "points.ply", cloud["xyz"], cloud["rgb"], comments=[world], **columns)
+    _write_colmap(folder / "colmap", scene)
+    draw_map(folder / "map.png", surface, list(scene.places.poses.values()), scene.places.up, voxel=voxel)
+    names = ["map.ply", "map.glb", "points.ply", "map.png"]
+    names += [f"colmap/{name}" for name in ("cameras.txt", "images.txt", "points3D.txt")]
+    return [folder / name for name in names]
+
+
+def _cloud(scene: Scene) -> dict[str, Tensor]:
+    """Every sample with depth, the sensor's or recovered, of every placed anchor, in the world."""
+    parts: dict[str, list[Tensor]] = {k: [] for k in ("xyz", "rgb", "sigma", "score", "hole", "source")}
+    for answer in scene.answers:
+        if answer.pair[0] in scene.places.poses:
+            whole = merge(answer.samples, answer.estimate)
+            there = whole.source[0] != Source.NONE
+            xyz = cameras.unproject(answer.camera, whole.uv, whole.depth)
+            world = se3.apply(scene.places.poses[answer.pair[0]], xyz.double())
+            values = {"xyz": world, "rgb": answer.rgb, "sigma": whole.sigma, "score": whole.score}
+            for name, value in {**values, "hole": answer.samples.hole, "source": whole.source}.items():
+                parts[name].append(value[0][there])
+    empty = {"xyz": torch.zeros(0, 3), "rgb": torch.zeros(0, 3)}
+    return {k: torch.cat(v) if v else empty.get(k, torch.zeros(0)) for k, v in parts.items()}
+
+
+def _write_colmap(folder: Path, scene: Scene) -> None:
+    """Views, tracks, and the points that were triangulated from them."""
+    poses = scene.places.poses
+    number = {k: n for n, k in enumerate(poses)}
+    lenses: dict[int, tuple[Camera, tuple[int, int]]] = {}
+    for k in poses:
+        frame: Frame = scene.recording[k]
+        lenses[k] = frame.camera, frame.hw
+    shots = [export.Shot(f"{int(scene.recording.number[k]):06d}.png", *lenses[k], poses[k]) for k in poses]
+    pieces = [_triangulated(a, number, poses) for a in scene.answers if set(a.pair) <= set(poses)]
+    none = [torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 2).long(), torch.zeros(0, 2, 2)]
+    export.write_colmap(folder, shots, *map(torch.cat, zip(*(pieces or [none]), strict=True)))
+
+
+def _triangulated(answer: Answer, number: Mapping[int, int], poses: Mapping[int, Any]) -> list[Tensor]:
+    """World points, colours, errors, views and pixels of what one pair answered."""
+    keep = answer.estimate.keep[0]
+    xyz = cameras.unproject(answer.camera, answer.estimate.uv, answer.estimate.depth.nan_to_num(1.0))
+    world = se3.apply(poses[answer.pair[0]], xyz.double())[0]
+    uv = torch.stack((answer.tracks.uv_0[0], answer.tracks.uv_1[0]), 1)
+    views = torch.tensor([number[k] for k in answer.pair]).expand(len(keep), 2)
+    return [x[keep] for x in (world, answer.rgb[0], answer.estimate.residual_px[0], views, uv)]
+
+
+def _pair_rows(scene: Scene) -> list[Row]:
+    common = {k: scene.row[k] for k in ("scene", "method", "truth")}
+    return [
+        {**common, "pair": list(a.pair), "pnp_ok": int(a.fit.ok[0]), "n_kept": int(a.estimate.keep.sum())}
+        | {"n_recovered": int(a.recovered.sum()), "placed": int(a.pair[0] in scene.places.poses)}
+        for a in scene.answers
+    ]
+
+
+def _said(row: Row, voxel: float) -> str:
+    """One scene in words."""
+    placed = f"{row['n_frames']} of {row['n_frames'] + row['n_unplaced']} frames placed by {row['truth']} poses"
+    fragments = f"{row['n_fragments']} fragment{'s' * (row['n_fragments'] != 1)}"
+    if not row["n_voxels"]:
+        return f"{row['scene']}: {placed}, {fragments}; no surface"
+    wider = f", {row['voxels_vs_sensor']:.3g} times the sensor's" if row["voxels_vs_sensor"] else ""
+    islands = f"{row['n_islands']} islands, the largest {row['largest_island']:.0%}"
+    size = f"{row['n_points']} points" + (f", {row['n_triangles']} triangles" if row["n_triangles"] else "")
+    return (
+        f"{row['scene']}: {placed}, {fragments}; {row['n_voxels']} voxels of {100 * voxel:g} cm{wider}, {islands};"
+        f" {size}, {row['volume_mib']:.1f} MiB, {row['seconds']:.1f} s"
+    )
+
+
+def _n_recovered(answers: Iterable[Answer]) -> int:
+    return sum(int(answer.recovered.sum()) for answer in answers)
+
+
+def _result(settings: Mapping[str, Any], sources: Sequence[Any], rows: list[Row], scenes: list[Row]) -> Row:
+    choices = {group: settings["choices"][group] for group in GROUPS}
+    config = {k: v for k, v in settings.items() if k != "choices"}
+    named = archive.files_named({k: config[k] for k in GROUPS})
+    digest = archive.data_digest({**archive.files_below(r.root for r in sources), **named})
+    units = {"n_voxels": "", "n_voxels_sensor": "", "voxels_vs_sensor": "", "n_fragments": "", "n_islands": ""}
+    summary = {}
+    for metric, unit in units.items():
+        values = sorted(row[metric] for row in scenes if row[metric] is not None and row["role"] is None)
+        middle = float(torch.tensor(values).double().quantile(0.5)) if values else None
+        entry = {"value": middle, "low": None, "high": None, "n": len(values), "unit": unit}
+        summary[f"{_name(settings)}.{metric}"] = entry
+    threads = torch.get_num_threads()
+    return archive.build(
+        experiment="integrate",
+        key=archive.result_key({**config, "choices": choices}, digest, roots=[__name__]),
+        meta=archive.meta(device=settings["device"], dtype=settings["dtype"], threads=threads, seed=settings["seed"]),
+        config=config,
+        data={
+            "name": choices["data"],
+            "scenes": [row["scene"] for row in scenes],
+            "n_pairs": sum(row["n_pairs"] for row in scenes),
+            "digest": digest,
+        },
+        summary=summary,
+        rows=rows,
+    )
+
+
+def _name(settings: Mapping[str, Any]) -> str:
+    return str(settings["choices"]["method"])
+
+
+def _meshed(wanted: bool | None) -> bool:
+    return importlib.util.find_spec("skimage") is not None if wanted is None else wanted
+
+
+def _check(settings: Mapping[str, Any]) -> None:
+    """Options that would only fail after minutes."""
+    if settings["dtype"] not in ("float32", "float64"):
+        raise ValueError(f"dtype: found {settings['dtype']!r}, expected float32 or float64")
+    if settings["poses"] not in recordings.POSES:
+        raise ValueError(f"poses: found {settings['poses']!r}, expected one of {', '.join(recordings.POSES)}")
+    if settings["cutoff"] is not None and not settings["cutoff"] > 0:
+        raise ValueError(f"cutoff: found {settings['cutoff']}, expected a positive number of metres, or null for none")
+    if settings["mesh"] and not _meshed(None):
+        raise ImportError("mesh: found no scikit-image, expected the extra: pip install 'dhtorch[mesh]'")
+    integrate.points(
+        integrate.empty(settings["voxel"], truncation=settings["truncation"]), min_weight=settings["min_weight"]
+    )

@@ -1,0 +1,136 @@
+"""Question: is ``map`` more accurate than ``paper``, and does it know what it does not know?
+
+Expectation (written before the run): over the scenes the median error falls to at most 0.7 of the paper's (``window``:
+0.6), no scene is more than 15 % worse at equal coverage, the area under the risk–coverage curve falls to 0.65 (0.55),
+more than a quarter of the candidates can be answered at 5 % mean risk, about 68 % of the errors lie within one stated
+sigma and 90 % within two, the recalibrated score is off by at most 0.07, and thresholds chosen on other rooms keep the
+mean error within their target.
+What would refute it: any of these numbers missed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+from dhtorch.evaluate import compare
+from dhtorch.studies import protocol
+from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
+from dhtorch.studies.rows import Row
+
+QUESTION = "Is the method more accurate than the paper's, and does it know what it does not know?"
+EXPECTATION = (
+    "Every number of the list of bars is met; scenes are the unit, promises are kept in rooms not learnt from."
+)
+
+#: Number → (bar, whether it holds); the second of two bars is for a method of several views.
+BARS: dict[str, tuple[float, float, Callable[[float, float], bool]]] = {
+    "median_rel_ratio": (0.70, 0.60, lambda value, bar: value <= bar),
+    "worst_scene_ratio": (1.15, 1.15, lambda value, bar: value <= bar),
+    "aurc_ratio": (0.65, 0.55, lambda value, bar: value <= bar),
+    "coverage_at_5": (0.26, 0.27, lambda value, bar: value >= bar),
+    "within_sigma": (0.68, 0.68, lambda value, bar: abs(value - bar) <= 0.07),
+    "within_2sigma": (0.90, 0.90, lambda value, bar: value >= bar),
+    "ece": (0.07, 0.07, lambda value, bar: value <= bar),
+    "realised_risk_10": (0.10, 0.10, lambda value, bar: value <= bar),
+    "realised_risk_5": (0.05, 0.05, lambda value, bar: value <= bar),
+}
+
+
+def run(
+    recordings: Sequence[Any],
+    chosen: Mapping[str, Method],
+    pairs: Pairs,
+    settings: Settings,
+    *,
+    methods: Mapping[str, Method] | None = None,
+    reference: str = "paper",
+    once: Sequence[str] = ("opencv",),
+    seeds: int = 5,
+    stand_ins: Mapping[str, str] | None = None,
+    progress: Progress = protocol.quiet,
+) -> Outcome:
+    """Run several methods on the same pairs, several seeds each, and compare them with the reference.
+
+    Rows are those of the first seed; scene rows of a compared method carry ``against_<reference>``: its numbers over
+    all seeds. The summary holds, for every compared method, the numbers of
+    :func:`dhtorch.evaluate.compare.method_ratios`. A method of several views is replaced, on scenes too short for
+    three, by its stand-in.
+
+    Args:
+        recordings, chosen, pairs, settings, progress: as :func:`dhtorch.studies.protocol.run`.
+        methods: name → method; None = ``chosen``.
+        reference: name of the method to compare with.
+        once: methods that are shown for one seed and not compared.
+        seeds: how many, from the job's own upwards.
+        stand_ins: method of several views → method of one; None = the first compared method for all.
+
+    Raises:
+        ValueError: no reference, or nothing to compare with it; else as the main job.
+    """
+    methods = dict(methods or chosen)
+    compared = [name for name in methods if name not in (*once, reference)]
+    if reference not in methods or not compared:
+        raise ValueError(f"experiment.methods: found {', '.join(methods)}, expected {reference} and one more")
+    variants = {
+        _named(name, k): Variant(method, seed=settings.seed + k, needs=partial(_views, pairs, method.views))
+        for name, method in methods.items()
+        for k in range(1 if name in once else seeds)
+    }
+    outcome = protocol.run(recordings, Protocol(variants), pairs, settings, progress=progress)
+    rooms = {r.name: getattr(r, "room", None) or r.name for r in recordings}
+    apart = {r.name for r in recordings if r.role is not None}
+    found = {name: _by_scene(outcome, name, seeds, apart) for name in (reference, *compared)}
+    fallback = stand_ins or {name: compared[0] for name in compared if methods[name].views > 1}
+    judged = compare.method_ratios(found, reference=reference, rooms=rooms, fallback=fallback)
+    later = {_named(name, k) for name in methods for k in range(1, seeds)}
+    outcome.rows = [r for r in outcome.rows if r["method"] not in later]
+    outcome.summary = {k: v for k, v in outcome.summary.items() if not any(k.startswith(f"{m}.") for m in later)}
+    outcome.summary |= judged.summary
+    _annotate(outcome.rows, judged.rows, f"against_{reference}")
+    several = {name for name in compared if methods[name].views > 1}
+    return outcome.decide(QUESTION, EXPECTATION, *verdict(judged, compared, several))
+
+
+def verdict(judged: compare.Comparison, compared: Sequence[str], several: set[str]) -> tuple[bool | None, str]:
+    """Hold the summary against the bars, and name what is missed, left out or silenced."""
+    missed, n_held = [], 0
+    for method in compared:
+        for number, (one, many, holds) in BARS.items():
+            value, bar = judged.summary.get(f"{method}.{number}", {}).get("value"), many if method in several else one
+            if value is None:
+                return None, f"{method}.{number} is not defined on these scenes"
+            n_held += holds(value, bar)
+            missed += [] if holds(value, bar) else [f"{method}.{number} {value:.3f} (bar {bar:g})"]
+    notes = [f"{m} without ratio: {', '.join(scenes)}" for m, scenes in judged.left_out.items() if scenes]
+    notes += [f"{m} % risk silences {', '.join(scenes)}" for m, scenes in judged.silent.items() if scenes]
+    return not missed, "; ".join([f"{n_held} of {n_held + len(missed)} bars met", *missed, *notes])
+
+
+def _named(method: str, k: int) -> str:
+    return method if k == 0 else f"{method}, seed {k}"
+
+
+def _views(pairs: Pairs, views: int, recording: Any) -> str | None:
+    """Why a method of several views is not asked on a scene; None where it is."""
+    short = views > 1 and min((j - i for i, j in pairs(recording)), default=2) < 2
+    return "fewer than 3 views" if short else None
+
+
+def _by_scene(outcome: Outcome, method: str, seeds: int, apart: set[str]) -> dict[str, list[Any]]:
+    """Scene → candidates of every seed; scenes with a role stay out."""
+    scenes: dict[str, list[Any]] = {}
+    for k in range(seeds):
+        for (scene, variant, cohort), points in outcome.points.items():
+            if (variant, cohort) == (_named(method, k), "full") and scene not in apart:
+                scenes.setdefault(scene, []).append(points)
+    return scenes
+
+
+def _annotate(rows: Sequence[Row], numbers: Sequence[Row], key: str) -> None:
+    """Put the comparison's numbers of a scene into its row."""
+    known = {(n["scene"], n["method"]): {k: v for k, v in n.items() if k not in ("scene", "method")} for n in numbers}
+    for row in rows:
+        if row["pair"] is None and (row["scene"], row["method"]) in known:
+            row[key] = known[row["scene"], row["method"]]

@@ -1,0 +1,1 @@
+"""The protocols and tables of the paper."""

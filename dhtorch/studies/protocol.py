@@ -1,0 +1,440 @@
+"""The one loop behind every experiment: pairs of a recording in, rows of a result out.
+
+A *variant* is a method as an experiment runs it. A *cohort* is what its answers are held against; it is counted for
+every variant alike, also where the pose fails. A *protocol* joins both and says what the methods may see. An
+experiment is a protocol, a question about the rows it gives, and a verdict.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+from dhtorch import tree
+from dhtorch.codes import Gate, Hole, names
+from dhtorch.data.files import set_opencv_threads
+from dhtorch.data.pairs import between
+from dhtorch.evaluate import errors, holdout
+from dhtorch.geometry.lookup import nearest, patches, round_half_up
+from dhtorch.method import Method, Trace
+from dhtorch.records import Estimate, Frame, PoseFit, Samples, TrackHint
+from dhtorch.studies.rows import Row, overlay, scene_row, summarise
+from dhtorch.studies.shared_tracks import SharedTracks
+
+Pairs = Callable[[Any], Sequence[tuple[int, int]]]
+Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
+
+#: A pair with fewer candidates says nothing: it is dropped and counted.
+MIN_CANDIDATES = 20
+
+#: A track looks at this many pixels across (LK window and a margin): what lies within may pull at it.
+REACH_PX = 25
+
+
+def scene_hint(recording: Any) -> TrackHint:
+    """What a recording knows of the motion in it."""
+    return TrackHint(levels=recording.levels)
+
+
+def quiet(items: Iterable[Any], _text: str, _total: int) -> Iterable[Any]:
+    """No progress bar."""
+    return items
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What all pairs of a job share."""
+
+    cutoff: float | None = None  # m; None = the scene's own near limit
+    cutoff_factor: float = 1.0  # on either
+    truth: tuple[str, ...] = ("full",)  # truth tests to report: raw | 5x5 | full
+    seed: int = 0
+    device: str = "cpu"
+    dtype: torch.dtype = torch.float32
+    batch: int = 1
+    workers: int = 0
+
+    def cutoff_of(self, recording: Any) -> float | None:
+        """The cutoff on one scene, m; None where nothing is known to be near."""
+        cutoff = recording.near if self.cutoff is None else self.cutoff
+        return None if cutoff is None else cutoff * self.cutoff_factor
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Some pairs of one recording, loaded: all that a protocol may look at."""
+
+    recording: Any
+    pairs: Sequence[tuple[int, int]]
+    cutoff: float | None  # m
+    anchor: Frame
+    others: tuple[Frame, ...]  # further views, the pair's own last
+    exact: Frame  # the anchor with the depth it is held against
+    surface: Tensor  # (B, H, W) kind of surface, (B, 1, 1) where the recording knows none
+    disagreement: Tensor  # (B,) median relative difference of the independent truth from the sensor; NaN = not known
+
+    @property
+    def odd(self) -> dict[int, str]:
+        """Kinds of surface that are counted apart: code → name."""
+        return {k: name for k, name in self.recording.surfaces.items() if name in self.recording.odd_surfaces}
+
+    def kinds(self, uv: Tensor) -> Tensor | None:
+        """Kind of surface (B, N) at samples; one whose track window touches an odd surface counts with that."""
+        if self.surface.shape[-1] == 1:
+            return None
+        kind = nearest(self.surface, uv)[0]
+        corner = (round_half_up(uv) - REACH_PX // 2).long()
+        around = patches(self.surface[:, None], corner, min(REACH_PX, *self.surface.shape[-2:]))[:, :, 0].flatten(-2)
+        for code in self.odd:
+            kind = torch.where((around == code).any(-1), torch.full_like(kind, code), kind)
+        return kind
+
+
+Cohort = Callable[[Batch, Trace], holdout.Truth]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A method as an experiment runs it."""
+
+    method: Method
+    ask: Callable[..., Estimate] | None = None  # in the place of the method's line: (method, anchor, others, *, …)
+    fit: Callable[[Batch, int], PoseFit] | None = None  # a pose from elsewhere: (batch, number of samples) → fit
+    seed: int | None = None  # None = the job's
+    given: Callable[[Batch], Mapping[str, Any]] = lambda _batch: {}  # further options: an oracle may see it all
+    needs: Callable[[Any], str | None] = lambda _recording: None  # recording → why it cannot run there, None = it can
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What one variant said about the pairs of a batch, and what it is held against."""
+
+    batch: Batch
+    variant: str
+    estimate: Estimate
+    trace: Trace
+    truths: Mapping[str, holdout.Truth]
+
+    @property
+    def samples(self) -> Samples:
+        """The samples as the method saw them."""
+        samples: Samples = self.trace["samples"]
+        return samples
+
+    def one(self, b: int) -> Answer:
+        """Pair ``b`` alone; milliseconds are the batch's share."""
+        size, cut = len(self.batch.pairs), slice(b, b + 1)
+        records = {k: v[cut] for k, v in self.trace.items() if isinstance(v, tree.Record)}
+        return replace(
+            self,
+            batch=replace(
+                self.batch,
+                pairs=self.batch.pairs[cut],
+                anchor=self.batch.anchor[cut],
+                others=tuple(f[cut] for f in self.batch.others),
+                exact=self.batch.exact[cut],
+                surface=self.batch.surface[cut],
+                disagreement=self.batch.disagreement[cut],
+            ),
+            estimate=self.estimate[cut],
+            trace={**records, "ms": {k: v / size for k, v in self.trace["ms"].items()}},
+            truths={k: v[cut] for k, v in self.truths.items()},
+        )
+
+
+def held_back(batch: Batch, trace: Trace, *, test: str = "full") -> holdout.Truth:
+    """The cohort of the range split: samples whose return was held back and passes the truth test."""
+    samples: Samples = trace["samples"]
+    kinds = batch.kinds(samples.uv)
+    odd = None if kinds is None else torch.isin(kinds, torch.tensor([*batch.odd], dtype=kinds.dtype).to(kinds.device))
+    found = holdout.truth_at(batch.exact, samples.uv, truth=test, sparse=batch.recording.sparse)
+    return holdout.candidates(samples, found, batch.cutoff if _is_cut(batch.cutoff) else None, excluded=odd)
+
+
+def no_columns(_answer: Answer) -> Row:
+    """Nothing beyond the usual columns."""
+    return {}
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """Which variants run, what they may see, what they are held against, and what else is noted of each pair."""
+
+    variants: Mapping[str, Variant]
+    cohorts: Mapping[str, Cohort] = field(default_factory=lambda: {"full": held_back})  # the last one decides
+    hide: Callable[[Frame, float | None], Frame] = holdout.range_split  # (view, cutoff) → what a method may see
+    columns: Callable[[Answer], Row] = no_columns  # of one pair; numbers are joined over the pairs of a scene by median
+    min_candidates: int = MIN_CANDIDATES
+
+
+@dataclass(frozen=True)
+class Example:
+    """The first pair of a scene, kept for figures and the point cloud (batch size 1)."""
+
+    scene: str
+    method: str
+    frame: Frame  # as the method saw it
+    samples: Samples
+    estimate: Estimate
+    truth: holdout.Truth
+
+    def cpu(self) -> Example:
+        """The same on the CPU, for figures."""
+        moved = {k: getattr(self, k).to("cpu") for k in ("frame", "samples", "estimate", "truth")}
+        return replace(self, **moved)
+
+
+@dataclass
+class Outcome:
+    """What a job found: rows of a result file, the summary over scenes, and an example of each scene."""
+
+    rows: list[Row] = field(default_factory=list)
+    summary: dict[str, Any] = field(default_factory=dict)
+    examples: list[Example] = field(default_factory=list)
+    n_pairs: int = 0
+    question: str | None = None
+    expectation: str | None = None
+    verdict: str | None = None
+    why: str | None = None
+    points: dict[tuple[str, str, str], errors.Points] = field(default_factory=dict)  # (scene, variant, cohort) → pool
+
+    def decide(self, question: str, expectation: str, holds: bool | None, why: str) -> Outcome:
+        """The same with the answer to its question: True supported, False refuted, None undecided."""
+        words = {True: "supported", False: "refuted", None: "undecided"}
+        return replace(self, question=question, expectation=expectation, verdict=words[holds], why=why)
+
+    def scenes(self, variant: str, cohort: str = "full") -> dict[str, Row]:
+        """Scene → its row, for one variant; scenes with a role are left out."""
+        wanted = (variant, cohort, None, None)
+        return {r["scene"]: r for r in self.rows if (r["method"], r["truth"], r["pair"], r.get("role")) == wanted}
+
+
+def join(outcomes: Iterable[Outcome]) -> Outcome:
+    """Several runs as one: their variants must bear different names."""
+    whole = Outcome()
+    for part in outcomes:
+        whole.rows += part.rows
+        whole.summary |= part.summary
+        whole.examples += [e for e in part.examples if e.scene not in {x.scene for x in whole.examples}]
+        whole.n_pairs += part.n_pairs
+        whole.points |= part.points
+    return whole
+
+
+def run(
+    recordings: Sequence[Any], protocol: Protocol, pairs: Pairs, settings: Settings, *, progress: Progress = quiet
+) -> Outcome:
+    """Run every variant on every pair of every recording.
+
+    Truth is the held-back return of the anchor, or, for a recording that knows it, the exact depth (``truth(i)``);
+    surfaces such as mirrors are then counted apart. Points are pooled inside a scene; the summary is the median over
+    scenes without a role. A scene for which ``pairs`` gives none keeps a row that says "too short".
+
+    Args:
+        recordings: scenes, see ``dhtorch.data``.
+        protocol: variants, cohorts and what is hidden.
+        pairs: recording → list of (anchor, other).
+        settings: cutoff, seed, device, batch, workers.
+        progress: wraps the loop over a scene's batches: (items, text, number of items) → items.
+
+    Raises:
+        ValueError: bad data or options, as the readers, ``pairs`` and the hold-out raise them.
+    """
+    outcome = Outcome()
+    for recording in recordings:
+        chosen = list(pairs(recording))  # first: a data set without pairs of views says so
+        scene = _Scene(recording, protocol, settings)
+        loader = _load(recording, chosen, protocol, settings)
+        for at, items in zip(
+            range(0, len(chosen), settings.batch), progress(loader, recording.name, len(loader)), strict=True
+        ):
+            moved = [_to(item, settings.device) for item in items]
+            scene.add(Batch(recording, chosen[at : at + settings.batch], scene.cutoff, *moved))
+        outcome.rows += scene.rows()
+        outcome.examples += scene.examples
+        outcome.n_pairs += len(chosen)
+        outcome.points |= {(recording.name, *k): tree.collate(p) for k, p in scene.pooled.items()}
+    outcome.summary = summarise(outcome.rows, list(protocol.variants), list(protocol.cohorts))
+    return outcome
+
+
+#: anchor, further views, anchor with its truth as depth, kinds of surface, disagreement of truth and sensor
+Loaded = tuple[Frame, tuple[Frame, ...], Frame, Tensor, Tensor]
+
+
+class PairData(Dataset[Loaded]):
+    """Pairs of one recording for a data loader."""
+
+    def __init__(self, recording: Any, pairs: Sequence[tuple[int, int]], dtype: torch.dtype, views: int = 1) -> None:
+        self.recording, self.pairs, self.dtype, self.views = recording, pairs, dtype, views
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def __getitem__(self, index: int) -> Loaded:
+        i, j = self.pairs[index]
+        anchor = self.recording[i].to(self.dtype)
+        others = tuple(self.recording[k].to(self.dtype) for k in between(i, j, self.views))
+        if not hasattr(self.recording, "truth"):
+            return anchor, others, anchor, torch.zeros(1, 1, 1), torch.full((1,), torch.nan)
+        exact = self.recording.truth(i)
+        known = anchor.replace(depth=exact["depth"].to(self.dtype), depth_camera=None)
+        return anchor, others, known, exact["surface"].float(), exact.get("disagreement", torch.full((1,), torch.nan))
+
+
+class _Scene:
+    """Collects the answers on one recording and turns them into rows."""
+
+    def __init__(self, recording: Any, protocol: Protocol, settings: Settings) -> None:
+        self.recording, self.protocol, self.settings = recording, protocol, settings
+        self.cutoff = settings.cutoff_of(recording)
+        self.missing = {k: reason for k, v in protocol.variants.items() if (reason := v.needs(recording))}
+        self.variants = {k: v for k, v in protocol.variants.items() if k not in self.missing}
+        self.hint = scene_hint(recording)
+        self.last = list(protocol.cohorts)[-1]
+        blind = protocol.hide is holdout.range_split and not _is_cut(self.cutoff)
+        self.least = 0 if blind else protocol.min_candidates
+        self.examples: list[Example] = []
+        self.pair_rows: list[Row] = []
+        self.pooled: dict[tuple[str, str], list[errors.Points]] = {}
+        self.apart: dict[tuple[str, str, str], list[errors.Points]] = {}
+        self.census: list[dict[int, float]] = []
+        self.dropped: dict[tuple[str, str], list[dict[str, int]]] = {}
+        self.overlays: dict[str, Row] = {}
+        self.n_few = 0
+
+    def add(self, batch: Batch) -> None:
+        """Run all variants on one batch of pairs."""
+        near = self.protocol.hide(batch.anchor, self.cutoff)
+        views = tuple(self.protocol.hide(view, self.cutoff) for view in batch.others)
+        several = {variant.method.views for variant in self.variants.values()}
+        seen = {n: tree.stack(views[-n:]) if n > 1 else views[-1] for n in several}
+        shared, enough = SharedTracks(), [True] * len(batch.pairs)
+        for k, (name, variant) in enumerate(self.variants.items()):
+            estimate, trace = self._ask(variant, batch, near, seen[variant.method.views], shared)
+            truths = {cohort: of(batch, trace) for cohort, of in self.protocol.cohorts.items()}
+            answer = Answer(batch, name, estimate, trace, truths)
+            if k == 0:
+                self._count_holes(variant.method, batch.anchor, answer.samples.uv)
+                enough = [int(ok.sum()) >= self.least for ok in truths[self.last].ok]
+                self.n_few += enough.count(False)
+            for b in (b for b in range(len(batch.pairs)) if enough[b]):
+                self._note(answer.one(b))
+            if not self.examples:
+                first = answer.one(0)
+                records = (near[:1], first.samples, first.estimate, first.truths[self.last])
+                self.examples.append(Example(self.recording.name, name, *records))
+
+    def rows(self) -> list[Row]:
+        """One row per pair, variant and cohort, then one per variant and cohort for the scene (pair null)."""
+        rows = list(self.pair_rows)
+        for name in self.protocol.variants:
+            for cohort in self.protocol.cohorts:
+                key = (name, cohort)
+                mine = [r for r in self.pair_rows if (r["method"], r["truth"]) == key]
+                row = {"scene": self.recording.name, "pair": None, "method": name, "truth": cohort}
+                row |= {"role": self.recording.role, "cutoff_m": self.cutoff}
+                row |= {"n_pairs": len(mine), "n_few": self.n_few}
+                if not mine:
+                    row["note"] = self.missing.get(name) or ("too few candidates" if self.n_few else "too short")
+                else:
+                    shares = {
+                        names(Hole)[k].lower(): sum(c[k] for c in self.census) / len(self.census)
+                        for k in names(Hole)
+                        if k
+                    }
+                    apart = {k[2]: p for k, p in self.apart.items() if k[:2] == key}
+                    row |= scene_row(mine, self.pooled[key], self.dropped[key], apart) | {"hole_share": shares}
+                    row |= {"overlay": self.overlays[name]} if cohort == self.last else {}
+                rows.append(row)
+        return rows
+
+    def _ask(
+        self, variant: Variant, batch: Batch, near: Frame, seen: Frame, shared: SharedTracks
+    ) -> tuple[Estimate, Trace]:
+        method = variant.method
+        trace: Trace = {}
+        spoil = getattr(self.recording, "spoil_track", lambda track: track)  # some recordings lead trackers astray
+        seed = self.settings.seed if variant.seed is None else variant.seed
+        told: dict[str, Any] = {"seed": seed, "hint": self.hint, "track": spoil(shared.seat(method.track))}
+        if variant.fit is not None:
+            told["fit"] = variant.fit(batch, method.n)
+        told |= variant.given(batch)
+        with torch.no_grad():
+            ask = method if variant.ask is None else partial(variant.ask, method)
+            estimate = ask(near, seen, trace=trace, **told)
+        shared.charge(trace["ms"])
+        return estimate, trace
+
+    def _count_holes(self, method: Method, anchor: Frame, uv: Tensor) -> None:
+        """The sensor's own holes, before anything is held back."""
+        for hole in method.look_at(anchor, uv).hole:
+            total = max(int((hole != Hole.NONE).sum()), 1)
+            self.census.append({k: float((hole == k).sum()) / total for k in names(Hole)})
+
+    def _note(self, answer: Answer) -> None:
+        """Rows and points of one pair."""
+        estimate, fit, kinds = answer.estimate, answer.trace["fit"], answer.batch.kinds(answer.samples.uv)
+        hole = answer.samples.xyz.isnan().any(-1)
+        share = {gate.lower(): float((estimate.gate == code).float().mean()) for code, gate in names(Gate).items()}
+        common: Row = {"scene": self.recording.name, "pair": list(answer.batch.pairs[0]), "method": answer.variant}
+        found: Row = {"pnp_ok": bool(fit.ok[0]), "n_inlier": int(fit.n_inlier[0]), "n_holes": int(hole.sum())}
+        found |= {"n_recovered": int((estimate.keep & hole).sum()), "gate_share": share, "ms": answer.trace["ms"]}
+        more = self.protocol.columns(answer)
+        self.overlays.setdefault(answer.variant, overlay(answer.samples, estimate, answer.batch.anchor.hw))
+        for cohort, truth in answer.truths.items():
+            points = errors.select(estimate, truth)
+            self.pooled.setdefault((answer.variant, cohort), []).append(points)
+            self.dropped.setdefault((answer.variant, cohort), []).append(truth.dropped())
+            self.pair_rows.append({**common, "truth": cohort, **found, **errors.measure(points), **more})
+            for code, kind in answer.batch.odd.items() if kinds is not None else ():
+                there = truth.replace(code=_reopened(truth, kinds, code))
+                self.apart.setdefault((answer.variant, cohort, kind), []).append(errors.select(estimate, there))
+
+
+def _load(recording: Any, pairs: list[tuple[int, int]], protocol: Protocol, settings: Settings) -> DataLoader[Loaded]:
+    wanted = max(v.method.views for v in protocol.variants.values())
+    views = min([wanted, *(j - i for i, j in pairs)])  # a short gap holds fewer frames
+    return DataLoader(
+        PairData(recording, pairs, settings.dtype, views),
+        batch_size=settings.batch,
+        num_workers=settings.workers if pairs else 0,
+        collate_fn=_collate,
+        worker_init_fn=_one_thread,
+        # A fork would copy the locks of whatever threads torch and OpenCV run here, and may never return.
+        multiprocessing_context="spawn" if settings.workers and pairs else None,
+    )
+
+
+def _collate(items: list[Loaded]) -> Loaded:
+    anchor, others, exact, surface, disagreement = zip(*items, strict=True)
+    views = tuple(tree.collate(view) for view in zip(*others, strict=True))
+    return tree.collate(anchor), views, tree.collate(exact), torch.cat(surface), torch.cat(disagreement)
+
+
+def _to(item: Any, device: str) -> Any:
+    return tuple(_to(i, device) for i in item) if isinstance(item, tuple) else item.to(device)
+
+
+def _one_thread(_worker: int) -> None:
+    torch.set_num_threads(1)
+    set_opencv_threads(1)
+
+
+def _is_cut(cutoff: float | None) -> bool:
+    return cutoff is not None and cutoff != math.inf
+
+
+def _reopened(truth: holdout.Truth, kinds: Tensor | None, kind: int) -> Tensor:
+    """Codes in which the samples on one kind of surface, turned away as EXCLUDED, count, and no others."""
+    if kinds is None:
+        return truth.code
+    code = torch.where(truth.code == holdout.Rule.EXCLUDED, holdout.Rule.CANDIDATE, truth.code)
+    return torch.where(kinds == kind, code, torch.full_like(code, holdout.Rule.EXCLUDED))

@@ -1,0 +1,83 @@
+"""What came out, for a person: tables and one page from archived results, and nothing but them.
+
+So ``dhtorch report`` shows a result of any age and machine exactly as the job that wrote it did.
+
+``reading`` knows the schema, ``cells`` how a number reads, ``tables`` which numbers stand together; ``layouts`` (and
+``timings``) lay them out as the paper does, beside the figures in ``published``; ``plots`` lists the figures (made by
+``curves``, ``sweeps`` and ``overlays``, drawn with ``figure`` and ``svg``); ``text`` and ``page`` are the media.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from dhtorch import archive
+from dhtorch.console import EPILOG, progress
+from dhtorch.studies.report import page, text
+from dhtorch.studies.report.layouts import SHOWN, in_layout
+from dhtorch.studies.report.reading import Result, describe
+from dhtorch.studies.report.tables import INTERVAL, Table, generic
+
+__all__ = ["INTERVAL", "Result", "Table", "describe", "main", "markdown", "print_tables", "tables"]
+
+
+def tables(result: Result) -> list[Table]:
+    """The tables of one result: the paper's, where it has this experiment, then those of every result."""
+    return [*in_layout(result), *generic(result, SHOWN)]
+
+
+def print_tables(result: Result, console: Any = None) -> None:
+    """Print the tables of a result with rich.
+
+    Args:
+        result: valid, as from :func:`dhtorch.archive.read`.
+        console: a ``rich.console.Console``; None = standard output.
+    """
+    for table in tables(result):
+        text.print_table(table, console)
+
+
+def markdown(result: Result) -> str:
+    """The tables of a result as Markdown."""
+    return text.markdown(tables(result))
+
+
+def main(argv: Sequence[str]) -> int:
+    """``dhtorch report RESULT…``: tables from archived results, or a page.
+
+    Raises:
+        FileNotFoundError, ValueError: a result is missing or not valid, or the page cannot be written there.
+    """
+    parser = argparse.ArgumentParser(
+        prog="dhtorch report", description="Tables and a page from archived results.", epilog=EPILOG
+    )
+    parser.add_argument("result", nargs="+", type=Path, help="result.json, or a folder with one or many below it")
+    form = parser.add_mutually_exclusive_group()
+    form.add_argument("--markdown", action="store_true", help="Markdown instead of console tables")
+    form.add_argument("--html", type=Path, metavar="FILE", help="write one page with tables and figures instead")
+    parser.add_argument("--traceback", action="store_true", help="show where an error came from")
+    options = parser.parse_args(argv)
+    paths = list(_found(options.result))
+    results = [archive.read(path) for path in progress(paths, "results", len(paths))]
+    if options.html:
+        print(f"wrote {page.write(options.html, results)}: {len(results)} result{'s' * (len(results) != 1)}")
+        return 0
+    for path, result in zip(paths, results, strict=True):
+        if options.markdown:
+            print(markdown(result))
+            continue
+        print(path)
+        print_tables(result)
+        if result["verdict"]:
+            print(f"{result['question']}\n{result['verdict']}: {result['why']}\n")
+    return 0
+
+
+def _found(paths: Iterable[Path]) -> Iterable[Path]:
+    """Files as they are; a folder without a result of its own stands for all below it, as a sweep writes them."""
+    for path in paths:
+        below = sorted(path.rglob("result.json")) if path.is_dir() and not (path / "result.json").is_file() else []
+        yield from below or [path]

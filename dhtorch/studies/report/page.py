@@ -1,0 +1,229 @@
+"""Results as one HTML page that needs nothing beside itself: tables, figures, settings, verdicts."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from dhtorch import archive
+from dhtorch.codes import Source
+from dhtorch.drawing import GATE_COLOURS, HOLE_COLOURS, RECOVERED, SENSOR
+from dhtorch.studies.report import published
+from dhtorch.studies.report.figure import Figure
+from dhtorch.studies.report.layouts import SHOWN, in_layout
+from dhtorch.studies.report.markup import Markup, join, tag
+from dhtorch.studies.report.plots import figures
+from dhtorch.studies.report.reading import Result
+from dhtorch.studies.report.tables import INTERVAL, PUBLISHED, Table, every_number, generic
+
+STYLE = Path(__file__).with_name("page.css")
+
+#: Data settings that list sequences of a benchmark that the paper uses.
+BENCHMARKS = ("tum11", "arkit5")
+
+VERDICTS = {"supported": "good", "refuted": "bad", "undecided": "open"}
+
+
+def page(results: Sequence[Result]) -> str:
+    """All results as one well-formed page.
+
+    Args:
+        results: valid ones, as from :func:`dhtorch.archive.read`.
+    """
+    title = "dhtorch: results"
+    style = Markup(STYLE.read_text(encoding="utf-8") + _colours())
+    metas = ({"charset": "utf-8"}, {"name": "viewport", "content": "width=device-width, initial-scale=1"})
+    head = tag("head", *(tag("meta", **m) for m in metas), tag("title", title), tag("style", style))
+    names = _anchors(results)
+    sections = [_section(result, name) for result, name in zip(results, names, strict=True)]
+    skip = tag("a", "To the results", href=f"#{names[0]}" if names else "#", class_="skip")
+    top = tag("header", tag("h1", title), tag("p", _about(results), class_="lead"), _overview(results, names))
+    body = tag("body", skip, top, tag("main", *sections))
+    return "<!doctype html>\n" + tag("html", head, body, lang="en") + "\n"
+
+
+def write(path: Path, results: Sequence[Result]) -> Path:
+    """Write the page.
+
+    Raises:
+        ValueError: the name is that of a folder, or does not end in .html.
+        OSError: the file cannot be written.
+    """
+    if path.is_dir():
+        raise ValueError(f"{path}: found a folder, expected the name of an HTML file")
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise ValueError(f"{path}: found {path.suffix or 'no ending'}, expected a name that ends in .html")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path}: found no folder {path.parent}, expected one")
+    return archive.replace_file(path, page(results).encode("utf-8"))
+
+
+def _colours() -> str:
+    """Style rules of the codes, in the colours of the figures that a job draws."""
+    gates = {f"gate{code}": colour for code, colour in GATE_COLOURS.items()}
+    codes = {**gates, f"source{Source.SENSOR}": SENSOR, f"source{Source.RECOVERED}": RECOVERED}
+    codes |= {f"hole{code}": colour for code, colour in HOLE_COLOURS.items()}
+    rule = ".overlay .{0} {{ stroke: {1}; }} .swatch.{0} {{ background: {1}; }} svg rect.{0} {{ fill: {1}; }}\n"
+    return "".join(rule.format(name, colour) for name, colour in codes.items())
+
+
+def _anchors(results: Sequence[Result]) -> list[str]:
+    return [f"result-{k + 1}" for k in range(len(results))]
+
+
+def _about(results: Sequence[Result]) -> Markup:
+    names = dict.fromkeys(result["data"]["name"] for result in results)
+    same, other = ([n for n in names if (n in BENCHMARKS) == known] for known in (True, False))
+    said = [f" marks figures quoted from “{published.PAPER}”, measured on the paper’s own data."]
+    if other:
+        said.append(
+            f"That data could not be downloaded for these results: ours are from other scenes ({', '.join(other)})."
+        )
+    if same:
+        said.append(f"Of its benchmarks the paper does not name the sequences; ours are {', '.join(same)}.")
+    said.append("The two stand side by side for orientation: no line reproduces a line of the paper.")
+    count = f"Everything on this page comes from {_many(len(results), 'archived result file')}. "
+    return join((count, tag("span", PUBLISHED, class_="theirs-word"), " ".join(said)))
+
+
+def _overview(results: Sequence[Result], anchors: Sequence[str]) -> Markup:
+    heads = ("experiment", "data", "scenes", "pairs", "verdict", "why")
+    rows = []
+    for result, name in zip(results, anchors, strict=True):
+        data = result["data"]
+        link = tag("th", tag("a", result["experiment"], href=f"#{name}"), scope="row")
+        cells = [
+            data["name"],
+            len(data["scenes"]),
+            data["n_pairs"],
+            _badge(result),
+            result["why"] or "asks no question",
+        ]
+        kinds = ("", "num", "num", "", "why")
+        rows.append(tag("tr", link, *(tag("td", c, class_=k or None) for c, k in zip(cells, kinds, strict=True))))
+    head = tag("thead", tag("tr", *(tag("th", h, scope="col") for h in heads)))
+    table = tag("table", tag("caption", tag("span", "All results")), head, tag("tbody", *rows))
+    return tag("nav", _scrolling(table, "All results"), aria_label="Results")
+
+
+def _badge(result: Result) -> Markup:
+    verdict = result["verdict"]
+    return tag("span", verdict, class_=f"badge {VERDICTS[verdict]}") if verdict else tag("span", "–")
+
+
+def _section(result: Result, name: str) -> Markup:
+    data, meta = result["data"], result["meta"]
+    title = result["experiment"].replace("_", " ")
+    heading = tag("h2", title, " ", tag("small", f"on {data['name']}"), id=f"{name}-title")
+    machine = f"{meta['device']}, {meta['dtype']}, {_many(meta['threads'], 'thread')}, seed {meta['seed']}"
+    counts = f"{_many(len(data['scenes']), 'scene')}, {_many(data['n_pairs'], 'pair')}"
+    facts = f"{counts} · {meta['utc']} · code {meta['git'] or 'unknown'} · {machine}"
+    paper, drawn = in_layout(result), figures(result)
+    parts = [heading, tag("p", facts, class_="facts"), _question(result), *map(table_markup, paper)]
+    parts += [figure_markup(figure) for figure in drawn if not figure.folded]
+    folded = [figure_markup(figure) for figure in drawn if figure.folded]
+    parts += [tag("details", tag("summary", "The same of the other variants"), *folded)] if folded else []
+    tables = [table_markup(table) for table in generic(result, SHOWN)]
+    everything = [table_markup(table) for table in every_number(result)]
+    parts += [
+        tag(
+            "details",
+            tag("summary", "By scene, and what became of every sample"),
+            *tables,
+            open=None if paper else "open",
+        ),
+        tag("details", tag("summary", "Every number of the result file"), *everything),
+        _settings(result),
+    ]
+    return tag("section", *parts, id=name, aria_labelledby=f"{name}-title")
+
+
+def _many(n: int, word: str) -> str:
+    return f"{n} {word}{'s' * (n != 1)}"
+
+
+def _question(result: Result) -> Markup:
+    if result["verdict"] is None:
+        return tag("p", "The main job: it asks no question.", class_="facts")
+    said = [(k, result[k.lower()]) for k in ("Question", "Expectation")]
+    pairs = [(tag("dt", k), tag("dd", text)) for k, text in said]
+    pairs.append((tag("dt", "Verdict"), tag("dd", _badge(result), " ", result["why"])))
+    return tag("dl", *(part for pair in pairs for part in pair), class_="question")
+
+
+def _settings(result: Result) -> Markup:
+    meta = result["meta"]
+    versions = ", ".join(f"{k} {v}" for k, v in meta["versions"].items() if v)
+    lines = (("key", result["key"]), ("data digest", result["data"]["digest"]), ("versions", versions))
+    known = tag("dl", *(part for k, v in lines for part in (tag("dt", k), tag("dd", v))), class_="question")
+    text = json.dumps(result["config"], indent=2, ensure_ascii=False)
+    return tag("details", tag("summary", "Configuration"), known, tag("pre", text))
+
+
+# ---------------------------------------------------------------------------------------------- tables and figures
+
+
+def table_markup(table: Table) -> Markup:
+    """A table with caption, headings and its note; wide ones scroll inside their own frame."""
+    theirs = {k for k, name in enumerate(table.head) if name == PUBLISHED}
+    first = table.n_label
+
+    def cells(row: Sequence[str], kind: str) -> Markup:
+        made = []
+        for k, cell in enumerate(row):
+            if k == 0:
+                made.append(tag("th", cell, scope="row"))
+                continue
+            style = "" if k < first else "num " if _short(cell) else "word "
+            made.append(tag("td", cell, class_=(style + "theirs-cell" * (k in theirs)).strip() or None))
+        return tag("tr", *made, class_=kind or None)
+
+    n_body = len(table.rows) - table.footer - table.quoted
+    kinds = [""] * n_body + ["sum"] * table.footer + ["cited"] * table.quoted
+    kinds = ["interval" if row[0] == INTERVAL else kind for row, kind in zip(table.rows, kinds, strict=True)]
+    groups = [table.rows[:n_body], table.rows[n_body : n_body + table.footer], table.rows[n_body + table.footer :]]
+    bodies, at = [], 0
+    for group in groups:
+        if group:
+            bodies.append(tag("tbody", *(cells(row, kind) for row, kind in zip(group, kinds[at:], strict=False))))
+        at += len(group)
+    heads = [tag("tr", *_spanning(table.over))] if table.over else []
+    heads.append(tag("tr", *(_heading(k, name, first, k in theirs) for k, name in enumerate(table.head))))
+    made = tag("table", tag("caption", tag("span", table.title)), tag("thead", *heads), *bodies)
+    note = tag("p", table.note, class_="note") if table.note else ""
+    return join((_scrolling(made, table.title), note))
+
+
+def _spanning(over: Sequence[tuple[str, int]]) -> list[Markup]:
+    made = []
+    for text, span in over:
+        if text:
+            made.append(tag("th", text, colspan=span, scope="colgroup", class_="over"))
+        else:
+            made.append(tag("td", colspan=span if span > 1 else None))
+    return made
+
+
+def _heading(k: int, name: str, n_label: int, theirs: bool) -> Markup:
+    if not name:
+        return tag("td")
+    style = ("num " if k >= n_label else "") + ("theirs-cell" if theirs else "")
+    return tag("th", name, scope="col", class_=style.strip() or None)
+
+
+def _short(cell: str) -> bool:
+    """Numbers stand to the right; reasons for their absence are set as words."""
+    return " " not in cell or any(c.isdigit() for c in cell)
+
+
+def _scrolling(table: Markup, label: str) -> Markup:
+    return tag("div", table, class_="scroll", tabindex="0", role="region", aria_label=label)
+
+
+def figure_markup(figure: Figure) -> Markup:
+    """Panels side by side where there is room, with caption and legend."""
+    legend = [tag("li", tag("span", class_=f"swatch {kind}"), text) for kind, text in figure.legend]
+    below = tag("figcaption", tag("strong", f"{figure.title}. "), figure.caption)
+    panels = tag("div", *figure.panels, class_="panels wide" if figure.wide else "panels")
+    return tag("figure", below, tag("ul", *legend, class_="legend") if legend else "", panels)

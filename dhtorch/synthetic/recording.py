@@ -1,0 +1,329 @@
+"""The built-in recording: a hand-held phone with a LiDAR in a furnished room, all truth known.
+
+The picture is ray cast (:mod:`dhtorch.synthetic.room`), so depth, poses and intrinsics are exact; what the sensor
+reports is a model of a phone's LiDAR on top. Every frame is a function of the options and its number alone: not of the
+other frames, the order of access, the process or the number of threads.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import operator
+from collections.abc import Sequence
+from random import Random
+from typing import Any
+
+import torch
+from torch import Generator, Tensor
+
+from dhtorch.geometry import se3
+from dhtorch.geometry.camera import Camera, resize
+from dhtorch.records import Frame, Pose
+from dhtorch.synthetic.paths import PATHS, hand_held
+from dhtorch.synthetic.raycast import DARK, MIRROR, ORDINARY, WINDOW, world_rays
+from dhtorch.synthetic.room import furnished_room
+from dhtorch.synthetic.shading import Scene
+
+#: Values of ``truth(i)["surface"]``.
+SURFACES = {ORDINARY: "ordinary", MIRROR: "mirror", WINDOW: "window", DARK: "dark"}
+
+
+class SyntheticRoom(Sequence[Frame]):
+    """A lazy sequence of frames (B = 1) of the built-in room, with the attributes of a recording.
+
+    Args:
+        seed: of the paint and small placements, the path and the sensor noise.
+        n_frames: number of frames.
+        hw: (height, width) of the image in pixels.
+        path: one of :data:`PATHS`. ``walk`` is a hand-held sweep; ``rotation`` does not translate, ``static`` not move.
+        step_m: way along the path from frame to frame (for ``rotation``: the same pace, as an angle).
+        rate_hz: frame rate.
+        lidar: ``phone`` = the model of :func:`phone_lidar`; ``exact`` = true depth at every image pixel; None = no
+            sensor, depth is 0 everywhere.
+        depth_hw: (height, width) of the phone's depth map, and of the empty one.
+        range_limit: of the phone's LiDAR, m along the ray.
+        depth_noise: factor on the LiDAR's noise; 0 keeps its drop-outs and limits.
+        image_noise: standard deviation of the pixel noise, grey levels of 255.
+        supersample: rays per pixel and axis.
+        trajectory_axes: ``cv`` or ``gl``, the axes in which the device is said to write its trajectory (``pose_axes``;
+            frames carry OpenCV axes in any case).
+        trajectory_offset_deg: constant angle by which the device's axes are turned against the camera's; the
+            trajectory that frames carry is then wrong by it, ``true_poses`` is not.
+        near: m, cutoff for a range split.
+        gap: frame step; 6 with the default step is a way of 12 cm.
+
+    Raises:
+        ValueError: an unknown path or LiDAR, or a size, count or limit that is not positive.
+    """
+
+    name = "synthetic_room"
+    format = "synthetic"
+    root = None
+    sparse = False
+    levels = None
+    surfaces = SURFACES  # values of ``truth(i)["surface"]``
+    odd_surfaces = ("mirror", "window")  # where triangulation rightly finds something else than the surface
+    report: tuple[str, ...] = ()
+
+    def __init__(
+        self,
+        *,
+        seed: int = 2,
+        n_frames: int = 12,
+        hw: tuple[int, int] = (480, 640),
+        path: str = "walk",
+        step_m: float = 0.02,
+        rate_hz: float = 30.0,
+        lidar: str | None = "phone",
+        depth_hw: tuple[int, int] = (192, 256),
+        range_limit: float = 5.0,
+        depth_noise: float = 1.0,
+        image_noise: float = 1.0,
+        supersample: int = 2,
+        trajectory_axes: str = "cv",
+        trajectory_offset_deg: float = 0.0,
+        near: float = 2.0,
+        gap: int = 6,
+    ):
+        if path not in PATHS:
+            raise ValueError(f"synthetic room: path is {path!r}, expected one of {', '.join(PATHS)}")
+        if lidar not in ("phone", "exact", None):
+            raise ValueError(f"synthetic room: lidar is {lidar!r}, expected phone, exact or None")
+        if trajectory_axes not in ("cv", "gl"):
+            raise ValueError(f"synthetic room: trajectory_axes is {trajectory_axes!r}, expected cv or gl")
+        positive = {"n_frames": n_frames, "rate_hz": rate_hz, "range_limit": range_limit, "supersample": supersample}
+        positive |= {"near": near, "gap": gap}
+        for name, value in {**positive, "hw": min(hw), "depth_hw": min(depth_hw)}.items():
+            if not value > 0:
+                raise ValueError(f"synthetic room: {name} is {value}, expected a positive number")
+        self.seed, self.path, self.rate_hz, self.lidar = seed, path, rate_hz, lidar
+        self.hw, self.depth_hw = (hw[0], hw[1]), (depth_hw[0], depth_hw[1])
+        self.range_limit, self.depth_noise, self.image_noise = range_limit, depth_noise, image_noise
+        self.supersample = supersample
+        self.near, self.gap = near, gap
+        self.role = "rotation" if path in ("rotation", "static") else None
+        self.number = torch.arange(n_frames)
+        self.times = self.number.double() / rate_hz
+        self.true_poses = hand_held(path, n_frames, step_m=step_m, rate_hz=rate_hz, seed=seed)
+        self.pose_axes, self.poses = trajectory_axes, _turned(self.true_poses, trajectory_offset_deg)
+        self.camera = _phone_camera(self.hw)
+        self._frames: dict[int, Frame] = {}
+
+    def __len__(self) -> int:
+        return len(self.number)
+
+    def __getitem__(self, index: int) -> Frame:  # type: ignore[override]  # one frame at a time: slices would render
+        i = self._position(index)
+        if i not in self._frames:
+            self._frames[i] = self._render(i)
+        return self._frames[i]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_frames": {}}  # a worker renders what it needs
+
+    def __repr__(self) -> str:
+        return f"SyntheticRoom(seed={self.seed}, path={self.path!r}, lidar={self.lidar!r}, {len(self)} frames)"
+
+    def truth(self, index: int) -> dict[str, Tensor]:
+        """What is really there at the centre of every image pixel of frame ``index``.
+
+        A mirror or a window pane counts with the depth of its own surface. What is seen *in* it lies elsewhere, and
+        triangulation finds it there: evaluate such pixels apart, by ``surface``.
+
+        Returns:
+            ``depth`` (1, H, W) m float32 and ``surface`` (1, H, W) uint8, a key of :data:`SURFACES`.
+        """
+        i = self._position(index)
+        return self._true_view(self.camera, self.true_poses[i : i + 1], self.hw)
+
+    def _true_view(self, camera: Camera, pose: Pose, hw: tuple[int, int]) -> dict[str, Tensor]:
+        scene = furnished_room(self.seed)
+        depth, solid = scene.solids.view(camera, pose, hw)
+        o, d = world_rays(camera, pose, hw)
+        face, _, _ = scene.solids.locate(solid, [o[k] + d[k] * depth for k in range(3)])
+        return {"depth": depth.view(1, *hw), "surface": scene.kind[face].to(torch.uint8).view(1, *hw)}
+
+    def _position(self, index: int) -> int:
+        i, n = operator.index(index), len(self)
+        if not -n <= i < n:
+            raise IndexError(f"synthetic room: frame {i} of {n}")
+        return i % n
+
+    def _render(self, i: int) -> Frame:
+        pose = self.true_poses[i : i + 1]
+        scene = furnished_room(self.seed)
+        image = self._picture(i)
+        image = image * 255 + self.image_noise * torch.randn(image.shape, generator=self._generator(i, "image"))
+        conf = torch.zeros(1, *self.depth_hw, dtype=torch.uint8)
+        depth, depth_camera = conf.float(), resize(self.camera, self.hw, self.depth_hw)
+        if self.lidar == "phone":
+            options = {"range_limit": self.range_limit, "noise_factor": self.depth_noise}
+            depth, conf = phone_lidar(
+                scene, depth_camera, pose, self.depth_hw, generator=self._generator(i, "lidar"), **options
+            )
+        elif self.lidar == "exact":
+            depth, depth_camera = self.truth(i)["depth"], self.camera
+            conf = torch.full_like(depth, 2, dtype=torch.uint8)
+        return Frame(
+            image=(image + 0.5).floor().clamp(0, 255).to(torch.uint8),
+            depth=depth,
+            camera=self.camera,
+            depth_camera=depth_camera,
+            conf=conf,
+            time=self.times[i : i + 1],
+            T_world_from_cam=self.poses[i : i + 1].to(torch.float32),
+        )
+
+    def _picture(self, i: int) -> Tensor:
+        return self._photograph(self.camera, self.true_poses[i : i + 1], self.hw)
+
+    def _photograph(self, camera: Camera, pose: Pose, hw: tuple[int, int]) -> Tensor:
+        return _photograph(furnished_room(self.seed), camera, pose, hw, self.supersample)
+
+    def _generator(self, i: int, stream: str) -> Generator:
+        return Generator().manual_seed(Random(f"{self.seed} {i} {stream}").getrandbits(62))
+
+
+def open_rooms(
+    paths: Sequence[str] = tuple(PATHS),
+    *,
+    seed: int | Sequence[int] = 2,
+    n_frames: int = 12,
+    hw: tuple[int, int] = (480, 640),
+    lidar: str | None = "phone",
+    depth_noise: float = 1.0,
+    image_noise: float = 1.0,
+    near: float = 2.0,
+    gap: int = 6,
+) -> list[SyntheticRoom]:
+    """The room along several paths, or built of several seeds, one recording each; options as :class:`SyntheticRoom`.
+
+    A recording is named after its path and, where there are several, its seed.
+    """
+    options: dict[str, Any] = {"n_frames": n_frames, "hw": hw, "lidar": lidar, "near": near, "gap": gap}
+    options |= {"depth_noise": depth_noise, "image_noise": image_noise}
+    seeds = [seed] if isinstance(seed, int) else list(seed)
+    rooms = []
+    for path, number in itertools.product(paths, seeds):
+        rooms.append(SyntheticRoom(path=path, seed=number, **options))
+        rooms[-1].name = f"synthetic_{path}" if isinstance(seed, int) else f"synthetic_{path}_{number}"
+    return rooms
+
+
+def phone_lidar(
+    scene: Scene,
+    camera: Camera,
+    T_world_from_cam: Pose,
+    hw: tuple[int, int],
+    *,
+    generator: Generator,
+    range_limit: float = 5.0,
+    noise_factor: float = 1.0,
+) -> tuple[Tensor, Tensor]:
+    """What a phone's LiDAR reports from one place (B = 1): depth (1, h, w) m, 0 = no return, and confidence 0–2.
+
+    The light that returns falls with reflectance, slant and squared range. Where it is weak the noise grows, the
+    confidence falls and returns go missing. They also go missing on mirrors (what is left lies *behind* the mirror, at
+    low confidence), window panes, grazing surfaces, at depth edges (what is left there mixes both sides) and towards
+    ``range_limit``, beyond which there are none. Gaps come in patches, and noise is shared by neighbours, as a device
+    that fills in between sparse beams has it. Numbers are chosen to be plausible, not fitted to a device.
+
+    Returns:
+        depth float32 and confidence uint8 (2 high, 1 medium, 0 low or no return), both (1, h, w).
+    """
+    depth, solid = scene.solids.view(camera, T_world_from_cam, hw)
+    o, d = world_rays(camera, T_world_from_cam, hw)
+    p = [o[k] + d[k] * depth for k in range(3)]
+    face, _, _ = scene.solids.locate(solid, p)
+    cosine, kind = scene.cosine(d, face, p), scene.kind[face]
+    per_depth = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).sqrt()
+    edge, mixed = _depth_edges(depth.view(hw))
+    seen = torch.where(edge, mixed, depth)
+    at = (kind == MIRROR).nonzero()[:, 0]
+    _, _, more, _ = scene.mirrored([c[at] for c in o], [c[at] for c in d], depth[at], face[at])
+    seen = seen.index_copy(0, at, depth[at] + more)
+    distance = seen * per_depth
+    returned = scene.albedo[face] * scene.albedo[face] * cosine / (distance * distance)
+
+    far = ((distance / range_limit - 0.85) / 0.15).clamp(0, 1)
+    lost = 0.6 * far
+    for why in (
+        0.5 * edge,
+        0.85 * (kind == MIRROR),
+        0.9 * (kind == WINDOW),
+        0.9 * ((0.25 - cosine) / 0.25).clamp(0, 1),
+        0.9 * (1 - returned / 0.001).clamp(0, 1),
+    ):
+        lost = 1 - (1 - lost) * (1 - why)
+    answered = (_patchy_uniform(hw, generator) >= lost) & (distance <= range_limit)
+
+    sigma = (0.002 + 0.0025 * distance * distance) * (0.025 / returned.clamp(min=1e-6)).sqrt().clamp(1, 2.5)
+    error = noise_factor * sigma * _shared_normal(hw, generator)
+    reported = ((distance + error) / per_depth).clamp(min=0.05)
+    level = (returned > 0.001).int() + ((returned > 0.025) & (far == 0)).int()
+    level = torch.where(edge | (kind == MIRROR) | (kind == WINDOW), 0, level)
+    depth = torch.where(answered, reported, torch.zeros_like(reported))
+    conf = torch.where(answered, level, 0).to(torch.uint8)
+    return depth.view(1, *hw), conf.view(1, *hw)
+
+
+def _turned(poses: Pose, degrees: float) -> Pose:
+    """The poses a device would report whose axes are turned by a constant angle against those of its camera."""
+    turn = se3.exp(poses.t.new_tensor([[math.radians(degrees) / 3**0.5] * 3 + [0.0] * 3]))
+    return Pose(poses.R @ turn.R, poses.t)
+
+
+def _photograph(scene: Scene, camera: Camera, pose: Pose, hw: tuple[int, int], supersample: int) -> Tensor:
+    """(1, 3, H, W) display values in [0, 1]: the mean over ``supersample``² rays in each pixel."""
+    s = supersample
+    fine = (hw[0] * s, hw[1] * s)
+    dense = resize(camera, hw, fine)
+    depth, solid = scene.solids.view(dense, pose, fine)
+    o, d = world_rays(dense, pose, fine)
+    colour, _ = scene.shade(o, d, depth, solid, 1 / float(dense.f.min()))
+    colour = colour.clamp(0, 1).view(hw[0], s, hw[1], s, 3)
+    total = torch.zeros(*hw, 3)
+    for i in range(s):
+        for k in range(s):
+            total = total + colour[:, i, :, k]
+    return total.permute(2, 0, 1)[None] / (s * s)
+
+
+def _depth_edges(depth: Tensor) -> tuple[Tensor, Tensor]:
+    """Where the depth map (h, w) jumps, and there the mean with the farther neighbour; both flat (h·w,).
+
+    A plane has linear inverse depth, however slanted: its second difference tells jumps from slopes.
+    """
+    inverse = torch.nn.functional.pad(1 / depth[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
+    middle = inverse[1:-1, 1:-1]
+    sides = [inverse[1:-1, :-2], inverse[1:-1, 2:], inverse[:-2, 1:-1], inverse[2:, 1:-1]]
+    bend = torch.maximum((sides[0] + sides[1] - 2 * middle).abs(), (sides[2] + sides[3] - 2 * middle).abs())
+    farther = torch.minimum(torch.minimum(sides[0], sides[1]), torch.minimum(sides[2], sides[3]))
+    return (bend > 0.05 * middle).flatten(), (0.5 * depth + 0.5 / farther).flatten()
+
+
+def _patchy_uniform(hw: tuple[int, int], generator: Generator) -> Tensor:
+    """Uniform numbers (h·w,) of which most are shared by 4×4 pixels, so that gaps have a size."""
+    coarse = torch.rand((hw[0] + 3) // 4, (hw[1] + 3) // 4, generator=generator)
+    coarse = coarse.repeat_interleave(4, 0)[: hw[0]].repeat_interleave(4, 1)[:, : hw[1]]
+    own = torch.rand(hw, generator=generator)
+    return torch.where(torch.rand(hw, generator=generator) < 0.3, own, coarse).flatten()
+
+
+def _shared_normal(hw: tuple[int, int], generator: Generator) -> Tensor:
+    """Standard normal numbers (h·w,), 64 % of whose variance is shared over about 6 pixels."""
+    smooth = torch.randn(-(-hw[0] // 6) + 1, -(-hw[1] // 6) + 1, generator=generator)
+    for dim in (0, 1):
+        at = torch.arange(hw[dim])
+        low, w = at // 6, ((at % 6) / 6).unsqueeze(1 - dim)
+        mixed = smooth.index_select(dim, low) * (1 - w) + smooth.index_select(dim, low + 1) * w
+        smooth = mixed / ((1 - w) * (1 - w) + w * w).sqrt()  # keeps the variance at 1
+    return (0.8 * smooth + 0.6 * torch.randn(hw, generator=generator)).flatten()
+
+
+def _phone_camera(hw: tuple[int, int]) -> Camera:
+    """525 px at 640 columns, principal point a little off the middle, as real ones are."""
+    s = hw[1] / 640
+    c = [hw[1] / 2 + 2.3 * s - 0.5, hw[0] / 2 - 1.4 * s - 0.5]
+    return Camera(torch.tensor([[525.0 * s, 525.0 * s]]), torch.tensor([c]))

@@ -1,0 +1,261 @@
+"""What surfaces look like: painted, lit once, mirrored once.
+
+Light is computed when a :class:`Scene` is made, on a grid of nodes over each face: area lights with soft shadows, and
+an ambient part that corners and crevices lose. It does not depend on the viewer, so a surface point has the same colour
+in every frame (the mirror and the gloss of the screen excepted, which is what they are for).
+
+Colours are display values, roughly square roots of light: multiplying them multiplies light and reflectance.
+Alphabet: as in :mod:`dhtorch.synthetic.raycast`; L nodes, P rays.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dhtorch.geometry.lookup import LUMA
+from dhtorch.synthetic.raycast import Solid, Solids, Surface, Triple, dot
+from dhtorch.synthetic.textures import SIZE, paint
+
+_STRIP = 1 << 16  # rays shaded at a time: enough to amortise a call, few enough to stay in the cache
+
+
+@dataclass(frozen=True)
+class Light:
+    """A rectangle ``centre ± u ± v`` that shines along ``normal``; with a zero normal, to all sides."""
+
+    centre: Triple
+    u: Triple
+    v: Triple
+    normal: Triple
+    colour: Triple
+    samples: tuple[int, int] = (3, 3)
+
+
+class Scene:
+    """Solids, pictures and light, ready to be looked at."""
+
+    def __init__(self, solids: Sequence[Solid], lights: Sequence[Light], *, ambient: float, seed: int):
+        self.solids = Solids(solids)
+        surfaces = [s.faces.get(f, s.surface) for s in solids for f in range(6)]
+        self.kind = torch.tensor([s.kind for s in surfaces])  # (faces,), also the next ones
+        names = sorted({s.picture for s in surfaces})
+        self._pictures = _Pictures(paint(names, torch.Generator().manual_seed(seed)))
+        self._picture = torch.tensor([names.index(s.picture) for s in surfaces])
+        self._reflect = torch.tensor([s.reflect for s in surfaces])
+        self._glow = torch.tensor([s.glow for s in surfaces])
+        self._tint = torch.tensor([s.tint for s in surfaces])
+        self._scale = _texture_scale(solids, surfaces)
+        #: Mean grey of each face (faces,), display values: the surface's brightness to a sensor with its own light.
+        self.albedo = (self._pictures.mean[self._picture] * self._tint * torch.tensor(LUMA)).sum(-1)
+        self.light = _Lightmap(self.solids, lights, ambient)
+
+    def shade(
+        self, o: Sequence[Tensor], d: Sequence[Tensor], t: Tensor, index: Tensor, spread: float
+    ) -> tuple[Tensor, Tensor]:
+        """Colours (P, 3), not clipped, and faces (P,) of rays that meet solid ``index`` (P,) at ``t`` (P,).
+
+        ``spread``: width of a ray per unit of ``t``; pictures are filtered to it.
+        """
+        parts = [slice(k, k + _STRIP) for k in range(0, t.numel(), _STRIP)]
+        strips = [self._paint([c[s] for c in o], [c[s] for c in d], t[s], index[s], spread) for s in parts]
+        colour, face = torch.cat([s[0] for s in strips]), torch.cat([s[1] for s in strips])
+        return self._mirror(colour, face, o, d, t, spread), face
+
+    def cosine(self, d: Sequence[Tensor], face: Tensor, p: Sequence[Tensor]) -> Tensor:
+        """Cosine (P,) of the angle between a ray and the normal of the face it meets at ``p``, in [0, 1]."""
+        along = dot(d, self.solids.normal(face, p)).abs()
+        return (along / dot(d, d).sqrt()).clamp(0, 1)
+
+    def mirrored(
+        self, o: Sequence[Tensor], d: Sequence[Tensor], t: Tensor, face: Tensor
+    ) -> tuple[list[Tensor], list[Tensor], Tensor, Tensor]:
+        """Origins, directions, distances and solids of the rays after reflection at ``face`` (P,)."""
+        p = [o[k] + d[k] * t for k in range(3)]
+        normal = self.solids.normal(face, p)
+        along = dot(d, normal)
+        bounced = [d[k] - 2 * along * normal[k] for k in range(3)]
+        start = [p[k] + 1e-4 * bounced[k] for k in range(3)]
+        return start, bounced, *self.solids.cast(start, bounced)
+
+    def _paint(
+        self, o: Sequence[Tensor], d: Sequence[Tensor], t: Tensor, index: Tensor, spread: float
+    ) -> tuple[Tensor, Tensor]:
+        p = [o[k] + d[k] * t for k in range(3)]
+        face, across, down = self.solids.locate(index, p)
+        scale = self._scale[face]
+        # Isotropic filter: the geometric mean of the footprint across and along the slant.
+        width = spread * t / self.cosine(d, face, p).clamp(min=1e-3).sqrt() * scale[:, 2]
+        picture = self._pictures.sample(self._picture[face], across * scale[:, 0], down * scale[:, 1], width)
+        return picture * self._tint[face] * (self.light.sample(face, across, down) + self._glow[face, None]), face
+
+    def _mirror(
+        self, colour: Tensor, face: Tensor, o: Sequence[Tensor], d: Sequence[Tensor], t: Tensor, spread: float
+    ) -> Tensor:
+        """Mix in what the mirrored rays see; a mirror in a mirror shows its own colour."""
+        at = (self._reflect[face] > 0).nonzero()[:, 0]
+        if not at.numel():
+            return colour
+        rays = self.mirrored([c[at] for c in o], [c[at] for c in d], t[at], face[at])
+        seen, _ = self._paint(*rays, spread * 2)  # about the width at the whole distance travelled
+        share = self._reflect[face[at], None]
+        return colour.index_copy(0, at, colour[at] * (1 - share) + seen * share)
+
+
+class _Pictures:
+    """Tiling pictures with a pyramid of halved sizes each, all texels in one table."""
+
+    def __init__(self, pictures: Tensor):
+        levels, parts, start = [], [], 0
+        while pictures.shape[1] > 1:
+            size = pictures.shape[1]
+            levels.append((start, size))
+            parts.append(pictures.reshape(len(pictures), -1, 3))
+            start += size * size
+            rows = pictures[:, ::2] + pictures[:, 1::2]
+            pictures = (rows[:, :, ::2] + rows[:, :, 1::2]) * 0.25
+        self.mean = pictures[:, 0, 0]  # (pictures, 3)
+        self._levels = torch.tensor(levels)
+        self._texels = torch.cat(parts, 1).reshape(-1, 3)
+        self._texels_each = start
+
+    def sample(self, picture: Tensor, x: Tensor, y: Tensor, width: Tensor) -> Tensor:
+        """Trilinear look-up (P, 3) at texel coordinates from the picture's middle, averaged over ``width`` texels."""
+        level = _log2(width).clamp(0, len(self._levels) - 1.001)
+        finer = level.floor().long()
+        near, far = (self._bilinear(picture * self._texels_each, finer + k, x, y) for k in (0, 1))
+        return near + (far - near) * (level - finer)[:, None]
+
+    def _bilinear(self, base: Tensor, level: Tensor, x: Tensor, y: Tensor) -> Tensor:
+        start, size = self._levels[level].unbind(-1)
+        shrink = size / SIZE
+        x, y = x * shrink + (size / 2 - 0.5), y * shrink + (size / 2 - 0.5)
+        left, above = x.floor(), y.floor()
+        wx, wy = (x - left)[:, None], (y - above)[:, None]
+        mask = size - 1
+        x0, y0 = left.long() & mask, above.long() & mask
+        x1, y1 = (x0 + 1) & mask, (y0 + 1) & mask
+        row0, row1 = base + start + y0 * size, base + start + y1 * size
+        a, b, c, e = (self._texels.index_select(0, k) for k in (row0 + x0, row0 + x1, row1 + x0, row1 + x1))
+        top = a + (b - a) * wx
+        return top + (c + (e - c) * wx - top) * wy
+
+
+class _Lightmap:
+    """Light on a grid of nodes over each face, bilinear between."""
+
+    def __init__(self, solids: Solids, lights: Sequence[Light], ambient: float, *, spacing: float = 0.1):
+        half = solids.half
+        size = torch.stack([half[:, [2, 1]], half[:, [0, 2]], half[:, [0, 1]]], 1) * 2
+        n = (size / spacing).ceil().long() + 1  # (solids, axis, 2)
+        n = torch.where(solids.ball[:, None, None], n.clamp(min=5), n)
+        self.n = n.repeat_interleave(2, 1).reshape(-1, 2)  # (faces, 2) nodes across and down
+        count = self.n[:, 0] * self.n[:, 1]
+        self.start = count.cumsum(0) - count
+        face = torch.arange(len(count)).repeat_interleave(count)
+        place = torch.arange(len(face)) - self.start[face]
+        n = self.n[face]
+        across, down = (place % n[:, 0]) / (n[:, 0] - 1) * 2 - 1, (place // n[:, 0]) / (n[:, 1] - 1) * 2 - 1
+        p = solids.points(face, across * 0.995, down * 0.995)
+        normal = solids.normal(face, p)
+        p = [p[k] + 0.003 * normal[k] for k in range(3)]
+        power = ambient * _ambient(solids, p, normal)
+        for light in lights:
+            power = power + _direct(solids, light, p, normal)
+        self.values = power.sqrt()  # (L, 3)
+
+    def sample(self, face: Tensor, across: Tensor, down: Tensor) -> Tensor:
+        """(P, 3) at places in [-1, 1] of faces."""
+        n = self.n[face]
+        columns, last = n[:, 0], n - 1
+        x = (across.clamp(-1, 1) + 1) * 0.5 * last[:, 0]
+        y = (down.clamp(-1, 1) + 1) * 0.5 * last[:, 1]
+        x0 = torch.minimum(x.long(), last[:, 0] - 1)
+        y0 = torch.minimum(y.long(), last[:, 1] - 1)
+        wx, wy = (x - x0)[:, None], (y - y0)[:, None]
+        k = self.start[face] + y0 * columns + x0
+        a, b, c, e = (self.values.index_select(0, j) for j in (k, k + 1, k + columns, k + columns + 1))
+        top = a + (b - a) * wx
+        return top + (c + (e - c) * wx - top) * wy
+
+
+def _direct(solids: Solids, light: Light, p: list[Tensor], normal: list[Tensor]) -> Tensor:
+    """Power (L, 3) that reaches points from a light past everything that casts a shadow."""
+    rows, columns = light.samples
+    places = [((2 * i + 1) / columns - 1, (2 * k + 1) / rows - 1) for k in range(rows) for i in range(columns)]
+    target = [torch.tensor([[light.centre[j] + a * light.u[j] + b * light.v[j]] for a, b in places]) for j in range(3)]
+    d = [target[k] - p[k] for k in range(3)]  # (samples, L)
+    square = dot(d, d).clamp(min=0.04)
+    shine = -dot(d, light.normal) if any(light.normal) else square.sqrt()
+    gain = dot(d, normal).clamp(min=0) * shine.clamp(min=0) / (square * square)
+    lit = gain.any(0).nonzero()[:, 0]  # what faces away from all of the light is dark whatever stands between
+    gain[:, lit] *= _unshaded(solids, light, [c[lit] for c in p], [c[:, lit] for c in d])
+    total = torch.zeros_like(gain[0])
+    for k in range(len(places)):  # a sum in written order
+        total = total + gain[k]
+    return (total / len(places))[:, None] * torch.tensor(light.colour)
+
+
+def _unshaded(solids: Solids, light: Light, p: list[Tensor], d: list[Tensor]) -> Tensor:
+    """1 where nothing stands on the ways ``d`` (samples, P) from points ``p`` (P,) to places of a light, else 0."""
+    clear = torch.ones_like(d[0])
+    half = math.hypot(*(abs(light.u[k]) + abs(light.v[k]) for k in range(3)))
+    for solid, at in solids.blockers(p, half + 1e-3, [light.centre[k] - p[k] for k in range(3)]):
+        far = solids.open_distance(solid, [c[at] for c in p], [c[:, at] for c in d])
+        clear[:, at] *= far > 0.98
+    return clear
+
+
+def _ambient(solids: Solids, p: list[Tensor], normal: list[Tensor], *, reach: float = 1.1) -> Tensor:
+    """Share (L, 3) of light from all around that what stands within ``reach`` (m) lets through."""
+    sphere = _sphere_directions()
+    d = [torch.tensor([[c[k]] for c in sphere]) for k in range(3)]
+    side = torch.where(dot(d, normal) < 0, -reach, reach)  # the same directions for all, turned to the open side
+    d = [c * side for c in d]  # (directions, L)
+    clear = solids.open_distance(solids.each[0], p, d)
+    for solid, at in solids.blockers(p, reach):
+        far = solids.open_distance(solid, [c[at] for c in p], [c[:, at] for c in d])
+        clear[:, at] = torch.minimum(clear[:, at], far)
+    weight = 0.35 + dot(d, normal) / reach
+    total, most = torch.zeros_like(p[0]), torch.zeros_like(p[0])
+    for k in range(len(sphere)):
+        total, most = total + clear[k] * weight[k], most + weight[k]
+    from_above = 0.8 - 0.2 * normal[1]
+    return (from_above * total / most)[:, None] * torch.tensor([0.96, 0.98, 1.04])
+
+
+def _sphere_directions(n: int = 14) -> list[Triple]:
+    """Directions spread over the sphere: a spiral in equal height steps, turned by the golden angle each."""
+    c, s = -0.7373688780783197, 0.6754902942615238  # cosine and sine of the golden angle
+    x, y = 1.0, 0.0
+    directions = []
+    for k in range(n):
+        h = 1 - (2 * k + 1) / n
+        r = (1 - h * h) ** 0.5
+        directions.append((r * x, h, r * y))
+        x, y = c * x - s * y, s * x + c * y
+    return directions
+
+
+def _texture_scale(solids: Sequence[Solid], surfaces: Sequence[Surface]) -> Tensor:
+    """(faces, 3): texels per half width across and down, signed so that print reads the right way round; per m."""
+    rows = []
+    for f, surface in enumerate(surfaces):
+        solid, axis, positive = solids[f // 6], (f % 6) // 2, f % 2
+        half = [solid.half[k] for k in ((2, 1), (0, 2), (0, 1))[axis]]
+        per_m = [SIZE / (surface.tile or 2 * h) for h in half]
+        # Seen from outside, x runs left on the far (+z) face and z runs left on the near (-x) one; inside, the reverse.
+        flip = (axis == 0 and not positive) or (axis == 2 and bool(positive))
+        across = -1 if axis != 1 and flip == (f >= 6) else 1
+        down = -1 if axis == 1 and not positive else 1
+        rows.append([across * half[0] * per_m[0], down * half[1] * per_m[1], (per_m[0] * per_m[1]) ** 0.5])
+    return torch.tensor(rows)
+
+
+def _log2(x: Tensor) -> Tensor:
+    """log2 to within 0.09, straight between powers of two: read off the exponent bits of a float32."""
+    return x.clamp(min=1e-6).view(torch.int32).float() * 2.0**-23 - 127

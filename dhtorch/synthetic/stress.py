@@ -1,0 +1,228 @@
+"""The built-in room under stress: one recording for each thing that goes wrong with a capture, all truth known.
+
+Paths that give little to triangulate with, near returns that hardly fix a pose, a worse sensor, a rolling shutter,
+places that are shown elsewhere, tracks that end elsewhere. Recordings bear the name ``stress_<name>``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from dhtorch.geometry.camera import Camera, depth_pixels
+from dhtorch.geometry.lookup import round_half_up
+from dhtorch.records import Frame, Pose, Tracks
+from dhtorch.synthetic.paths import hand_held
+from dhtorch.synthetic.raycast import world_rays
+from dhtorch.synthetic.recording import SyntheticRoom
+from dhtorch.synthetic.room import furnished_room
+
+#: Near returns that are left in ``few_near``.
+FEW = 20
+
+#: Standard deviation of the additional relative depth error in ``depth_noise``; per pixel, on top of the phone's.
+DEPTH_NOISE = 0.025
+
+#: Rolling shutter: seconds from the first row to the last, in so many bands of rows that share a pose.
+READOUT_S, BANDS = 0.02, 30
+
+#: Share of the picture (``moved``) or of the tracks (``mistracks``) that is shown or found elsewhere, by between so
+#: many pixels at 640 columns; the picture in squares of ``TILE_PX`` px.
+MOVED_SHARE, TILE_PX, MOVED_PX = 0.3, 80, (6.0, 24.0)
+
+#: Where samples will be taken: ``(hw, n) -> uv (n, 2)``.
+Places = Callable[[tuple[int, int], int], Tensor]
+
+
+class StressRoom(SyntheticRoom):
+    """The built-in room with one thing wrong.
+
+    Args:
+        stress: one of :data:`STRESSES`.
+        places: for ``few_near``, where a method will look, with ``n_places``: returns are kept there. None = anywhere.
+        n_places: number of places.
+        options: of :class:`SyntheticRoom`; those that make the stress are set by it.
+
+    Raises:
+        ValueError: an unknown stress; else as :class:`SyntheticRoom`.
+    """
+
+    def __init__(self, stress: str, *, places: Places | None = None, n_places: int = 2048, **options: Any):
+        if stress not in STRESSES:
+            raise ValueError(f"stress room: stress is {stress!r}, expected one of {', '.join(STRESSES)}")
+        super().__init__(**options | STRESSES[stress].options)
+        self.stress, self.places, self.n_places = stress, places, n_places
+        self.name = f"stress_{stress}"
+        self.bands: list[Pose] = []
+        if stress == "rolling_shutter":
+            self._roll(options.get("step_m", 0.02))
+
+    def truth(self, index: int) -> dict[str, Tensor]:
+        """As :meth:`SyntheticRoom.truth`; under a rolling shutter each row in its own camera."""
+        i = self._position(index)
+        if not self.bands:
+            return super().truth(i)
+        parts = [self._true_view(camera, pose, hw) for camera, pose, hw in self._rows(i)]
+        return {k: torch.cat([part[k] for part in parts], 1) for k in parts[0]}
+
+    def spoil_track(self, track: Callable[..., Tracks]) -> Callable[..., Tracks]:
+        """A method's tracker as it works in this room: under ``mistracks`` many of its tracks end elsewhere."""
+        if self.stress != "mistracks":
+            return track
+        return partial(_mistrack, track)
+
+    def _picture(self, i: int) -> Tensor:
+        if not self.bands:
+            return super()._picture(i)
+        return torch.cat([self._photograph(camera, pose, hw) for camera, pose, hw in self._rows(i)], 2)
+
+    def _render(self, i: int) -> Frame:
+        return STRESSES[self.stress].spoil(self, i, super()._render(i))
+
+    def _roll(self, step_m: float) -> None:
+        """Poses of the bands of every frame; a frame's own pose is that of its middle band."""
+        per_frame = round(BANDS / (READOUT_S * self.rate_hz))
+        options = {"step_m": step_m / per_frame, "rate_hz": self.rate_hz * per_frame, "seed": self.seed}
+        every = hand_held(self.path, len(self) * per_frame + BANDS, **options)  # type: ignore[arg-type]
+        self.bands = [every[i * per_frame : i * per_frame + BANDS] for i in range(len(self))]
+        middle = torch.arange(len(self)) * per_frame + BANDS // 2
+        self.true_poses = self.poses = Pose(every.R[middle], every.t[middle])
+        self.camera = self.camera.replace(readout=torch.tensor([READOUT_S]))
+
+    def _rows(self, i: int) -> Iterator[tuple[Camera, Pose, tuple[int, int]]]:
+        """Camera, pose and size of the bands of rows of frame ``i``, from the top."""
+        edges = [round(k * self.hw[0] / BANDS) for k in range(BANDS + 1)]
+        for k, (top, bottom) in enumerate(pairwise(edges)):
+            if bottom > top:
+                shift = torch.tensor([[0.0, float(top)]])
+                pose = self.bands[i][k : k + 1]
+                yield self.camera.replace(c=self.camera.c - shift), pose, (bottom - top, self.hw[1])
+
+
+def open_stress(
+    stresses: Sequence[str] | None = None,
+    *,
+    seed: int = 2,
+    n_frames: int = 12,
+    hw: tuple[int, int] = (240, 320),
+    near: float = 2.0,
+    gap: int = 6,
+    places: Places | None = None,
+    n_places: int = 2048,
+) -> list[StressRoom]:
+    """The room under each of :data:`STRESSES` (None = all), one recording each; options as :class:`StressRoom`."""
+    options: dict[str, Any] = {"seed": seed, "n_frames": n_frames, "hw": hw, "near": near, "gap": gap}
+    names = STRESSES if stresses is None else stresses
+    return [StressRoom(name, places=places, n_places=n_places, **options) for name in names]
+
+
+def _nothing(room: StressRoom, i: int, frame: Frame) -> Frame:
+    return frame
+
+
+def _one_plane(room: StressRoom, i: int, frame: Frame) -> Frame:
+    """Near returns off the plane that most of them lie on are gone, and so are those off their surface."""
+    assert frame.depth_camera is not None
+    scene, pose, hw = furnished_room(room.seed), room.true_poses[i : i + 1], room.depth_hw
+    depth, solid = scene.solids.view(frame.depth_camera, pose, hw)
+    o, d = world_rays(frame.depth_camera, pose, hw)
+    face, _, _ = scene.solids.locate(solid, [o[k] + d[k] * depth for k in range(3)])
+    said = frame.depth.flatten()
+    near = (said > 0) & (said <= room.near)
+    sound = near & ((said / depth - 1).abs() < 0.05) & ~scene.solids.ball[solid]
+    plane = torch.bincount(face[sound], minlength=1).argmax()
+    return _without(frame, near & ~(sound & (face == plane)))
+
+
+def _few(room: StressRoom, i: int, frame: Frame) -> Frame:
+    """Of the near returns that a method would read, :data:`FEW` are left."""
+    said = frame.depth.flatten()
+    near = (said > 0) & (said <= room.near)
+    usable = near if frame.conf is None else near & (frame.conf.flatten() > 0)
+    if room.places is not None:
+        uv = room.places(room.hw, room.n_places)[None].to(frame.depth)
+        at = round_half_up(depth_pixels(frame.camera, room.hw, frame.depth_camera, room.depth_hw, uv))[0].long()
+        h, w = room.depth_hw
+        at = at[((at >= 0) & (at < torch.tensor([w, h]))).all(-1)]
+        read = torch.zeros_like(near).index_fill(0, at[:, 1] * w + at[:, 0], True)
+        usable = usable & read
+    chosen = usable.nonzero()[:, 0]
+    chosen = chosen[torch.randperm(len(chosen), generator=room._generator(i, "few"))[:FEW]]
+    return _without(frame, near & ~torch.zeros_like(near).index_fill(0, chosen, True))
+
+
+def _noisy(room: StressRoom, i: int, frame: Frame) -> Frame:
+    noise = torch.randn(frame.depth.shape, generator=room._generator(i, "noise"))
+    return frame.replace(depth=frame.depth * (1 + DEPTH_NOISE * noise).clamp_min(0.5))
+
+
+def _elsewhere(room: StressRoom, i: int, frame: Frame) -> Frame:
+    """Squares of the later views show what lies beside them, so that tracks end in the wrong place, and fit there.
+
+    The first ``gap`` frames are left alone: anchors show what is there.
+    """
+    if i < room.gap:
+        return frame
+    g, (H, W) = room._generator(i, "moved"), room.hw
+    tile = max(round(TILE_PX * W / 640), 1)
+    v, u = torch.meshgrid(torch.arange(H), torch.arange(W), indexing="ij")
+    rows, columns = -(-H // tile), -(-W // tile)
+    square = (v // tile) * columns + u // tile
+    moved = torch.randperm(rows * columns, generator=g)[: round(MOVED_SHARE * rows * columns)]
+    low, high = (px * W / 640 for px in MOVED_PX)
+    way = torch.randn(rows * columns, 2, generator=g)
+    way = way / way.norm(dim=-1, keepdim=True) * (low + (high - low) * torch.rand(rows * columns, 1, generator=g))
+    shift = torch.zeros_like(way).index_copy(0, moved, way[moved]).round().long()
+    row, column = (v + shift[square, 1]).clamp(0, H - 1), (u + shift[square, 0]).clamp(0, W - 1)
+    return frame.replace(image=frame.image[..., row, column])
+
+
+def _mistrack(track: Callable[..., Tracks], image_0: Tensor, image_1: Tensor, uv_0: Tensor, **options: Any) -> Tracks:
+    """Tracks of which :data:`MOVED_SHARE` end elsewhere, while all that they say of themselves stays as it was.
+
+    Which ones and where to depends on the second image alone, so every method that looks at it errs alike.
+    """
+    tracks = track(image_0, image_1, uv_0, **options)
+    low, high = (px * image_1.shape[-1] / 640 for px in MOVED_PX)
+    shifts = []
+    for image in image_1:
+        grey_levels = image if image.dtype == torch.uint8 else (255 * image).round()
+        g = torch.Generator().manual_seed(int(grey_levels.long().sum()))
+        wrong, length, angle = torch.rand(3, uv_0.shape[1], 1, generator=g)
+        way = torch.cat((torch.cos(2 * torch.pi * angle), torch.sin(2 * torch.pi * angle)), -1)
+        shifts.append(torch.where(wrong < MOVED_SHARE, way * (low + (high - low) * length), 0.0))
+    return tracks.replace(uv_1=tracks.uv_1 + torch.stack(shifts).to(tracks.uv_1))
+
+
+def _without(frame: Frame, gone: Tensor) -> Frame:
+    """The frame without the returns under the flat mask."""
+    depth = torch.where(gone.view(frame.depth.shape), torch.zeros_like(frame.depth), frame.depth)
+    return frame.replace(depth=depth)
+
+
+class Stress(NamedTuple):
+    """Options of the room, and what is done to its frames."""
+
+    options: dict[str, Any]
+    spoil: Callable[[StressRoom, int, Frame], Frame] = _nothing
+
+
+#: What may go wrong; the hand-held walk where no path is said.
+STRESSES: dict[str, Stress] = {
+    "lateral": Stress({"path": "lateral"}),
+    "forward": Stress({"path": "forward"}),
+    "orbit": Stress({"path": "orbit"}),
+    "rotation": Stress({"path": "rotation"}),
+    "rotation_exact": Stress({"path": "rotation", "lidar": "exact", "image_noise": 0.0}),
+    "planar_near": Stress({"path": "walk"}, _one_plane),
+    "few_near": Stress({"path": "walk"}, _few),
+    "depth_noise": Stress({"path": "walk"}, _noisy),
+    "rolling_shutter": Stress({"path": "walk"}),
+    "moved": Stress({"path": "walk"}, _elsewhere),
+    "mistracks": Stress({"path": "walk"}),
+}

@@ -1,0 +1,76 @@
+"""The built-in room from many places and in many directions: independent views, one frame each."""
+
+from __future__ import annotations
+
+import math
+from random import Random
+
+import torch
+
+from dhtorch.geometry.camera import resize
+from dhtorch.records import Pose
+from dhtorch.synthetic.recording import SyntheticRoom
+from dhtorch.synthetic.room import BACK, FRONT, LEFT, RIGHT, furnished_room
+
+#: Views of one furnished room before the next one is painted.
+VIEWS_A_ROOM = 5
+
+#: A view is drawn anew while more than a hundredth of it is nearer than this, m.
+NEAREST = 0.4
+
+
+def open_viewpoints(
+    n: int = 20,
+    *,
+    seed: int = 2,
+    hw: tuple[int, int] = (240, 320),
+    image_noise: float = 0.0,
+    supersample: int = 2,
+) -> list[SyntheticRoom]:
+    """``n`` views of the room, a recording of one frame each, with exact depth.
+
+    The viewer stands anywhere, at a height of 0.9 to 1.7 m, and looks anywhere, mostly a little down; every
+    :data:`VIEWS_A_ROOM` views the room is painted anew. View ``k`` is the same however many follow.
+
+    Args:
+        n: number of views.
+        seed: of rooms and viewers.
+        hw, image_noise, supersample: as :class:`SyntheticRoom`. Without noise by default: a camera model on top of the
+            picture adds its own.
+
+    Raises:
+        ValueError: no view, or an option that :class:`SyntheticRoom` does not take.
+    """
+    if n < 1:
+        raise ValueError(f"viewpoints: n is {n}, expected at least 1")
+    views = []
+    for k in range(n):
+        room = SyntheticRoom(
+            seed=seed + k // VIEWS_A_ROOM,
+            n_frames=1,
+            hw=hw,
+            lidar="exact",
+            image_noise=image_noise,
+            supersample=supersample,
+        )
+        room.name = f"viewpoint_{k:02d}"
+        room.true_poses = _place(room, Random(f"viewpoint {seed} {k}"))
+        room.poses = room.true_poses
+        views.append(room)
+    return views
+
+
+def _place(room: SyntheticRoom, draw: Random) -> Pose:
+    """A place with some air around it, and a direction: ``T_world_from_cam`` (1), float64."""
+    solids = furnished_room(room.seed).solids
+    small = (24, 32)
+    camera = resize(room.camera, room.hw, small)
+    while True:
+        x, z = draw.uniform(LEFT + 0.5, RIGHT - 0.5), draw.uniform(FRONT + 0.4, BACK - 0.8)
+        yaw, pitch = math.radians(draw.uniform(-180, 180)), math.radians(draw.uniform(-22, 4))
+        ca, sa, cb, sb = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
+        R = torch.tensor([[[ca, sa * sb, sa * cb], [0.0, cb, -sb], [-sa, ca * sb, ca * cb]]], dtype=torch.float64)
+        pose = Pose(R, torch.tensor([[x, -draw.uniform(0.9, 1.7), z]], dtype=torch.float64))
+        depth, _ = solids.view(camera, pose, small)
+        if float(depth.sort().values[len(depth) // 100]) > NEAREST:
+            return pose

@@ -1,0 +1,43 @@
+"""Writers: every format we read, tiny and complete, from given frames.
+
+They exist so that a reader can be held against a scene whose geometry is known exactly, and so that a notebook can show
+a format without a download. Nothing is compressed cleverly and no decoder of ours is used: the PNG bytes are put
+together here. Frames have B = 1; those with poses carry them in ``T_world_from_cam``.
+"""
+
+from dhtorch.testing.arkitscenes import write_arkitscenes
+from dhtorch.testing.ca1m import write_ca1m
+from dhtorch.testing.focal_stacks import write_ddff12, write_fod500, write_image_folder, write_light_field
+from dhtorch.testing.layouts import (
+    write_calib_pair,
+    write_counted_frames,
+    write_driving,
+    write_named_frames,
+    write_npz_pair,
+    write_tum,
+)
+from dhtorch.testing.lerobot import write_lerobot
+from dhtorch.testing.record3d import write_r3d, write_record3d_exr, write_record3d_mp4
+from dhtorch.testing.rh20t import write_rh20t
+from dhtorch.testing.stray import write_stray
+
+__all__ = [
+    "write_arkitscenes",
+    "write_ca1m",
+    "write_calib_pair",
+    "write_counted_frames",
+    "write_ddff12",
+    "write_driving",
+    "write_fod500",
+    "write_image_folder",
+    "write_lerobot",
+    "write_light_field",
+    "write_named_frames",
+    "write_npz_pair",
+    "write_r3d",
+    "write_record3d_exr",
+    "write_record3d_mp4",
+    "write_rh20t",
+    "write_stray",
+    "write_tum",
+]

@@ -1,0 +1,85 @@
+"""Writer of CA-1M archives."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import tarfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from dhtorch.geometry import camera as cameras
+from dhtorch.records import Camera, Frame
+from dhtorch.testing.parts import K_matrix, depth_codes, pixels, png, pose_matrix, seconds, write
+
+
+def write_ca1m(
+    file: Path,
+    frames: Sequence[Frame],
+    lasers: Sequence[Frame],  # one for each frame: its depth is the truth
+    *,
+    without: Sequence[tuple[int, str]] = (),
+) -> None:
+    """One WebDataset archive, ``ca1m-<split>-<video id>.tar``.
+
+    Args:
+        file: the archive; its name ends in the video id.
+        frames: image, LiDAR depth, confidence (levels 0, 1, 2 become 0, ½, 1) and pose.
+        lasers: laser depth, at a size of its own.
+        without: (frame, member) to leave out, ``(3, "gt/depth.png")``.
+    """
+    video = file.stem.rsplit("-", 1)[-1]
+    out = io.BytesIO()
+    with tarfile.open(fileobj=out, mode="w", format=tarfile.USTAR_FORMAT) as archive:
+
+        def add(name: str, content: bytes) -> None:
+            info = tarfile.TarInfo(f"{video}/{name}")
+            info.size = len(content)
+            archive.addfile(info, io.BytesIO(content))
+
+        for i, (frame, laser) in enumerate(zip(frames, lasers, strict=True)):
+            stamp = round(seconds(frame) * 1e9)
+            for what, content in _members(frame, laser).items():
+                if (i, what) not in without:
+                    add(f"{stamp}.{what}", content)
+        add("world.gt/instances.json", b"[]")
+    write(file, out.getvalue())
+
+
+def _members(frame: Frame, laser: Frame) -> dict[str, bytes]:
+    """The members of one frame."""
+    members = {
+        "wide/image.png": png(pixels(frame)),
+        "wide/image/K.json": _json(K_matrix(frame.camera)),
+        "wide/depth.png": png(depth_codes(frame.depth, 1000)),
+        "wide/depth/K.json": _json(K_matrix(_depth_camera(frame))),
+        "wide/instances.json": b"[]",
+        "wide/T_gravity.json": _json(np.eye(3)),
+        "gt/RT.json": _json(pose_matrix(frame)),
+        "gt/depth.png": png(depth_codes(laser.depth, 1000)),
+        "gt/depth/K.json": _json(K_matrix(_depth_camera(laser))),
+    }
+    if frame.conf is not None:
+        members["wide/depth/confidence.tiff"] = float_tiff(frame.conf[0].numpy() / np.float32(2))
+    return members
+
+
+def _depth_camera(frame: Frame) -> Camera:
+    hw = (frame.depth.shape[-2], frame.depth.shape[-1])
+    return frame.depth_camera or cameras.resize(frame.camera, frame.hw, hw)
+
+
+def _json(matrix: np.ndarray) -> bytes:
+    return json.dumps(matrix.tolist()).encode()
+
+
+def float_tiff(picture: np.ndarray) -> bytes:
+    """TIFF of (h, w) numbers as float32: one strip, little-endian, not compressed."""
+    h, w = picture.shape
+    body = picture.astype("<f4").tobytes()
+    tags = [(256, w), (257, h), (258, 32), (259, 1), (262, 1), (273, 8), (277, 1), (278, h), (279, len(body)), (339, 3)]
+    entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags)
+    return struct.pack("<2sHI", b"II", 42, 8 + len(body)) + body + struct.pack("<H", len(tags)) + entries + bytes(4)

@@ -1,0 +1,188 @@
+"""Writers of the plain layouts: TUM RGB-D, numbered frames, rectified pairs, LiDAR with cameras."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from dhtorch.geometry import camera as cameras
+from dhtorch.geometry import se3
+from dhtorch.records import Camera, Frame, Pose
+from dhtorch.testing.parts import (
+    K_matrix,
+    depth_codes,
+    pixels,
+    png,
+    pose_matrix,
+    quaternion,
+    seconds,
+    text_row,
+    text_rows,
+    write,
+)
+
+#: TUM's colour, depth and pose streams tick apart; the written depth stamps lag by this.
+_TUM_LAG = 0.0125  # s
+
+
+def write_tum(
+    root: Path, frames: Sequence[Frame], *, camera: int | None = None, units_per_metre: float = 5000.0
+) -> None:
+    """A TUM RGB-D sequence: ``rgb/``, ``depth/``, their lists and ``groundtruth.txt``.
+
+    The format has no place for K. ``camera`` 1, 2 or 3 names the freiburg camera in the trajectory's header, so that a
+    reader takes the published calibration (frames of 640×480); None puts the frames' own into ``meta.json``. The
+    trajectory ticks at the colour stamps.
+    """
+    lists: dict[str, list[str]] = {"rgb": ["# color images"], "depth": ["# depth maps"]}
+    poses = ["# ground truth trajectory", f"# file: 'rgbd_dataset_{f'freiburg{camera}' if camera else 'own'}.bag'"]
+    poses.append("# timestamp tx ty tz qx qy qz qw")
+    for frame in frames:
+        time = seconds(frame)
+        for kind, stamp in (("rgb", f"{time:.6f}"), ("depth", f"{time + _TUM_LAG:.6f}")):
+            lists[kind].append(f"{stamp} {kind}/{stamp}.png")
+            picture = pixels(frame) if kind == "rgb" else depth_codes(frame.depth, units_per_metre)
+            write(root / kind / f"{stamp}.png", png(picture))
+        pose = pose_matrix(frame)
+        poses.append(f"{time:.6f} " + text_row([*pose[:3, 3], *quaternion(pose[:3, :3])]))
+    for name, lines in (("rgb", lists["rgb"]), ("depth", lists["depth"]), ("groundtruth", poses)):
+        write(root / f"{name}.txt", "\n".join(lines) + "\n")
+    if camera is None:
+        lens = frames[0].camera.distortion
+        meta = {"K": K_matrix(frames[0].camera).tolist(), "dist": [0.0] * 5 if lens is None else lens[0].tolist()}
+        write(root / "meta.json", json.dumps(meta))
+
+
+def write_named_frames(
+    root: Path, frames: Sequence[Frame], *, units_per_metre: float = 1000.0, fps: float | None = None
+) -> None:
+    """``frame-XXXXXX.{color.png,depth.png,pose.txt}`` and ``camera-intrinsics.txt``, as 7-Scenes and its descendants.
+
+    Where the frames' depth has a camera of its own, the intrinsics file holds that one and ``meta.json`` holds both.
+    """
+    meta: dict[str, Any] = {} if fps is None else {"fps": fps}
+    if frames[0].depth_camera is not None:
+        meta |= {"K": K_matrix(frames[0].camera).tolist(), "K_depth": K_matrix(frames[0].depth_camera).tolist()}
+    for i, frame in enumerate(frames):
+        write(root / f"frame-{i:06d}.color.png", png(pixels(frame)))
+        write(root / f"frame-{i:06d}.depth.png", png(depth_codes(frame.depth, units_per_metre)))
+        write(root / f"frame-{i:06d}.pose.txt", text_rows(pose_matrix(frame)))
+    write(root / "camera-intrinsics.txt", text_rows(K_matrix(frames[0].depth_camera or frames[0].camera)))
+    if meta:
+        write(root / "meta.json", json.dumps(meta))
+
+
+def write_counted_frames(root: Path, frames: Sequence[Frame], *, units_per_metre: float = 1000.0) -> None:
+    """``images/``, ``depth/``, ``poses.txt`` (a row-major matrix a line) and ``K.txt``."""
+    for i, frame in enumerate(frames):
+        write(root / "images" / f"{i:05d}.png", png(pixels(frame)))
+        write(root / "depth" / f"{i:05d}.png", png(depth_codes(frame.depth, units_per_metre)))
+    write(root / "poses.txt", "".join(text_row(pose_matrix(frame).ravel()) + "\n" for frame in frames))
+    write(root / "K.txt", text_rows(K_matrix(frames[0].camera)))
+
+
+def write_calib_pair(root: Path, left: Frame, right: Frame) -> None:
+    """A rectified pair as Middlebury and ETH3D write it: ``calib.txt``, ``im0.png``, ``im1.png``, ``disp0.pfm``."""
+    baseline, doffs = _rectification(left, right)
+    h, w = left.hw
+    lines = [f"cam{i}={_matlab(K_matrix(frame.camera))}" for i, frame in enumerate((left, right))]
+    lines += [f"doffs={doffs!r}", f"baseline={baseline * 1000!r}", f"width={w}", f"height={h}", f"ndisp={w}"]
+    write(root / "calib.txt", "\n".join(lines) + "\n")
+    for i, frame in enumerate((left, right)):
+        write(root / f"im{i}.png", png(pixels(frame)))
+    disparity = _disparity(left, baseline, doffs)
+    write(root / "disp0.pfm", f"Pf\n{w} {h}\n-1\n".encode() + disparity[::-1].astype("<f4").tobytes())
+
+
+def write_npz_pair(root: Path, left: Frame, right: Frame, *, name: str = "scene") -> None:
+    """A rectified pair as scikit-image ships one: ``*_left.png``, ``*_right.png``, ``*_disp.npz``, ``meta.json``."""
+    baseline, doffs = _rectification(left, right)
+    write(root / f"{name}_left.png", png(pixels(left)))
+    write(root / f"{name}_right.png", png(pixels(right)))
+    disparity = np.ascontiguousarray(_disparity(left, baseline, doffs), np.float32)
+    np.savez_compressed(root / f"{name}_disp.npz", disparity)
+    meta = {"K_left": K_matrix(left.camera).tolist(), "K_right": K_matrix(right.camera).tolist()}
+    write(root / "meta.json", json.dumps(meta | {"baseline_m": baseline, "doffs": doffs}))
+
+
+def write_driving(
+    root: Path,
+    frames: Mapping[str, Sequence[Frame]],  # camera name → its frames, as many for each camera
+    T_world_from_lidar: Pose,  # (n) one for each instant
+    *,
+    lidar_lag: float = 0.09,
+) -> None:
+    """A DGP scene folder: ``scene_*.json``, ``calibration/``, ``rgb/<camera>/``, ``point_cloud/LIDAR/*.npz``.
+
+    The sweep of an instant holds every return of its frames' depth maps, in the LiDAR's frame, stamped later.
+    """
+    key = "0" * 40
+    data, samples = [], []
+    for i in range(T_world_from_lidar.t.shape[0]):
+        shots = {name: list_[i] for name, list_ in frames.items()}
+        stamp = max(seconds(frame) for frame in shots.values()) + lidar_lag
+        data.append(_datum(f"{i}L", "LIDAR", stamp, _write_sweep(root, i, shots, T_world_from_lidar[i : i + 1])))
+        for name, frame in shots.items():
+            file, (h, w) = f"rgb/{name}/{i:06d}.png", frame.hw
+            write(root / file, png(pixels(frame)))
+            image = {"filename": file, "channels": 3, "height": h, "width": w, "pose": _pose_json(pose_matrix(frame))}
+            data.append(_datum(f"{i}{name}", name, seconds(frame), {"image": image}))
+        samples.append({"calibration_key": key, "datum_keys": [f"{i}L", *(f"{i}{name}" for name in shots)]})
+    write(root / f"scene_{key}.json", json.dumps({"data": data, "samples": samples, "name": "written"}))
+    zero = dict.fromkeys(("fx", "fy", "cx", "cy", "skew"), 0.0)  # the LiDAR has an entry too
+    intrinsics = [zero, *(_intrinsics_json(list_[0].camera) for list_ in frames.values())]
+    write(root / "calibration" / f"{key}.json", json.dumps({"names": ["LIDAR", *frames], "intrinsics": intrinsics}))
+
+
+def _write_sweep(root: Path, i: int, shots: Mapping[str, Frame], T_world_from_lidar: Pose) -> dict[str, Any]:
+    points = []
+    for frame in shots.values():
+        v, u = torch.nonzero(frame.depth[0] > 0, as_tuple=True)
+        uv = torch.stack((u, v), -1).double()
+        xyz = cameras.unproject(frame.camera.to(torch.float64), uv[None], frame.depth[0, v, u].double()[None])
+        T_world_from_cam = se3.from_matrix(torch.from_numpy(pose_matrix(frame))[None])
+        points.append(se3.apply(se3.relative(T_world_from_cam, T_world_from_lidar), xyz)[0])
+    xyz_lidar = torch.cat(points).numpy()
+    file = f"point_cloud/LIDAR/{i:06d}.npz"
+    (root / file).parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(root / file, data=np.concatenate((xyz_lidar, np.full((len(xyz_lidar), 1), 0.5)), 1))
+    pose = _pose_json(se3.to_matrix(T_world_from_lidar)[0].numpy())
+    return {"point_cloud": {"filename": file, "point_format": ["X", "Y", "Z", "INTENSITY"], "pose": pose}}
+
+
+def _datum(key: str, name: str, stamp: float, datum: dict[str, Any]) -> dict[str, Any]:
+    text = datetime.fromtimestamp(stamp, UTC).isoformat(timespec="microseconds").replace("+00:00", "Z")
+    return {"key": key, "id": {"name": name, "timestamp": text}, "datum": datum}
+
+
+def _pose_json(pose: np.ndarray) -> dict[str, dict[str, float]]:
+    rotation = dict(zip(("qx", "qy", "qz", "qw"), map(float, quaternion(pose[:3, :3])), strict=True))
+    return {"rotation": rotation, "translation": dict(zip("xyz", map(float, pose[:3, 3]), strict=True))}
+
+
+def _intrinsics_json(camera: Camera) -> dict[str, float]:
+    (fx, fy), (cx, cy) = camera.f[0].tolist(), camera.c[0].tolist()
+    return {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "skew": 0.0}
+
+
+def _rectification(left: Frame, right: Frame) -> tuple[float, float]:
+    """Baseline (m) and difference of the principal points (px)."""
+    baseline = (pose_matrix(right)[:3, 3] - pose_matrix(left)[:3, 3])[0]
+    return float(baseline), float(K_matrix(right.camera)[0, 2] - K_matrix(left.camera)[0, 2])
+
+
+def _disparity(left: Frame, baseline: float, doffs: float) -> np.ndarray:
+    """f · baseline / depth − doffs; infinite where there is no return."""
+    depth = left.depth[0].double().numpy()
+    scale = float(left.camera.f[0, 0]) * baseline
+    return np.where(depth > 0, scale / np.where(depth > 0, depth, 1) - doffs, np.inf)
+
+
+def _matlab(K: np.ndarray) -> str:
+    return "[" + "; ".join(" ".join(f"{x!r}" for x in row) for row in K.tolist()) + "]"

@@ -1,0 +1,145 @@
+"""Writers of Record3D's three layouts."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from dhtorch.data.files import need
+from dhtorch.geometry import camera as cameras
+from dhtorch.records import Frame
+from dhtorch.testing.mp4 import write_video
+from dhtorch.testing.parts import K_matrix, pixels, pose_matrix, quaternion, seconds, write
+
+_NO_POSE = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+
+
+def write_r3d(
+    file: Path,
+    frames: Sequence[Frame],
+    *,
+    fps: float = 60.0,
+    declared_hw: tuple[int, int] | None = None,
+    depth_size: bool = True,
+    per_frame: bool = True,
+    compression: int = zipfile.ZIP_STORED,
+) -> None:
+    """An ``.r3d`` archive: ``metadata``, ``rgbd/<i>.jpg``, ``.depth``, and ``.conf`` where the frames have confidence.
+
+    Args:
+        file: the archive.
+        frames: depth may have its own resolution. Without poses the table says what the front camera says.
+        fps: nominal rate.
+        declared_hw: size that the metadata and K speak of; None = the pictures'.
+        depth_size: write ``dw`` and ``dh``, which old files lack.
+        per_frame: write the intrinsics of every frame, which old files lack.
+        compression: of the archive's entries.
+    """
+    file.parent.mkdir(parents=True, exist_ok=True)
+    meta = _metadata(frames, fps, declared_hw)
+    if not depth_size:
+        del meta["dw"], meta["dh"]
+    if not per_frame:
+        del meta["perFrameIntrinsicCoeffs"]
+    pack = need("lzfse", "liblzfse").compress
+    with zipfile.ZipFile(file, "w", compression) as archive:
+        archive.writestr("metadata", json.dumps(meta))
+        archive.writestr("icon", _jpeg(pixels(frames[0])[:16, :16]))
+        for i, frame in enumerate(frames):
+            archive.writestr(f"rgbd/{i}.jpg", _jpeg(pixels(frame)))
+            archive.writestr(f"rgbd/{i}.depth", pack(frame.depth[0].numpy().astype("<f4").tobytes()))
+            if frame.conf is not None:
+                archive.writestr(f"rgbd/{i}.conf", pack(frame.conf[0].numpy().astype(np.uint8).tobytes()))
+
+
+def write_record3d_exr(
+    root: Path,
+    frames: Sequence[Frame],
+    *,
+    fps: float = 60.0,
+    channel: str = "R",
+    dtype: np.typing.DTypeLike = np.float16,
+) -> None:
+    """The EXR + RGB export: ``EXR_RGBD/`` with ``metadata.json``, ``rgb/<i>.jpg`` and ``depth/<i>.exr``."""
+    exr = need("OpenEXR")
+    folder = root / "EXR_RGBD"
+    for i, frame in enumerate(frames):
+        write(folder / "rgb" / f"{i}.jpg", _jpeg(pixels(frame)))
+        header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
+        picture = io.BytesIO()
+        # The library takes memory as it lies, whatever the strides say.
+        exr.File(header, {channel: np.ascontiguousarray(frame.depth[0].numpy(), dtype)}).write(picture)
+        write(folder / "depth" / f"{i}.exr", picture.getvalue())
+    meta = _metadata(frames, fps, None)
+    del meta["perFrameIntrinsicCoeffs"]
+    write(folder / "metadata.json", json.dumps(meta))
+
+
+def write_record3d_mp4(
+    file: Path,
+    frames: Sequence[Frame],  # depth as large as the image, no poses needed
+    *,
+    fps: float = 30.0,
+    depth_range: tuple[float, float] | None = None,
+    crf: int = 4,
+    stored: str = "yuv420p",
+) -> None:
+    """The RGBD mp4: hue and colour side by side, intrinsics as JSON behind the film.
+
+    ``depth_range``: m, written into the file; None = 0 to 3 m, unsaid, as older files.
+    """
+    near, far = depth_range or (0.0, 3.0)
+    pictures = [np.concatenate((_hue((f.depth[0].numpy() - near) / (far - near)), pixels(f)), 1) for f in frames]
+    write_video(file, pictures, [i / fps for i in range(len(frames))], crf=crf, stored=stored)
+    meta: dict[str, Any] = {"intrinsicMatrix": K_matrix(frames[0].camera).T.ravel().tolist()}
+    if depth_range is not None:
+        meta["rangeOfEncodedDepth"] = list(depth_range)
+    text = json.dumps(meta, separators=(",", ":")).encode()
+    with file.open("ab") as stream:  # as a box of its own, so that the file remains an mp4
+        stream.write(struct.pack(">I4s", 8 + len(text) + 1, b"free") + text + b"\0")
+
+
+def _metadata(frames: Sequence[Frame], fps: float, declared_hw: tuple[int, int] | None) -> dict[str, Any]:
+    hw = declared_hw or frames[0].hw
+    own = [cameras.resize(f.camera, f.hw, hw) if declared_hw else f.camera for f in frames]
+    return {
+        "w": hw[1],
+        "h": hw[0],
+        "dw": frames[0].depth.shape[-1],
+        "dh": frames[0].depth.shape[-2],
+        "fps": fps,
+        "K": K_matrix(own[0]).T.ravel().tolist(),
+        "perFrameIntrinsicCoeffs": [[*camera.f[0].tolist(), *camera.c[0].tolist()] for camera in own],
+        "frameTimestamps": [seconds(f) - seconds(frames[0]) for f in frames],
+        "poses": [_pose(f) for f in frames],
+        "initPose": _NO_POSE,
+    }
+
+
+def _pose(frame: Frame) -> list[float]:
+    """Quaternion and position of the camera with ARKit's axes."""
+    if frame.T_world_from_cam is None:
+        return _NO_POSE
+    c2w = pose_matrix(frame) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    return [*map(float, quaternion(c2w[:3, :3])), *map(float, c2w[:3, 3])]
+
+
+def _jpeg(picture: np.ndarray) -> bytes:
+    out = io.BytesIO()
+    Image.fromarray(picture).save(out, "JPEG", quality=95, subsampling=0)
+    return out.getvalue()
+
+
+def _hue(share: np.ndarray) -> np.ndarray:
+    """(h, w, 3) uint8: the colour of full saturation and value at a share of the circle."""
+    distance = np.abs((share[..., None] * 6 - [3.0, 2.0, 4.0] + 3) % 6 - 3)
+    value = np.stack((distance[..., 0] - 1, 2 - distance[..., 1], 2 - distance[..., 2]), -1)
+    return (value.clip(0, 1) * 255).round().astype(np.uint8)

@@ -1,0 +1,66 @@
+"""Writer of Stray Scanner captures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from dhtorch.records import Frame
+from dhtorch.testing.mp4 import write_video
+from dhtorch.testing.parts import K_matrix, depth_codes, pixels, png, pose_matrix, quaternion, seconds, write
+
+_HEADER = "timestamp, frame, x, y, z, qx, qy, qz, qw"
+
+
+def write_stray(
+    root: Path,
+    frames: Sequence[Frame],
+    *,
+    codec: str = "libx264",
+    video: bool = True,
+    first_picture: Literal["shown", "hidden", "lost"] = "shown",
+    per_frame: bool = False,
+    depth_format: Literal["png", "npy"] = "png",
+    confidence_channels: int = 1,
+    start: int = 0,
+) -> None:
+    """``rgb.mp4``, ``depth/``, ``confidence/`` where the frames have it, ``odometry.csv`` and ``camera_matrix.csv``.
+
+    Args:
+        root: folder of the capture.
+        frames: depth may have its own resolution; the image's sides are even.
+        codec: of the video; the app writes HEVC, ``libx265``.
+        video: write it.
+        first_picture: ``hidden`` by an edit list, before time 0; or ``lost``.
+        per_frame: columns with K, as newer versions of the app write; the two of the distortion's centre stay empty.
+        depth_format: ``npy`` as the oldest versions.
+        confidence_channels: 3 as some converters leave it.
+        start: number of the first frame.
+    """
+    times = [seconds(frame) for frame in frames]
+    lines = [_HEADER + (", fx, fy, cx, cy, distortion_center_x, distortion_center_y" if per_frame else "")]
+    for i, frame in enumerate(frames, start):
+        code = depth_codes(frame.depth, 1000)
+        if depth_format == "png":
+            write(root / "depth" / f"{i:06d}.png", png(code))
+        else:
+            (root / "depth").mkdir(parents=True, exist_ok=True)
+            np.save(root / "depth" / f"{i:06d}.npy", code)
+        if frame.conf is not None:
+            conf = frame.conf[0].numpy()
+            write(root / "confidence" / f"{i:06d}.png", png(np.stack([conf] * confidence_channels, -1)))
+        c2w, K = pose_matrix(frame), K_matrix(frame.camera)
+        cells = [*c2w[:3, 3], *quaternion(c2w[:3, :3])]
+        cells += [K[0, 0], K[1, 1], K[0, 2], K[1, 2]] if per_frame else []
+        text = ", ".join(f"{float(cell):.17g}" for cell in cells)
+        lines.append(f"{seconds(frame):.9f}, {i:06d}, {text}" + (", , " if per_frame else ""))
+    write(root / "odometry.csv", "\n".join(lines) + "\n")
+    K = K_matrix(frames[-1].camera)
+    write(root / "camera_matrix.csv", "\n".join(", ".join(f"{x!r}" for x in row) for row in K.tolist()))
+    if video:
+        kept = slice(1 if first_picture == "lost" else 0, None)
+        pictures = [pixels(frame) for frame in frames][kept]
+        write_video(root / "rgb.mp4", pictures, times[kept], codec=codec, hide_first=first_picture == "hidden")
