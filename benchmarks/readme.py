@@ -158,7 +158,7 @@ def picture(path: Path) -> None:
     from dhtorch import extend, merge
     from dhtorch.codes import Source
     from dhtorch.evaluate import holdout
-    from dhtorch.synthetic.recording import SyntheticRoom
+    from dhtorch.synthetic import SyntheticRoom
 
     torch.set_num_threads(1)
     recording = SyntheticRoom()

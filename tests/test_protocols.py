@@ -363,8 +363,14 @@ SMALLER = {
     ],
     "method_comparison": ["experiment.seeds=1"],
     "part_ablation": ["experiment.seeds=1"],
-    "rh20t_probe": ["experiment.dinov2=null"],
-    "vo_probe": ["experiment.dinov2=null", "experiment.min_pairs=2", "experiment.blocks=2"],
+    "rh20t_probe": [
+        *("data=rh20t_synthetic", "data.hw=[72,128]", "data.tasks=3", "data.n_frames=12"),
+        *("experiment.dinov2=null", "experiment.n_folds=3"),
+    ],
+    "vo_probe": [
+        *("data=synthetic", "data.n_frames=12", "data.gap=3", "data.supersample=1"),
+        *("experiment.dinov2=null", "experiment.min_pairs=2", "experiment.blocks=3"),
+    ],
 }
 NAMES = sorted(path.stem for path in (config_dir() / "experiment").glob("*.yaml"))
 QUICK = ("heldout", "hole_census")

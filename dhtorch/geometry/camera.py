@@ -9,11 +9,18 @@ Pixel convention, once for the whole project: *integer coordinates are pixel cen
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor
 
+from dhtorch.geometry import se3
+from dhtorch.geometry.se3 import Pose
 from dhtorch.geometry.shapes import check
 from dhtorch.tree import Record, record
+
+if TYPE_CHECKING:
+    from kornia.geometry.camera import PinholeCamera
 
 #: How many coefficients a distortion may have: k1 k2 p1 p2 [k3 [k4 k5 k6]].
 COEFFICIENTS = (4, 5, 8)
@@ -27,6 +34,31 @@ class Camera(Record):
     c: Tensor  # (B, 2) px
     distortion: Tensor | None = None  # (B, k) k1 k2 p1 p2 [k3 [k4 k5 k6]], OpenCV's order; None = ideal pinhole
     readout: Tensor | None = None  # (B,) s from first to last row (rolling shutter); None = global shutter
+
+    @classmethod
+    def from_kornia(cls, camera: PinholeCamera, distortion: Tensor | None = None) -> Camera:
+        """The intrinsics of a ``kornia.geometry.camera.PinholeCamera``; where it stands is ``Pose.from_kornia``'s.
+
+        Its matrix is used as it is: kornia, too, leaves it to the caller where a pixel's centre lies, and here that is
+        at whole numbers. Skew is not carried. kornia keeps a lens apart from its cameras: ``distortion`` (B, k).
+
+        Gradient: to the intrinsics.
+        """
+        return from_matrix(camera.intrinsics[:, :3, :3], distortion)
+
+    def to_kornia(self, hw: tuple[int, int], T_cam_from_world: Pose | None = None) -> PinholeCamera:
+        """As a ``kornia.geometry.camera.PinholeCamera`` of pictures of size ``hw``; the lens stays behind.
+
+        Its extrinsics map points of the world into the camera; None = the world is the camera's frame.
+
+        Gradient: to the intrinsics and the pose.
+        """
+        from kornia.geometry.camera import PinholeCamera  # noqa: PLC0415  (as long to import as torch)
+
+        eye = torch.eye(4, dtype=self.f.dtype, device=self.f.device).expand(len(self.f), 4, 4)
+        K = torch.cat((torch.cat((to_matrix(self), eye[:, :3, 3:]), -1), eye[:, 3:]), 1)
+        extrinsics = eye if T_cam_from_world is None else se3.to_matrix(T_cam_from_world)
+        return PinholeCamera(K, extrinsics, *(self.f.new_full((len(self.f),), float(side)) for side in hw))
 
 
 def from_matrix(K: Tensor, distortion: Tensor | None = None, readout: Tensor | None = None) -> Camera:

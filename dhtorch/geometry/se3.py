@@ -7,12 +7,17 @@ Alphabet: ``T_b_from_a`` maps points of frame a into frame b, ``x_b = R x_a + t`
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import torch
 from torch import Tensor
 
 from dhtorch.geometry.shapes import check
 from dhtorch.geometry.steady import steady
 from dhtorch.tree import Record, record
+
+if TYPE_CHECKING:
+    from kornia.geometry.liegroup import Se3
 
 
 @record
@@ -21,6 +26,24 @@ class Pose(Record):
 
     R: Tensor  # (B, 3, 3)
     t: Tensor  # (B, 3) m
+
+    @classmethod
+    def from_kornia(cls, motion: Any) -> Pose:
+        """A ``kornia.geometry.liegroup.Se3``, or ``T_cam_from_world`` of a ``kornia.geometry.camera.PinholeCamera``.
+
+        Gradient: to the motion.
+        """
+        extrinsics = getattr(motion, "extrinsics", None)
+        return cls(motion.so3.matrix(), motion.t) if extrinsics is None else from_matrix(extrinsics)
+
+    def to_kornia(self) -> Se3:
+        """As a ``kornia.geometry.liegroup.Se3``. Beware of tangents: kornia's begin with the translation, ours end so.
+
+        Gradient: to the motion.
+        """
+        from kornia.geometry.liegroup import Se3, So3  # noqa: PLC0415  (as long to import as torch)
+
+        return Se3(So3.from_matrix(self.R), self.t)
 
 
 def identity(batch: int, like: Tensor) -> Pose:
