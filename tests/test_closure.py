@@ -1,8 +1,11 @@
 """Which code a job can reach: editing that makes its result another one, editing anything else does not."""
 
 import ast
+import contextlib
+import copy
 import shutil
 import sys
+from functools import cache
 from pathlib import Path
 
 import hydra
@@ -17,21 +20,27 @@ ROOT = Path(dhtorch.__file__).parent
 FILES = sorted(ROOT.rglob("*.py"))
 
 
+@cache
 def settings(*overrides):
     OmegaConf.register_new_resolver("dhtorch.job_name", job_name, replace=True)
     with hydra.initialize_config_dir(str(config_dir()), version_base="1.3", job_name="dhtorch"):
         return OmegaConf.to_container(hydra.compose("run", list(overrides)), resolve=True)
 
 
-@pytest.fixture
-def package(tmp_path):
+@pytest.fixture(scope="module")
+def package(tmp_path_factory):
     """A copy of the package that may be edited."""
-    return Path(shutil.copytree(ROOT, tmp_path / "dhtorch", ignore=shutil.ignore_patterns("__pycache__")))
+    folder = tmp_path_factory.mktemp("copy") / "dhtorch"
+    return Path(shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns("__pycache__")))
 
 
-def edit(path):
-    assert path.is_file()
-    path.write_bytes(path.read_bytes() + b"\n# edited\n")
+@contextlib.contextmanager
+def edited(path):
+    """A file with a comment at its end, for as long as it is looked at."""
+    before = path.read_bytes()
+    path.write_bytes(before + b"\n# edited\n")
+    yield
+    path.write_bytes(before)
 
 
 MAIN = ("data=synthetic",)
@@ -65,17 +74,18 @@ MAIN = ("data=synthetic",)
 def test_a_result_is_another_one_when_what_it_reaches_is_edited(package, overrides, path, counts):
     config = settings(*overrides)
     before = archive.result_key(config, "d", code_dir=package)
-    edit(package / path)
-    assert (archive.result_key(config, "d", code_dir=package) != before) == counts
+    with edited(package / path):
+        assert (archive.result_key(config, "d", code_dir=package) != before) == counts
+    assert archive.result_key(config, "d", code_dir=package) == before
 
 
 def test_tables_that_travel_with_a_module_count_with_it(package):
-    config = settings(*MAIN)
+    config = copy.deepcopy(settings(*MAIN))
     node = {"_target_": "dhtorch.calibration.probability", "name": "map"}
     config["method"]["score"]["recalibration"] = node
     before = archive.result_key(config, "d", code_dir=package)
-    edit(package / "calibration" / "map.json")
-    assert archive.result_key(config, "d", code_dir=package) != before
+    with edited(package / "calibration" / "map.json"):
+        assert archive.result_key(config, "d", code_dir=package) != before
     assert not any(name.endswith((".pyc", ".css")) for name in closure.reached(closure.targets(config), package))
 
 
@@ -84,8 +94,8 @@ def test_further_roots_count(package):
     roots = {"roots": ["dhtorch.extract.rows"], "code_dir": package}
     before = archive.result_key(config, "d", **roots)
     assert before != archive.result_key(config, "d", code_dir=package)
-    edit(package / "extract" / "rows.py")
-    assert before != archive.result_key(config, "d", **roots)
+    with edited(package / "extract" / "rows.py"):
+        assert before != archive.result_key(config, "d", **roots)
 
 
 def test_names_are_those_of_modules_functions_and_packages():
@@ -106,8 +116,8 @@ def test_somebody_elses_function_counts_and_what_it_takes_from_here(tmp_path, mo
     assert {"stages/track.py", "geometry/lucas_kanade.py"} <= set(found) and "window.py" not in found
     config = {"track": {"_target_": "their_tracker.follow"}}
     before = archive.result_key(config, "d")
-    edit(tmp_path / "their_tracker.py")
-    assert archive.result_key(config, "d") != before
+    with edited(tmp_path / "their_tracker.py"):
+        assert archive.result_key(config, "d") != before
     sys.modules.pop("their_tracker", None)
 
 

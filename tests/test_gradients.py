@@ -439,7 +439,7 @@ def relative(estimate, truth, counts):
     return r.flatten(), (counts.flatten(), r.detach().flatten())
 
 
-@pytest.mark.slow  # a camera; the test below does the same with depth, and notebooks/4_gradients.ipynb shows both
+@pytest.mark.slow  # the derivatives it goes by are checked above; notebooks/4_gradients.ipynb shows both
 @pytest.mark.parametrize("sign", [1, -1])
 def test_intrinsics_five_per_cent_wrong_are_recovered_from_far_depth(task, sign):
     f, c = task.near.camera.f, task.near.camera.c
@@ -461,6 +461,7 @@ def test_intrinsics_five_per_cent_wrong_are_recovered_from_far_depth(task, sign)
     assert median[1] < 0.2 * median[0] and median[1] < 0.01
 
 
+@pytest.mark.slow
 def test_a_wrong_scale_of_near_depth_is_recovered_pixel_by_pixel(task):
     """The sensor lies by a smooth field, 1 % to 11 %; far truth fixes its mean, near triangulation its shape."""
     hw = task.near.depth.shape[-2:]

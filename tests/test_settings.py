@@ -39,6 +39,7 @@ GROUPS = {
 }
 
 
+@functools.cache
 def compose(*overrides):
     with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
         return hydra.compose("run", list(overrides))
