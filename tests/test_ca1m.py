@@ -19,8 +19,7 @@ from test_arkitscenes import VGA, VGA_HW, shots
 from dhtorch import data
 from dhtorch import testing as writers
 from dhtorch.data import FormatError, ca1m
-from dhtorch.data.codecs import tarballs as codec_tar
-from dhtorch.data.codecs import tiff as codec_tiff
+from dhtorch.data.codecs import tarballs, tiff
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame
 from dhtorch.testing.ca1m import float_tiff
@@ -196,8 +195,8 @@ def test_poses_are_camera_to_world(tmp_path: Path) -> None:
 def test_opening_reads_only_poses_and_recordings_travel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file, _, _ = archive(tmp_path)
     read: list[int] = []
-    member = codec_tar.read_member
-    monkeypatch.setattr(codec_tar, "read_member", lambda *args: read.append(args[2]) or member(*args))
+    member = tarballs.read_member
+    monkeypatch.setattr(tarballs, "read_member", lambda *args: read.append(args[2]) or member(*args))
     recording = data.open(file)
     assert len(read) == 4 and max(read) < 400
     twin = pickle.loads(pickle.dumps(recording))
@@ -221,7 +220,7 @@ def test_what_is_no_archive_of_ours(tmp_path: Path) -> None:
         with pytest.raises(FormatError, match=message):
             data.open(tmp_path / name, "ca1m")
     with pytest.raises(FormatError, match="file: found no such file"):
-        list(codec_tar.members(tmp_path / "gone.tar"))
+        list(tarballs.members(tmp_path / "gone.tar"))
 
 
 def test_a_folder_of_archives_is_listed_and_none_is_opened(tmp_path: Path) -> None:
@@ -258,16 +257,16 @@ def test_members_against_the_standard_library(tmp_path: Path, format: int) -> No
         archive.addfile(info, io.BytesIO(b"end"))
     with tarfile.open(file) as archive:
         want = [(m.name, m.offset_data, m.size) for m in archive.getmembers() if m.isreg()]
-        got = list(codec_tar.members(file))
+        got = list(tarballs.members(file))
         assert [tuple(m) for m in got] == want and len(got) == 6
         for m in got:
-            assert codec_tar.read_member(file, m.offset, m.size) == archive.extractfile(m.name).read()
+            assert tarballs.read_member(file, m.offset, m.size) == archive.extractfile(m.name).read()
 
 
 def test_damaged_archives_end_the_walk(tmp_path: Path) -> None:
     file, _, _ = archive(tmp_path, n=1)
     good = file.read_bytes()
-    offset = next(iter(codec_tar.members(file))).offset
+    offset = next(iter(tarballs.members(file))).offset
 
     def header(at: int, field: bytes) -> bytes:
         block = bytearray(good[:512])
@@ -288,15 +287,15 @@ def test_damaged_archives_end_the_walk(tmp_path: Path) -> None:
     ):
         file.write_bytes(content)
         if message is None:
-            assert len(list(codec_tar.members(file))) == 10
+            assert len(list(tarballs.members(file))) == 10
         else:
             with pytest.raises(FormatError, match=message):
-                list(codec_tar.members(file))
+                list(tarballs.members(file))
     file.write_bytes(good)
     with pytest.raises(FormatError, match="found 9 bytes, expected at most 8 bytes"):
-        codec_tar.read_member(file, 512, 9, limit=8)
+        tarballs.read_member(file, 512, 9, limit=8)
     with pytest.raises(FormatError, match="found 0 bytes, expected 9 bytes"):
-        codec_tar.read_member(file, len(good), 9)
+        tarballs.read_member(file, len(good), 9)
 
 
 def test_pax_sizes_and_long_names_are_bounded(tmp_path: Path) -> None:
@@ -310,7 +309,7 @@ def test_pax_sizes_and_long_names_are_bounded(tmp_path: Path) -> None:
             info.pax_headers = {key: value}
             archive.addfile(info)
         with pytest.raises(FormatError, match=message):
-            list(codec_tar.members(file))
+            list(tarballs.members(file))
 
 
 # -------------------------------------------------------------------------------------------------------------- TIFF
@@ -323,10 +322,10 @@ def test_tiff_against_tifffile(tmp_path: Path, order: str, kind: str, compressio
     picture = (np.random.default_rng(0).random((20, 30)) * 100).astype(kind)
     file = tmp_path / "a.tiff"
     tifffile.imwrite(file, picture, byteorder=order, compression=compression)
-    got = codec_tiff.read_tiff(file, (20, 30))
+    got = tiff.read_tiff(file, (20, 30))
     assert got.dtype == picture.dtype and np.array_equal(got, picture)
     with pytest.raises(FormatError, match=r"a.tiff: size: found 30x20, expected 20x30"):
-        codec_tiff.read_tiff(file, (30, 20))
+        tiff.read_tiff(file, (30, 20))
 
 
 def test_our_tiff_is_one() -> None:
@@ -356,7 +355,7 @@ def test_bad_tiff(tmp_path: Path) -> None:
         (tag(277, 3), "layout: found 3 samples a pixel"),
     ):
         with pytest.raises(FormatError, match=message) as caught:
-            codec_tiff.decode_tiff(content, Path("a.tiff"))
+            tiff.decode_tiff(content, Path("a.tiff"))
         assert "\n" not in str(caught.value)
 
 

@@ -21,7 +21,7 @@ from torch.utils.data import DataLoader
 from dhtorch import data, tree
 from dhtorch import testing as writers
 from dhtorch.data import convert, driving, files, frames_dir, rectified, tum
-from dhtorch.data.codecs import npy as codec_numpy
+from dhtorch.data.codecs import npy
 from dhtorch.data.files import FormatError
 from dhtorch.data.recording import numbers
 from dhtorch.geometry import camera as cameras
@@ -457,9 +457,9 @@ def test_npz_bomb_is_not_unpacked(tmp_path: Path) -> None:
         with zipfile.ZipFile(tmp_path / f"{name}.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             archive.writestr("data.npy", head.getvalue() + body)
     with pytest.raises(FormatError, match=r"liar.npz: data: found 64 bytes, expected \(1000000000000,\) of float64"):
-        codec_numpy.read_npz(tmp_path / "liar.npz", "data")
+        npy.read_npz(tmp_path / "liar.npz", "data")
     with pytest.raises(FormatError, match=r"big.npz: data: found an array that unpacks beyond the limit"):
-        codec_numpy.read_npz(tmp_path / "big.npz", "data")
+        npy.read_npz(tmp_path / "big.npz", "data")
 
 
 def test_bad_driving(tmp_path: Path) -> None:

@@ -11,6 +11,9 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 
+from dhtorch import data
+from dhtorch.studies.report import layouts
+
 REPO = Path(__file__).resolve().parents[1]
 DOCS = REPO / "docs"
 WITHOUT = [name for name in ("mkdocs", "material", "mkdocstrings") if importlib.util.find_spec(name) is None]
@@ -133,14 +136,25 @@ def test_a_mark_that_nobody_makes_is_an_error():
         script("hooks").filled("<!-- make: readme Nowhere -->")
 
 
-@pytest.mark.parametrize("page", ["methods", "pipelines"])
-def test_the_examples_run(page, capsys):
+@pytest.mark.parametrize("page", ["methods", "pipelines", "extend"])
+def test_the_examples_run(page, capsys, monkeypatch):
     blocks = re.findall(r"^```python\n(.*?)^```", (DOCS / f"{page}.md").read_text(encoding="utf-8"), re.M | re.S)
     names: dict = {}
+    monkeypatch.setattr(data, "FORMATS", dict(data.FORMATS))  # to which an example adds
+    monkeypatch.setattr(layouts, "LAYOUTS", dict(layouts.LAYOUTS))
     exec(compile("\n".join(blocks), f"{page}.md", "exec"), names)
     if page == "methods":
         score = names["estimate"].score
         assert ((score > 0) == names["estimate"].keep).all() and (score > 0).any()
+    elif page == "extend":
+        said = capsys.readouterr().out
+        assert "3 frames" in said and "torch.Size([1, 24, 32])" in said and "R. Hartley, A. Zisserman" in said
+        assert names["outcome"].verdict in ("supported", "refuted") and names["mine"].track is names["half_size"]
+        kept = names["estimate"].keep
+        assert ((names["estimate"].score > 0) == kept).all() and int(kept.sum()) > 50
+        tracked = names["mine"](names["room"][0], names["room"][6])
+        both = tracked.keep & kept
+        assert float((tracked.depth / names["estimate"].depth - 1).abs()[both].median()) < 0.1, "the half-size tracker"
     else:
         assert "torch.Size([80, 10])" in capsys.readouterr().out and names["more"]["task"] == "pick up the cup"
 

@@ -19,9 +19,7 @@ from dhtorch import data
 from dhtorch import testing as writers
 from dhtorch.commands import run
 from dhtorch.data import FormatError, ddff12, fod500, image_folder
-from dhtorch.data.codecs import hdf5 as codec_hdf5
-from dhtorch.data.codecs import npy as codec_numpy
-from dhtorch.data.codecs import tiff as codec_tiff
+from dhtorch.data.codecs import hdf5, npy, tiff
 from dhtorch.data.light_field import refocus
 from dhtorch.data.stacks import FocalStack, Stacks
 
@@ -276,7 +274,7 @@ def test_ddff12_raw_without_its_depth_is_left_out(tmp_path: Path) -> None:
 def test_opening_decodes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     writers.write_fod500(tmp_path / "a", {0: stack(0)})
     writers.write_ddff12(tmp_path / "b.h5", {"train": [stack(0, 10)]})
-    for module, name in ((codec_tiff, "read_tiff"), (fod500.codec_exr, "read_exr"), (codec_hdf5.Hdf5Array, "row")):
+    for module, name in ((tiff, "read_tiff"), (fod500.codec_exr, "read_exr"), (hdf5.Hdf5Array, "row")):
         monkeypatch.setattr(module, name, lambda *a, **k: 1 / 0)
     assert len(data.open_stacks(tmp_path / "a")) == len(data.open_stacks(tmp_path / "b.h5")) == 1
 
@@ -394,7 +392,7 @@ def test_bad_light_field(tmp_path: Path) -> None:
     fails(r"LF_0001.npy: light field: found float32 of", tmp_path)
     np.save(file, np.array([{"a": 1}]), allow_pickle=True)
     fails(r"LF_0001.npy: light field dtype: found object, expected real numbers", tmp_path)
-    assert codec_numpy.npy_header(file, "x", good).shape == (3, 3, 12, 16, 3)
+    assert npy.npy_header(file, "x", good).shape == (3, 3, 12, 16, 3)
 
 
 def test_a_missing_library_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

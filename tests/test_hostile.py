@@ -30,8 +30,7 @@ from hypothesis import strategies as st
 from dhtorch import data
 from dhtorch import testing as writers
 from dhtorch.data import FormatError
-from dhtorch.data.codecs import pickles as codec_pickle
-from dhtorch.data.codecs import tiff as codec_tiff
+from dhtorch.data.codecs import pickles, tiff
 from dhtorch.geometry import se3
 from dhtorch.records import Frame, Pose
 
@@ -108,8 +107,8 @@ SAMPLES: dict[str, Sample] = {
         }.items()
     },
     "rh20t": (test_rh20t.hostile_sample, test_rh20t.read_all),
-    "pickle": (test_pickle.hostile_sample, codec_pickle.read_npy),
-    "tiff": (test_ca1m.hostile_tiff, codec_tiff.read_tiff),
+    "pickle": (test_pickle.hostile_sample, pickles.read_npy),
+    "tiff": (test_ca1m.hostile_tiff, tiff.read_tiff),
 }
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dhtorch.data.codecs import pickles as codec_pickle
+from dhtorch.data.codecs import pickles
 from dhtorch.data.files import FormatError
 
 FILE = Path("some.npy")
@@ -61,9 +61,9 @@ def same(a: Any, b: Any) -> bool:
 @pytest.mark.parametrize("protocol", [2, 3, 4, 5])
 def test_plain_data_comes_back(protocol: int) -> None:
     content = pickle.dumps(plain(), protocol)
-    assert same(codec_pickle.loads(content, FILE), plain())
+    assert same(pickles.loads(content, FILE), plain())
     old = content.replace(b"numpy._core.", b"numpy.core.") if protocol < 4 else None  # as numpy 1 wrote it
-    assert old is None or same(codec_pickle.loads(old, FILE), plain())
+    assert old is None or same(pickles.loads(old, FILE), plain())
 
 
 def test_short_names_of_numpy_1() -> None:
@@ -72,7 +72,7 @@ def test_short_names_of_numpy_1() -> None:
     )
     assert b"numpy.core" in content
     unframed = content[:2] + content[11:] if content[2:3] == b"\x95" else content
-    assert codec_pickle.loads(unframed, FILE).tolist() == [0, 1, 2]
+    assert pickles.loads(unframed, FILE).tolist() == [0, 1, 2]
 
 
 def test_npy_files(tmp_path: Path) -> None:
@@ -84,14 +84,14 @@ def test_npy_files(tmp_path: Path) -> None:
         np.arange(3, dtype=">u2"),
     ):
         np.save(file, content, allow_pickle=True)
-        assert same(codec_pickle.read_npy(file), content)
+        assert same(pickles.read_npy(file), content)
     np.save(file, np.array([{"a": 1}, 2], dtype=object), allow_pickle=True)
-    assert codec_pickle.read_npy(file) == [{"a": 1}, 2]
+    assert pickles.read_npy(file) == [{"a": 1}, 2]
 
 
 def test_two_names_for_one_list_stay_equal() -> None:
     stamps = [1, 2, 3]
-    got = codec_pickle.loads(pickle.dumps({"color": stamps, "depth": stamps}), FILE)
+    got = pickles.loads(pickle.dumps({"color": stamps, "depth": stamps}), FILE)
     assert got == {"color": stamps, "depth": stamps}
 
 
@@ -171,7 +171,7 @@ def test_nothing_in_a_file_runs(name: str, tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.chdir(tmp_path)
     FLAG.clear()
     with pytest.raises(FormatError, match=r"some.npy: pickle: found") as error:
-        codec_pickle.loads(ATTACKS[name], FILE)
+        pickles.loads(ATTACKS[name], FILE)
     assert FLAG == [] and list(tmp_path.iterdir()) == [] and "\n" not in str(error.value)
 
 
@@ -241,7 +241,7 @@ def test_sizes_are_not_believed(name: str) -> None:
     tracemalloc.start()
     try:
         with pytest.raises(FormatError, match=r"some.npy: pickle: found"):
-            codec_pickle.loads(HUGE[name], FILE)
+            pickles.loads(HUGE[name], FILE)
         assert tracemalloc.get_traced_memory()[1] < 64 << 20
     finally:
         tracemalloc.stop()
@@ -249,7 +249,7 @@ def test_sizes_are_not_believed(name: str) -> None:
 
 def test_a_memo_of_any_number_costs_one_entry() -> None:
     """Python's own reader makes room for twice the number: 64 GB."""
-    assert codec_pickle.loads(b"\x80\x02K\x01r\xff\xff\xff\xff0j\xff\xff\xff\xff.", FILE) == 1
+    assert pickles.loads(b"\x80\x02K\x01r\xff\xff\xff\xff0j\xff\xff\xff\xff.", FILE) == 1
 
 
 def test_damaged_headers(tmp_path: Path) -> None:
@@ -271,7 +271,7 @@ def test_damaged_headers(tmp_path: Path) -> None:
     ):
         file.write_bytes(bad)
         with pytest.raises(FormatError, match=r"x.npy: (header|data|pickle|file)"):
-            codec_pickle.read_npy(file)
+            pickles.read_npy(file)
 
 
 HEADERS = [
@@ -311,7 +311,7 @@ def test_no_header_raises_anything_else(tmp_path: Path, version: int) -> None:
         size = struct.pack("<H" if version == 1 else "<I", len(head))
         (tmp_path / "x.npy").write_bytes(b"\x93NUMPY" + bytes([version, 0]) + size + head + bytes(24))
         with pytest.raises(FormatError, match=r"x.npy: (header|header shape|data): found ") as caught:
-            codec_pickle.read_npy(tmp_path / "x.npy")
+            pickles.read_npy(tmp_path / "x.npy")
         assert "\n" not in str(caught.value)
 
 
@@ -326,5 +326,5 @@ def test_a_minute_of_robot() -> None:
     minute = {str(s): [{**entry, "timestamp": i, "tcp": np.arange(7.0) + i} for i in range(600)] for s in range(10)}
     content = io.BytesIO()
     np.save(content, np.array(minute, dtype=object), allow_pickle=True)
-    got = codec_pickle.loads(content.getvalue()[128:], FILE)
+    got = pickles.loads(content.getvalue()[128:], FILE)
     assert same(got["9"][599], minute["9"][599])

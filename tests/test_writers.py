@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from dhtorch import testing as writers
-from dhtorch.data.codecs import exr as codec_exr
+from dhtorch.data.codecs import exr
 from dhtorch.data.stacks import FocalStack
 from dhtorch.records import Camera, Frame, Pose
 from dhtorch.testing.lossless import write_lossless
@@ -133,7 +133,7 @@ def test_expanded_depth_of_a_focal_stack_is_written_where_it_belongs(tmp_path: P
     depth = torch.linspace(0.5, 2.0, HW[1]).half().float().expand(1, *HW)
     images = torch.zeros(1, 5, 3, *HW, dtype=torch.uint8)
     writers.write_fod500(tmp_path, {0: FocalStack(images, depth=depth)})
-    found = codec_exr.read_exr(tmp_path / "000000Dpt.exr")
+    found = exr.read_exr(tmp_path / "000000Dpt.exr")
     np.testing.assert_array_equal(found, depth[0].numpy())
 
 

@@ -22,8 +22,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.data import convert, files
-from dhtorch.data.codecs import tarballs as codec_tar
-from dhtorch.data.codecs import tiff as codec_tiff
+from dhtorch.data.codecs import tarballs, tiff
 from dhtorch.data.files import FormatError
 from dhtorch.data.laser import judged
 from dhtorch.data.recording import Recording, Recordings, TruthRecording
@@ -46,7 +45,7 @@ def recognise(root: Path) -> str | None:
     if root.suffix != ".tar":
         return None
     try:
-        names = [member.name for member in islice(codec_tar.members(root), 32)]
+        names = [member.name for member in islice(tarballs.members(root), 32)]
     except FormatError:
         return None
     found = {match[3].lower() for name in names if (match := _MEMBER.fullmatch(name))}
@@ -134,7 +133,7 @@ class _Load:
     def member(self, i: int, what: str) -> tuple[bytes, Path]:
         """Bytes of a member and the name it has in errors."""
         offset, size = self.spans[what][i].tolist()
-        return codec_tar.read_member(self.archive, offset, size), self.archive / f"{self.stamps[i]}.{what}"
+        return tarballs.read_member(self.archive, offset, size), self.archive / f"{self.stamps[i]}.{what}"
 
     def depth(self, i: int, what: str) -> Tensor:
         """Depth (h, w) m."""
@@ -172,7 +171,7 @@ class _LoadTruth:
 def _index(archive: Path, skip: set[str]) -> dict[tuple[int, str], dict[str, tuple[int, int]]]:
     """(time in ns, its member prefix) → what → (offset, size); times in their order."""
     frames: dict[tuple[int, str], dict[str, tuple[int, int]]] = {}
-    for member in codec_tar.members(archive):
+    for member in tarballs.members(archive):
         match = _MEMBER.fullmatch(member.name)
         if match and (what := match[3].lower()) in _KNOWN - skip:
             frame = frames.setdefault((int(match[2]), f"{match[1]}/{match[2]}"), {})
@@ -227,7 +226,7 @@ def _matrix(data: bytes, file: Path, n: int) -> np.ndarray:
 
 def _levels(data: bytes, file: Path, hw: tuple[int, int], stored: str | None) -> np.ndarray:
     """Confidence (h, w) uint8, 0 low to 2 high."""
-    value = codec_tiff.decode_tiff(data, file, hw).astype(np.float64)
+    value = tiff.decode_tiff(data, file, hw).astype(np.float64)
     top = 2 if stored == "level" else 1
     if not ((value >= 0) & (value <= top)).all():
         expected = f"0 to {top} (option confidence: unit or level)"

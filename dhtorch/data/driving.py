@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from dhtorch.data import convert, files
-from dhtorch.data.codecs import npy as codec_numpy
+from dhtorch.data.codecs import npy
 from dhtorch.data.files import FormatError
 from dhtorch.data.recording import Recording
 from dhtorch.geometry import se3
@@ -202,7 +202,7 @@ def _camera(file: Path, name: str, hw: tuple[int, int]) -> Camera:
 
 def _sweep(file: Path, fields: tuple[str, ...]) -> np.ndarray:
     """Points (M, 3) m in the LiDAR's frame."""
-    data = codec_numpy.read_npz(file, "data")
+    data = npy.read_npz(file, "data")
     if not {"X", "Y", "Z"} <= set(fields) or data.ndim != 2 or data.shape[1] != len(fields):
         raise FormatError(file, "data", f"shape {data.shape}", f"points with columns {', '.join(fields)}")
     return np.ascontiguousarray(data[:, [fields.index(axis) for axis in "XYZ"]], dtype=np.float64)

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.data import files
-from dhtorch.data.codecs import exr as codec_exr
+from dhtorch.data.codecs import exr
 from dhtorch.data.files import FormatError
 from dhtorch.data.stacks import FocalStack, Stacks, focus_distances, read_pictures
 
@@ -98,7 +98,7 @@ class _Load:
         images, file = read_pictures(self.pictures[i]), self.depths[i]
         depth = None
         if file is not None:
-            metres = codec_exr.read_exr(file, "R", (images.shape[-2], images.shape[-1]))
+            metres = exr.read_exr(file, "R", (images.shape[-2], images.shape[-1]))
             metres = np.where(np.isfinite(metres) & (metres > 0), metres, 0)
             depth = torch.from_numpy(metres if self.max_depth is None else metres.clip(max=self.max_depth))[None]
         lens, f_number = torch.tensor([self.focal_length_m]), torch.tensor([self.f_number])

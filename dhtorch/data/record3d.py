@@ -25,7 +25,7 @@ import torch
 
 from dhtorch.data import convert, files, record3d_video
 from dhtorch.data.codecs import exr as codec_exr
-from dhtorch.data.codecs import lzfse as codec_lzfse
+from dhtorch.data.codecs import lzfse
 from dhtorch.data.files import FormatError
 from dhtorch.data.members import Member, folder_members, member, zip_members
 from dhtorch.data.recording import Recording
@@ -175,13 +175,13 @@ class _Load:
             depth = codec_exr.decode_exr(part.read(), part.path, self.exr_channel, self.depth_hw)
         else:
             h, w = self.depth_hw
-            depth = np.frombuffer(codec_lzfse.unpack(part.read(), 4 * h * w, part.path, "depth"), "<f4").reshape(h, w)
+            depth = np.frombuffer(lzfse.unpack(part.read(), 4 * h * w, part.path, "depth"), "<f4").reshape(h, w)
         with np.errstate(invalid="ignore"):
             return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
     def _conf(self, part: Member) -> np.ndarray:
         h, w = self.depth_hw
-        conf = np.frombuffer(codec_lzfse.unpack(part.read(), h * w, part.path, "confidence"), np.uint8)
+        conf = np.frombuffer(lzfse.unpack(part.read(), h * w, part.path, "confidence"), np.uint8)
         if conf.max() > 2:
             raise FormatError(part.path, "confidence", int(conf.max()), "0, 1 or 2")
         return conf.reshape(h, w).copy()
@@ -324,7 +324,7 @@ def _sizes_of(shot: _Shot, meta: _Metadata) -> tuple[tuple[int, int], tuple[int,
     if meta.depth_hw is not None:
         return hw, meta.depth_hw
     data = shot.depth.read()
-    count = codec_lzfse.unpacked_size(data, shot.depth.path, "depth") if data.startswith(b"bvx") else len(data)
+    count = lzfse.unpacked_size(data, shot.depth.path, "depth") if data.startswith(b"bvx") else len(data)
     if count / 4 not in _DEPTH_SIZES:
         expected = "dw and dh in the metadata, or 4 for each of " + ", ".join(map(str, _DEPTH_SIZES))
         raise FormatError(shot.depth.path, "depth", f"{count} bytes", expected)

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from dhtorch.data import convert, files
-from dhtorch.data.codecs import video as codec_video
+from dhtorch.data.codecs import video
 from dhtorch.data.files import FormatError
 from dhtorch.data.recording import Recording
 from dhtorch.records import Camera, Frame
@@ -45,7 +45,7 @@ def recognise(file: Path) -> str | None:
 def read(file: Path, *, depth_range: Sequence[float] | None = None, max_step: float = 0.05) -> list[Recording]:
     """Open one video; see :func:`dhtorch.data.record3d.read`."""
     meta, source = _metadata(file)
-    header = codec_video.video_header(file)
+    header = video.video_header(file)
     hw = (header.hw[0], header.hw[1] // 2)
     K = files.to_array(meta.get("intrinsicMatrix", meta.get("K")), (9,), source, "intrinsicMatrix").reshape(3, 3).T
     limits = depth_range if depth_range is not None else meta.get("rangeOfEncodedDepth", _RANGE)
@@ -83,7 +83,7 @@ class _Load:
 
     def __call__(self, i: int) -> Frame:
         # Nearest: hues must not be blended on the way from the half-size colour planes to the full size.
-        picture = codec_video.read_video_frame(self.file, i, self.hw, nearest=True)
+        picture = video.read_video_frame(self.file, i, self.hw, nearest=True)
         half = self.hw[1] // 2
         image = np.ascontiguousarray(picture[:, half:].transpose(2, 0, 1))
         depth = hue_depth(picture[:, :half], self.near, self.far, self.max_step)

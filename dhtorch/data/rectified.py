@@ -19,8 +19,7 @@ import numpy as np
 import torch
 
 from dhtorch.data import convert, files
-from dhtorch.data.codecs import npy as codec_numpy
-from dhtorch.data.codecs import pfm as codec_pfm
+from dhtorch.data.codecs import npy, pfm
 from dhtorch.data.files import FormatError
 from dhtorch.data.recording import Recording, numbers
 from dhtorch.records import Camera, Frame, Pose
@@ -133,8 +132,8 @@ def _checked(pair: _Pair, file: Path) -> _Pair:
 
 def _disparity(file: Path, hw: tuple[int, int]) -> np.ndarray:
     if file.suffix == ".pfm":
-        return codec_pfm.read_pfm(file, hw)
-    disparity = codec_numpy.read_npz(file, "arr_0")
+        return pfm.read_pfm(file, hw)
+    disparity = npy.read_npz(file, "arr_0")
     if disparity.shape != hw:
         raise FormatError(file, "arr_0", f"shape {disparity.shape}", f"{hw}, as the image")
     return disparity

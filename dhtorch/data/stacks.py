@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.data import files
-from dhtorch.data.codecs import tiff as codec_tiff
+from dhtorch.data.codecs import tiff
 from dhtorch.data.files import FormatError
 from dhtorch.records import Camera
 from dhtorch.tree import Record, record
@@ -105,7 +105,7 @@ def _picture(file: Path) -> Tensor:
     """(C, H, W); an alpha channel of a TIFF is dropped."""
     if file.suffix.lower() not in (".tif", ".tiff"):
         return torch.from_numpy(files.read_image(file))
-    picture = codec_tiff.read_tiff(file, samples=(1, 3, 4))
+    picture = tiff.read_tiff(file, samples=(1, 3, 4))
     picture = picture[None] if picture.ndim == 2 else np.ascontiguousarray(picture[..., :3].transpose(2, 0, 1))
     if picture.dtype not in (np.uint8, np.uint16):
         raise FormatError(file, "samples", picture.dtype, "8 or 16 bits")

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 
 from dhtorch.data import convert, files
-from dhtorch.data.codecs import pickles as codec_pickle
+from dhtorch.data.codecs import pickles
 from dhtorch.data.codecs.video import read_video_frame, video_header
 from dhtorch.data.files import FormatError
 from dhtorch.data.recording import Recording
@@ -175,7 +175,7 @@ class _Load:
         """(h, w) m."""
         if shot.depth.suffix == ".png":
             return files.read_depth_png(shot.depth, _UNITS_PER_METRE, self.depth_hw)
-        code = codec_pickle.read_npy(shot.depth)
+        code = pickles.read_npy(shot.depth)
         if not isinstance(code, np.ndarray) or code.dtype != np.uint16 or code.shape != self.depth_hw:
             found = f"{getattr(code, 'dtype', type(code).__name__)} of shape {getattr(code, 'shape', None)}"
             raise FormatError(shot.depth, "depth", found, f"uint16 of shape {self.depth_hw}")
@@ -280,7 +280,7 @@ def _depth_hw(shots: list[_Shot]) -> tuple[int, int]:
         try:
             if shot.depth.suffix == ".png":
                 return files.image_header(shot.depth).hw
-            h, w = np.shape(codec_pickle.read_npy(shot.depth))
+            h, w = np.shape(pickles.read_npy(shot.depth))
             return int(h), int(w)
         except ValueError as found:
             error = error or found
