@@ -31,6 +31,7 @@ from torch import Tensor
 from dhtorch import data
 from dhtorch.data.pairs import by_gap
 from dhtorch.geometry import lucas_kanade as lk
+from dhtorch.geometry.exact import LANES
 from dhtorch.geometry.lookup import luma
 from dhtorch.geometry.pyramid import Pyramid, Pyramids, build_pyramid
 from dhtorch.records import TrackHint
@@ -69,7 +70,7 @@ def pairs(count: int) -> tuple[Tensor, Tensor]:
 def forward(image_0: Tensor, image_1: Tensor, uv: Tensor, window: int, pyramid_0: Pyramid | None = None):
     """Positions (B, N, 2) and whether they were found (B, N)."""
     B, N, _ = uv.shape
-    assert B * N % lk.LANES == 0
+    assert B * N % LANES == 0
     o = lk.Options(window, 30, 0.01, track.MIN_EIGENVALUE, "none")
     with torch.no_grad():
         source = build_pyramid(image_0, LEVELS, window) if pyramid_0 is None else pyramid_0

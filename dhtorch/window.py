@@ -17,9 +17,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dhtorch.geometry.exact import steady
 from dhtorch.geometry.pyramid import Pyramids
 from dhtorch.geometry.shapes import check
-from dhtorch.geometry.steady import steady
 from dhtorch.method import Method, Trace
 from dhtorch.pair import ask_pair, lifted
 from dhtorch.records import NO_HINT, Estimate, Frame, PoseFit, Samples, TrackHint, Tracks

@@ -17,6 +17,7 @@ from dhtorch.geometry import (
     cells,
     covariance,
     epipolar,
+    exact,
     filters,
     least_squares,
     lookup,
@@ -26,7 +27,6 @@ from dhtorch.geometry import (
     pyramid,
     ransac,
     se3,
-    steady,
     thin_lens,
 )
 from dhtorch.records import Camera, Frame, Samples, Tracks
@@ -165,7 +165,7 @@ def positive(batch, n, dtype):
 
 def problems(batch, n, dtype):
     """Near and far tracks of a few pairs as planes, the unknowns near their optimum, and a noise."""
-    n = n + -n % least_squares.LANES
+    n = n + -n % exact.PRODUCT_LANES
     samples, tracks, fit, camera_0, camera_1 = tracked(batch, n, dtype)
     near = torch.arange(n) % 3 > 0
     planes = lambda v: v.transpose(1, 2) if v.ndim == 3 else v  # noqa: E731
@@ -323,7 +323,7 @@ ROWS = [
     Row(epipolar.describe, lambda b, n, d: (camera.unproject(two_views(b, n, d)[2], two_views(b, n, d)[0], uniform(b, n, dtype=d, low=1, high=2)), *two_views(b, n, d)), ALL, (0, 1, 2), (0, 1, 2, 3, 4, 5), bad=wrong_last_axis(0), leaks=True),
     Row(epipolar.point_jacobians, lambda b, n, d: (cameras(b, d), uniform(b, n, 3, dtype=d, low=1, high=2)), ALL, (1,), (0, 1), bad=wrong_last_axis(1), leaks=True),
     Row(epipolar.depth_variance, lambda b, n, d: (epipolar.triangulate(*two_views(b, n, d)), tracked(b, n, d)[1].cov, tracked(b, n, d)[2].cov), "dtype batch vmap capture gradcheck empty shuffle padding nan", (0, 1), (0, 1, 2), leaks=True),
-    Row(steady.steady, lambda b, n, d: (torch.sin, uniform(b, n, dtype=d)), "dtype batch vmap capture gradcheck empty shuffle padding nan", (1,), (1,)),
+    Row(exact.steady, lambda b, n, d: (torch.sin, uniform(b, n, dtype=d)), "dtype batch vmap capture gradcheck empty shuffle padding nan", (1,), (1,)),
     Row(backproject.backproject, frames, ALL, (1,), (0, 1), bad=wrong_last_axis(1)),
     Row(holes.classify, sampled, "dtype batch vmap capture empty shuffle padding nan raises", (1,), (), bad=wrong_last_axis(1)),
     Row(holes.min_eigenvalue, lambda b, n, d: (frames(b, n, d)[0].image, pixels(b, n, d)), ALL, (1,), (0,), bad=wrong_last_axis(1)),
@@ -424,6 +424,7 @@ ELSEWHERE = {
     *(f"dhtorch.pair.{name}" for name in ("ask_pair", "merge", "lifted", "undistort_tracks", "uniform_draws")),
     "dhtorch.method.networks",
     "dhtorch.stages.fuse.inverse_variance",
+    "dhtorch.geometry.exact.filled",
     "dhtorch.geometry.least_squares.minimise",
     *(f"dhtorch.geometry.lucas_kanade.{n}" for n in ("search", "step", "squares", "covariance", "for_some", "within")),
     *(f"dhtorch.geometry.ransac.{name}" for name in ("msac_cost", "search")),

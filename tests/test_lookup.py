@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from dhtorch.geometry import lookup
+from dhtorch.geometry.exact import LANES
 
 H, W = 9, 13
 #: Pixels, some of whose patches lie beyond each border and corner.
@@ -160,7 +161,7 @@ def test_summaries_see_whole_lanes_of_a_few_patches_at_a_time(n, dtype, monkeypa
     seen = []
 
     def first(p):
-        assert p.shape[:2] == (3, 3) and p.shape[2] % lookup.LANES == 0
+        assert p.shape[:2] == (3, 3) and p.shape[2] % LANES == 0
         seen.append(p.shape[2])
         return (p[0, 0],)
 
@@ -242,3 +243,8 @@ def test_bytes_and_floats_of_one_picture_have_the_same_grey_bit_for_bit():
     one = pictures(C=1, dtype=torch.uint8)
     assert torch.equal(lookup.luma(one, 1), one.float() / 255)
     assert lookup.luma(one.double(), 1).equal(one.double())
+
+
+def test_rounding_to_bytes_has_the_variance_that_residuals_are_not_believed_below():
+    grey = torch.rand(1_000_000, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    assert float(((grey * 255).round() / 255 - grey).var()) == pytest.approx(lookup.QUANTISATION, rel=0.01)

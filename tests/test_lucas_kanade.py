@@ -9,6 +9,7 @@ import torch
 from by_hand import Level, levels, places, waves
 
 from dhtorch.geometry import lucas_kanade as lk
+from dhtorch.geometry.exact import LANES
 from dhtorch.geometry.pyramid import Pyramids, build_pyramid
 from dhtorch.records import TrackHint
 from dhtorch.stages.track import MIN_EIGENVALUE, lucas_kanade, refine
@@ -440,7 +441,7 @@ def test_some_are_replaced_and_the_others_kept():
     seen = []
 
     def double(x, y):
-        assert x.shape[-1] % lk.LANES == 0
+        assert x.shape[-1] % LANES == 0
         seen.append(x)
         return 2 * x, y + 1
 

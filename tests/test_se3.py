@@ -8,8 +8,8 @@ import torch
 from kornia.geometry.liegroup import Se3, So3
 
 from dhtorch.geometry import se3
+from dhtorch.geometry.exact import LANES, filled, steady
 from dhtorch.geometry.se3 import Pose
-from dhtorch.geometry.steady import STRIDE, steady
 
 #: Rotation angles on both sides of where the series end (0.1 rad), up to beyond half a turn.
 BELOW = [0.0, 1e-160, 1e-9, 1e-4, 0.01, 0.03, *(0.09 + 0.0005 * k for k in range(20)), 0.0999999]
@@ -208,7 +208,7 @@ def test_the_gradient_of_an_angle_is_one_along_its_axis():
 # ------------------------------------------------------------------------------------------------ steady rounding
 
 
-@pytest.mark.parametrize("shape", [(1,), (7, 3), (STRIDE,), (2, STRIDE + 1), (0, 3), ()])
+@pytest.mark.parametrize("shape", [(1,), (7, 3), (LANES,), (2, LANES + 1), (0, 3), ()])
 def test_functions_are_handed_whole_strides_in_one_row(shape):
     """No element is left over for the scalar loop, whose rounding differs."""
     seen = []
@@ -219,7 +219,7 @@ def test_functions_are_handed_whole_strides_in_one_row(shape):
 
     a = torch.rand(shape, generator=torch.Generator().manual_seed(0))
     found = steady(fn, a, 1 + a)
-    count = -(-a.numel() // STRIDE) * STRIDE
+    count = -(-a.numel() // LANES) * LANES
     assert seen == [((count,), (count,))]
     torch.testing.assert_close(found, torch.atan2(a, 1 + a))
 
@@ -228,7 +228,7 @@ def test_an_element_s_value_does_not_hang_on_its_place():
     x = torch.linspace(-6, 6, 203)
     alone = torch.cat([steady(torch.sigmoid, v[None]) for v in x])
     assert torch.equal(steady(torch.sigmoid, x), alone)
-    assert STRIDE % 32 == 0, "two registers of sixteen"
+    assert LANES % 32 == 0, "two registers of sixteen"
 
 
 def test_unequal_shapes_are_refused():
@@ -236,3 +236,7 @@ def test_unequal_shapes_are_refused():
         steady(torch.atan2, torch.ones(3), torch.ones(1))
     with pytest.raises(ValueError, match="equal shapes"):
         steady(torch.atan2, torch.ones(2, 3), torch.ones(3, 2))
+
+
+def test_rows_are_filled_up_to_whole_lanes():
+    assert [filled(n, 16) for n in (0, 1, 15, 16, 17, 32)] == [16, 16, 16, 16, 32, 32] and filled(1) == LANES

@@ -5,7 +5,7 @@ TESTS: dict[str, list[str]] = {
     "geometry.se3": ["tests/test_se3.py", "tests/test_contract.py"],
     "geometry.epipolar": ["tests/test_epipolar.py", "tests/test_contract.py"],
     "geometry.shapes": ["tests/test_camera.py", "tests/test_contract.py"],
-    "geometry.steady": ["tests/test_se3.py", "tests/test_contract.py"],
+    "geometry.exact": ["tests/test_se3.py", "tests/test_contract.py"],
 }
 
 FAULTS: dict[str, list[tuple[str, ...]]] = {
@@ -209,10 +209,12 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("is_static", "torch.compiler.is_compiling() or ", ""),
         ("is_static", " or torch._C._functorch.is_functorch_wrapped_tensor(x)", ""),
     ],
-    "geometry.steady": [
-        ("STRIDE", "64", "8"),
-        ("steady", "-xs[0].numel() % STRIDE", "xs[0].numel() % STRIDE"),
-        ("steady", "-xs[0].numel() % STRIDE", "0"),
+    "geometry.exact": [
+        ("LANES", "64", "8"),
+        ("filled", "count + -count % lanes", "count + count % lanes"),
+        ("filled", ", lanes)", ", 0)"),
+        ("steady", "-xs[0].numel() % LANES", "xs[0].numel() % LANES"),
+        ("steady", "-xs[0].numel() % LANES", "0"),
         ("steady", "any(x.shape != shape for x in xs)", "any(x.numel() != shape.numel() for x in xs)"),
         ("steady", ".reshape(shape)", ".reshape(-1)"),
         ("steady", "value=0.5", "value=0.0", "the padding is cut off again, and its gradient with it"),

@@ -9,8 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dhtorch.geometry.exact import steady
 from dhtorch.geometry.shapes import check
-from dhtorch.geometry.steady import steady
 from dhtorch.tree import Record, record
 
 #: Rise given to the two end blocks of a table, where isotonic regression is flat, so that no order is lost there.

@@ -23,14 +23,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from dhtorch.geometry.exact import CHUNK
 from dhtorch.geometry.least_squares import MIN_PIVOT, solve_spd
-from dhtorch.geometry.lookup import round_half_up
+from dhtorch.geometry.lookup import QUANTISATION, round_half_up
 from dhtorch.geometry.lucas_kanade import for_some
 from dhtorch.geometry.pyramid import GRAD_X, GRAD_Y, GREY, REACH, Pyramid
 from dhtorch.geometry.shapes import check, is_static
-
-#: Points treated at once: few enough for their windows to stay in the cache.
-CHUNK = 256
 
 #: Of what would follow a step, at most so many times that step is taken at once; more overshoots under large warps.
 AHEAD = 0.5
@@ -44,9 +42,6 @@ GAIN, SCALE = (0.2, 5.0), (0.4, 2.5)
 
 #: From this magnification on image 1 is read from its half-size level, where a pixel of the window meets a pixel again.
 HALVE = 1.5
-
-#: Variance of rounding grey values to 8 bits; no residual is believed to be smaller.
-QUANTISATION = 1 / (12 * 255**2)
 
 #: Variance of a pyramid's gradient in unit white noise.
 GRADIENT_NOISE = 2 * (3**2 + 10**2 + 3**2) / 32**2

@@ -16,9 +16,9 @@ from torch import Tensor
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.camera import Camera
+from dhtorch.geometry.exact import steady
 from dhtorch.geometry.se3 import Pose
 from dhtorch.geometry.shapes import check
-from dhtorch.geometry.steady import steady
 
 #: Points of all pairs that :func:`depths` works on at once: torch does not split so few over threads.
 POINTS = 1 << 15

@@ -25,9 +25,6 @@ MIN_DEPTH = 1e-6
 #: A matrix whose scaled Cholesky factor has a smaller pivot than this is called singular.
 MIN_PIVOT = 1e-6
 
-#: Matrix products over points round alike in any company when the number of points is a multiple of this.
-LANES = 16
-
 
 #: A pose, or another tree of unknowns with a leading batch dimension.
 S = TypeVar("S")
@@ -128,7 +125,7 @@ def weight_slope(square: Tensor, kernel: str | None, scale: float) -> Tensor:
 
 
 def normal_equations(
-    rows: Tensor,  # (B, n + 1, 2, N), of linearise; N a multiple of LANES for answers that do not depend on the batch
+    rows: Tensor,  # (B, n + 1, 2, N), of linearise; N a multiple of PRODUCT_LANES, or rounding depends on the batch
     weight: Tensor,  # (B, N) ≥ 0, one per point
     *,
     block: int | None = None,

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dhtorch.geometry.exact import LANES
 from dhtorch.geometry.shapes import check
 
 #: ITU-R BT.601 luma, the weights of ``cv2.cvtColor`` (``tests/test_lookup.py``).
@@ -22,8 +23,8 @@ _THOUSANDTHS = (299.0, 587.0, 114.0)
 #: Numbers of patches that are summarised together: few enough to stay in cache, and to need no fresh memory pages.
 NUMBERS = 1 << 18
 
-#: Rows of this many points leave no tail to vector loops, which may round differently there.
-LANES = 64
+#: Variance of rounding grey values to 8 bits; no residual is believed to be smaller.
+QUANTISATION = 1 / (12 * 255**2)
 
 
 def summarise(

@@ -22,15 +22,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from dhtorch.geometry.exact import CHUNK, LANES
+from dhtorch.geometry.lookup import QUANTISATION
 from dhtorch.geometry.pyramid import GRAD_X, GRAD_Y, GREY, Pyramid
 from dhtorch.geometry.shapes import is_static
-
-#: Points whose windows are read at once: few enough for the windows to stay in the cache.
-CHUNK = 256
-
-#: Rows of points are filled up to multiples of this, so that vector instructions leave no remainder and a point's
-#: rounding does not depend on how many others there are.
-LANES = 64
 
 #: Width of a cell, px of its level, and the finest level with cells. Coarse levels only say where the next one starts:
 #: there the points of a cell share one search. Cells are nested, so that they share its start as well.
@@ -52,9 +47,6 @@ TOP, BETWEEN, FINEST = (2, 2, 2, 2), (1, 2, 2), (1, 2, 2, 2)
 
 #: A ratio of contrasts beyond these limits is not believed.
 GAIN = (0.2, 5.0)
-
-#: Variance of rounding grey values to 8 bits; no residual is believed to be smaller.
-QUANTISATION = 1 / (12 * 255**2)
 
 
 class Options(NamedTuple):

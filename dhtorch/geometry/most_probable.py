@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.geometry.covariance import median
+from dhtorch.geometry.exact import SUM_LANES, filled
 from dhtorch.geometry.least_squares import (
     Normal,
     choose,
@@ -22,7 +23,6 @@ from dhtorch.geometry.least_squares import (
     weight_slope,
 )
 from dhtorch.geometry.near_far import (
-    LANES,
     Problem,
     Unknowns,
     linearise_tracks,
@@ -136,7 +136,7 @@ def _used_first(problem: Problem) -> tuple[Problem, Problem]:
 
     def some(wanted: Tensor) -> Problem:
         most = int(wanted.sum(1).max())
-        index = order[:, : max(most + -most % LANES, LANES)]
+        index = order[:, : filled(most, SUM_LANES)]
 
         def pick(x: Tensor) -> Tensor:
             return x.gather(-1, index.view(len(x), *[1] * (x.ndim - 2), -1).expand(*x.shape[:-1], -1))
@@ -202,8 +202,8 @@ def covariance(problem: Problem, solution: Solution, o: Options) -> tuple[Tensor
         bread = torch.where(used, weight * (omega * rise)[:, None], bread)
         meat = torch.where(used, weight * weight * (omega * omega * scatter)[:, None], meat)
     rows = residuals(problem, linear, solution.noise).double()
-    A, _ = normal_equations(rows, bread.double(), block=LANES)
-    M, _ = normal_equations(rows, meat.double(), block=LANES)
+    A, _ = normal_equations(rows, bread.double(), block=SUM_LANES)
+    M, _ = normal_equations(rows, meat.double(), block=SUM_LANES)
     free = o.turn_sigma**-2 if o.turn_sigma > 0 else RIGID
     known = torch.diag_embed(prior(torch.full_like(solution.turn_precision, free).double()))
     A, M = A + known, M + known

@@ -23,13 +23,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from dhtorch.geometry.exact import SUM_LANES
 from dhtorch.geometry.least_squares import MIN_DEPTH, Normal, move, normal_equations, robust, solve_spd
 from dhtorch.geometry.se3 import Pose
 from dhtorch.geometry.shapes import check
 from dhtorch.tree import Record, record
-
-#: Sums over whole blocks of so many tracks round alike in any company, however many empty ones follow.
-LANES = 256
 
 #: A far track is not closer to the anchor than the nearest point of the sensor by more than this factor.
 MAX_NEARER = 2.0
@@ -40,7 +38,7 @@ BEHIND = 1e4
 
 @record
 class Problem(Record):
-    """Tracks of B pairs as planes, N a multiple of :data:`LANES`; unused ones at any finite place."""
+    """Tracks of B pairs as planes, N a multiple of ``SUM_LANES``; unused ones at any finite place."""
 
     f: Tensor  # (B, 2) px, camera 1
     c: Tensor  # (B, 2) px, camera 1
@@ -201,7 +199,7 @@ def normal(
     rows = residuals(problem, linear, noise)
     rho, weight = robust(_square(linear, rows[:, -1]), kernel, bend)
     share = problem.near + far_weight[:, None] * problem.far
-    H, g = normal_equations(rows, weight * share * linear.front, block=LANES)
+    H, g = normal_equations(rows, weight * share * linear.front, block=SUM_LANES)
     known = prior(turn_precision.to(g.dtype))
     turn = torch.cat((torch.zeros_like(g[:, :6]), at.turn), -1)
     cost = (rho * share).sum(-1) + turn_precision * (at.turn * at.turn).sum(-1)

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from dhtorch.geometry.exact import steady
 from dhtorch.geometry.shapes import check
-from dhtorch.geometry.steady import steady
 from dhtorch.tree import Record, record
 
 if TYPE_CHECKING:

@@ -13,8 +13,8 @@ from torch.utils import _pytree as pytree
 from dhtorch.codes import PoseCode, first_reason
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import covariance, near_far, ransac, se3
+from dhtorch.geometry.exact import PRODUCT_LANES, SUM_LANES, filled
 from dhtorch.geometry.least_squares import (
-    LANES,
     MIN_DEPTH,
     Normal,
     choose,
@@ -173,12 +173,12 @@ def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, f: Tensor, c
 
 
 def _planes(xyz: Tensor, uv: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-    """x, y, z, u, v (B, 5, N') and usable (B, N'), N' > 0 a multiple of LANES; unusable points at zero."""
+    """x, y, z, u, v (B, 5, N') and usable (B, N'), N' > 0 a multiple of PRODUCT_LANES; unusable points at zero."""
     points = torch.cat((xyz.transpose(1, 2), uv.transpose(1, 2)), 1)
     usable = valid & (points.abs().amax(1) < torch.inf)
     points = torch.where(usable[:, None], points, torch.zeros_like(points))
     N = usable.shape[1]
-    more = (0, max(N + -N % LANES, LANES) - N)
+    more = (0, filled(N, PRODUCT_LANES) - N)
     return torch.nn.functional.pad(points, more), torch.nn.functional.pad(usable, more)
 
 
@@ -340,7 +340,7 @@ def _fit_all(o: Options, threshold_px: float, first: PoseFit, problem: Problem, 
 
 
 def _near_far(samples: Samples, tracks: Tracks, camera_0: Camera, camera_1: Camera, isotropic: float) -> Problem:
-    """The tracks as planes, N' > 0 a multiple of ``near_far.LANES``; unused ones at a safe place."""
+    """The tracks as planes, N' > 0 a multiple of ``SUM_LANES``; unused ones at a safe place."""
     usable = tracks.valid & tracks.uv_1.isfinite().all(-1) & tracks.uv_0.isfinite().all(-1)
     xyz, sigma = samples.xyz, samples.sigma.detach()
     near = usable & xyz.isfinite().all(-1) & (xyz[..., 2] > 0) & (sigma > 0) & sigma.isfinite()
@@ -352,15 +352,15 @@ def _near_far(samples: Samples, tracks: Tracks, camera_0: Camera, camera_1: Came
     spread = torch.where(near, sigma, torch.ones_like(sigma)) / (z * z).detach()
     uv = torch.where(usable[..., None], tracks.uv_1, torch.zeros_like(tracks.uv_1))
     N = usable.shape[1]
-    padding = max(N + -N % near_far.LANES, near_far.LANES) - N
+    padding = filled(N, SUM_LANES) - N
 
     def plane(x: Tensor, value: float = 0.0) -> Tensor:
         x = x.transpose(1, 2) if x.ndim == 3 else x
         return torch.nn.functional.pad(x, (0, padding), value=value)
 
     shape = torch.stack((shape[..., 0, 0], shape[..., 0, 1], shape[..., 1, 1]), 1)
-    filled = torch.eye(1, dtype=shape.dtype, device=shape.device).expand(1, padding)
-    ends = torch.cat((filled, 0 * filled, filled)).expand(len(shape), 3, padding)
+    one = torch.eye(1, dtype=shape.dtype, device=shape.device).expand(1, padding)
+    ends = torch.cat((one, 0 * one, one)).expand(len(shape), 3, padding)
     return Problem(
         f=camera_1.f,
         c=camera_1.c,

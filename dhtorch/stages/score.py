@@ -15,8 +15,8 @@ import torch
 from torch import Tensor, nn
 
 from dhtorch.codes import Gate
+from dhtorch.geometry.exact import steady
 from dhtorch.geometry.shapes import check
-from dhtorch.geometry.steady import steady
 from dhtorch.records import Estimate, PoseFit, Samples, Tracks
 
 #: The pose's part of a variance is subtracted from the whole; no own part is believed to be a smaller share of it.

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from dhtorch.geometry import affine
 from dhtorch.geometry import lucas_kanade as lk
+from dhtorch.geometry.exact import filled
 from dhtorch.geometry.pyramid import Pyramid, Pyramids, build_pyramid
 from dhtorch.geometry.shapes import check
 from dhtorch.records import NO_HINT, TrackHint, Tracks
@@ -132,7 +133,7 @@ def _there_and_back(
 ) -> Tracks:
     """Tracks of all points, laid out in one row (2, M), filled up to whole ``LANES`` by points outside the image."""
     B, N, _ = uv_0.shape
-    fill = -(B * N) % lk.LANES if N else lk.LANES
+    fill = filled(B * N) - B * N
 
     def row(uv: Tensor) -> Tensor:
         return F.pad(uv.to(source.levels[0].dtype).permute(2, 0, 1).reshape(2, B * N), (0, fill), value=-2.0)

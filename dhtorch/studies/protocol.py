@@ -382,7 +382,7 @@ class _Scene:
     def _note(self, answer: Answer) -> None:
         """Rows and points of one pair."""
         estimate, fit, kinds = answer.estimate, answer.trace["fit"], answer.batch.kinds(answer.samples.uv)
-        hole = answer.samples.xyz.isnan().any(-1)
+        hole = ~answer.samples.usable
         share = {gate.lower(): float((estimate.gate == code).float().mean()) for code, gate in names(Gate).items()}
         common: Row = {"scene": self.recording.name, "pair": list(answer.batch.pairs[0]), "method": answer.variant}
         found: Row = {"pnp_ok": bool(fit.ok[0]), "n_inlier": int(fit.n_inlier[0]), "n_holes": int(hole.sum())}

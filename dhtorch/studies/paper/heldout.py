@@ -60,7 +60,7 @@ def run(
 def reach(split: HeldOut, answer: Answer) -> Row:
     """How many of the sensor's true holes were recovered and how far they lie, beside how far the sensor sees."""
     whole = split.whole(answer.batch, answer.samples.uv)
-    hole = whole.xyz.isnan().any(-1)
+    hole = ~whole.usable
     found = answer.estimate.depth[hole & answer.estimate.keep]
     returns = whole.depth[~hole]
     numbers: Row = {"n_holes": int(hole.sum()), "n_recovered": found.numel()}
