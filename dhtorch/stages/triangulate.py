@@ -43,6 +43,18 @@ def two_view(
 ) -> Estimate:
     """Triangulate every track under the anchored pose and abstain where the geometry is weak.
 
+    The variance of a depth z, to first order, with s = ∂uv_1/∂z (px/m) and g = s / (sᵀ s) what a pixel is worth::
+
+        sigma² = c² · gᵀ Σ_track g · (1 + Σ_k (sign_k / scale_k)²)    the point's own: its track, and signs against it
+               + c² · gᵀ J Σ_pose Jᵀ g                                shared through the pose, J = ∂uv_1/∂pose
+               + (h · n · z)²                                         shared through the sensor: a wrong scale
+
+    c is ``sigma_scale``; Σ_track the track's covariance, or its shape with the size of the pose's residuals
+    (``fitted_noise``); the signs are the mismatch of the patches, the reprojection residual and the round trip, each
+    over its scale (``mismatch_px``, ``residual_px``, ``round_trip_px``; None leaves it out); Σ_pose has a shutter's
+    turn beside the motion where one was found; h is ``sensor_share`` and n the median relative noise of the near
+    returns that hold the pose. ``sigma_shared``² is the last two lines.
+
     Args:
         samples: N samples of view 0 (their own depth is not used here).
         tracks: where they were found, in ideal pixels.
