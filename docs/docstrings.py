@@ -41,6 +41,7 @@ def markdown(docstring: str) -> str:
     text = _SECTION.sub(lambda m: f"\n**{m[1]}:** ", docstring)  # a section in one line is a sentence
     text = _WORD.sub(lambda m: f"\n**{m[1]}:** ", text)
     text = _ROLE.sub(r"`\1`", text)
+    text = re.sub(r"::$", ":", text, flags=re.M)  # what stands indented below is code to Markdown as well
     # Markdown would read these as links or emphasis; inside ``…`` they are left alone.
     return re.sub(r"(?<=\w)\*(?=\w)", r"\\*", text)
 
