@@ -99,7 +99,8 @@ def test_heavy_libraries_are_not_imported_with_the_package():
 
 
 @pytest.mark.parametrize(
-    "words", [["--version"], ["--help"], ["sede=1"], ["view", "--help"], ["extract", "mehtod=map"]]
+    "words",
+    [["--version"], ["--help"], ["sede=1"], ["method.track.windw=3"], ["view", "--help"], ["extract", "mehtod=map"]],
 )
 def test_help_and_misspelt_options_are_answered_before_torch_is_loaded(words):
     code = "import atexit, sys\nfrom dhtorch.commands import run\n"
