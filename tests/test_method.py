@@ -139,6 +139,7 @@ def test_a_method_is_a_frozen_record_that_travels():
     assert isinstance(PAPER, Method) and dhtorch.extend is PAPER and WINDOW.views == 5 and MAP.views == 1
     with pytest.raises(AttributeError):
         PAPER.n = 3
+    assert all(getattr(WINDOW, f.name) is getattr(MAP, f.name) for f in fields(Method) if f.name != "views")
     again = pickle.loads(pickle.dumps(MAP))
     assert again.track.keywords == MAP.track.keywords and again.pose is MAP.pose
 
@@ -151,6 +152,13 @@ def test_replace_changes_a_seat_or_its_options_and_nothing_else():
     for wrong in ({"trak": len}, {"seed": 1}):
         with pytest.raises(TypeError, match=f"found {next(iter(wrong))}, expected seats and options among sample, "):
             PAPER.replace(**wrong)
+
+
+def test_the_front_end_looks_in_the_precision_of_the_intrinsics(room):
+    for dtype in (torch.float32, torch.float64):
+        samples = PAPER.replace(n=16).look(room[0].to(dtype))
+        assert samples.uv.dtype == samples.xyz.dtype == dtype
+        assert torch.equal(samples.uv[0], spiral(room[0].hw, 16, dtype=dtype))
 
 
 def test_options_of_a_call_are_those_of_a_record(room):

@@ -1,7 +1,7 @@
 """The line of seats, and several views."""
 
 TESTS: dict[str, list[str]] = {
-    "pair": ["tests/test_merge.py", "tests/test_pair.py"],
+    "pair": ["tests/test_merge.py", "tests/test_pair.py", "tests/test_method.py"],
     "method": ["tests/test_method.py"],
     "methods": ["tests/test_merge.py", "tests/test_method.py"],
     "stages.fuse": ["tests/test_fusion.py", "tests/test_window.py"],
