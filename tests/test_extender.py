@@ -127,6 +127,18 @@ def test_the_number_of_samples_is_that_of_the_method():
     assert ExtendDepth(depth_unit="m").method.n == 2048, "dhtorch.extend's own"
 
 
+def test_the_tracker_is_told_what_is_known_of_the_motion():
+    seen = []
+
+    def track(image_0, image_1, uv_0, *, hint):
+        seen.append(hint.levels)
+        return dhtorch.stages.track.lucas_kanade(image_0, image_1, uv_0, window=5)
+
+    for options in ({}, {"hint": dhtorch.TrackHint(levels=2)}):
+        tiny(dhtorch.PAPER.replace(n=4, track=track), **options)(sample())
+    assert seen == [None, 2]
+
+
 def test_seeds_of_samples_are_told_apart_by_their_index():
     method = Told()
     for index in (4, np.int64(4), torch.tensor([4]), np.array([[4]], np.int32)):

@@ -154,6 +154,26 @@ def test_replace_changes_a_seat_or_its_options_and_nothing_else():
             PAPER.replace(**wrong)
 
 
+def test_options_are_the_papers_unless_they_are_changed():
+    assert (PAPER.n, PAPER.hypotheses, PAPER.min_trackability) == (2048, 200, 1e-5)
+    assert (PAPER.views, PAPER.chain) == (1, True)
+
+
+def test_options_are_those_of_what_sits_there_now():
+    seat = PAPER.replace(track=track).replace(track={"hint": TrackHint()}).track
+    assert seat.func is track and PAPER.replace(score={"min_score": 0.5}).score.func is rank
+
+
+def test_a_pose_from_elsewhere_takes_the_place_of_seat_5(room):
+    trace = {}
+    found = USUAL(room[0], room[3], trace=trace)
+
+    def nobody(*_):
+        raise AssertionError("there is a pose")
+
+    assert alike(found, USUAL(room[0], room[3], fit=trace["fit"], pose=nobody))
+
+
 def test_the_front_end_looks_in_the_precision_of_the_intrinsics(room):
     for dtype in (torch.float32, torch.float64):
         samples = PAPER.replace(n=16).look(room[0].to(dtype))
