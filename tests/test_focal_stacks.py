@@ -274,7 +274,7 @@ def test_ddff12_raw_without_its_depth_is_left_out(tmp_path: Path) -> None:
 def test_opening_decodes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     writers.write_fod500(tmp_path / "a", {0: stack(0)})
     writers.write_ddff12(tmp_path / "b.h5", {"train": [stack(0, 10)]})
-    for module, name in ((tiff, "read_tiff"), (fod500.codec_exr, "read_exr"), (hdf5.Hdf5Array, "row")):
+    for module, name in ((tiff, "read_tiff"), (fod500.exr, "read_exr"), (hdf5.Hdf5Array, "row")):
         monkeypatch.setattr(module, name, lambda *a, **k: 1 / 0)
     assert len(data.open_stacks(tmp_path / "a")) == len(data.open_stacks(tmp_path / "b.h5")) == 1
 
