@@ -65,7 +65,7 @@ ALIASES = {
     },
     **{
         f"dhtorch.baselines.{name}": f"dhtorch.studies.baselines.{name}"
-        for name in ("dinov2", "dust3r", "opencv", "vggt")
+        for name in ("dinov2", "dust3r", "opencv", "relative", "vggt")
     },
 }
 

@@ -16,11 +16,14 @@ PAPER = Method()
 #: The paper's method as a function of two frames.
 extend = PAPER
 
+#: Pyramid levels of ``MAP``: one more than the paper, motions are larger than 30 px.
+LEVELS = 5
+
 #: Pose from near and far tracks together, a sigma in metres for every answer, and silence where that is too large.
 #: Tracks are registered once more with an affine window; the pose starts from the paper's. Its constants were chosen on
 #: ``data=shared_scenes`` and on the built-in rooms: figures on these are not figures on scenes that it has not seen.
 MAP = PAPER.replace(
-    track=partial(lucas_kanade_affine, levels=5),  # one more than the paper: motions are larger than 30 px
+    track=partial(lucas_kanade_affine, levels=LEVELS),
     pose=map_pose,
     triangulate=partial(
         two_view,

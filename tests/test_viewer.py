@@ -19,7 +19,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 from rooms import room as rendered
 
-from dhtorch import archive, drawing, viewer
+from dhtorch import archive, closure, drawing, viewer
 from dhtorch.codes import Gate, Source, names
 from dhtorch.commands import run
 from dhtorch.data.pairs import by_gap
@@ -406,19 +406,10 @@ def test_options_that_a_function_has_not_are_named(job):
         again.parts(result)
 
 
-def targets(node):
-    if isinstance(node, dict):
-        if "_target_" in node:
-            yield node["_target_"]
-        node = list(node.values())
-    for value in node if isinstance(node, list) else []:
-        yield from targets(value)
-
-
 @pytest.mark.parametrize(("group", "folder"), [("data", "data"), ("pairs", "pairs"), ("method", "method")])
 def test_every_setting_that_ships_can_be_shown_again(job, group, folder):
     files = list((run.config_dir() / folder).glob("*.yaml"))
-    named = {name for file in files for name in targets(OmegaConf.to_container(OmegaConf.load(file)))}
+    named = {name for file in files for name in closure.targets(OmegaConf.to_container(OmegaConf.load(file)))}
     assert named
     for name in named:
         result = archive.read(job)

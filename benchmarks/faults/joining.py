@@ -82,7 +82,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("networks", "*part.args, ", ""),
     ],
     "methods": [
-        ("MAP", "levels=5", "levels=4"),
+        ("LEVELS", "5", "4"),
         ("MAP", "min_t_snr=30.0", "min_t_snr=3.0"),
         ("MAP", "max_mismatch_px=10.0,\n", "\n"),
         ("MAP", "mismatch_px=2.0,\n", "\n"),

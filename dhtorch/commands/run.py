@@ -22,6 +22,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import dhtorch
 from dhtorch import console
 
 #: Sub-command → module with ``main(argv) -> int``.
@@ -87,8 +88,6 @@ def main(argv: list[str] | None = None) -> int:
 
 def _run(argv: list[str]) -> int:
     if argv == ["--version"]:
-        import dhtorch  # noqa: PLC0415
-
         print(f"dhtorch {dhtorch.__version__}")
         return DONE
     if argv and argv[0] in COMMANDS:

@@ -116,7 +116,7 @@ class _Opened:
 
     def _transform(self, optional: tuple[str, ...]) -> ExtendDepth:
         options: dict[str, Any] = {**_TRUSTED, **self.options, **{key: key for key in optional}}
-        options |= {"sparse": self.recording.sparse, "hint": TrackHint(levels=self.recording.levels)}
+        options |= {"sparse": self.recording.sparse, "hint": TrackHint.of(self.recording)}
         other_at = list(range(len(self.steps))) if len(self.steps) > 1 else 0
         return ExtendDepth(method=self.method, other_at=other_at, **options)
 

@@ -88,7 +88,7 @@ def ask(
     Raises:
         ValueError: as the method, the readers and the hold-out raise it.
     """
-    views, hint = method.views, TrackHint(levels=recording.levels)
+    views, hint = method.views, TrackHint.of(recording)
     for i, j in pairs:
         shown = [range_split(recording[k].to(dtype).to(device), cutoff) for k in (i, *between(i, j, views))]
         trace: dict[str, Any] = {}

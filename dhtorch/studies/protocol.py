@@ -38,11 +38,6 @@ MIN_CANDIDATES = 20
 REACH_PX = 25
 
 
-def scene_hint(recording: Any) -> TrackHint:
-    """What a recording knows of the motion in it."""
-    return TrackHint(levels=recording.levels)
-
-
 def quiet(items: Iterable[Any], _text: str, _total: int) -> Iterable[Any]:
     """No progress bar."""
     return items
@@ -297,7 +292,7 @@ class _Scene:
         self.cutoff = settings.cutoff_of(recording)
         self.missing = {k: reason for k, v in protocol.variants.items() if (reason := v.needs(recording))}
         self.variants = {k: v for k, v in protocol.variants.items() if k not in self.missing}
-        self.hint = scene_hint(recording)
+        self.hint = TrackHint.of(recording)
         self.last = list(protocol.cohorts)[-1]
         blind = protocol.hide is holdout.range_split and not _is_cut(self.cutoff)
         self.least = 0 if blind else protocol.min_candidates

@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
+from dhtorch.methods import LEVELS
 from dhtorch.studies import protocol
 from dhtorch.studies.compare import method_comparison
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Settings
@@ -46,9 +47,6 @@ PAPER_SIGMA: dict[str, Any] = {
     "sigma_scale": 1.0,
     "sensor_share": 0.0,
 }
-
-#: Pyramid levels of the whole's tracker, which the paper's takes where the affine registration is left out.
-LEVELS = {"levels": 5}
 
 #: What several views are replaced by on scenes that have too few.
 STAND_INS = {"+ views": "paper", "window": "map"}
@@ -105,7 +103,7 @@ def taken_apart(paper: Method, whole: Method, window: Method) -> dict[str, Metho
         "+ score by error": paper.replace(score=whole.score),
         "+ views": paper.replace(views=window.views, chain=window.chain, fuse=window.fuse),
         "map": whole,
-        "- affine tracks": whole.replace(track=partial(paper.track, **LEVELS)),
+        "- affine tracks": whole.replace(track=partial(paper.track, levels=LEVELS)),
         "- far tracks": whole.replace(pose=NEAR_ONLY),
         "- turn": whole.replace(pose=NO_TURN),
         "- pose": whole.replace(pose=paper.pose),

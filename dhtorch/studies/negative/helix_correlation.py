@@ -25,10 +25,10 @@ from torch import Tensor
 
 from dhtorch.evaluate import bootstrap, holdout
 from dhtorch.evaluate.correlation import pearson, spearman
-from dhtorch.records import Frame
+from dhtorch.records import Frame, TrackHint
 from dhtorch.stages.sample import spiral
 from dhtorch.studies.negative.arms import Shift, correlate, read_arm
-from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Settings, quiet, scene_hint
+from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
 from dhtorch.studies.rows import Row, median
 from dhtorch.studies.screening import Item, paired, screen
 
@@ -175,7 +175,7 @@ def _pair(
     samples = method.look_at(frame_0, uv)
     truth = holdout.truth_at(frame_0, samples.uv, sparse=recording.sparse)
     candidate = holdout.candidates(samples, truth, 0.0).ok[0]
-    tracks = method.track(frame_0.image, frame_1.image, samples.uv, hint=scene_hint(recording))
+    tracks = method.track(frame_0.image, frame_1.image, samples.uv, hint=TrackHint.of(recording))
     flow = (tracks.uv_1 - tracks.uv_0)[0]
 
     own = [_against(signals, arms, sites, k, k, 0.0, correlated) for k in (0, 1)]

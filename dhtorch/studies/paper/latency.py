@@ -31,10 +31,10 @@ from torch.nn.functional import interpolate
 from dhtorch.evaluate import holdout
 from dhtorch.geometry import camera as cam
 from dhtorch.method import Trace
-from dhtorch.records import Estimate, Frame, Samples
+from dhtorch.records import Estimate, Frame, Samples, TrackHint
 from dhtorch.studies import memory
 from dhtorch.studies.baselines import dinov2 as visual
-from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Settings, quiet, scene_hint
+from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
 from dhtorch.studies.rows import Row
 
 QUESTION = "What does the method cost beside a DINOv2-L forward pass, and how does it grow with the image?"
@@ -120,7 +120,7 @@ def run(
             raise ValueError(f"experiment.{name}: found {count}, expected at least 1")
     name, method = next(iter(chosen.items()))
     recording = recordings[0]
-    told: dict[str, Any] = {"seed": settings.seed, "hint": scene_hint(recording)}
+    told: dict[str, Any] = {"seed": settings.seed, "hint": TrackHint.of(recording)}
     views = _views(recording, pairs, settings)
     branches: list[Branch] = []
     for hw in sizes:

@@ -157,7 +157,7 @@ def visual(build: Callable[..., torch.nn.Module] | None, *, cells: int, device: 
 
 def adapted(method: Method, recording: Any, **options: Any) -> DepthTokens:
     """Depth tokens of a method with what a recording asks for."""
-    return DepthTokens(method, hint=TrackHint(levels=recording.levels), sparse=recording.sparse, **options)
+    return DepthTokens(method, hint=TrackHint.of(recording), sparse=recording.sparse, **options)
 
 
 def _as_sample(frames: list[Frame]) -> dict[str, Tensor]:
