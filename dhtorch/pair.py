@@ -11,6 +11,7 @@ from torch import Tensor
 from dhtorch.codes import Gate, Source
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.shapes import check, is_transformed
+from dhtorch.geometry.small import product
 from dhtorch.method import Method, Trace
 from dhtorch.records import NO_HINT, Camera, Estimate, Frame, Map, PoseFit, Samples, TrackHint, Tracks
 from dhtorch.tree import in_pieces
@@ -110,10 +111,9 @@ def undistort_tracks(tracks: Tracks, camera_0: Camera, camera_1: Camera) -> Trac
     uv_0 = torch.where(fine[..., None], uv_0, tracks.uv_0)
     uv_1 = torch.where(fine[..., None], uv_1, tracks.uv_1)
     J = cam.undistort_jacobian(camera_1, torch.where(fine[..., None], uv_1, centre_1))
-    # Products of 2×2 matrices written as sums: rounding then does not depend on the batch.
     known = tracks.cov.isfinite()
-    half = (J[..., :, :, None] * torch.where(known, tracks.cov, 0)[..., None, :, :]).sum(-2)
-    cov = torch.where(known, (half[..., :, None, :] * J[..., None, :, :]).sum(-1), tracks.cov)
+    turned = product(product(J, torch.where(known, tracks.cov, 0)), J.mT)
+    cov = torch.where(known, turned, tracks.cov)
     return tracks.replace(uv_0=uv_0, uv_1=uv_1, cov=cov, valid=tracks.valid & fine)
 
 

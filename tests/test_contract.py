@@ -27,6 +27,7 @@ from dhtorch.geometry import (
     pyramid,
     ransac,
     se3,
+    small,
     thin_lens,
 )
 from dhtorch.records import Camera, Frame, Samples, Tracks
@@ -271,6 +272,11 @@ def filled(batch, n, dtype):
     return filling.bilinear(coarse, HW), coarse, blurs(batch, n, dtype)
 
 
+def entries(batch, n, dtype):
+    """Of 2×2 matrices, none of them singular."""
+    return tuple(uniform(batch, n, dtype=dtype, low=k, high=k + 0.5, seed=k) for k in (1, 2, 4, 3))
+
+
 def wrong_last_axis(position):
     """A call whose argument at ``position`` lacks its last column."""
     return lambda args: tuple(tensor_map(lambda v: v[..., :-1], a) if k == position else a for k, a in enumerate(args))
@@ -280,6 +286,7 @@ def wrong_last_axis(position):
 
 ALL = "dtype batch vmap capture gradcheck empty shuffle padding nan raises"
 POINTLESS = "dtype batch vmap capture gradcheck"
+POINTWISE = "dtype batch vmap capture gradcheck empty shuffle padding nan"
 
 ROWS = [
     Row(camera.from_matrix, lambda b, n, d: (camera.to_matrix(cameras(b, d)),), POINTLESS + " raises", grad=(0,), bad=wrong_last_axis(0)),
@@ -324,6 +331,16 @@ ROWS = [
     Row(epipolar.point_jacobians, lambda b, n, d: (cameras(b, d), uniform(b, n, 3, dtype=d, low=1, high=2)), ALL, (1,), (0, 1), bad=wrong_last_axis(1), leaks=True),
     Row(epipolar.depth_variance, lambda b, n, d: (epipolar.triangulate(*two_views(b, n, d)), tracked(b, n, d)[1].cov, tracked(b, n, d)[2].cov), "dtype batch vmap capture gradcheck empty shuffle padding nan", (0, 1), (0, 1, 2), leaks=True),
     Row(exact.steady, lambda b, n, d: (torch.sin, uniform(b, n, dtype=d)), "dtype batch vmap capture gradcheck empty shuffle padding nan", (1,), (1,)),
+    Row(small.determinant, entries, POINTWISE, (0, 1, 2, 3), (0, 1, 2, 3)),
+    Row(small.adjugate, entries, POINTWISE, (0, 1, 2, 3), (0, 1, 2, 3)),
+    Row(with_options(small.inverse, least=1e-9), entries, "dtype capture gradcheck", grad=(0, 1, 2, 3)),
+    Row(small.eigenvalues, lambda b, n, d: entries(b, n, d)[:3], POINTWISE, (0, 1, 2), (0, 1, 2)),
+    Row(small.quadratic, lambda b, n, d: (*entries(b, n, d), uniform(b, n, dtype=d)), POINTWISE, (0, 1, 2, 3, 4), (0, 1, 2, 3, 4)),
+    Row(small.upper, lambda b, n, d: (tracked(b, n, d)[1].cov,), POINTWISE, (0,), (0,)),
+    Row(small.product, lambda b, n, d: (tracked(b, n, d)[1].cov, uniform(b, n, 2, 3, dtype=d)), POINTWISE, (0, 1), (0, 1)),
+    Row(small.product_of_planes, lambda b, n, d: (uniform(3, 2, b, n, dtype=d), uniform(2, 3, b, n, dtype=d)), "dtype capture gradcheck empty", grad=(0, 1)),
+    Row(small.turned, lambda b, n, d: (poses(b, d).R, uniform(b, 3, n, dtype=d)), "dtype batch vmap capture gradcheck empty", grad=(0, 1)),
+    Row(small.cofactors, lambda b, n, d: (uniform(3, 3, b, n, dtype=d),), "dtype capture gradcheck empty", grad=(0,)),
     Row(backproject.backproject, frames, ALL, (1,), (0, 1), bad=wrong_last_axis(1)),
     Row(holes.classify, sampled, "dtype batch vmap capture empty shuffle padding nan raises", (1,), (), bad=wrong_last_axis(1)),
     Row(holes.min_eigenvalue, lambda b, n, d: (frames(b, n, d)[0].image, pixels(b, n, d)), ALL, (1,), (0,), bad=wrong_last_axis(1)),

@@ -23,12 +23,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from dhtorch.geometry import small
 from dhtorch.geometry.exact import CHUNK
 from dhtorch.geometry.least_squares import MIN_PIVOT, solve_spd
 from dhtorch.geometry.lookup import QUANTISATION, round_half_up
 from dhtorch.geometry.lucas_kanade import for_some
 from dhtorch.geometry.pyramid import GRAD_X, GRAD_Y, GREY, REACH, Pyramid
 from dhtorch.geometry.shapes import check, is_static
+from dhtorch.geometry.small import product_of_planes as product
 
 #: Of what would follow a step, at most so many times that step is taken at once; more overshoots under large warps.
 AHEAD = 0.5
@@ -299,14 +301,14 @@ def _covariance(state: _State, place: Tensor, window: int) -> Tensor:
     energy = R.new_tensor([1.0, 1.0, u2, u2, u2, u2, 1 / GRADIENT_NOISE, 0.0]) * GRADIENT_NOISE * n
     noise = (R[:, None] * R[None] * energy[:, None]).sum(2) * variance
     S = _inverse(C)
-    false = _product(_product(S, noise), S)
-    ratio = _product(C, false)
+    false = product(product(S, noise), S)
+    ratio = product(C, false)
     trace = (ratio[0, 0] + ratio[1, 1]) / 2
     most = trace + (trace * trace - _determinant(ratio)).clamp_min(0).sqrt()
     true = _inverse(S - false * (MOST_NOISE / most.clamp_min(MOST_NOISE)))
-    spread = _product(_product(true, S), true) * (variance * (1 + square) / square)
+    spread = product(product(true, S), true) * (variance * (1 + square) / square)
     A = _linear(state.warp, window).double()
-    return _product(_product(A.transpose(0, 1), spread), A).to(state.warp.dtype)
+    return product(product(A.transpose(0, 1), spread), A).to(state.warp.dtype)
 
 
 def _place(d: Tensor, window: int) -> Tensor:
@@ -419,7 +421,7 @@ def _change(solution: Tensor) -> Tensor:
 def _compose(warp: Tensor, change: Tensor, window: int) -> Tensor:
     """The warp after a change on the template's side: A becomes A (1 + D)⁻¹, and with that W_0 becomes W_0 - A δ."""
     half = window // 2
-    sides = _product(_inverse(_still(change) + change[1:] / half), warp[1:])
+    sides = product(_inverse(_still(change) + change[1:] / half), warp[1:])
     return torch.cat(((warp[0] - (sides * change[0, :, None]).sum(0) / half)[None], sides))
 
 
@@ -429,16 +431,9 @@ def _inside(x: Tensor, pyramid: Pyramid) -> Tensor:
 
 
 def _determinant(A: Tensor) -> Tensor:
-    return A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
+    return small.determinant(*A.flatten(0, 1))
 
 
 def _inverse(A: Tensor) -> Tensor:
     """Inverse of (2, 2, M), its determinant kept from vanishing."""
-    det = _determinant(A)
-    det = torch.where(det.abs() > 1e-30, det, torch.full_like(det, 1e-30))
-    return torch.stack((torch.stack((A[1, 1], -A[0, 1])), torch.stack((-A[1, 0], A[0, 0])))) / det
-
-
-def _product(A: Tensor, B: Tensor) -> Tensor:
-    """(2, 2, M) times (2, 2, M), as sums: rounding then does not depend on the batch."""
-    return (A[:, :, None] * B[None]).sum(1)
+    return small.inverse(*A.flatten(0, 1), least=1e-30).unflatten(0, (2, 2))

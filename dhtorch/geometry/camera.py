@@ -17,6 +17,7 @@ from torch import Tensor
 from dhtorch.geometry import se3
 from dhtorch.geometry.se3 import Pose
 from dhtorch.geometry.shapes import check
+from dhtorch.geometry.small import inverse
 from dhtorch.tree import Record, record
 
 if TYPE_CHECKING:
@@ -234,7 +235,4 @@ def _distort(distortion: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _inverse_2x2(m: Tensor) -> Tensor:
-    a, b, c, d = m[..., 0, 0], m[..., 0, 1], m[..., 1, 0], m[..., 1, 1]
-    det = a * d - b * c
-    det = torch.where(det.abs() < 1e-12, torch.full_like(det, 1e-12), det)
-    return torch.stack((d, -b, -c, a), -1).unflatten(-1, (2, 2)) / det[..., None, None]
+    return inverse(*m.flatten(-2).unbind(-1), least=1e-12).movedim(0, -1).unflatten(-1, (2, 2))

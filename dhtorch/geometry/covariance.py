@@ -10,6 +10,7 @@ from torch import Tensor
 
 from dhtorch.geometry.least_squares import solve_spd
 from dhtorch.geometry.shapes import check
+from dhtorch.geometry.small import upper
 
 
 def from_normal(
@@ -60,7 +61,7 @@ def noise_shape(
     Gradient: to cov, the median's choice excepted. Raises ValueError for wrong shapes.
     """
     check("noise_shape", cov=(cov, "B N 2 2"), used=(used, "B N"))
-    xx, xy, yy = cov[..., 0, 0], cov[..., 0, 1], cov[..., 1, 1]
+    xx, xy, yy = upper(cov)
     good = used & (xx > 0) & (yy > 0) & (xx * yy > xy * xy) & (xx + yy < torch.inf)
     size = torch.where(good, 0.5 * (xx + yy), torch.ones_like(xx))
     scale = median(size, good)[..., None, None]

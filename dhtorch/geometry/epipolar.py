@@ -19,6 +19,7 @@ from dhtorch.geometry.camera import Camera
 from dhtorch.geometry.exact import steady
 from dhtorch.geometry.se3 import Pose
 from dhtorch.geometry.shapes import check
+from dhtorch.geometry.small import quadratic, upper
 
 #: Points of all pairs that :func:`depths` works on at once: torch does not split so few over threads.
 POINTS = 1 << 15
@@ -173,7 +174,7 @@ def depth_variance(
     defined = steep > 1e-18
     gain = slope / torch.where(defined, steep, torch.ones_like(steep))[..., None]  # d(depth) / d(uv_1), m/px
     g0, g1 = gain.unbind(-1)
-    own = g0 * g0 * cov_uv_1[..., 0, 0] + 2 * g0 * g1 * cov_uv_1[..., 0, 1] + g1 * g1 * cov_uv_1[..., 1, 1]
+    own = quadratic(g0, g1, *upper(cov_uv_1))
     row = g0[..., None] * geometry.J_pose[..., 0, :] + g1[..., None] * geometry.J_pose[..., 1, :]  # (B, N, k)
     carried = sum(row[..., k, None] * cov_pose[:, None, k] for k in range(cov_pose.shape[-1]))
     shared = (carried * row).sum(-1)

@@ -18,6 +18,7 @@ from torch.utils import _pytree as pytree
 
 from dhtorch.geometry.se3 import Pose
 from dhtorch.geometry.shapes import check
+from dhtorch.geometry.small import product
 
 #: Points nearer to the camera plane than this (m), or behind it, are not in front.
 MIN_DEPTH = 1e-6
@@ -184,13 +185,8 @@ def solve_spd(
         L = torch.where(bad, eye, L)
     A, rhs = torch.where(bad, eye, A), rhs.masked_fill(bad, 0.0)
     start = torch.cholesky_solve(rhs.detach(), L)
-    x = start + torch.cholesky_solve(rhs - _product(A, start), L)
+    x = start + torch.cholesky_solve(rhs - product(A, start), L)
     return (x * s)[:, :n].to(b.dtype), ok
-
-
-def _product(A: Tensor, x: Tensor) -> Tensor:
-    """Batched A x by multiply and add."""
-    return (A[..., None] * x[:, None]).sum(2)
 
 
 def gauss_newton_step(T: Pose, H: Tensor, g: Tensor) -> tuple[Pose, Tensor]:

@@ -26,6 +26,7 @@ from dhtorch.geometry.exact import CHUNK, LANES
 from dhtorch.geometry.lookup import QUANTISATION
 from dhtorch.geometry.pyramid import GRAD_X, GRAD_Y, GREY, Pyramid
 from dhtorch.geometry.shapes import is_static
+from dhtorch.geometry.small import adjugate, determinant, eigenvalues
 
 #: Width of a cell, px of its level, and the finest level with cells. Coarse levels only say where the next one starts:
 #: there the points of a cell share one search. Cells are nested, so that they share its start as well.
@@ -130,11 +131,11 @@ def squares(source: Pyramid, target: Pyramid, o: Options, x: Tensor, d: Tensor, 
 def covariance(A: Tensor, variance: Tensor) -> Tensor:
     """s² A⁻¹ (2, 2, M). The small eigenvalue of A is raised to 1e-5 of the large one, which float32 can represent."""
     a, b, c = torch.where(A.isfinite(), A, torch.zeros_like(A)).double()
-    small = _small_eigenvalue(a, b, c)
+    small, _ = eigenvalues(a, b, c)
     lift = (1e-5 * (a + c - small).clamp_min(1e-4) - small).clamp_min(0)
     a, c = a + lift, c + lift
-    scale = variance.double().clamp_min(QUANTISATION) / (a * c - b * b)
-    return (torch.stack([c, -b, -b, a]) * scale).to(A.dtype).unflatten(0, (2, 2))
+    scale = variance.double().clamp_min(QUANTISATION) / determinant(a, b, b, c)
+    return (torch.stack(adjugate(a, b, b, c)) * scale).to(A.dtype).unflatten(0, (2, 2))
 
 
 def for_some(wanted: Tensor, fn: Callable, values: tuple[Tensor, ...], columns: tuple[Tensor, ...]):
@@ -307,16 +308,10 @@ def _gain(correlation: Tensor, energy: Tensor) -> Tensor:
 def _inverse(A: Tensor, min_eigenvalue: float) -> tuple[Tensor, Tensor]:
     """Inverse (2, 2, M) of A (3, M), zero where its small eigenvalue is not above the limit; and where it is (M,)."""
     a, b, c = A.double()
-    textured = _small_eigenvalue(a, b, c) > min_eigenvalue
-    det = torch.where(textured, a * c - b * b, torch.ones_like(a))
-    adjugate = torch.stack([c, -b, -b, a]) / det
-    return torch.where(textured, adjugate, torch.zeros_like(adjugate)).to(A.dtype).unflatten(0, (2, 2)), textured
-
-
-def _small_eigenvalue(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
-    """Of the matrices ((a, b), (b, c))."""
-    half = (a - c) / 2
-    return (a + c) / 2 - (half * half + b * b).sqrt()
+    textured = eigenvalues(a, b, c)[0] > min_eigenvalue
+    det = torch.where(textured, determinant(a, b, b, c), torch.ones_like(a))
+    found = torch.stack(adjugate(a, b, b, c)) / det
+    return torch.where(textured, found, torch.zeros_like(found)).to(A.dtype).unflatten(0, (2, 2)), textured
 
 
 def within(x: Tensor, low: Tensor, high: Tensor) -> Tensor:

@@ -34,6 +34,7 @@ from dhtorch.geometry.near_far import (
 )
 from dhtorch.geometry.se3 import Pose
 from dhtorch.geometry.shapes import is_static
+from dhtorch.geometry.small import product
 
 #: Standard deviations of a residual coordinate, px, that are believed.
 MIN_NOISE_PX, MAX_NOISE_PX = 0.1, 5.0
@@ -208,8 +209,7 @@ def covariance(problem: Problem, solution: Solution, o: Options) -> tuple[Tensor
     known = torch.diag_embed(prior(torch.full_like(solution.turn_precision, free).double()))
     A, M = A + known, M + known
     inverse, ok = solve_spd(A, torch.eye(9, dtype=A.dtype, device=A.device).expand_as(A))
-    half = (inverse[:, :, :, None] * M[:, None]).sum(2)
-    whole = (half[:, :, :, None] * inverse[:, None]).sum(2)
+    whole = product(product(inverse, M), inverse)
     return 0.5 * (whole + whole.transpose(1, 2)), ok
 
 

@@ -27,6 +27,7 @@ from dhtorch.geometry.exact import SUM_LANES
 from dhtorch.geometry.least_squares import MIN_DEPTH, Normal, move, normal_equations, robust, solve_spd
 from dhtorch.geometry.se3 import Pose
 from dhtorch.geometry.shapes import check
+from dhtorch.geometry.small import turned
 from dhtorch.tree import Record, record
 
 #: A far track is not closer to the anchor than the nearest point of the sensor by more than this factor.
@@ -122,7 +123,7 @@ def linearise_tracks(problem: Problem, at: Unknowns) -> Linear:
     """
     check("linearise_tracks", ray=(problem.ray, "B 3 N"), uv=(problem.uv, "B 2 N"), turn=(at.turn, "B 3"))
     seen = _straight((problem.uv - problem.c[..., None]) / problem.f[..., None], _height(problem), at.turn)
-    a, t = _turned(at.T.R, problem.ray), at.T.t[..., None]
+    a, t = turned(at.T.R, problem.ray), at.T.t[..., None]
     with torch.no_grad():
         free = _inverse_depth(a, t, seen, _noise_shape(problem))
         # A point cannot lie beyond infinity: there q is known, and nothing is eliminated.
@@ -215,12 +216,6 @@ def prior(turn_precision: Tensor) -> Tensor:
     """Information (B, 9) that is there before any track: none on the pose."""
     zero = torch.zeros_like(turn_precision)
     return torch.stack((*[zero] * 6, *[turn_precision] * 3), -1)
-
-
-def _turned(R: Tensor, ray: Tensor) -> Tensor:
-    x, y, z = ray[:, None].unbind(2)
-    R = R[..., None]
-    return R[:, :, 0] * x + R[:, :, 1] * y + R[:, :, 2] * z
 
 
 def _noise_shape(problem: Problem) -> Tensor:

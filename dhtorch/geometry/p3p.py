@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.linalg import cross
 
 from dhtorch.geometry.shapes import check
+from dhtorch.geometry.small import cofactors
 
 #: Triples flatter than this (height over longest side) count as collinear.
 MIN_HEIGHT = 1e-3
@@ -80,9 +81,9 @@ def _ranges(m: Tensor, a: Tensor) -> Tensor:
     first, second = (cones * (gamma * gamma + 1).rsqrt()).unbind(2)
     split, other = gamma * first + second, first - gamma * second  # det(split) = 0
     # Planes g and h: split = g hᵀ + h gᵀ, and its cofactors are −p pᵀ with p = g × h, where the planes meet.
-    cofactors = _cofactors(split)
-    least, index = cofactors.diagonal(dim1=0, dim2=1).min(-1)
-    p = _row(cofactors, index) * (-least).clamp_min(1e-300).rsqrt()
+    minors = cofactors(split)
+    least, index = minors.diagonal(dim1=0, dim2=1).min(-1)
+    p = _row(minors, index) * (-least).clamp_min(1e-300).rsqrt()
     eye = torch.eye(3, dtype=p.dtype, device=p.device).view(3, 3, *[1] * (p.ndim - 1))
     product = split + cross(p[:, None], eye, dim=0)  # = 2 h gᵀ
     product = torch.stack((product, product.transpose(0, 1)), 2)  # (row, column, plane, *)
@@ -102,11 +103,6 @@ def _cones(m: Tensor, a: Tensor) -> Tensor:
     return torch.stack([x for entry in zip(first, second, strict=True) for x in entry]).unflatten(0, (3, 3, 2))
 
 
-def _cofactors(A: Tensor) -> Tensor:
-    """Cofactor matrices of matrices (3, 3, *)."""
-    return cross(A.roll(-1, 0), A.roll(-2, 0), dim=1)
-
-
 def _row(A: Tensor, index: Tensor) -> Tensor:
     """Rows (3, …) of matrices (row, column, …) by their number (…)."""
     return A.gather(0, index.expand(1, *A.shape[1:]))[0]
@@ -119,7 +115,7 @@ def _outer_root(cones: Tensor) -> Tensor:
     It is made of functions that torch rounds alike wherever an element stands; sinh and pow are not among them.
     """
     k = (
-        (_cofactors(cones)[:, :, :, None] * cones[:, :, None]).sum(0).sum(0).flatten(0, 1)
+        (cofactors(cones)[:, :, :, None] * cones[:, :, None]).sum(0).sum(0).flatten(0, 1)
     )  # 3 det, 3 mixed terms and back: γ³, γ², γ, 1
     tiny = 1e-12 * k.abs().amax(0) + 1e-300
     _, third, c, last = (k / (k[0] + tiny.copysign(k[0]))).unbind(0)  # γ³ + 3 third γ² + 3 c γ + last = 0

@@ -13,6 +13,7 @@ from torch import Tensor
 from dhtorch.codes import ROUTE_OF_HOLE, Flag, Hole, first_reason
 from dhtorch.geometry.lookup import pixels, summarise
 from dhtorch.geometry.shapes import check
+from dhtorch.geometry.small import eigenvalues
 from dhtorch.records import Frame, Samples
 
 
@@ -73,11 +74,8 @@ def min_eigenvalue(
     """
     check("min_eigenvalue", image=(image, "B C H W"), uv=(uv, "B N 2"))
     a, b, c = summarise(image, pixels(uv), block + 2, _gradient_sums, grey=True)
-    half = (a - c) / 2
-    split2 = half * half + b * b
-    positive = split2 > 0
-    split = torch.where(positive, torch.where(positive, split2, 1.0).sqrt(), split2)
-    return ((a + c) / 2 - split) / (16 * block * block)
+    smaller, _ = eigenvalues(a, b, c)
+    return smaller / (16 * block * block)
 
 
 def _gradient_sums(grey: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -30,6 +30,7 @@ from dhtorch.geometry.most_probable import Options, most_probable
 from dhtorch.geometry.most_probable import covariance as m_covariance
 from dhtorch.geometry.near_far import Problem
 from dhtorch.geometry.shapes import check
+from dhtorch.geometry.small import upper
 from dhtorch.records import Camera, Pose, PoseFit, Samples, Shutter, Tracks
 from dhtorch.tree import in_pieces
 
@@ -358,7 +359,7 @@ def _near_far(samples: Samples, tracks: Tracks, camera_0: Camera, camera_1: Came
         x = x.transpose(1, 2) if x.ndim == 3 else x
         return torch.nn.functional.pad(x, (0, padding), value=value)
 
-    shape = torch.stack((shape[..., 0, 0], shape[..., 0, 1], shape[..., 1, 1]), 1)
+    shape = torch.stack(upper(shape), 1)
     one = torch.eye(1, dtype=shape.dtype, device=shape.device).expand(1, padding)
     ends = torch.cat((one, 0 * one, one)).expand(len(shape), 3, padding)
     return Problem(

@@ -14,6 +14,7 @@ from dhtorch.geometry import se3
 from dhtorch.geometry.least_squares import choose, gauss_newton_step
 from dhtorch.geometry.se3 import Pose
 from dhtorch.geometry.shapes import check
+from dhtorch.geometry.small import product
 from dhtorch.tree import Record, record
 
 #: Fewest matched points that fix a rigid motion with something to spare.
@@ -180,8 +181,7 @@ class _Sets:
         c = se3.apply(T, self.centre[:, None])[:, 0]
         size = self.size[:, None, None]
         A = torch.cat((torch.cat((eye / size, 0 * eye), -1), torch.cat((se3.hat(c) / size, eye), -1)), -2)
-        HA = (H[..., :, :, None] * A[..., None, :, :]).sum(-2)
-        values = torch.linalg.eigvalsh((A.mT[..., :, :, None] * HA[..., None, :, :]).sum(-2))
+        values = torch.linalg.eigvalsh(product(A.mT, product(H, A)))
         return (values[:, 0].clamp_min(0) / values[:, -1].clamp_min(1e-300)).clamp(0, 1)
 
 
