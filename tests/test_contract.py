@@ -7,7 +7,7 @@ import pkgutil
 
 import pytest
 import torch
-from contract import PROMISES, Row, equal, leaves, reorder, take, tensor_map
+from contract import PROMISES, NoMasksAsNumbers, Row, equal, leaves, reorder, take, tensor_map
 
 from dhtorch import method, pair, window
 from dhtorch.evaluate import holdout, probe
@@ -30,11 +30,13 @@ from dhtorch.geometry import (
     small,
     thin_lens,
 )
+from dhtorch.methods import MAP, PAPER, WINDOW
 from dhtorch.records import Camera, Frame, Samples, Tracks
 from dhtorch.stages import backproject, holes, pose, score, track, triangulate
 from dhtorch.studies.baselines.device_pose import given_pose
 from dhtorch.studies.focal import blur, filling, sharpness
 from dhtorch.studies.negative import arms, clusters, registration
+from dhtorch.synthetic import SyntheticRoom
 
 HW = (48, 64)
 FEW = 11  # points; no other axis of any answer is as long
@@ -483,6 +485,25 @@ def named(promise):
 def test_floating_outputs_follow_the_inputs_dtype(row, dtype):
     out = leaves(row.fn(*row.make(2, 7, dtype)))
     assert out and all(x.dtype == dtype for x in out if x.is_floating_point())
+
+
+@pytest.mark.parametrize("row", [pytest.param(r, id=f"{r.fn.__module__.split('.')[-1]}.{r.fn.__name__}") for r in ROWS])
+def test_masks_are_no_numbers(row):
+    args = row.make(2, 7, torch.float32)
+    with NoMasksAsNumbers():
+        row.fn(*args)
+
+
+def test_no_method_counts_with_masks():
+    """The seats in a row, of a view, of several, and the room that they look at."""
+    room = SyntheticRoom(n_frames=3, hw=(96, 128), depth_hw=(24, 32))
+    frames = [room[i] for i in range(3)]
+    with NoMasksAsNumbers():
+        SyntheticRoom(n_frames=2, seed=1, hw=(96, 128), depth_hw=(24, 32))[0]
+        for method in (PAPER, MAP, WINDOW.replace(views=2)):
+            method.replace(n=64)(frames[0], frames[1:] if method.views > 1 else frames[1])
+    with pytest.raises(AssertionError, match="mul of a mask"), NoMasksAsNumbers():
+        (frames[0].depth > 0) * frames[0].depth
 
 
 @named("batch")

@@ -241,7 +241,8 @@ def write_sheet(survey: Survey, out: Path) -> Path:
     plots = [draw for draw, there in wanted if there]
     first = next((x for t in survey.tiles for x in (t.image, t.depth) if x is not None), torch.zeros(3, 4))
     tall = 1.6 * min(max(first.shape[-2] / first.shape[-1], 0.5), 1.5) * len(rows) + 0.15
-    width, heights = max(1.6 * len(survey.tiles), 3.2 * len(plots), 4.8), [tall] + [1.9] * bool(plots)
+    width = max(1.6 * len(survey.tiles), 3.2 * len(plots), 4.8)
+    heights = [tall, 1.9] if plots else [tall]
     figure = Figure(figsize=(width, sum(heights) + 0.3), dpi=120, layout="constrained")
     figure.suptitle(f"{survey.name}: {survey.format}", fontsize=9)
     parts = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]

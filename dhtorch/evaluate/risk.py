@@ -80,7 +80,7 @@ def measure(pooled: Points, *, min_points: int = MIN_POINTS) -> Numbers:
     cuts = _ends_of_ties(score)
     for percent in (5, 10, 20):
         fits = cuts & (risk <= percent / 100) & (_count(loss) >= min_points)
-        most = int((_count(loss) * fits).max()) if some else 0
+        most = int(torch.where(fits, _count(loss), 0).max()) if some else 0
         numbers[f"coverage_at_{percent}"] = most / n if n else None
     numbers["monotonicity"], numbers["largest_fall"] = _monotonicity(risk)
     return numbers

@@ -123,7 +123,7 @@ def most_probable(problem: Problem, start: Pose, o: Options) -> Solution:
     at, precision = choose(believed, both, near), torch.where(believed, precision, rigid)
     far, noise = torch.where(believed, far, none), noise_scale(problem, at)
     translates = _translates(problem, at, noise, far, precision, o)
-    of_near, of_far = ((noise * kind).amax(-1, keepdim=True) for kind in (~problem.far, problem.far))
+    of_near, of_far = (torch.where(kind, noise, 0.0).amax(-1, keepdim=True) for kind in (~problem.far, problem.far))
     noise = torch.where(whole.far, of_far, of_near.clamp_min(MIN_NOISE_PX**2))
     return Solution(at, noise, far, precision, translates)
 
@@ -216,7 +216,7 @@ def covariance(problem: Problem, solution: Solution, o: Options) -> tuple[Tensor
 def _near_cost(problem: Problem, at: Unknowns, noise: Tensor, o: Options) -> Tensor:
     """Robust cost (B,) of the near tracks alone."""
     rho, _ = robust(squares(problem, linearise_tracks(problem, at), noise), o.kernel, o.bend)
-    return (rho * problem.near).sum(-1)
+    return torch.where(problem.near, rho, 0.0).sum(-1)
 
 
 def _rise_and_scatter(square: Tensor, weight: Tensor, used: Tensor, size: int, o: Options) -> tuple[Tensor, Tensor]:
@@ -228,7 +228,7 @@ def _rise_and_scatter(square: Tensor, weight: Tensor, used: Tensor, size: int, o
     steeper = weight_slope(square, o.kernel, o.bend) * square * (2 / size) + weight
 
     def total(x: Tensor) -> Tensor:
-        return (x * used).sum(-1)
+        return torch.where(used, x, 0.0).sum(-1)
 
     count = total(torch.ones_like(weight)).clamp_min(1.0)
     mean = total(steeper) / count

@@ -199,8 +199,8 @@ def normal(
     linear = linearise_tracks(problem, at)
     rows = residuals(problem, linear, noise)
     rho, weight = robust(_square(linear, rows[:, -1]), kernel, bend)
-    share = problem.near + far_weight[:, None] * problem.far
-    H, g = normal_equations(rows, weight * share * linear.front, block=SUM_LANES)
+    share = torch.where(problem.near, 1.0, torch.where(problem.far, far_weight[:, None], 0.0))
+    H, g = normal_equations(rows, torch.where(linear.front, weight * share, 0.0), block=SUM_LANES)
     known = prior(turn_precision.to(g.dtype))
     turn = torch.cat((torch.zeros_like(g[:, :6]), at.turn), -1)
     cost = (rho * share).sum(-1) + turn_precision * (at.turn * at.turn).sum(-1)

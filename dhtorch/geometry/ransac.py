@@ -67,10 +67,10 @@ def distinct_triples(
     check("distinct_triples", draws=(draws, "B H 3"), count=(count, "B"))
     left = (count[:, None, None] - torch.arange(3, device=count.device)).clamp_min(1)
     first, second, third = torch.minimum((draws * left).long(), left - 1).unbind(-1)
-    second = second + (second >= first)
+    second = torch.where(second >= first, second + 1, second)
     low, high = torch.minimum(first, second), torch.maximum(first, second)
-    third = third + (third >= low)
-    third = third + (third >= high)
+    third = torch.where(third >= low, third + 1, third)
+    third = torch.where(third >= high, third + 1, third)
     return torch.minimum(torch.stack((first, second, third), -1), (count - 1).clamp_min(0)[:, None, None])
 
 
@@ -138,7 +138,8 @@ def search(
     poses = torch.cat((R, t[..., None]), -1).permute(0, 4, 3, 2, 1).flatten(3)  # (B, column, row, K)
     lenses = poses * torch.cat((f, one[:, 0, :1]), 1)[:, None, :, None]
     points = torch.cat((uv, xyz, one), 1)
-    limits = (torch.arange(M, device=count.device) < count[:, None]) * threshold_px**2
+    used = torch.arange(M, device=count.device) < count[:, None]
+    limits = torch.where(used, threshold_px**2, 0.0).to(points.dtype)
     some = min(preview, M)
     seen = _take(points, even_slots(count, some)[:, None])
     cost = msac_cost(lenses.flatten(2), seen, limits[:, :some]).masked_fill(~valid.mT.flatten(1), torch.inf)
@@ -166,7 +167,7 @@ def collinear(
     reach = xyz.detach().abs().amax(1)
     used = (used & (reach <= FAR_OFF * median(reach, used)))[:, None]
     x = xyz.masked_fill(~used, 0.0).double()
-    x = (x - x.sum(-1, keepdim=True) / used.sum(-1, keepdim=True).clamp_min(1)) * used
+    x = torch.where(used, x - x.sum(-1, keepdim=True) / used.sum(-1, keepdim=True).clamp_min(1), 0.0)
     scatter = torch.bmm(x, x.transpose(1, 2))
     trace = scatter.diagonal(dim1=-2, dim2=-1).sum(-1)
     minors = 0.5 * (trace * trace - (scatter * scatter).sum((-2, -1)))  # ≈ product of the two largest eigenvalues

@@ -126,7 +126,7 @@ def _describe(volume: Volume, a: Tensor, b: Tensor, t: Tensor, xyz: Tensor) -> S
 def _described(volume: Volume, a: Tensor, b: Tensor, t: Tensor, xyz: Tensor) -> Surface:
     t = t.to(volume.distance.dtype)[:, None]
     index, known = _slot(volume, torch.stack((a, b)))
-    share = torch.stack((1 - t, t)) * known[..., None]
+    share = torch.where(known[..., None], torch.stack((1 - t, t)), 0.0)
     weight = (volume.weight.flatten(0, 1)[index] * share).sum(0) / share.sum(0).clamp_min(1e-12)
     mixed = (volume.features.flatten(0, 1)[index].to(t.dtype) * share).sum(0)
     slope = (_slope(volume, torch.stack((a, b))) * share).sum(0)

@@ -84,7 +84,7 @@ def backproject(
     xyz = cam.unproject(frame.camera, uv.nan_to_num(0.0, 0.0, 0.0), depth)  # no gradient to what is no number
     usable = returned & ~(unsure | beyond)
     usable = usable & (xyz.detach().abs().amax(-1) < torch.inf)  # a pixel outside the lens model has no ray
-    halvings = edge.int().add_(shine).add_(white)
+    halvings = edge.int() + shine.int() + white.int()
     confidence = (level.to(depth.dtype) / 2).clamp(0, 1) * 0.5**halvings
     return Samples(
         uv=uv,
@@ -172,5 +172,5 @@ def _bits(*masks: tuple[Tensor, int]) -> Tensor:
     """One int32 bit set of (mask, bit) pairs."""
     flag = torch.zeros_like(masks[0][0], dtype=torch.int32)
     for mask, bit in masks:
-        flag.add_(mask, alpha=bit)
+        flag = torch.where(mask, flag | bit, flag)
     return flag

@@ -131,7 +131,8 @@ def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, f: Tensor, c
     with torch.no_grad():
         square = (rows[:, 6] * rows[:, 6]).sum(1)
         inlier = usable & found[:, None] & (depth > MIN_DEPTH) & (square < options.threshold_px**2)
-        weight = (robust(square, options.kernel, options.kernel_px)[1] * inlier).detach()
+        _, weight = robust(square, options.kernel, options.kernel_px)
+        weight = torch.where(inlier, weight, 0.0).detach()
     H, g = normal_equations(rows, weight)
     eye = torch.eye(6, dtype=H.dtype, device=H.device).expand_as(H)
     x, solved = solve_spd(H, torch.cat((-g[..., None], eye), -1))
@@ -149,7 +150,7 @@ def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, f: Tensor, c
             otherwise=PoseCode.OK,
         )
         ok, nan = code == PoseCode.OK, torch.full((), torch.nan, dtype=points.dtype, device=points.device)
-        total = (square * inlier).sum(-1)
+        total = torch.where(inlier, square, 0.0).sum(-1)
         rms_px = (total / n_inlier.clamp_min(1)).sqrt()
         sigma_px = (total / (2 * n_inlier - 6).clamp_min(1)).sqrt().clamp_min(MIN_SIGMA_PX)
         cov = (inverse + inverse.transpose(1, 2)) * (0.5 * sigma_px * sigma_px)[:, None, None]
@@ -212,7 +213,7 @@ def _truncated(
     kernel_px: float = 1.0,
 ) -> Callable[[Pose], Normal]:
     """The cost that search and refinement share: Σ rho(min(r², threshold²)), points behind the camera in full."""
-    limits = usable * (threshold_px * threshold_px)
+    limits = torch.where(usable, threshold_px * threshold_px, 0.0).to(points.dtype)
     xyz, uv = points.split((3, 2), 1)
 
     def evaluate(T: Pose) -> Normal:
@@ -220,7 +221,7 @@ def _truncated(
         square = (rows[:, 6] * rows[:, 6]).sum(1)
         square = torch.where(depth > MIN_DEPTH, torch.minimum(square, limits), limits)
         rho, weight = robust(square, kernel, kernel_px)
-        return Normal(rho.sum(-1), *normal_equations(rows, weight * (square < limits)))
+        return Normal(rho.sum(-1), *normal_equations(rows, torch.where(square < limits, weight, 0.0)))
 
     return evaluate
 
@@ -321,7 +322,8 @@ def _fit_all(o: Options, threshold_px: float, first: PoseFit, problem: Problem, 
         code = torch.where(first.ok, code, first.code).to(torch.int32)
         ok = (code == PoseCode.OK) | (code == PoseCode.KEPT_PNP)
         inlier, rms_px = _reprojection(problem, at, threshold_px)
-        variance = torch.where(problem.far.any(-1), (found.noise * problem.far).amax(-1), found.noise.amax(-1))
+        far_noise = torch.where(problem.far, found.noise, 0.0).amax(-1)
+        variance = torch.where(problem.far.any(-1), far_noise, found.noise.amax(-1))
         t_snr = covariance.mahalanobis(at.T.t, cov[:, 3:6, 3:6])
 
     def answer(x: Tensor) -> Tensor:
@@ -382,4 +384,4 @@ def _reprojection(problem: Problem, at: near_far.Unknowns, threshold_px: float) 
     rows, depth = linearise(at.T, problem.f, problem.c, problem.ray / problem.inverse[:, None], uv)
     square = (rows[:, 6] * rows[:, 6]).sum(1)
     inlier = problem.near & (depth > MIN_DEPTH) & (square < threshold_px**2)
-    return inlier, ((square * inlier).sum(-1) / inlier.sum(-1).clamp_min(1)).sqrt()
+    return inlier, (torch.where(inlier, square, 0.0).sum(-1) / inlier.sum(-1).clamp_min(1)).sqrt()

@@ -63,8 +63,9 @@ def summarise(rows: Sequence[Row], variants: Sequence[str], cohorts: Sequence[st
                 for row in rows
                 if row["pair"] is None and (row["method"], row["truth"], row["role"]) == (variant, cohort, None)
             ]
-            parts = [variant] * (len(variants) > 1 or len(cohorts) > 1) + [cohort] * (cohort != cohorts[-1])
-            prefix = "".join(f"{p}." for p in parts)
+            prefix = f"{variant}." if len(variants) > 1 or len(cohorts) > 1 else ""
+            if cohort != cohorts[-1]:
+                prefix += f"{cohort}."
             summary |= {prefix + name: value for name, value in errors.summarise(scenes).items()}
     return summary
 

@@ -117,7 +117,7 @@ class Solids:
         axis = torch.where(is_x, 0, torch.where(is_y, 1, 2))
         reach = main.abs().clamp(min=1e-12)
         across, down = torch.where(is_x, z, x) / reach, torch.where(is_y, z, y) / reach
-        return index * 6 + axis * 2 + (main > 0), across, down
+        return index * 6 + axis * 2 + torch.where(main > 0, 1, 0), across, down
 
     def points(self, face: Tensor, across: Tensor, down: Tensor) -> list[Tensor]:
         """The inverse of :meth:`locate`: three components (P,) of world points."""

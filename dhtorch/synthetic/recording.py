@@ -249,9 +249,9 @@ def phone_lidar(
     far = ((distance / range_limit - 0.85) / 0.15).clamp(0, 1)
     lost = 0.6 * far
     for why in (
-        0.5 * edge,
-        0.85 * (kind == MIRROR),
-        0.9 * (kind == WINDOW),
+        torch.where(edge, 0.5, 0.0),
+        torch.where(kind == MIRROR, 0.85, 0.0),
+        torch.where(kind == WINDOW, 0.9, 0.0),
         0.9 * ((0.25 - cosine) / 0.25).clamp(0, 1),
         0.9 * (1 - returned / 0.001).clamp(0, 1),
     ):

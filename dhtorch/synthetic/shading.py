@@ -206,7 +206,7 @@ def _unshaded(solids: Solids, light: Light, p: list[Tensor], d: list[Tensor]) ->
     half = math.hypot(*(abs(light.u[k]) + abs(light.v[k]) for k in range(3)))
     for solid, at in solids.blockers(p, half + 1e-3, [light.centre[k] - p[k] for k in range(3)]):
         far = solids.open_distance(solid, [c[at] for c in p], [c[:, at] for c in d])
-        clear[:, at] *= far > 0.98
+        clear[:, at] = torch.where(far > 0.98, clear[:, at], 0.0)
     return clear
 
 

@@ -220,12 +220,14 @@ def _page(g: Generator) -> Tensor:
     lines = 36
     row = (v * lines).floor()
     word = _per_cell(g, row, (u * 30).floor(), (lines, 30)) > 0.22
-    ink = _step(_triangle(v * lines) - 0.45, 0.12) * word * (_triangle(u * 2) > 0.12)
+    printed = word & (_triangle(u * 2) > 0.12)
+    ink = torch.where(printed, _step(_triangle(v * lines) - 0.45, 0.12), 0.0)
     ink = ink * (0.35 + 0.65 * noise(g, (SIZE, SIZE), (128, 200)))
     page = _mix((0.94, 0.93, 0.90), (0.18, 0.18, 0.20), ink)
     head = _step(noise(g, (SIZE, SIZE), (24, 64)) - 0.5, 0.05)
-    page = _mix(page, _mix((0.94, 0.93, 0.90), (0.08, 0.08, 0.10), head), (v < 0.14) * (_triangle(u) > 0.08) * 1.0)
-    photo = (u > 0.55) * (u < 0.93) * (v > 0.22) * (v < 0.52) * 1.0
+    top = (v < 0.14) & (_triangle(u) > 0.08)
+    page = _mix(page, _mix((0.94, 0.93, 0.90), (0.08, 0.08, 0.10), head), top.float())
+    photo = ((u > 0.55) & (u < 0.93) & (v > 0.22) & (v < 0.52)).float()
     return _mix(page, _mix(_pigment(g), _pigment(g), _step(_fractal(g, 6, 4) - 0.5, 0.05)), photo)
 
 
@@ -243,7 +245,8 @@ def _spine(g: Generator) -> Tensor:
 def _keyboard(g: Generator) -> Tensor:
     u, v = _uv()
     x, y = u * 14, v * 8
-    key = _step(torch.minimum(_triangle(x), _triangle(y)) - 0.22, 0.08) * (v < 0.62) * (_triangle(u) > 0.07)
+    board = (v < 0.62) & (_triangle(u) > 0.07)
+    key = torch.where(board, _step(torch.minimum(_triangle(x), _triangle(y)) - 0.22, 0.08), 0.0)
     glyph = _step(_fractal(g, 48, 2) - 0.56, 0.03) * key
     base = _mix((0.66, 0.67, 0.69), (0.20, 0.20, 0.22), key)
     pad = _step(0.13 - (u - 0.5).abs(), 0.004) * _step(0.13 - (v - 0.81).abs(), 0.004)

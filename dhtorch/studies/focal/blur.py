@@ -148,7 +148,7 @@ def side_by_colour(
     red, blue = (local_blur(image[:, k : k + 1], window_px=window_px, noise=noise) for k in (0, 2))
     both = red.valid & blue.valid
     lead = torch.where(both, blue.sigma * blue.sigma - red.sigma * red.sigma, torch.zeros_like(red.sigma))
-    return torch.sign(gaussian(lead[:, None], window_px / 2)[:, 0]) * both
+    return torch.where(both, torch.sign(gaussian(lead[:, None], window_px / 2)[:, 0]), 0.0)
 
 
 def _gradient_energy(grey: Tensor, width_px: float, window_px: float, noise: float) -> tuple[Tensor, float]:

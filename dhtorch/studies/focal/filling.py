@@ -75,11 +75,12 @@ def joint_bilateral(
     for dy in range(-radius, radius + 1):
         for dx in range(-radius, radius + 1):
             r, c = (row + dy).clamp(0, h - 1), (column + dx).clamp(0, w - 1)
-            inside = ((row + dy == r)[:, None] & (column + dx == c)).to(coarse.dtype)
+            inside = (row + dy == r)[:, None] & (column + dx == c)
             near = ((y - r) ** 2)[:, None] + (x - c) ** 2
             value, colour = coarse[:, r][:, :, c], small[:, :, r][..., c]
             unlike = ((picture - colour) ** 2).mean(1)
-            share = torch.exp(-0.5 * (near / spatial**2 + unlike / contrast**2)) * inside * (value > 0)
+            share = torch.exp(-0.5 * (near / spatial**2 + unlike / contrast**2))
+            share = torch.where(inside & (value > 0), share, 0.0)
             total, weight = total + share * value, weight + share
     seen = weight > LEAST
     return torch.where(seen, total / torch.where(seen, weight, torch.ones_like(weight)), torch.zeros_like(total))
