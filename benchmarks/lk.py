@@ -78,7 +78,7 @@ def forward(image_0: Tensor, image_1: Tensor, uv: Tensor, window: int, pyramid_0
         x = uv.permute(2, 0, 1).reshape(2, B * N).contiguous()
         batch = torch.arange(B).repeat_interleave(N)
         known = lk.within(x, *source.bounds())
-        d, found, _ = lk.search(source, target, o, True, x, torch.zeros_like(x), batch, known)
+        d, found, _ = lk.search(source, target, o, x, torch.zeros_like(x), batch, known=known, alike=True)
     return (x + d).reshape(2, B, N).permute(1, 2, 0), found.reshape(B, N)
 
 

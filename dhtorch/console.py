@@ -65,7 +65,8 @@ def speaking(flags: Sequence[str]) -> Iterator[None]:
 
 def listen() -> None:
     """Debug messages of dhtorch go to stderr where much is to be said; nobody else's do."""
-    logger, verbose = logging.getLogger("dhtorch"), verbosity() == "verbose"
+    logger = logging.getLogger("dhtorch")
+    verbose = verbosity() == "verbose"
     for handler in [h for h in logger.handlers if h.get_name() == VERBOSITY]:
         logger.removeHandler(handler)
     for name, known in logging.root.manager.loggerDict.items():

@@ -1,6 +1,6 @@
-"""Windows of images read and moved slowly, point by point in float64: what the fast searches are checked against.
+"""Textures that are moved by exactly so much, and levels of pictures as OpenCV makes, filters and pads them.
 
-Levels are made and padded by OpenCV, gradients by its Scharr filter; reading between pixels is written out.
+The searches are checked against ``dhtorch.geometry.reference``; that, and the pyramid, against these levels.
 """
 
 import cv2

@@ -1,13 +1,13 @@
-"""Affine registration against a slow twin: eight pictures, one regression at a time, matrices as NumPy has them."""
+"""Affine registration against its slow twin, ``geometry.reference``: one window at a time, one regression a step."""
 
 import math
 
 import numpy as np
 import pytest
 import torch
-from by_hand import REACH, levels, places, waves
+from by_hand import places, waves
 
-from dhtorch.geometry import affine
+from dhtorch.geometry import affine, reference
 from dhtorch.geometry.pyramid import Pyramids, build_pyramid
 from dhtorch.records import TrackHint, Tracks
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
@@ -33,127 +33,15 @@ def pyramids(src, dst, n=2, window=WINDOW):
     return build_pyramid(src, n, window), build_pyramid(dst, n, window, gradients=False)
 
 
-# --- the twin --------------------------------------------------------------------------------------------------------
-
-
-class Window:
-    """Around the whole pixel nearest to a place of image 0: regression of what image 1 shows on eight pictures."""
-
-    def __init__(self, level, uv, window):
-        self.w, self.h, self.q = window, window // 2, np.floor(uv + 0.5)
-        v, u = np.mgrid[-self.h : self.h + 1, -self.h : self.h + 1]
-        self.p = np.stack([u.ravel(), v.ravel()])
-        self.u, self.v = self.p / self.h
-        gx, gy, T = (level.window(k, self.q, window) for k in (1, 2, 0))
-        self.T = T - T.mean()
-        self.Q = np.stack([gx, gy, self.u * gx, self.u * gy, self.v * gx, self.v * gy, self.T, np.ones_like(T)])
-        damping = (2 / 255 / 2) ** 2  # 2 / 255 of noise, of a corner that moves by 2 px
-        self.S = self.Q @ self.Q.T + np.diag([0, 0, 1, 1, 1, 1, 0, 0]) * damping
-        offset = uv - self.q
-        self.place = np.array([1, *(offset / self.h)])
-        self.textured = np.linalg.cond(self.S) < 1e12
-
-    def reads(self, level, patch, middle, A):
-        """Image 1 at middle + A p; beyond a patch around the start the value of the patch's border."""
-        low, high = patch
-        return level.read(0, *np.clip(middle[:, None] + A @ self.p, low[:, None], high[:, None]))
-
-    def solve(self, J):
-        """The motion of the template's pixels that explains what image 1 shows: at its middle, and what that adds at
-        u = 1 and at v = 1."""
-        s = np.linalg.solve(self.S, self.Q @ J)
-        return s[:6].reshape(3, 2) / np.clip(s[6], 0.2, 5)
-
-    def fit(self, places, J):
-        """Gain, mean square that gain and bias leave, and what reading between pixels leaves of white noise."""
-        gain = self.T @ J / (self.T @ self.T)
-        rest = J - gain * self.T
-        f = places - np.floor(places)
-        return gain, rest.var(), np.prod(f**2 + (1 - f) ** 2, axis=0).mean()
-
-
-def compose(middle, A, change, h):
-    """On the template's side: x -> x + δ + D x there, undone, before the warp that was."""
-    D = np.stack([change[1], change[2]], 1) / h
-    back = A @ np.linalg.inv(np.eye(2) + D)
-    return middle - back @ change[0], back
-
-
-def noise_of(fit):
-    gain, variance, share = fit
-    return variance / (share + np.clip(gain, 0.2, 5) ** 2)
-
-
-def search(window, level, zoom, middle, A, steps, epsilon):
-    """Gauss-Newton steps with Anderson's of one memory; the warp, how well it fits, and how well at the start."""
-    middle, A = middle * zoom, A * zoom
-    reach = window.h + REACH
-    centre = np.clip(np.floor(middle + 0.5), 0, [level.W - 1, level.H - 1])
-    patch = (centre - reach, centre + reach)
-    first = window.fit(middle[:, None], window.reads(level, patch, middle, A))
-    taken = before = None
-    for _ in range(steps):
-        change = window.solve(window.reads(level, patch, middle, A))
-        step = change
-        if taken is not None:
-            bend = change - before
-            share = np.clip((change * bend).sum() / (bend**2).sum(), -0.5, 0.5 / 1.5)
-            step = change - share * (taken + bend)
-        taken, before = step, change
-        middle, A = compose(middle, A, step, window.h)
-        if np.abs(change).sum(0).max() <= epsilon * zoom:
-            break
-    J = window.reads(level, patch, middle, A)
-    return middle / zoom, A / zoom, window.fit(middle[:, None] + A @ window.p, J), first
-
-
-def covariance_by_hand(window, A, fit):
-    """White noise of one variance in both images through the regression; what it adds to the texture taken out."""
-    n = window.w**2
-    gain2, s2 = np.clip(fit[0], 0.2, 5) ** 2, max(noise_of(fit), 1 / 12 / 255**2) * n / (n - 8)
-    P = np.kron(window.place, np.eye(2))  # (2, 6) what the six motions do to the place
-    R = P @ np.linalg.inv(window.S)[:6]
-    C = R[:, :6] @ P.T
-    scharr = np.outer([3, 10, 3], [-1, 0, 1]) / 32
-    slope = (scharr**2).sum()
-    u2, v2 = (window.u**2).sum(), (window.v**2).sum()
-    energy = np.diag([slope * n, slope * n, slope * u2, slope * u2, slope * v2, slope * v2, n, 0]) * s2
-    S = np.linalg.inv(C)
-    false = S @ R @ energy @ R.T @ S
-    most = np.linalg.eigvals(C @ false).real.max()
-    true = np.linalg.inv(S - false * (0.9 / max(most, 0.9)))
-    return A @ (true @ S @ true) @ A.T * s2 * (1 + gain2) / gain2
-
-
-def inside(x):
-    return bool(((x >= -0.5) & (x <= [W - 0.5, H - 0.5])).all())
-
-
 def by_hand(src, dst, uv, uv_1, steps=7, epsilon=0.01, max_shift=2.0, n_levels=2, window=WINDOW):
+    """Registrations (B, N) by the slow search."""
+    options = {"window": window, "iterations": steps, "epsilon_px": epsilon, "max_shift_px": max_shift}
     rows = []
     for b in range(len(uv)):
-        here, there = levels(src[b], 1, window)[0], levels(dst[b], n_levels, window)
-        for x, x_1 in zip(uv[b].numpy(), uv_1[b].numpy(), strict=True):
-            if not (inside(x) and inside(x_1)):
-                rows.append((x_1, np.eye(2), 0.0, np.eye(2), 0.0, False))
-                continue
-            w = Window(here, x, window)
-            start, eye = x_1 - (x - w.q), np.eye(2)
-            middle, A, fit, first = search(w, there[0], 1.0, start, eye, steps, epsilon)
-            began, size = first, np.linalg.det(A)
-            if n_levels > 1 and size > 1.5**2:
-                middle, A, fit, _ = search(w, there[1], 0.5, middle, A, steps, epsilon)
-            size, end = np.linalg.det(A), middle + A @ (x - w.q)
-            shift = np.linalg.norm(end - x_1)
-            shift = shift if np.isfinite(shift) else max_shift
-            ok = w.textured and 0.4**2 < size < 2.5**2 and 0.2 < fit[0] < 5 and shift <= max_shift
-            ok = ok and noise_of(fit) <= 1.2 * noise_of(began)
-            ok = ok and inside(middle)
-            if not ok:
-                end, A, fit = x_1, eye, began
-            rms = math.sqrt(fit[1]) / np.clip(fit[0], 0.2, 5)
-            rows.append((end, A, rms, covariance_by_hand(w, A, fit), shift, ok))
-    return [np.array(c).reshape(*uv.shape[:2], *np.shape(c[0])) for c in zip(*rows, strict=True)]
+        here, there = reference.levels(src[b], 1, window), reference.levels(dst[b], n_levels, window)
+        rows += [reference.register(here, there, x, x_1, **options) for x, x_1 in zip(uv[b], uv_1[b], strict=True)]
+    shaped = [np.array([np.asarray(x) for x in c]) for c in zip(*rows, strict=True)]
+    return [c.reshape(*uv.shape[:2], *c.shape[1:]) for c in shaped]
 
 
 def agrees(found, expected, rtol=1e-6):
@@ -271,14 +159,10 @@ def test_the_differentiable_step_is_one_regression_from_where_it_is_put():
     source, target = pyramids(src, dst, 1)
     found = affine.step(source, target, uv, uv_1, linear, window=WINDOW)
     for b in range(2):
-        here, there = levels(src[b], 1, WINDOW)[0], levels(dst[b], 1, WINDOW)[0]
+        here, there = (reference.levels(image[b], 1, WINDOW)[0] for image in (src, dst))
         for n in range(6):
-            x, A = uv[b, n].numpy(), linear[b, n].numpy()
-            w = Window(here, x, WINDOW)
-            middle = uv_1[b, n].numpy() - A @ (x - w.q)
-            J = w.reads(there, (np.zeros(2), np.array([W - 1, H - 1])), middle, A)
-            moved, turned = compose(middle, A, w.solve(J), w.h)
-            np.testing.assert_allclose(found[b, n].numpy(), moved + turned @ (x - w.q), atol=1e-8)
+            want = reference.register_step(here, there, uv[b, n], uv_1[b, n], linear[b, n], window=WINDOW)
+            np.testing.assert_allclose(found[b, n].numpy(), want.numpy(), atol=1e-8)
 
 
 def test_a_step_leaves_what_it_cannot_move():

@@ -196,7 +196,7 @@ def linear(batch, n, dtype):
 def weighed(batch, n, dtype):
     problem, at, noise = problems(batch, n, dtype)
     weights = uniform(batch, dtype=dtype), uniform(batch, dtype=dtype, low=1e4, high=1e5)
-    return problem, at, noise, *weights, "geman_mcclure", 2.0
+    return problem, at, noise, *weights
 
 
 def nine(batch, n, dtype):
@@ -376,11 +376,11 @@ ROWS = [
     Row(near_far.linearise_tracks, lambda b, n, d: problems(b, n, d)[:2], "dtype batch vmap capture raises", bad=lambda a: (a[0].replace(uv=a[0].uv[..., 1:]), a[1])),
     Row(near_far.residuals, linear, "dtype batch vmap capture gradcheck raises", grad=(2,), bad=wrong_last_axis(2)),
     Row(near_far.squares, linear, "dtype batch vmap capture gradcheck raises", grad=(2,), bad=wrong_last_axis(2)),
-    Row(near_far.normal, weighed, "dtype batch vmap capture"),
+    Row(with_options(near_far.normal, kernel="geman_mcclure", bend=2.0), weighed, "dtype batch vmap capture"),
     Row(near_far.prior, lambda b, n, d: (uniform(b, dtype=d),), POINTLESS, grad=(0,)),
     Row(most_probable.noise_scale, lambda b, n, d: problems(b, n, d)[:2], "dtype batch vmap capture"),
     Row(most_probable.most_probable, lambda b, n, d: (problems(b, n, d)[0], problems(b, n, d)[1].T, most_probable.Options()), "batch vmap capture", slow="capture"),
-    Row(most_probable.covariance, lambda b, n, d: (problems(b, n, d)[0], most_probable.Solution(*weighed(b, n, d)[1:5], torch.ones(b, dtype=torch.bool)), most_probable.Options()), "batch vmap capture"),
+    Row(most_probable.covariance, lambda b, n, d: (problems(b, n, d)[0], most_probable.Solution(*weighed(b, n, d)[1:], torch.ones(b, dtype=torch.bool)), most_probable.Options()), "batch vmap capture"),
     Row(covariance.noise_shape, lambda b, n, d: (tracked(b, n, d)[1].cov * uniform(b, n, 1, 1, dtype=d, low=0.5), torch.ones(b, n, dtype=torch.bool), 0.1), "dtype batch vmap capture gradcheck empty shuffle raises", (0, 1), (0,), bad=wrong_last_axis(0)),
     Row(covariance.median, lambda b, n, d: (uniform(b, n, dtype=d), uniform(b, n, dtype=d, seed=1) > 0.3), "dtype batch vmap capture gradcheck empty shuffle raises", (0, 1), (0,), bad=wrong_last_axis(1)),
     Row(covariance.from_normal, lambda b, n, d: (positive(b, n, d), uniform(b, dtype=d, low=0.1)), "dtype batch vmap capture"),
@@ -429,6 +429,15 @@ ROWS = [
 ELSEWHERE = {
     *(f"dhtorch.stages.sample.{name}" for name in ("spiral", "vogel", "grid")),
     *(f"dhtorch.geometry.shapes.{name}" for name in ("check", "is_static", "is_transformed")),
+    *(f"dhtorch.geometry.reference.{name}" for name in ("patch", "nearest", "luma", "offsets", "levels")),
+    *(
+        f"dhtorch.geometry.reference.{name}"
+        for name in ("lucas_kanade", "search", "descend", "template", "one_step", "leap", "difference", "within")
+    ),
+    *(
+        f"dhtorch.geometry.reference.{name}"
+        for name in ("register", "register_step", "composed", "believed", "nearest_inside")
+    ),
     *(f"dhtorch.geometry.cells.{name}" for name in ("occupied", "components")),
     *(f"dhtorch.integrate.volume.{name}" for name in ("empty", "fuse", "splat")),
     *(f"dhtorch.integrate.surface.{name}" for name in ("points", "mesh")),

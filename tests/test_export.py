@@ -230,7 +230,7 @@ def test_colmap_sees_every_point_where_we_do(tmp_path, name):
     pycolmap = pytest.importorskip("pycolmap")
     shots, xyz, rgb, error, seen, uv = model(LENSES[name])
     seen[3, 1], xyz[5, 0] = -1, math.nan
-    write_colmap(tmp_path, shots, xyz, rgb, error, seen, uv)
+    write_colmap(tmp_path, shots, xyz, rgb=rgb, error=error, seen_by=seen, uv=uv)
     found = pycolmap.Reconstruction(str(tmp_path))
     assert len(found.cameras) == 1 and len(found.images) == 2 and len(found.points3D) == 39
     (camera,) = found.cameras.values()
@@ -250,16 +250,17 @@ def test_colmap_sees_every_point_where_we_do(tmp_path, name):
 
 
 def test_colmap_files_have_two_lines_a_picture_and_few_cameras(tmp_path):
-    shots, *points = model(None)
+    shots, xyz, *columns = model(None)
+    points = dict(zip(("rgb", "error", "seen_by", "uv"), columns, strict=True))
     other = shots[1].camera.replace(f=shots[1].camera.f * 2)
-    write_colmap(tmp_path, [*shots, Shot("2.png", other, (480, 640), shots[0].T_world_from_cam)], *points)
+    write_colmap(tmp_path, [*shots, Shot("2.png", other, (480, 640), shots[0].T_world_from_cam)], xyz, **points)
     lines = lambda name: [x for x in (tmp_path / name).read_text().split("\n")[:-1] if not x.startswith("#")]  # noqa: E731
     assert len(lines("cameras.txt")) == 2 and len(lines("images.txt")) == 6 and len(lines("points3D.txt")) == 40
     assert lines("images.txt")[5] == "", "a picture that sees nothing still has its line"
     with pytest.raises(ValueError, match="seen_by names shot 7, expected at most 1"):
-        write_colmap(tmp_path, shots, *points[:3], points[3] * 0 + 7, points[4])
+        write_colmap(tmp_path, shots, xyz, **points | {"seen_by": points["seen_by"] * 0 + 7})
     with pytest.raises(ValueError, match=r"uv has shape \(40, 2, 1\)"):
-        write_colmap(tmp_path, shots, *points[:4], points[4][..., :1])
+        write_colmap(tmp_path, shots, xyz, **points | {"uv": points["uv"][..., :1]})
 
 
 @pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0.5, -0.3, 0.8), (0, 0, 0)])
@@ -280,6 +281,6 @@ def test_quaternions_of_all_turns(tmp_path, axis, angle):
 
 def written(folder, shot, xyz, rgb, error, seen, uv):
     """The line of every picture of a model with one picture."""
-    write_colmap(folder, [shot], xyz, rgb, error, seen[:, :1], uv[:, :1])
+    write_colmap(folder, [shot], xyz, rgb=rgb, error=error, seen_by=seen[:, :1], uv=uv[:, :1])
     lines = [x for x in (folder / "images.txt").read_text().splitlines() if not x.startswith("#")]
     return lines[::2]

@@ -247,7 +247,7 @@ def test_sparse_answers_become_patches_of_surface():
     sigma = torch.tensor([[0.02, 0.02, 0.02, 0.02, math.nan]])
     features = torch.arange(5.0).view(1, 5, 1)
     camera = wall().camera
-    one = splat(camera, (60, 80), uv, depth, sigma, features, se3.identity(1, uv), radius=0.06)
+    one = splat(camera, (60, 80), uv, depth, sigma, features, T_world_from_cam=se3.identity(1, uv), radius=0.06)
     assert one.depth.shape == (1, 60, 80) and one.features.shape == (1, 60, 80, 1)
     assert (
         float(one.depth[0, 30, 20]) == 2.0 and float(one.depth[0, 30, 23]) == 2.0 and float(one.depth[0, 30, 24]) == 0
@@ -264,7 +264,9 @@ def test_sparse_answers_become_patches_of_surface():
 def no_points(camera, n=0, wrong=0):
     """Splats of ``n`` answers at depth 0, or a call whose depths are too many."""
     uv, zero = torch.zeros(1, n, 2), torch.zeros(1, n)
-    return splat(camera, (60, 80), uv, torch.zeros(1, n + wrong), zero, zero[..., None], se3.identity(1, zero))
+    return splat(
+        camera, (60, 80), uv, torch.zeros(1, n + wrong), zero, zero[..., None], T_world_from_cam=se3.identity(1, zero)
+    )
 
 
 def test_no_answer_leaves_no_trace():

@@ -1,4 +1,4 @@
-"""Reading pixels, against loops over single pixels in plain Python."""
+"""Reading pixels, against single patches and pixels of ``geometry.reference``."""
 
 import math
 
@@ -9,6 +9,7 @@ import torch
 
 from dhtorch.geometry import lookup
 from dhtorch.geometry.exact import LANES
+from dhtorch.geometry.reference import luma, nearest, patch
 
 H, W = 9, 13
 #: Pixels, some of whose patches lie beyond each border and corner.
@@ -37,12 +38,6 @@ def strided(image):
     return wide[..., ::2]
 
 
-def patch_by_hand(image, u, v, size):
-    """(C, size, size) around a pixel, moved back inside; ``size // 2`` pixels before it."""
-    left, top = (min(max(x - size // 2, 0), n - size) for x, n in ((u, W), (v, H)))
-    return image[:, top : top + size, left : left + size]
-
-
 # --- whole numbers ---------------------------------------------------------------------------------------------------
 
 
@@ -69,9 +64,7 @@ def test_the_nearest_pixel_is_read_and_border_pixels_beyond():
     value, inside = lookup.nearest(grid, uv)
     for b in range(2):
         for n, (u, v) in enumerate(uv[b].tolist()):
-            i, j = math.floor(u + 0.5), math.floor(v + 0.5)
-            assert value[b, n] == grid[b, min(max(j, 0), H - 1), min(max(i, 0), W - 1)]
-            assert inside[b, n] == (0 <= i < W and 0 <= j < H)
+            assert (value[b, n], bool(inside[b, n])) == nearest(grid[b], (u, v))
 
 
 def test_the_index_of_a_pixel_counts_along_rows():
@@ -144,11 +137,11 @@ def test_summaries_are_those_of_a_loop_over_patches(layout, dtype, colour, grey)
         found = lookup.summarise(layout(image), pixels(), size, corner_and_sum, grey=grey)
         for b in range(2):
             for n, (u, v) in enumerate(pixels()[b].tolist()):
-                patch = patch_by_hand(image[b], u, v, size).double()
-                patch = patch / 255 if grey and dtype == torch.uint8 else patch
+                around = patch(image[b], (u, v), size).double()
+                around = around / 255 if grey and dtype == torch.uint8 else around
                 if grey and colour == 3:
-                    patch = (patch * torch.tensor([0.299, 0.587, 0.114]).view(3, 1, 1).double()).sum(0, keepdim=True)
-                for x, want in zip(found, corner_and_sum(patch[..., None]), strict=True):
+                    around = luma(around)
+                for x, want in zip(found, corner_and_sum(around[..., None]), strict=True):
                     assert float(x[b, n]) == pytest.approx(float(want), rel=1e-6)
 
 
@@ -171,7 +164,7 @@ def test_summaries_see_whole_lanes_of_a_few_patches_at_a_time(n, dtype, monkeypa
     (parts,) = lookup.summarise(image, pixel, 3, first, grey=True)
     assert torch.equal(parts, whole) and max(seen[1:]) <= 128
     assert len(seen) - 1 == max(1, -(-2 * n // 128)), "as many patches at a time as there is room for"
-    want = [[patch_by_hand(image[b], *pixel[b, k].tolist(), 3)[:, 0, 0] for k in range(n)] for b in range(2)]
+    want = [[patch(image[b], pixel[b, k].tolist(), 3)[:, 0, 0] for k in range(n)] for b in range(2)]
     if n:
         grey = lookup.luma(torch.stack([torch.stack(x) for x in want]), -1)[..., 0]
         torch.testing.assert_close(whole, grey)
@@ -184,7 +177,7 @@ def test_a_summarys_gradient_falls_on_the_pixels_it_saw():
     want = torch.zeros_like(image)
     for b in range(2):
         for u, v in pixels()[b].tolist():
-            patch_by_hand(want[b], u, v, 4)[1] += 2 * patch_by_hand(image.detach()[b], u, v, 4)[1]
+            patch(want[b], (u, v), 4)[1] += 2 * patch(image.detach()[b], (u, v), 4)[1]
     torch.testing.assert_close(image.grad, want)
 
 

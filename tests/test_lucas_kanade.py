@@ -1,4 +1,4 @@
-"""Lucas-Kanade against a slow twin: every window read pixel by pixel, every step solved by itself, in float64."""
+"""Lucas-Kanade against its slow twin, ``geometry.reference``: windows read pixel by pixel, steps solved one by one."""
 
 import math
 
@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from by_hand import Level, levels, places, waves
+from by_hand import levels, places, waves
 
 from dhtorch.geometry import lucas_kanade as lk
+from dhtorch.geometry import reference
 from dhtorch.geometry.exact import LANES
 from dhtorch.geometry.pyramid import Pyramids, build_pyramid
 from dhtorch.records import TrackHint
@@ -27,116 +28,26 @@ def two_views(shift=(1.3, -0.9), gain=1.0, bias=0.0, shortest=9.0):
     ) + bias
 
 
-# --- the twin --------------------------------------------------------------------------------------------------------
-
-
-def project(y, T, normalise):
-    """``y`` without what the normalisation leaves free: a constant, and the template."""
-    if normalise != "none":
-        y, T = y - y.mean(-1, keepdims=True), T - T.mean()
-    return y - (y @ T)[..., None] / (T @ T) * T if normalise == "gain_bias" else y
-
-
-def template(level, x, window, normalise):
-    """Gradients (2, w²) and grey values of a window, as a step uses them."""
-    T = level.window(0, x, window)
-    g = np.stack([level.window(k, x, window) for k in (1, 2)])
-    return project(g, T, normalise), T if normalise == "none" else T - T.mean()
-
-
-def one_step(level_1, x_1, g, T, window, normalise):
-    """To be subtracted from ``x_1``: least squares of J - T on the gradients, in units of T's contrast."""
-    J = level_1.window(0, x_1, window)
-    found = np.linalg.solve(g @ g.T, g @ (J - T))
-    return found / np.clip(T @ J / (T @ T), 0.2, 5.0) if normalise == "gain_bias" else found
-
-
-def leap(last, step, epsilon):
-    """Steps that shrink by one ratio, all of them at once."""
-    if step @ step <= epsilon**2:
-        return step
-    return step / (1 - np.clip(step @ last / max(last @ last, epsilon**2), -0.9, 0.9))
-
-
-def descend(level_0, level_1, x, d, o, radii, finest):
-    """One level: where it ends, whether on the last map, whether textured, A, and whether it never left a map."""
-    g, T = template(level_0, x, o["window"], o["normalise"])
-    A, stayed, held = g @ g.T, True, True
-    if np.linalg.eigvalsh(A)[0] <= o["min_eigenvalue"] * o["window"] ** 2:
-        return d, True, False, A, True
-    for m, radius in enumerate(radii):
-        steps = min(8, o["iterations"] - 8 * m)
-        if steps <= 0:
-            break
-        corner, step = np.floor(x + d) - radius, np.zeros(2)
-        for k in range(1, steps + 1):
-            last, step = step, one_step(level_1, x + d, g, T, o["window"], o["normalise"])
-            step = leap(last, step, o["epsilon_px"]) if finest and k == 6 and k < steps else step
-            d = d - step
-            p = x + d - corner
-            held = bool(((p >= 0) & (p <= 2 * radius + 1)).all())
-            stayed = stayed and held
-        if step @ step <= o["epsilon_px"] ** 2:
-            break
-    return d, held, True, A, stayed
-
-
-def search(views_0, views_1, x, d, o, shared):
-    """Coarse to fine; where no start is given, points of a cell of 4 x 4 pixels of level 2 and above share a search."""
-    top, stayed = len(views_0) - 1, True
-    rough = o | {"epsilon_px": 4 * o["epsilon_px"]}
-
-    def coarse(level, x):
-        nonlocal stayed
-        if shared and level >= 2:
-            size = 4 * 2**level
-            cell = np.minimum((x + 0.5) // size, -(-np.array([W, H]) // size) - 1)
-            x = np.minimum((cell + 0.5) * size, [W - 1, H - 1])
-        start = d / 2**top if level == top else 2 * coarse(level + 1, x)
-        pixel = np.floor(x / 2**level + 0.5)
-        radii = (2, 2, 2, 2) if level == top else (1, 2, 2)
-        found = descend(views_0[level], views_1[level], pixel, start, rough, radii, False)
-        stayed = stayed and found[-1]
-        return found[0]
-
-    start = 2 * coarse(1, x) if top else d
-    radii = (1, 2, 2, 2) if top else (2, 2, 2, 2)
-    d, held, textured, A, still = descend(views_0[0], views_1[0], x, start, o, radii, True)
-    inside = bool(((x + d >= -0.5) & (x + d <= [W - 0.5, H - 0.5])).all())
-    return d, held and textured and inside, A, stayed and still
-
-
 OPTIONS = {"window": WINDOW, "levels": 3, "iterations": 3, "epsilon_px": 0.0, "normalise": "none"}
 
 
+def reference_options(o):
+    """Those that the slow search knows."""
+    return reference.Options(**{name: o[name] for name in reference.Options._fields})
+
+
 def twin(src, dst, uv, init=None, limit=1.0, **options):
-    """Tracks (B, N) by hand, and where their search never left its maps."""
+    """Tracks (B, N) by the slow search, and where that never left the fast one's maps."""
     o = OPTIONS | {"min_eigenvalue": MIN_EIGENVALUE} | options
     rows = []
     for b in range(len(uv)):
-        views_0, views_1 = (levels(image[b], o["levels"], o["window"]) for image in (src, dst))
-        for n, x in enumerate(uv[b].numpy()):
-            d = np.zeros(2) if init is None else init[b, n].numpy() - x
-            forward, found, A, stayed = search(views_0, views_1, x, d, o, init is None)
-            backward, returned, _, also = search(views_1, views_0, x + forward, -d, o, init is None)
-            if not found:
-                backward, returned, also = np.zeros(2), False, True
-            error = np.linalg.norm(forward + backward)
-            squares = squares_by_hand(views_0[0], views_1[0], x, x + forward, o)
-            photometric, s2 = math.sqrt(squares / o["window"] ** 2), squares / (o["window"] ** 2 - 2)
-            cov = max(s2, 1 / 12 / 255**2) * np.linalg.inv(A)
-            rows.append((x + forward, error, photometric, cov, found and returned and error < limit, stayed and also))
-    shaped = [np.array(c).reshape(*uv.shape[:2], *np.shape(c[0])) for c in zip(*rows, strict=True)]
+        views = [reference.levels(image[b], o["levels"], o["window"]) for image in (src, dst)]
+        for n, x in enumerate(uv[b]):
+            start = None if init is None else init[b, n]
+            rows.append(reference.lucas_kanade(*views, x, reference_options(o), start=start, max_round_trip_px=limit))
+    shaped = [np.array([np.asarray(x) for x in c]) for c in zip(*rows, strict=True)]
+    shaped = [c.reshape(*uv.shape[:2], *c.shape[1:]) for c in shaped]
     return dict(zip(FIELDS, shaped[:5], strict=True)), shaped[5]
-
-
-def squares_by_hand(level_0, level_1, x, x_1, o):
-    T, J = level_0.window(0, x, o["window"]), level_1.window(0, x_1, o["window"])
-    if o["normalise"] != "none":
-        T, J = T - T.mean(), J - J.mean()
-    if o["normalise"] == "gain_bias":
-        J = J / np.clip(T @ J / (T @ T), 0.2, 5.0)
-    return ((J - T) ** 2).sum()
 
 
 def agrees(tracks, expected, where, share=0.8):
@@ -267,8 +178,10 @@ def test_windows_need_more_texture_than_the_limit_in_both_images(normalise):
     uv_1 = lucas_kanade(src, dst, uv, **options, min_eigenvalue=0.0).uv_1
 
     def texture(image, x):
-        g, _ = template(levels(image, 1, WINDOW)[0], x.numpy(), WINDOW, normalise)
-        return np.linalg.eigvalsh(g @ g.T)[0] / WINDOW**2
+        g, _ = reference.template(
+            reference.levels(image, 1, WINDOW)[0], x, reference.Options(WINDOW, normalise=normalise)
+        )
+        return float(torch.linalg.eigvalsh(g @ g.T)[0]) / WINDOW**2
 
     pairs = [(b, n) for b in range(2) for n in range(25)]
     here = np.array([texture(src[b], uv[b, n]) for b, n in pairs]).reshape(2, 25)
@@ -377,8 +290,8 @@ def test_refining_leaves_what_it_cannot_refine():
     want[:, 5, 1] = 0
     moved = torch.tensor([False, True, False, False, False, False])
     assert torch.equal(found[:, ~moved], want[:, ~moved]) and (found - want)[:, 1].abs().min() > 1e-4
-    g, _ = template(levels(src[0], 1, WINDOW)[0], uv[0, 1].numpy(), WINDOW, "none")
-    texture = float(np.linalg.eigvalsh(g @ g.T)[0]) / WINDOW**2
+    g, _ = reference.template(reference.levels(src[0], 1, WINDOW)[0], uv[0, 1], reference.Options(WINDOW))
+    texture = float(torch.linalg.eigvalsh(g @ g.T)[0]) / WINDOW**2
     for share, stays in ((0.999, False), (1.001, True)):
         found = refine(src, dst, uv, uv_1, window=WINDOW, min_eigenvalue=share * texture)
         assert torch.equal(found[0, 1], uv_1[0, 1]) == stays
@@ -389,9 +302,10 @@ def test_the_usual_limit_of_texture_is_opencvs():
     wave = (127.5 + 60 * np.sin(np.arange(64) / 3.0)[None] * np.cos(np.arange(64) / 4.0)[:, None]).astype(np.uint8)
     g = [cv2.Scharr(wave, cv2.CV_64F, *o)[22:43, 22:43] for o in ((1, 0), (0, 1))]
     theirs = np.linalg.eigvalsh([[(a * b).sum() for a in g] for b in g])[0] / 2**20 / 21**2
-    level = Level(wave / 255.0, 21)
-    ours = template(level, np.array([32.0, 32.0]), 21, "none")[0]
-    assert theirs / 1e-4 == pytest.approx(np.linalg.eigvalsh(ours @ ours.T)[0] / 21**2 / MIN_EIGENVALUE, rel=1e-6)
+    (level,) = reference.levels(torch.from_numpy(wave / 255.0)[None], 1, 21)
+    ours, _ = reference.template(level, torch.tensor([32.0, 32.0]).double(), reference.Options())
+    small = float(torch.linalg.eigvalsh(ours @ ours.T)[0])
+    assert theirs / 1e-4 == pytest.approx(small / 21**2 / MIN_EIGENVALUE, rel=1e-6)
 
 
 @pytest.mark.parametrize("normalise", NORMALISE)
@@ -403,8 +317,9 @@ def test_squares_are_those_of_the_windows(normalise):
     pyramids = (build_pyramid(y, 1, WINDOW) for y in (src, dst))
     found = lk.squares(*pyramids, o, x, d, batch)
     for n in range(9):
-        views = (levels(y[n % 2], 1, WINDOW)[0] for y in (src, dst))
-        want = squares_by_hand(*views, x[:, n].numpy(), (x + d)[:, n].numpy(), o._asdict())
+        views = (reference.levels(y[n % 2], 1, WINDOW)[0] for y in (src, dst))
+        slow = reference.Options(WINDOW, normalise=normalise)
+        want = reference.difference(*views, x[:, n], (x + d)[:, n], slow)
         assert float(found[n]) == pytest.approx(want, rel=1e-9)
     dark = torch.full_like(dst, math.nan)
     broken = lk.squares(build_pyramid(src, 1, WINDOW), build_pyramid(dark, 1, WINDOW), o, x, d, batch)

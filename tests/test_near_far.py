@@ -150,7 +150,7 @@ def test_a_baseline_of_a_tenth_of_a_millimetre_is_one():
 def test_normal_equations_are_the_schur_complement_of_one_with_all_inverse_depths(kernel):
     problem, at = scene()
     weight, precision = torch.tensor([0.3, 0.7], dtype=D), torch.tensor([2e3, 5e4], dtype=D)
-    cost, H, g = near_far.normal(problem, at, NOISE, weight, precision, kernel, 1.5)
+    cost, H, g = near_far.normal(problem, at, NOISE, weight, precision, kernel=kernel, bend=1.5)
     for b, tracks in enumerate(every(problem, at)):
         share = [(x.near + float(weight[b]) * x.far) * dense.weight(x.square, kernel, 1.5)[1] for x in tracks]
         wanted_H, wanted_g = dense.reduced(tracks, share)
@@ -173,10 +173,12 @@ def test_the_gradient_is_half_that_of_the_cost(kernel):
 
         def cost(x, problem=problem, at=at, precision=precision):
             moved = Unknowns(se3.retract(at.T, x[:, :6]), at.turn + x[:, 6:])
-            return near_far.normal(problem, moved, NOISE, torch.ones(2, dtype=D), precision, kernel, 2.0).cost.sum()
+            return near_far.normal(
+                problem, moved, NOISE, torch.ones(2, dtype=D), precision, kernel=kernel, bend=2.0
+            ).cost.sum()
 
         half = 0.5 * torch.autograd.functional.jacobian(cost, torch.zeros(2, 9, dtype=D))
-        g = near_far.normal(problem, at, NOISE, torch.ones(2, dtype=D), precision, kernel, 2.0).g
+        g = near_far.normal(problem, at, NOISE, torch.ones(2, dtype=D), precision, kernel=kernel, bend=2.0).g
         parts = (slice(0, 3), slice(3, 6), slice(6, 9)) if turn else (slice(0, 3), slice(3, 6))
         for part in parts:
             torch.testing.assert_close(g[:, part], half[:, part], rtol=0, atol=rtol * float(half[:, part].abs().max()))
@@ -185,7 +187,7 @@ def test_the_gradient_is_half_that_of_the_cost(kernel):
 def test_a_prior_adds_its_own_cost_gradient_and_information_and_nothing_else():
     problem, at = scene()
     one, precision = torch.ones(2, dtype=D), torch.tensor([1e4, 3e5], dtype=D)
-    free, held = (near_far.normal(problem, at, NOISE, one, p, "cauchy", 2.0) for p in (0 * one, precision))
+    free, held = (near_far.normal(problem, at, NOISE, one, p, kernel="cauchy", bend=2.0) for p in (0 * one, precision))
     torch.testing.assert_close(held.cost - free.cost, precision * (at.turn**2).sum(-1))
     torch.testing.assert_close((held.g - free.g)[:, 6:], precision[:, None] * at.turn)
     torch.testing.assert_close(held.H - free.H, torch.diag_embed(near_far.prior(precision)), rtol=1e-9, atol=1e-6)
@@ -199,7 +201,9 @@ def test_elimination_is_the_schur_complement_of_the_whole_problem():
     used = [k for k in range(N) if k not in (3, BEYOND, EPIPOLE, BEHIND, UNUSED)]
     problem = problem.map(lambda x: x[..., used] if x.shape[-1] == N else x)
     noise, n = NOISE[:, used], len(used)
-    _, H, g = near_far.normal(problem, at, noise, torch.ones(2, dtype=D), torch.zeros(2, dtype=D), None, 1.0)
+    _, H, g = near_far.normal(
+        problem, at, noise, torch.ones(2, dtype=D), torch.zeros(2, dtype=D), kernel=None, bend=1.0
+    )
     for b in range(2):
         ray, near = problem.ray[b].T, problem.near[b]
         xx, xy, yy = problem.shape[b] * noise[b]

@@ -188,7 +188,7 @@ def test_splats_are_discs_of_which_the_nearest_is_seen(radius):
     depth[0, 3], sigma[0, 4], depth[1, 5] = 0.0, math.nan, -1.0
     both = CAMERA.map(lambda x: x.expand(2, 2))
     T = se3.identity(2, uv)
-    view = splat(both, HW, uv, depth, sigma, features, T, radius=radius, max_radius_px=4)
+    view = splat(both, HW, uv, depth, sigma, features, T_world_from_cam=T, radius=radius, max_radius_px=4)
     for b, v, u in itertools.product(range(2), range(HW[0]), range(HW[1])):
         best = (math.inf, -1)
         for k in range(n):

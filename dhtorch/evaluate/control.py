@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -190,11 +190,17 @@ def _lowest(
 ) -> Control:
     """The lowest threshold that fits, which answers most; None of none."""
     n = risk.shape[0]
+    none = Control(None, target, None, risk=0.0, coverage=0.0, n=n, needed=needed, confidence=confidence)
     if not bool(fits.any()):
-        return Control(None, target, None, 0.0, 0.0, n, needed, confidence)
+        return none
     k = int(fits.long().argmax())
-    means = float(risk[:, k].mean()), float(coverage[:, k].mean())
-    return Control(float(thresholds[k]), target, float(bound[k]), *means, n, needed, confidence)
+    return replace(
+        none,
+        threshold=float(thresholds[k]),
+        bound=float(bound[k]),
+        risk=float(risk[:, k].mean()),
+        coverage=float(coverage[:, k].mean()),
+    )
 
 
 def _checked(scenes: Sequence[Points], target: float) -> list[Points]:

@@ -129,7 +129,8 @@ def measure(pooled: Points) -> Numbers:
         recovered and true depth), median ``residual_px``, ``within_sigma`` and ``within_2sigma`` (share whose error is
         at most one and two claimed standard deviations). None where undefined.
     """
-    n, answered = pooled.keep.numel(), pooled.answered()
+    n = pooled.keep.numel()
+    answered = pooled.answered()
     error, sigma = answered.error, answered.sigma
     off = (answered.depth - answered.true_depth).abs()
     stated = sigma.isfinite()
@@ -206,7 +207,8 @@ def _quantile(x: Tensor, q: float) -> float | None:
     place = q * (x.numel() - 1)
     low = int(place)
     ordered = x.sort().values
-    a, b = float(ordered[low]), float(ordered[min(low + 1, x.numel() - 1)])
+    a = float(ordered[low])
+    b = float(ordered[min(low + 1, x.numel() - 1)])
     return a + (place - low) * (b - a)
 
 

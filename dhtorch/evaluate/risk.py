@@ -65,7 +65,8 @@ def measure(pooled: Points, *, min_points: int = MIN_POINTS) -> Numbers:
     al., "Selective regression under fairness criteria", 2022 (a risk that should fall whenever less is answered; the
     two numbers for how nearly it does are ours).
     """
-    n, answered = pooled.keep.numel(), pooled.answered()
+    n = pooled.keep.numel()
+    answered = pooled.answered()
     loss, score = capped(answered.error), answered.score
     risk = curve(loss, score)
     some = bool(risk.numel())

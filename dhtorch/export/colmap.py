@@ -34,6 +34,7 @@ def write_colmap(
     folder: str | Path,
     shots: Sequence[Shot],
     xyz: Any,  # (P, 3) m in the world
+    *,
     rgb: Any,  # (P, 3) uint8, or float in [0, 1]
     error: Any,  # (P,) px, reprojection error
     seen_by: Any,  # (P, V) numbers of shots, -1 = none

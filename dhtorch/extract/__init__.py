@@ -184,7 +184,8 @@ def _folder(out: str) -> Path:
 def _say(folder: Path, counts: Mapping[str, Counter[str]], n_before: int, complaints: Sequence[str]) -> None:
     """What is there now, and what was wrong with frames."""
     total = sum(counts.values(), Counter())
-    skipped, size = total.pop("skipped", 0), sum(file.stat().st_size for file in shards.shard_files(folder))
+    skipped = total.pop("skipped", 0)
+    size = sum(file.stat().st_size for file in shards.shard_files(folder))
     before = f" ({n_before} left untouched)" if n_before else ""
     print(f"{folder}: {len(counts)} shard{'s' * (len(counts) != 1)}{before}, {total.total()} rows, {size / 1e6:.1f} MB")
     said = [

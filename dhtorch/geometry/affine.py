@@ -75,6 +75,14 @@ class _Options(NamedTuple):
     max_shift_px: float
 
 
+class _Views(NamedTuple):
+    """Both pictures, and how to search in them."""
+
+    source: Pyramid
+    target: Pyramid
+    o: _Options
+
+
 class _State(NamedTuple):
     warp: Tensor  # (3, 2, M) px
     textured: Tensor  # (M,) the normal equations have a solution
@@ -122,6 +130,7 @@ def register(
         ValueError: wrong shapes.
 
     Gradient: none; take :func:`step` from the result.
+    Twin: :func:`dhtorch.geometry.reference.register`, one point at a time.
     Cost: reads a patch of image 1 once and 441 pixels of it per point and step.
     """
     B, N = (check("register", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), wanted=(wanted, "B N"))[k] for k in "BN")
@@ -129,8 +138,8 @@ def register(
         here, there, batch, usable = _rows(source, target, uv_0, uv_1)
         if wanted is not None:
             usable = usable & wanted.reshape(-1)
-        o = _Options(window, iterations, epsilon_px, max_shift_px)
-        answer = for_some(usable, partial(_register, source, target, o), _nothing(there), (here, there, batch))
+        views = _Views(source, target, _Options(window, iterations, epsilon_px, max_shift_px))
+        answer = for_some(usable, partial(_register, views), _nothing(there), (here, there, batch))
 
     def grid(y: Tensor) -> Tensor:  # (..., M) -> (B, N, ...)
         y = y.unflatten(-1, (B, N)).movedim((-2, -1), (0, 1))
@@ -158,6 +167,7 @@ def step(
         ValueError: wrong shapes.
 
     Gradient: to both pyramids and ``uv_0``; ``uv_1`` and ``linear`` are detached.
+    Twin: :func:`dhtorch.geometry.reference.register_step`.
     """
     B, N = (check("step", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), linear=(linear, "B N 2 2"))[k] for k in "BN")
     here, there, batch, usable = _rows(source, target, uv_0, uv_1)
@@ -186,23 +196,21 @@ def _rows(source: Pyramid, target: Pyramid, uv_0: Tensor, uv_1: Tensor):
 
 
 def _register(
-    source: Pyramid,
-    target: Pyramid,
-    o: _Options,
+    views: _Views,
     here: Tensor,  # (2, M) px
     there: Tensor,  # (2, M) px
     batch: Tensor,  # (M,)
 ) -> tuple[Tensor, ...]:
     """The fields of a :class:`Registration`, points last."""
+    target, o = views.target, views.o
     q = round_half_up(here)
     place = _place(here - q, o.window)
     warp = _start(there, place, _still(there), o.window)
-    search = partial(_search, source, target, o)
-    state = search(0, q, place, warp, batch)
+    state = _search(views, 0, q, place, warp, batch)
     best = state._replace(warp=warp, fit=state.first)
     if len(target.levels) > 1:
         big = _determinant(_linear(state.warp, o.window)) > HALVE**2
-        state = _State(*for_some(big, partial(search, 1), state, (q, place, state.warp, batch)))
+        state = _State(*for_some(big, partial(_search, views, 1), state, (q, place, state.warp, batch)))
     shift = ((state.warp * place[:, None]).sum(0) - there).square().sum(0).sqrt()
     shift = torch.where(shift.isfinite(), shift, torch.full_like(shift, o.max_shift_px))
     ok = _accept(state, best.fit, target, o.window) & (shift <= o.max_shift_px)
@@ -213,9 +221,7 @@ def _register(
 
 
 def _search(
-    source: Pyramid,
-    target: Pyramid,
-    o: _Options,
+    views: _Views,
     level: int,
     q: Tensor,  # (2, M) px
     place: Tensor,  # (3, M)
@@ -223,6 +229,7 @@ def _search(
     batch: Tensor,  # (M,)
 ) -> _State:
     """Steps of all points, a chunk at a time, reading image 1 from one level."""
+    source, target, o = views
     zoom = 0.5**level
     fine = o._replace(epsilon_px=o.epsilon_px * zoom)
     memory = None if is_static(warp) else warp.new_empty(2, min(CHUNK, len(batch)), 8, o.window * o.window)
@@ -274,7 +281,8 @@ def _further(change: Tensor, taken: Tensor | None, before: Tensor | None) -> Ten
 
 def _nothing(there: Tensor) -> tuple[Tensor, ...]:
     """The fields of a :class:`Registration` for points (2, M) that are not registered."""
-    none, zero = torch.zeros_like(there[0], dtype=torch.bool), torch.zeros_like(there[0])
+    none = torch.zeros_like(there[0], dtype=torch.bool)
+    zero = torch.zeros_like(there[0])
     return there, _still(there), zero, _still(there), zero, none
 
 
@@ -343,7 +351,9 @@ def _pictures(source: Pyramid, q: Tensor, batch: Tensor, window: int, out: Tenso
     first, _ = source.locate(0, q, batch, window // 2, (GRAD_X, GRAD_Y, GREY))
     G = source.read(0, first, window).transpose(0, 1)
     s = torch.linspace(-1, 1, window, dtype=q.dtype, device=q.device)
-    one, u, v = torch.ones_like(G[:, :1]), s.repeat(window), s.repeat_interleave(window)
+    one = torch.ones_like(G[:, :1])
+    u = s.repeat(window)
+    v = s.repeat_interleave(window)
     g, T = G[:, :2], G[:, 2:]
     return torch.cat((g, g * u, g * v, T - T.mean(-1, keepdim=True), one), 1, out=out)
 

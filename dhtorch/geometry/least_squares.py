@@ -65,7 +65,9 @@ def linearise(
     f = f[..., None]
     plane = Y[:, :2] * w[:, None]  # (a, b): where the point is seen at z = 1
     minus, square = -plane, plane * plane
-    (a, b), (na, nb), (aw, bw) = plane.unbind(1), minus.unbind(1), (minus * w[:, None]).unbind(1)
+    (a, b) = plane.unbind(1)
+    (na, nb) = minus.unbind(1)
+    (aw, bw) = (minus * w[:, None]).unbind(1)
     aa, bb = square.unbind(1)
     ra, rb = (plane - (uv - c[..., None]) / f).unbind(1)
     zero = torch.zeros_like(a)
@@ -143,7 +145,8 @@ def normal_equations(
     N = check("normal_equations", rows=(rows, "B n 2 N"), weight=(weight, "B N"))["N"]
     sums: Tensor | None = None
     for part, share in zip(rows.split(block or max(N, 1), -1), weight.split(block or max(N, 1), -1), strict=True):
-        weighted, whole = (part[:, :-1] * share[:, None, None]).flatten(2), part.flatten(2).transpose(1, 2)
+        weighted = (part[:, :-1] * share[:, None, None]).flatten(2)
+        whole = part.flatten(2).transpose(1, 2)
         sums = torch.bmm(weighted, whole) if sums is None else torch.baddbmm(sums, weighted, whole)
     assert sums is not None  # an empty tensor is split into one
     return sums[..., :-1], sums[..., -1]
@@ -183,7 +186,8 @@ def solve_spd(
         ok = (info == 0) & (pivot > MIN_PIVOT) & (rhs * 0 == 0).flatten(1).all(1)
         bad = ~ok[:, None, None]
         L = torch.where(bad, eye, L)
-    A, rhs = torch.where(bad, eye, A), rhs.masked_fill(bad, 0.0)
+    A = torch.where(bad, eye, A)
+    rhs = rhs.masked_fill(bad, 0.0)
     start = torch.cholesky_solve(rhs.detach(), L)
     x = start + torch.cholesky_solve(rhs - product(A, start), L)
     return (x * s)[:, :n].to(b.dtype), ok

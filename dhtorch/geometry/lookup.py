@@ -46,6 +46,7 @@ def summarise(
         ValueError: wrong shapes, or an image smaller than a patch.
 
     Gradient: to the image, through ``reduce``.
+    Twin: :func:`dhtorch.geometry.reference.patch`, one point at a time.
     """
     sizes = check("lookup.summarise", image=(image, "B C H W"), pixel=(pixel, "B N 2"))
     B, N, C, H, W = (sizes[k] for k in "BNCHW")
@@ -190,6 +191,7 @@ def nearest(grid: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
     """Values (B, N) of ``grid`` (B, h, w) at the nearest pixel of ``uv`` (B, N, 2), and whether that pixel exists.
 
     Outside the grid, and for non-finite ``uv``, the value is that of some border pixel and ``inside`` is false.
+    Twin: :func:`dhtorch.geometry.reference.nearest`.
     """
     sizes = check("lookup.nearest", grid=(grid, "B h w"), uv=(uv, "B N 2"))
     index, inside = nearest_index((sizes["h"], sizes["w"]), pixels(uv))

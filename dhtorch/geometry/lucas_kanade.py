@@ -16,11 +16,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 from dhtorch.geometry.exact import CHUNK, LANES
 from dhtorch.geometry.lookup import QUANTISATION
@@ -61,21 +62,45 @@ class Options(NamedTuple):
 
 
 class _Pair(NamedTuple):
-    """One level of two pyramids, and where points may be on it."""
+    """One level of two pyramids, how to search on it, and where points may be."""
 
     source: Pyramid
     target: Pyramid
+    o: Options
     level: int
     low: Tensor  # (2, 1) px of the level
     high: Tensor  # (2, 1) px of the level
 
 
-def search(
-    source: Pyramid, target: Pyramid, o: Options, alike: bool, x: Tensor, d: Tensor, batch: Tensor, known: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Coarse to fine from ``d`` for the points that are ``known`` (M,), M a multiple of ``LANES``.
+class _Windows(NamedTuple):
+    """What is known of the windows of image 0, whatever image 1 shows."""
 
-    ``alike``: all ``d`` are equal, so that the points of a cell may share a search.
+    x: Tensor  # (2, M) px of the level
+    batch: Tensor  # (M,)
+    moments: Tensor  # (5 or 6, M) see the alphabet
+    A_inv: Tensor  # (2, 2, M)
+
+
+class _State(NamedTuple):
+    """How far the points are."""
+
+    d: Tensor  # (2, M) px of the level
+    live: Tensor  # (M,) wants to move
+    held: Tensor  # (M,) is still on its map
+
+
+def search(
+    source: Pyramid,
+    target: Pyramid,
+    o: Options,
+    x: Tensor,  # (2, M) px, M a multiple of LANES
+    d: Tensor,  # (2, M) px, the start
+    batch: Tensor,  # (M,)
+    *,
+    known: Tensor,  # (M,) bool, the others are not searched for
+    alike: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Coarse to fine from ``d``. ``alike``: all ``d`` are equal, so that the points of a cell may share a search.
 
     Returns the displacement (2, M), whether it was found (M,), and A (3, M) of the finest level.
     """
@@ -92,13 +117,14 @@ def search(
         return coarse(level + 1, x, d, batch) * 2
 
     def coarse(level: int, x: Tensor, d: Tensor, batch: Tensor) -> Tensor:
-        pair, radii = _Pair(source, target, level, *target.bounds(level)), TOP if level == top else BETWEEN
+        pair = _Pair(source, target, rough, level, *target.bounds(level))
+        radii = TOP if level == top else BETWEEN
         pixel = source.corner(level, x * 0.5**level + 0.5)  # read between pixels only where it decides the answer
         every = torch.ones_like(batch, dtype=torch.bool)
-        return _descend(pair, rough, radii, pixel, start(level, x, d, batch), batch, every)[0]
+        return _descend(pair, radii, pixel, start(level, x, d, batch), batch, every)[0]
 
-    pair = _Pair(source, target, 0, *target.bounds(0))
-    d, held, textured, A = _descend(pair, o, FINEST if top else TOP, x, start(0, x, d, batch), batch, known)
+    pair = _Pair(source, target, o, 0, *target.bounds(0))
+    d, held, textured, A = _descend(pair, FINEST if top else TOP, x, start(0, x, d, batch), batch, known)
     return d, known & textured & held & within(x + d, pair.low, pair.high), A
 
 
@@ -138,10 +164,11 @@ def covariance(A: Tensor, variance: Tensor) -> Tensor:
     return (torch.stack(adjugate(a, b, b, c)) * scale).to(A.dtype).unflatten(0, (2, 2))
 
 
-def for_some(wanted: Tensor, fn: Callable, values: tuple[Tensor, ...], columns: tuple[Tensor, ...]):
+def for_some(wanted: Tensor, fn: Callable, values: tuple[Tensor, ...], columns: tuple[Any, ...]):
     """``values`` (each (..., M)), replaced where ``wanted`` (M,) by what ``fn(*columns)`` returns.
 
-    Where shapes may depend on values, ``fn`` sees only the wanted points, filled up by copies of the first.
+    ``columns`` are tensors (..., M) or trees of them. Where shapes may depend on values, ``fn`` sees only the wanted
+    points, filled up by copies of the first.
     """
     if is_static(wanted):
         return tuple(torch.where(wanted, new, old) for new, old in zip(fn(*columns), values, strict=True))
@@ -149,7 +176,7 @@ def for_some(wanted: Tensor, fn: Callable, values: tuple[Tensor, ...], columns: 
     if not len(some):
         return values
     some = _whole_lanes(some)
-    new = fn(*(column.index_select(-1, some) for column in columns))
+    new = fn(*pytree.tree_map(lambda column: column.index_select(-1, some), columns))
     return tuple(old.index_copy(-1, some, n) for old, n in zip(values, new, strict=True))
 
 
@@ -182,48 +209,48 @@ def _by_cell(pyramid: Pyramid, level: int, fn: Callable, x: Tensor, d: Tensor, b
     return search(cells).index_select(-1, (wanted.cumsum(0) - 1)[own])
 
 
-def _descend(pair: _Pair, o: Options, radii: tuple[int, ...], x: Tensor, d: Tensor, batch: Tensor, known: Tensor):
+def _descend(pair: _Pair, radii: tuple[int, ...], x: Tensor, d: Tensor, batch: Tensor, known: Tensor):
     """One level: all points on a first map, then those that need it on further ones.
 
     Returns the displacement; who stayed on the last map, and whose window is textured (both (M,)); and A (3, M).
     """
-    corner = pair.target.corner(pair.level, x + d) - radii[0]
-    C, moments = _map(pair, o, radii[0], x, corner, batch)
+    o, corner = pair.o, pair.target.corner(pair.level, x + d) - radii[0]
+    C, moments = _map(pair, radii[0], x, corner, batch)
     A_inv, textured = _inverse(moments[2:5], o.min_eigenvalue * o.window**2)
+    windows = _Windows(x, batch, moments, A_inv)
     live = known & textured & within(x + d, pair.low, pair.high)
     first, *further = (min(STEPS, o.iterations - k * STEPS) for k in range(len(radii)))
-    state = _on_map(pair, o, first, _steps(C, moments, A_inv), corner, x, d, live)
+    state = _on_map(pair, first, _steps(C, moments, A_inv), corner, x, _State(d, live, live))
     for radius, steps in zip(radii[1:], further, strict=True):
         if steps > 0:
-            columns = (x, *state, batch, moments, A_inv)
-            state = for_some(state[1], partial(_on_new_map, pair, o, radius, steps), state, columns)
-    d, _, held = state
-    return d, held, textured, moments[2:5]
+            again = partial(_on_new_map, pair, radius, steps)
+            state = _State(*for_some(state.live, again, state, (windows, state)))
+    return state.d, state.held, textured, moments[2:5]
 
 
-def _on_new_map(pair: _Pair, o: Options, radius: int, steps: int, x, d, live, held, batch, moments, A_inv):  # noqa: PLR0917
+def _on_new_map(pair: _Pair, radius: int, steps: int, windows: _Windows, state: _State) -> _State:
     """:func:`_on_map` with a map around where the points are, of windows whose moments are known."""
-    corner = pair.target.corner(pair.level, x + d) - radius
-    C, _ = _map(pair, o, radius, x, corner, batch, moments)
-    return _on_map(pair, o, steps, _steps(C, moments, A_inv), corner, x, d, live)
+    x, batch, moments, A_inv = windows
+    corner = pair.target.corner(pair.level, x + state.d) - radius
+    C, _ = _map(pair, radius, x, corner, batch, moments)
+    return _on_map(pair, steps, _steps(C, moments, A_inv), corner, x, state)
 
 
 def _on_map(
     pair: _Pair,
-    o: Options,
     steps: int,
     field: Tensor,  # (2 or 3, n, n, M) see _steps
     corner: Tensor,  # (2, M) the target's pixel where the map begins
     x: Tensor,  # (2, M)
-    d: Tensor,  # (2, M)
-    live: Tensor,  # (M,) wants to move
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The displacement after ``steps`` Gauss-Newton steps on one map, who wants to go on from there on another, and who
-    is still on this one.
+    state: _State,
+) -> _State:
+    """Where the living are after ``steps`` Gauss-Newton steps on one map, who of them wants to go on from there on
+    another, and who is still on this one.
 
     Beyond a map's border its field fades to zero, so that a point that leaves is held near it.
     """
-    start = p = x + d - corner
+    o, start = pair.o, x + state.d - corner
+    p = start
     node = torch.arange(field.shape[1], dtype=p.dtype, device=p.device)[:, None]
     step = torch.zeros_like(p)
     for k in range(1, steps + 1):
@@ -234,10 +261,11 @@ def _on_map(
         if k == LEAP and k < steps and pair.level == 0:
             step = _leap(last, step, o.epsilon_px)
         p = p - step
-    p = torch.where(live & p.isfinite().all(0), p, start)
+    p = torch.where(state.live & p.isfinite().all(0), p, start)
     held = (p == p.clamp(0, field.shape[1] - 1.0)).all(0)
     restless = ~held | ((step * step).sum(0) > o.epsilon_px**2)
-    return p + corner - x, live & restless & within(p, pair.low - corner, pair.high - corner), held
+    live = state.live & restless & within(p, pair.low - corner, pair.high - corner)
+    return _State(p + corner - x, live, held)
 
 
 def _leap(last: Tensor, step: Tensor, epsilon_px: float) -> Tensor:
@@ -257,9 +285,10 @@ def _steps(C: Tensor, moments: Tensor, A_inv: Tensor) -> Tensor:
     return steps if len(C) == 2 else torch.cat([steps, _gain(C[2:], moments[5])])
 
 
-def _map(pair: _Pair, o: Options, radius: int, x: Tensor, corner: Tensor, batch: Tensor, moments: Tensor | None = None):
+def _map(pair: _Pair, radius: int, x: Tensor, corner: Tensor, batch: Tensor, moments: Tensor | None = None):
     """Map (K, n, n, M) of the windows at ``x`` (2, M) that begins at the target's pixels ``corner``; the moments."""
-    w, side = o.window, o.window + 2 * radius + 1
+    o, w = pair.o, pair.o.window
+    side = w + 2 * radius + 1
     planes = (GRAD_X, GRAD_Y) if moments is not None and o.normalise != "gain_bias" else (GRAD_X, GRAD_Y, GREY)
     first_0, fraction = pair.source.locate(pair.level, x, batch, w // 2, planes)
     first_1, _ = pair.target.locate(pair.level, corner + radius, batch, w // 2 + radius, (GREY,))

@@ -102,7 +102,7 @@ def most_probable(problem: Problem, start: Pose, o: Options) -> Solution:
         at: Unknowns, noise: Tensor, far: Tensor, precision: Tensor, steps: int, problem: Problem = problem
     ) -> tuple[Unknowns, Tensor]:
         def evaluate(at: Unknowns) -> Normal:
-            return normal(problem, at, noise, far, precision, o.kernel, o.bend)
+            return normal(problem, at, noise, far, precision, kernel=o.kernel, bend=o.bend)
 
         return minimise(evaluate, at, steps, step=trial_step)
 
@@ -121,7 +121,8 @@ def most_probable(problem: Problem, start: Pose, o: Options) -> Solution:
     cost_near, cost_both = (_near_cost(close, x, scales, o) for x in (near, both))
     believed = cost_both <= cost_near * (1 + o.max_rise) + SLACK
     at, precision = choose(believed, both, near), torch.where(believed, precision, rigid)
-    far, noise = torch.where(believed, far, none), noise_scale(problem, at)
+    far = torch.where(believed, far, none)
+    noise = noise_scale(problem, at)
     translates = _translates(problem, at, noise, far, precision, o)
     of_near, of_far = (torch.where(kind, noise, 0.0).amax(-1, keepdim=True) for kind in (~problem.far, problem.far))
     noise = torch.where(whole.far, of_far, of_near.clamp_min(MIN_NOISE_PX**2))
@@ -154,7 +155,7 @@ def _translates(problem: Problem, at: Unknowns, noise: Tensor, far: Tensor, prec
     free = at.turn.new_tensor([1.0] * 3 + [0.0] * 3 + [1.0] * 3)  # a trace of t would be a baseline to a far track
 
     def evaluate(at: Unknowns) -> Normal:
-        cost, H, g = normal(problem, at, noise, far, precision, o.kernel, o.bend)
+        cost, H, g = normal(problem, at, noise, far, precision, kernel=o.kernel, bend=o.bend)
         return Normal(cost, H * free * free[:, None] + torch.diag(1 - free), g * free)
 
     still = Unknowns(Pose(at.T.R, torch.zeros_like(at.T.t)), at.turn)
@@ -169,7 +170,8 @@ def noise_scale(problem: Problem, at: Unknowns, rounds: int = 3) -> Tensor:
     Medians know nothing of the scale that the sensor's noise adds to a near residual; so the estimate is repeated with
     what the last one found.
     """
-    noise, linear = torch.ones_like(problem.inverse), linearise_tracks(problem, at)
+    noise = torch.ones_like(problem.inverse)
+    linear = linearise_tracks(problem, at)
     for _ in range(rounds):
         size = squares(problem, linear, noise).sqrt()
         near = median(size, problem.near & linear.front) / MEDIAN_2D

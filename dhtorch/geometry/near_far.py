@@ -136,8 +136,10 @@ def linearise_tracks(problem: Problem, at: Unknowns) -> Linear:
     front = (Y[:, 2] > MIN_DEPTH) & (problem.near | (q < MAX_NEARER * nearest))
     w = 1 / torch.where(front, Y[:, 2], 1.0)
     plane, k = Y[:, :2] * w[:, None], q * w
-    (x, y), (x_r, y_r) = plane.unbind(1), (plane - seen).unbind(1)
-    (xx, yy), (xk, yk) = (1 + plane * plane).unbind(1), (plane * -k[:, None]).unbind(1)
+    (x, y) = plane.unbind(1)
+    (x_r, y_r) = (plane - seen).unbind(1)
+    (xx, yy) = (1 + plane * plane).unbind(1)
+    (xk, yk) = (plane * -k[:, None]).unbind(1)
     xy, zero = x * y, torch.zeros_like(x)
     u, v = torch.stack((-xy, xx, -y, k, zero, xk, x_r), 1), torch.stack((-yy, xy, x, zero, k, yk, y_r), 1)
     return Linear(u, v, (t[:, :2] - plane * t[:, 2:]) * w[:, None], variance, front)
@@ -183,6 +185,7 @@ def normal(
     noise: Tensor,  # (B, N) px²
     far_weight: Tensor,  # (B,)
     turn_precision: Tensor,  # (B,) 1/rad²
+    *,
     kernel: str | None,
     bend: float,
 ) -> Normal:
@@ -247,7 +250,8 @@ def _whitener(problem: Problem, linear: Linear, noise: Tensor) -> tuple[Tensor, 
     xx, xy, yy = (_noise_shape(problem) * noise[:, None]).unbind(1)
     s0, s1 = linear.slope.unbind(1)
     b = xy / xx
-    a, d = xx.rsqrt(), (yy - b * xy).rsqrt()  # L⁻¹ = [[a, 0], [−b d, d]]
+    a = xx.rsqrt()
+    d = (yy - b * xy).rsqrt()  # L⁻¹ = [[a, 0], [−b d, d]]
     e0, e1 = a * s0, d * (s1 - b * s0)
     square = e0 * e0 + e1 * e1
     flat = square < 1e-12  # the pixel does not depend on q

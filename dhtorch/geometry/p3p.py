@@ -35,6 +35,10 @@ def p3p(
     symmetric triangles. A Newton step on the law of cosines restores digits lost on the way. Planar scenes are
     nothing special to three points.
 
+    Args:
+        rays: (*, 3, 3) viewing rays in the camera, of any length; the second last axis counts the points.
+        xyz: (*, 3, 3) the points in the world, m.
+
     Returns:
         R (*, 4, 3, 3) and t (*, 4, 3) with ``Y = R X + t``, and ``valid`` (*, 4): a real solution with all points in
         front. Collinear or coincident points, or rays, give none. Where not valid R is the identity and t is 0;
@@ -47,6 +51,18 @@ def p3p(
     Source: the pencil of conics of M. Persson, K. Nordberg, "Lambda Twist" (ECCV 2018), with another way to find the
     degenerate member; its planes as in J. Richter-Gebert, "Perspectives on Projective Geometry" (2011). Checked
     against synthetic truth and ``poselib.p3p`` (``tests/test_p3p.py``).
+
+    Example:
+        >>> import torch
+        >>> from dhtorch.geometry.p3p import p3p
+        >>> xyz = torch.tensor([[[0.0, 0.0, 2.0], [1.0, 0.2, 3.0], [-0.3, 1.0, 2.5]]])  # (B, point, coordinate) m
+        >>> seen = xyz + torch.tensor([0.1, 0.0, -0.2])  # from a camera that stands elsewhere
+        >>> R, t, valid = p3p(seen / seen[..., 2:], xyz)
+        >>> R.shape, t.shape, valid.shape  # four solutions each, some of which there are not
+        (torch.Size([1, 4, 3, 3]), torch.Size([1, 4, 3]), torch.Size([1, 4]))
+        >>> right = valid & ((t - torch.tensor([0.1, 0.0, -0.2])).norm(dim=-1) < 1e-4)
+        >>> int(right.sum()), bool(torch.allclose(R[right], torch.eye(3), atol=1e-4))
+        (1, True)
     """
     check("p3p", rays=(rays, "* 3 3"), xyz=(xyz, "* 3 3"))
     if rays.shape != xyz.shape:
@@ -57,7 +73,8 @@ def p3p(
         )
         j = j / (j * j).sum(1, keepdim=True).sqrt()  # (point, coordinate, *)
         side = X.roll(-1, 0) - X
-        m, a = (j * j.roll(-1, 0)).sum(1), (side * side).sum(1)
+        m = (j * j.roll(-1, 0)).sum(1)
+        a = (side * side).sum(1)
         longest = a.amax(0)
         a = a / longest
         total = a.sum(0)
@@ -69,7 +86,8 @@ def p3p(
         Y = (d * longest.sqrt())[:, None] * j[:, :, None]  # (point, coordinate, root, *)
         R, t = _align(torch.cat((Y, X[:, :, None]), 2).to(xyz.dtype))
         eye = torch.eye(3, dtype=R.dtype, device=R.device).view(3, 3, *[1] * valid.ndim)
-        R, t = torch.where(valid, R, eye), t.masked_fill(~valid, 0.0)
+        R = torch.where(valid, R, eye)
+        t = t.masked_fill(~valid, 0.0)
     # (row, column, root, *) → (*, root, row, column)
     return R.movedim((2, 0, 1), (-3, -2, -1)), t.movedim((1, 0), (-2, -1)), valid.movedim(0, -1)
 
@@ -96,7 +114,10 @@ def _ranges(m: Tensor, a: Tensor) -> Tensor:
 def _cones(m: Tensor, a: Tensor) -> Tensor:
     """Symmetric matrices (3, 3, 2, *) of a_1 × (equation 0) − a_0 × (equation 1), and of the same with 2 for 0."""
     p = a[::2]
-    yz, mixed, yy, zz = (p * m[1]).unbind(0), (-a[1] * m[::2]).unbind(0), (a[1] - p).unbind(0), (-p).unbind(0)
+    yz = (p * m[1]).unbind(0)
+    mixed = (-a[1] * m[::2]).unbind(0)
+    yy = (a[1] - p).unbind(0)
+    zz = (-p).unbind(0)
     xx, zero = a[1], torch.zeros_like(a[1])
     first = (xx, mixed[0], zero, mixed[0], yy[0], yz[0], zero, yz[0], zz[0])
     second = (xx, zero, mixed[1], zero, zz[1], yz[1], mixed[1], yz[1], yy[1])
@@ -137,7 +158,9 @@ def _null_directions(A: Tensor, u: Tensor, v: Tensor) -> Tensor:
     A negative discriminant counts as zero; whether the solution exists shows when it is put back into the equations.
     """
     Au, u = (A * u).sum(1), u[:, None]
-    uu, uv, vv = (Au[:, None] * u).sum(0), (Au[:, None] * v).sum(0), ((A[:, :, None] * v).sum(1) * v).sum(0)
+    uu = (Au[:, None] * u).sum(0)
+    uv = (Au[:, None] * v).sum(0)
+    vv = ((A[:, :, None] * v).sum(1) * v).sum(0)
     s = uv + (uv * uv - uu * vv).clamp_min(0).sqrt().copysign(uv)
     first, second = vv * u - s * v, uu * v - s * u  # α : β twice, each free of cancellation
     return torch.cat((first, second), 1)

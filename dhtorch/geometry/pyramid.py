@@ -131,6 +131,7 @@ def build_pyramid(
         ValueError: not an image batch, ``levels`` < 1, a window that is even or < 3, or an image no larger than it.
 
     Gradient: to the image.
+    Twin: :func:`dhtorch.geometry.reference.levels`.
     """
     sizes = check("build_pyramid", image=(image, "B C H W"))
     if sizes["C"] not in (1, 3):
@@ -176,7 +177,8 @@ def _half(level: Tensor, pad: int, part: slice) -> Tensor:
     top, bottom = (pad + 2 * row for row in (part.start, part.stop))
     rows = [level[:, GREY : GREY + 1, top + k : bottom + k : 2, pad - 2 : pad + 2 * w + 1] for k in (-2, -1, 0, 1, 2)]
     smooth = _binomial(*rows)
-    even, odd = smooth[..., ::2].contiguous(), smooth[..., 1::2].contiguous()
+    even = smooth[..., ::2].contiguous()
+    odd = smooth[..., 1::2].contiguous()
     return _binomial(even[..., :w], odd[..., :w], even[..., 1 : w + 1], odd[..., 1:], even[..., 2:])
 
 

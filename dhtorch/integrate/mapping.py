@@ -63,7 +63,8 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         torch.set_num_threads(settings["threads"])
         data_files.set_opencv_threads(settings["threads"])
     sources = parts["data"] if isinstance(parts["data"], list | Recordings) else [parts["data"]]
-    folder, began = Path(settings["output"]), time.perf_counter()
+    folder = Path(settings["output"])
+    began = time.perf_counter()
     scenes: list[Row] = []
     rows: list[Row] = []
     written: list[Path] = []
@@ -169,7 +170,8 @@ def _write_colmap(folder: Path, scene: Scene) -> None:
     shots = [export.Shot(f"{int(scene.recording.number[k]):06d}.png", *lenses[k], poses[k]) for k in poses]
     pieces = [_triangulated(a, number, poses) for a in scene.answers if set(a.pair) <= set(poses)]
     none = [torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 2).long(), torch.zeros(0, 2, 2)]
-    export.write_colmap(folder, shots, *map(torch.cat, zip(*(pieces or [none]), strict=True)))
+    xyz, rgb, error, seen_by, uv = map(torch.cat, zip(*(pieces or [none]), strict=True))
+    export.write_colmap(folder, shots, xyz, rgb=rgb, error=error, seen_by=seen_by, uv=uv)
 
 
 def _triangulated(answer: Answer, number: Mapping[int, int], poses: Mapping[int, Any]) -> list[Tensor]:

@@ -36,9 +36,10 @@ def draw_map(
     ahead = (xyz[..., 2] > voxel) & ~away
     way = se3.apply(se3.invert(T), torch.cat([pose.t for pose in cameras])[None].double())
     lens = _fitted(torch.cat((xyz[ahead], way[way[..., 2] > voxel])), hw)
-    uv, depth = project(lens, xyz), torch.where(ahead, xyz[..., 2], 0.0)
+    uv = project(lens, xyz)
+    depth = torch.where(ahead, xyz[..., 2], 0.0)
     colours = torch.cat((surface.features[:, :3].double(), by_source), -1)[None]
-    seen = splat(lens, hw, uv, depth, torch.ones_like(depth), colours, T, radius=0.8 * voxel)
+    seen = splat(lens, hw, uv, depth, torch.ones_like(depth), colours, T_world_from_cam=T, radius=0.8 * voxel)
     picture = torch.where(seen.depth[0, ..., None] > 0, seen.features[0], 1.0).clamp(0, 1).numpy()
     dots = project(lens, way)[way[..., 2] > voxel].numpy()
     figure, left = panel(4.8, 4.8 * hw[0] / hw[1], f"Map of {len(cameras)} views")

@@ -94,10 +94,20 @@ def ask(
         trace: dict[str, Any] = {}
         with torch.no_grad():
             estimate = method(shown[0], stack(shown[1:]) if views > 1 else shown[-1], seed=seed, hint=hint, trace=trace)
-            samples, rgb = trace["samples"].to("cpu"), _colour(shown[0], trace["samples"].uv)
+            samples = trace["samples"].to("cpu")
+            rgb = _colour(shown[0], trace["samples"].uv)
         tracks, fit = (trace[k].to("cpu") for k in ("tracks", "fit"))
         camera = shown[0].camera.to("cpu")
-        yield Answer((i, j), samples, estimate.to("cpu"), tracks, fit, rgb.cpu(), camera, shown[0].hw)
+        yield Answer(
+            pair=(i, j),
+            samples=samples,
+            estimate=estimate.to("cpu"),
+            tracks=tracks,
+            fit=fit,
+            rgb=rgb.cpu(),
+            camera=camera,
+            hw=shown[0].hw,
+        )
 
 
 def place(recording: Any, answers: Sequence[Answer], *, poses: str = "device") -> Places:
@@ -237,7 +247,7 @@ def sensed(
     if radius is not None:
         some = (depth.flatten() > 0).nonzero()[:, 0]
         values = (uv[:, some], depth.flatten(1)[:, some], sigma.flatten(1)[:, some], features[:, some])
-        return splat(camera, hw, *values, T_world_from_cam, radius=radius)
+        return splat(camera, hw, *values, T_world_from_cam=T_world_from_cam, radius=radius)
     return View(depth, sigma, features.view(1, *hw, 4), camera, T_world_from_cam)
 
 
@@ -247,7 +257,14 @@ def recovered(answer: Answer, T_world_from_cam: Pose, *, radius: float) -> View:
     depth = torch.where(answer.recovered, estimate.depth, 0.0)
     features = torch.cat((answer.rgb, estimate.score[..., None]), -1)
     return splat(
-        answer.camera, answer.hw, estimate.uv, depth, estimate.sigma, features, T_world_from_cam, radius=radius
+        answer.camera,
+        answer.hw,
+        estimate.uv,
+        depth,
+        estimate.sigma,
+        features,
+        T_world_from_cam=T_world_from_cam,
+        radius=radius,
     )
 
 

@@ -198,7 +198,8 @@ def _bricks(volume: Volume, min_weight: float):
     block = cells.unpack(volume.key)
     brick = cells.pack(block.div(_BRICK, rounding_mode="floor"))
     key = volume.key.cpu()
-    distance, known = volume.distance.cpu(), _known(volume, min_weight).cpu()
+    distance = volume.distance.cpu()
+    known = _known(volume, min_weight).cpu()
     local = torch.cartesian_prod(*(torch.arange(_BRICK + 1),) * 3)
     n = SIDE * _BRICK + 1
     for number in brick.unique():

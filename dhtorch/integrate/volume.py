@@ -139,8 +139,8 @@ def splat(
     depth: Tensor,  # (B, N) m; not finite or 0 = no answer
     sigma: Tensor,  # (B, N) m
     features: Tensor,  # (B, N, C)
-    T_world_from_cam: Pose,  # B
     *,
+    T_world_from_cam: Pose,  # B
     radius: float = 0.03,
     max_radius_px: int = 12,
 ) -> View:

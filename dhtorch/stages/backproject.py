@@ -153,7 +153,8 @@ def _nearest_return(depth: Tensor, place: Tensor, size: int, search_px: int) -> 
 def _appearance(image: Tensor, uv: Tensor, dark: float, saturated: float, highlight: float) -> tuple[Tensor, ...]:
     """What the picture alone decides, (B, N) each: at the border, too dark, clipped at white, a highlight."""
     hw = (image.shape[-2], image.shape[-1])
-    pixel, size = pixels(uv), min(NEIGHBOURHOOD, *hw)
+    pixel = pixels(uv)
+    size = min(NEIGHBOURHOOD, *hw)
     mean, centre, top, bottom = summarise(image.detach(), pixel, size, _brightness)
     white = 1 if image.is_floating_point() else 255
     shine = (top - bottom <= 0.15 * top) & (centre >= highlight * white) & (centre - mean >= 0.1 * white)

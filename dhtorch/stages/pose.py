@@ -95,6 +95,32 @@ def pnp_ransac(
     Cost: linear in B, H and N. Float64 in the minimal solver and the last step, the inputs' dtype elsewhere.
     Source: paper, "LiDAR-anchored relative pose", with P3P in place of EPnP. Checked against
     ``cv2.solvePnPRansac`` and ``poselib.estimate_absolute_pose`` (``tests/test_pose.py``).
+
+    Example:
+        >>> import torch
+        >>> from dhtorch.codes import PoseCode
+        >>> from dhtorch.geometry.camera import project, unproject
+        >>> from dhtorch.records import Camera, Samples, Tracks
+        >>> from dhtorch.stages.pose import pnp_ransac
+        >>> draw = torch.Generator().manual_seed(0)
+        >>> camera = Camera(f=torch.full((2, 2), 500.0), c=torch.full((2, 2), 320.0))  # B = 2 pairs
+        >>> uv_0, depth = 640 * torch.rand(2, 50, 2, generator=draw), 1 + 3 * torch.rand(2, 50, generator=draw)
+        >>> xyz = unproject(camera, uv_0, depth)  # (B, N, 3) m
+        >>> uv_1 = project(camera, xyz + torch.tensor([0.2, 0.0, 0.0]))  # camera 1 stands 0.2 m to the left
+        >>> uv_1[:, :10] += 40.0  # wrong tracks
+        >>> zero, code = torch.zeros(2, 50), torch.zeros(2, 50, dtype=torch.int32)
+        >>> unread = {"confidence": zero, "flag": code, "trackability": zero, "hole": code}
+        >>> samples = Samples(uv_0, depth, sigma=0.01 * depth, xyz=xyz, **unread)
+        >>> valid = torch.stack((zero[0] == 0, zero[1] == 1))  # nothing was found again in the second pair
+        >>> cov = torch.eye(2).expand(2, 50, 2, 2)
+        >>> tracks = Tracks(uv_0, uv_1, error=zero, photometric=zero, cov=cov, valid=valid)
+        >>> fit = pnp_ransac(samples, tracks, camera, camera, torch.rand(2, 100, 3, generator=draw))
+        >>> fit.code.tolist() == [PoseCode.OK, PoseCode.TOO_FEW], fit.n_inlier.tolist()
+        (True, [40, 0])
+        >>> (fit.T_1_from_0.t[0] - torch.tensor([0.2, 0.0, 0.0])).abs().max() < 1e-4
+        tensor(True)
+        >>> fit.T_1_from_0.t[1]
+        tensor([nan, nan, nan])
     """
     check(
         "pnp_ransac",
@@ -104,8 +130,15 @@ def pnp_ransac(
         f_1=(camera_1.f, "B 2"),
         draws=(draws, "B H 3"),
     )
-    options = _Options(threshold_px, max(4, min_inlier), local_optimisation, polish_steps, kernel, kernel_px)
-    inputs = (samples.xyz, tracks.uv_1, tracks.valid, camera_1.f, camera_1.c, draws.to(samples.xyz))
+    options = _Options(
+        threshold_px=threshold_px,
+        min_inlier=max(4, min_inlier),
+        local_optimisation=local_optimisation,
+        polish_steps=polish_steps,
+        kernel=kernel,
+        kernel_px=kernel_px,
+    )
+    inputs = (samples.xyz, tracks.uv_1, tracks.valid, cam.ideal(camera_1), draws.to(samples.xyz))
     return in_pieces(partial(_fit, options), PAIRS, *inputs)
 
 
@@ -119,8 +152,8 @@ class _Options:
     kernel_px: float
 
 
-def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, f: Tensor, c: Tensor, draws: Tensor) -> PoseFit:
-    N = xyz.shape[1]
+def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, camera: Camera, draws: Tensor) -> PoseFit:
+    N, f, c = xyz.shape[1], camera.f, camera.c
     points, usable = _planes(xyz, uv, valid)
     with torch.no_grad():
         start, found = _robust_pose(points, usable, f, c, draws, options)
@@ -136,7 +169,8 @@ def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, f: Tensor, c
     H, g = normal_equations(rows, weight)
     eye = torch.eye(6, dtype=H.dtype, device=H.device).expand_as(H)
     x, solved = solve_spd(H, torch.cat((-g[..., None], eye), -1))
-    T, inverse = move(start, x[..., 0]), x[..., 1:].detach()
+    T = move(start, x[..., 0])
+    inverse = x[..., 1:].detach()
     with torch.no_grad():
         n_inlier = inlier.sum(-1)
         enough = n_inlier >= options.min_inlier
@@ -194,11 +228,13 @@ def _robust_pose(
     found, keep = cost[:, 0].isfinite(), cost.shape[1]
     used = torch.arange(index.shape[1], device=index.device) < count[:, None]
     near, used, fk, ck = (x.repeat_interleave(keep, 0) for x in (near, used, f, c))
-    cost_of = _truncated(near, used, fk, ck, options.threshold_px)
+    cost_of = _truncated(near, used, fk, ck, threshold_px=options.threshold_px)
     flat = Pose(poses.R.flatten(0, 1), poses.t.flatten(0, 1))
     flat, cost = minimise(cost_of, flat, options.local_optimisation, step=trial_step)
     best = cost.view(-1, keep).argmin(1) + keep * torch.arange(len(f), device=f.device)
-    cost_of = _truncated(points, usable, f, c, options.threshold_px, options.kernel, options.kernel_px)
+    cost_of = _truncated(
+        points, usable, f, c, threshold_px=options.threshold_px, kernel=options.kernel, kernel_px=options.kernel_px
+    )
     T, _ = minimise(cost_of, flat[best], options.polish_steps, step=trial_step)
     return Pose(_orthonormal(T.R.double()), T.t.double()), found
 
@@ -208,6 +244,7 @@ def _truncated(
     usable: Tensor,
     f: Tensor,
     c: Tensor,
+    *,
     threshold_px: float,
     kernel: str | None = None,
     kernel_px: float = 1.0,
@@ -294,10 +331,44 @@ def map_pose(
     detached optimum: exact to first order for small residuals. Noise, weights, cov and codes are detached.
     Cost: linear in B and N. Float64 in the last step and the covariance, the inputs' dtype elsewhere.
     Source: see :mod:`dhtorch.geometry.near_far`.
+
+    Example:
+        >>> import torch
+        >>> from dhtorch.geometry.camera import project, unproject
+        >>> from dhtorch.records import Camera, Samples, Tracks
+        >>> from dhtorch.stages.pose import map_pose
+        >>> draw = torch.Generator().manual_seed(0)
+        >>> camera = Camera(f=torch.full((1, 2), 500.0), c=torch.full((1, 2), 320.0))
+        >>> uv_0, depth = 640 * torch.rand(1, 60, 2, generator=draw), 1 + 3 * torch.rand(1, 60, generator=draw)
+        >>> xyz = unproject(camera, uv_0, depth)  # (B, N, 3) m
+        >>> uv_1 = project(camera, xyz + torch.tensor([0.2, 0.0, 0.0])) + 0.2 * torch.randn(1, 60, 2, generator=draw)
+        >>> xyz[:, 20:] = torch.nan  # the sensor does not reach the last 40
+        >>> zero, code = torch.zeros(1, 60), torch.zeros(1, 60, dtype=torch.int32)
+        >>> unread = {"confidence": zero, "flag": code, "trackability": zero, "hole": code}
+        >>> samples = Samples(uv_0, depth, sigma=0.01 * depth, xyz=xyz, **unread)
+        >>> cov = torch.eye(2).expand(1, 60, 2, 2)
+        >>> tracks = Tracks(uv_0, uv_1, error=zero, photometric=zero, cov=cov, valid=zero == 0)
+        >>> fit = map_pose(samples, tracks, camera, camera, torch.rand(1, 100, 3, generator=draw))
+        >>> fit.T_1_from_0.R.shape, fit.cov.shape, fit.shutter.turn.shape
+        (torch.Size([1, 3, 3]), torch.Size([1, 6, 6]), torch.Size([1, 3]))
+        >>> off = fit.T_1_from_0.t - torch.tensor([0.2, 0.0, 0.0])
+        >>> sigma = fit.cov.diagonal(dim1=1, dim2=2).sqrt()[:, 3:]  # m
+        >>> bool((off.abs() < 0.01).all()), bool((off.abs() < 4 * sigma).all())
+        (True, True)
     """
     check("map_pose", xyz=(samples.xyz, "B N 3"), uv_1=(tracks.uv_1, "B N 2"), cov=(tracks.cov, "B N 2 2"))
     first = start(samples, tracks, camera_0, camera_1, draws)
-    options = Options(far_weight, max_rise, turn_sigma, turn_gain, translation_gain, kernel, bend, near_steps, steps)
+    options = Options(
+        far_weight=far_weight,
+        max_rise=max_rise,
+        turn_sigma=turn_sigma,
+        turn_gain=turn_gain,
+        translation_gain=translation_gain,
+        kernel=kernel,
+        bend=bend,
+        near_steps=near_steps,
+        steps=steps,
+    )
     problem = _near_far(samples, tracks, camera_0, camera_1, isotropic)
     return in_pieces(partial(_fit_all, options, threshold_px), MAP_PAIRS, first, problem, tracks)
 
@@ -311,7 +382,7 @@ def _fit_all(o: Options, threshold_px: float, first: PoseFit, problem: Problem, 
     found = pytree.tree_map(lambda x: x.double() if x.is_floating_point() else x, found)
     found = found._replace(at=found.at._replace(T=Pose(_orthonormal(found.at.T.R), found.at.T.t)))
     weights = (found.noise, found.far_weight, found.turn_precision)
-    _, H, g = near_far.normal(problem, found.at, *weights, o.kernel, o.bend)
+    _, H, g = near_far.normal(problem, found.at, *weights, kernel=o.kernel, bend=o.bend)
     at, solved = near_far.step(found.at, H, g)
     with torch.no_grad():
         cov, known = m_covariance(problem, found, o)

@@ -55,13 +55,13 @@ def spiral(
     if foveation <= 0:
         raise ValueError(f"spiral: foveation is {foveation}, expected > 0")
     centre = None if gaze is None else (gaze[0], gaze[1])
-    uv = _kept((hw[0], hw[1]), n, turns, foveation, centre, inner_px, margin_px)
+    uv = _kept((hw[0], hw[1]), n, turns=turns, foveation=foveation, gaze=centre, inner_px=inner_px, margin_px=margin_px)
     return uv.to(device=device, dtype=dtype, copy=True)
 
 
-def _kept(*args: Any) -> Tensor:
+def _kept(*args: Any, **options: Any) -> Tensor:
     """:func:`_arms`, which torch.compile takes as it is and does not look into."""
-    return _arms(*args)
+    return _arms(*args, **options)
 
 
 # All that torch.compiler.assume_constant_result does after it has imported the compiler, for which nobody asked yet.
@@ -72,6 +72,7 @@ _kept._dynamo_marked_constant = True  # type: ignore[attr-defined]
 def _arms(
     hw: tuple[int, int],
     n: int,
+    *,
     turns: float | None,
     foveation: float,
     gaze: tuple[float, float] | None,

@@ -7,7 +7,6 @@ row, ``x`` (2, M) in image 0 and ``d`` their displacement to image 1.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 import torch
 import torch.nn.functional as F
@@ -47,6 +46,8 @@ def lucas_kanade(
     there is lost and not tested.
 
     Args:
+        image_0, image_1: (B, C, H, W) with C 1 or 3, float in [0, 1] or uint8; the two may differ in size.
+        uv_0: (B, N, 2) px, x to the right and y down, 0 the middle of the first pixel.
         hint: where to start in image 1, pyramids of image 0 made once for many views, and ``levels`` for this scene.
         window: width in pixels, odd.
         levels: pyramid levels, full resolution included; fewer where a level would be no larger than the window.
@@ -73,6 +74,22 @@ def lucas_kanade(
 
     Source: Lucas and Kanade 1981; Bouguet 2000 (pyramid); Baker and Matthews 2004 (inverse composition); checked
     against ``cv2.calcOpticalFlowPyrLK`` (``tests/test_track.py``).
+    Twin: :func:`dhtorch.geometry.reference.lucas_kanade`, one point at a time.
+
+    Example:
+        >>> import torch
+        >>> from dhtorch.stages.track import lucas_kanade
+        >>> v, u = torch.meshgrid(torch.arange(80.0), torch.arange(100.0), indexing="ij")
+        >>> here, there = (0.5 + 0.2 * (0.4 * (u - dx)).sin() + 0.2 * (0.3 * (v + dx)).cos() for dx in (0.0, 1.5))
+        >>> uv_0 = torch.tensor([[[40.0, 30.0], [60.5, 45.25], [99.0, 40.0]]])  # (B, N, 2)
+        >>> tracks = lucas_kanade(here[None, None], there[None, None], uv_0)  # two (B, C, H, W)
+        >>> tracks.uv_1.shape, tracks.cov.shape
+        (torch.Size([1, 3, 2]), torch.Size([1, 3, 2, 2]))
+        >>> (tracks.uv_1 - uv_0).round(decimals=1)[0, :2]
+        tensor([[ 1.5000, -1.5000],
+                [ 1.5000, -1.5000]])
+        >>> tracks.valid  # the third has left the image
+        tensor([[ True,  True, False]])
     """
     check("lucas_kanade", image_0=(image_0, "B C H W"), uv_0=(uv_0, "B N 2"), start=(hint.start, "B N 2"))
     check("lucas_kanade", image_1=(image_1, "B C H W"), uv_0=(uv_0, "B N 2"))
@@ -115,7 +132,8 @@ def refine(
     check("refine", image_0=(image_0, "B C H W"), uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"))
     check("refine", image_1=(image_1, "B C H W"), uv_0=(uv_0, "B N 2"))
     _check_options(1, normalise)
-    source, target = build_pyramid(image_0, 1, window), build_pyramid(image_1, 1, window, gradients=False)
+    source = build_pyramid(image_0, 1, window)
+    target = build_pyramid(image_1, 1, window, gradients=False)
     B, N, _ = uv_0.shape
     x, x_1 = (uv.to(source.levels[0].dtype).permute(2, 0, 1).reshape(2, B * N) for uv in (uv_0, uv_1.detach()))
     usable = lk.within(x, *source.bounds(0)) & lk.within(x_1, *target.bounds(0))
@@ -150,8 +168,12 @@ def _there_and_back(
     x = torch.where(known, x, torch.zeros_like(x))
     batch = F.pad(torch.arange(B, device=x.device).repeat_interleave(N), (0, fill))
 
-    there, back = (partial(lk.search, *views, o, init is None) for views in ((source, target), (target, source)))
-    forward, found, A = there(x, d, batch, known)
+    alike = init is None
+
+    def back(x: Tensor, d: Tensor, batch: Tensor, known: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return lk.search(target, source, o, x, d, batch, known=known, alike=alike)
+
+    forward, found, A = lk.search(source, target, o, x, d, batch, known=known, alike=alike)
     nothing = torch.zeros_like(d), torch.zeros_like(found), torch.zeros_like(A)
     backward, returned, _ = lk.for_some(found, back, nothing, (x + forward, -d, batch, found))
     error = (forward + backward).square().sum(0).sqrt()

@@ -59,7 +59,8 @@ def _lateral(hand: _Hand, way: float, time: float) -> tuple[Place, Angles]:
 
 
 def _forward(hand: _Hand, way: float, time: float) -> tuple[Place, Angles]:
-    a, go = math.radians(_YAW), 0.35 * math.sin(way / 0.35 - 0.5)
+    a = math.radians(_YAW)
+    go = 0.35 * math.sin(way / 0.35 - 0.5)
     x, height, z = _PLACE
     return (x + math.sin(a) * go, height, z + 0.2 + math.cos(a) * go), (_YAW, _PITCH, 0.0)
 

@@ -72,7 +72,8 @@ class Solids:
         """
         x, y = _plane(camera, hw)
         R, o = T_world_from_cam.R[0].double(), T_world_from_cam.t[0].double()
-        t, index = torch.full(hw, NOWHERE), torch.zeros(hw, dtype=torch.int64)
+        t = torch.full(hw, NOWHERE)
+        index = torch.zeros(hw, dtype=torch.int64)
         rectangles = _rectangles(self, R, o, x, y)
         rectangles[0] = (slice(None), slice(None))
         for i, (solid, (rows, columns)) in enumerate(zip(self.each, rectangles, strict=True)):

@@ -156,7 +156,8 @@ class SyntheticRoom(Sequence[Frame]):
         image = self._picture(i)
         image = image * 255 + self.image_noise * torch.randn(image.shape, generator=self._generator(i, "image"))
         conf = torch.zeros(1, *self.depth_hw, dtype=torch.uint8)
-        depth, depth_camera = conf.float(), resize(self.camera, self.hw, self.depth_hw)
+        depth = conf.float()
+        depth_camera = resize(self.camera, self.hw, self.depth_hw)
         if self.lidar == "phone":
             options = {"range_limit": self.range_limit, "noise_factor": self.depth_noise}
             depth, conf = phone_lidar(

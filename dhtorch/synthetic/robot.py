@@ -110,7 +110,8 @@ def write_robot(root: Path, *, tasks: int, scenes: int, n_frames: int, hw: tuple
             room.true_poses = room.poses = Pose(torch.from_numpy(c2w[:, :3, :3]), torch.from_numpy(c2w[:, :3, 3]))
             start = _START_MS / 1000 + 1000 * (1 + task) + 100 * scene
             room.times = torch.tensor([start + t for t in times], dtype=torch.float64)
-            base, home = episode.base(), _Episode.of(task, 0, seed).camera(0.0)
+            base = episode.base()
+            home = _Episode.of(task, 0, seed).camera(0.0)
             arm = ARMS[_CONFIGURATION]
             write_rh20t(
                 root,
@@ -145,7 +146,8 @@ class _Episode:
     def of(task: int, scene: int, seed: int) -> _Episode:
         """A task fixes the thing and the motion; a scene the rest."""
         x, height, z, yaw, pitch = THINGS[task % len(THINGS)]
-        own, draw = Random(f"robot {seed} {task}"), Random(f"robot {seed} {task} {scene}")
+        own = Random(f"robot {seed} {task}")
+        draw = Random(f"robot {seed} {task} {scene}")
         return _Episode(
             motion=MOTIONS[(task + task // len(THINGS)) % len(MOTIONS)],
             thing=(x, -height, z),

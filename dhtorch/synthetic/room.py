@@ -149,7 +149,8 @@ def _on_the_divider(draw: Random) -> list[Solid]:
 
 
 def _laptop(x: float, height: float, z: float) -> list[Solid]:
-    case, picture = Surface("plain", (0.7, 0.7, 0.72)), Surface("poster:0", (0.9, 0.9, 0.9), glow=0.12)
+    case = Surface("plain", (0.7, 0.7, 0.72))
+    picture = Surface("poster:0", (0.9, 0.9, 0.9), glow=0.12)
     lid, keys, screen = (x + 0.045, height + 0.015, z + 0.125), {TOP: Surface("keyboard")}, {NEG_Z: picture}
     return [
         _box(x, height, z, (0.35, 0.018, 0.23), case, yaw=-18, faces=keys),
@@ -159,7 +160,8 @@ def _laptop(x: float, height: float, z: float) -> list[Solid]:
 
 def _plant(x: float, height: float, z: float, size: float) -> list[Solid]:
     """A pot with a bush of four balls."""
-    leaf, pot = Surface("leaves", tile=0.25), Surface("speckle")
+    leaf = Surface("leaves", tile=0.25)
+    pot = Surface("speckle")
     bush = ((0, 0, 0.10), (-0.06, -0.03, 0.07), (0.05, 0.04, 0.075), (0.02, -0.06, 0.06))
     balls = [
         _ball(x + size * dx, height + size * (0.15 + 0.045 * k), z + size * dz, size * r, leaf)
@@ -243,7 +245,9 @@ def _books(draw: Random, left: float, right: float, height: float, z: float, *, 
     x = left
     stop = right - draw.uniform(0.0, 0.12)
     while True:
-        wide, tall, deep = draw.uniform(0.025, 0.06), draw.uniform(0.33 * shortest, 0.33), draw.uniform(0.16, 0.24)
+        wide = draw.uniform(0.025, 0.06)
+        tall = draw.uniform(0.33 * shortest, 0.33)
+        deep = draw.uniform(0.16, 0.24)
         if x + wide > stop:
             return books
         surface = Surface("spine", _tint(draw))

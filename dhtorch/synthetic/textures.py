@@ -156,7 +156,8 @@ def _wallpaper(g: Generator) -> Tensor:
     u, v = _uv()
     n = 8
     stripe = _step(_triangle(u * n) - 0.5, 0.06)
-    row, column = (v * 2 * n).floor(), (u * n).floor()
+    row = (v * 2 * n).floor()
+    column = (u * n).floor()
     size = 0.20 + 0.30 * _per_cell(g, row, column, (2 * n, n))
     x, y = u * n - column - 0.5, v * 2 * n - row - 0.5
     leaf = _step(size - x.abs() * 2 - y.abs(), 0.05)

@@ -23,7 +23,8 @@ def write_fod500(root: Path, stacks: Mapping[int, FocalStack]) -> None:
             write(root / f"{index:06d}_{k:02d}All.tif", rgb_tiff(image.permute(1, 2, 0).numpy()))
         if stack.depth is not None:
             # The library takes memory as it lies, whatever the strides say.
-            plane, picture = np.ascontiguousarray(stack.depth[0].numpy(), np.float16), io.BytesIO()
+            plane = np.ascontiguousarray(stack.depth[0].numpy(), np.float16)
+            picture = io.BytesIO()
             header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
             exr.File(header, dict.fromkeys("RGB", plane)).write(picture)
             write(root / f"{index:06d}Dpt.exr", picture.getvalue())

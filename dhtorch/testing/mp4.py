@@ -44,7 +44,8 @@ def write_video(
             stream.options = {"crf": str(crf), "x265-params": f"{order}:pools=none:frame-threads=1"}
         for picture, time in zip(pictures, times, strict=True):
             frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
-            frame.pts, frame.time_base = round((time - times[0]) * _TICKS), Fraction(1, _TICKS)
+            frame.pts = round((time - times[0]) * _TICKS)
+            frame.time_base = Fraction(1, _TICKS)
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
         shift = round(Fraction(times[1] - times[0]) / stream.time_base) if hide_first else 0

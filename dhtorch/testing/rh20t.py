@@ -85,7 +85,8 @@ def robot_notation(robot: str, T: np.ndarray) -> np.ndarray:
         return _vector(T)
     if robot == "franka":  # its own tool looks the other way
         x, y, z, w = quaternion(T[:3, :3] @ np.diag([1.0, -1.0, -1.0]))
-        axis, angle = np.array([x, y, z]), 2 * np.arctan2(np.linalg.norm([x, y, z]), w)
+        axis = np.array([x, y, z])
+        angle = 2 * np.arctan2(np.linalg.norm([x, y, z]), w)
         return np.append(T[:3, 3], angle * axis / max(float(np.linalg.norm(axis)), 1e-300))
     R = T[:3, :3]
     angles = (

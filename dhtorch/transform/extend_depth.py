@@ -220,5 +220,15 @@ def _pose(fit: PoseFit | None, paired: Tensor, like: Tensor) -> dict[str, Tensor
 def _silent(samples: Samples) -> Estimate:
     """No answer anywhere: there is no view to track into."""
     nan = torch.full_like(samples.depth, torch.nan)
-    zero, code = torch.zeros_like(samples.depth), torch.zeros_like(samples.flag)
-    return Estimate(samples.uv, nan, nan, nan, zero, zero, code, zero, code + Gate.NO_TRACK)
+    zero = torch.zeros_like(samples.depth)
+    return Estimate(
+        uv=samples.uv,
+        depth=nan,
+        sigma=nan,
+        sigma_shared=nan,
+        parallax_deg=zero,
+        residual_px=zero,
+        n_views=torch.zeros_like(samples.flag),
+        score=zero,
+        gate=torch.full_like(samples.flag, Gate.NO_TRACK),
+    )

@@ -66,7 +66,7 @@ def patch_tokens(
     """
     check("patch_tokens", uv=(found.uv, "B N 2"), depth=(found.depth, "B N"), hole=(hole, "B N"))
     rows, columns = grid(hw, patch=patch, tokens_hw=tokens_hw)
-    cell = _cells(found.uv, hw, patch, tokens_hw or hw, fit, rows, columns)
+    cell = _cells(found.uv, hw, patch=patch, tokens_hw=tokens_hw or hw, fit=fit, rows=rows, columns=columns)
 
     def total(x: Tensor) -> Tensor:  # (B, N, k) → (B, P, k)
         zero = torch.zeros(x.shape[0], rows * columns + 1, x.shape[2], dtype=torch.float64, device=x.device)
@@ -91,7 +91,7 @@ def patch_tokens(
 
 
 def _cells(
-    uv: Tensor, hw: tuple[int, int], patch: int, tokens_hw: tuple[int, int], fit: str, rows: int, columns: int
+    uv: Tensor, hw: tuple[int, int], *, patch: int, tokens_hw: tuple[int, int], fit: str, rows: int, columns: int
 ) -> Tensor:
     """(B, N) index of the patch each sample lies in; rows · columns where it lies in none."""
     if fit not in FITS:

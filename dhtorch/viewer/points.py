@@ -39,7 +39,8 @@ def read(path: Path) -> Scene:
     xyz = np.stack([vertex[a] for a in "xyz"], -1).astype(np.float32)
     grey = np.full(n, 128, np.uint8)
     rgb = np.stack([vertex[c] if c in known else grey for c in ("red", "green", "blue")], -1)
-    absent, zero = np.full(n, np.nan, np.float32), np.zeros((n, 2), np.float32)
+    absent = np.full(n, np.nan, np.float32)
+    zero = np.zeros((n, 2), np.float32)
     depth = xyz[:, 2] if (xyz[:, 2] > 0).all() else np.linalg.norm(xyz, axis=1)  # a map's origin is no camera
     samples = {"xyz": xyz, "rgb": rgb.astype(np.uint8), "depth": depth, "source": source.astype(np.int32), **column}
     samples |= {"uv_0": zero, "uv_1": zero, "tracked": np.zeros(n, bool), "candidate": np.zeros(n, bool)}

@@ -122,7 +122,8 @@ def _log_points(rr: Any, stream: Any, shot: Shot) -> None:
     answer = s["source"] == Source.RECOVERED
     xyz, sigma = s["xyz"][answer], s["sigma"][answer]
     kept = {name: s[name][answer] for name in ("score", "sigma", "hole")}
-    radii, classes = sigma.clip(SMALLEST, LARGEST), np.full(len(xyz), Gate.ANSWER, np.uint16)
+    radii = sigma.clip(SMALLEST, LARGEST)
+    classes = np.full(len(xyz), Gate.ANSWER, np.uint16)
     stream.log("world/map/recovered", rr.Points3D(_moved(T, xyz), radii=radii, class_ids=classes), rr.AnyValues(**kept))
     share = (sigma / np.maximum(s["depth"][answer], 1e-9)).clip(0, 0.9)[:, None]
     bars = np.stack((_moved(T, xyz * (1 - share)), _moved(T, xyz * (1 + share))), 1)

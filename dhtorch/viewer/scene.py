@@ -243,7 +243,8 @@ def _jpeg(pixels: np.ndarray) -> tuple[bytes, tuple[int, int]]:
     """The picture, made smaller where it is large, and its (height, width)."""
     from PIL import Image  # noqa: PLC0415  (comes with matplotlib)
 
-    picture, out = Image.fromarray(pixels), io.BytesIO()
+    picture = Image.fromarray(pixels)
+    out = io.BytesIO()
     picture.thumbnail((LONGEST, LONGEST))
     picture.save(out, "JPEG", quality=QUALITY)
     return out.getvalue(), (picture.height, picture.width)

@@ -28,7 +28,8 @@ def sensor_only(
     like = frame_0.camera.f
     samples = method.look(frame_0)
     keep = samples.usable
-    nan, zero = torch.full_like(samples.depth, torch.nan), torch.zeros_like(samples.depth)
+    nan = torch.full_like(samples.depth, torch.nan)
+    zero = torch.zeros_like(samples.depth)
     estimate = Estimate(
         uv=samples.uv,
         depth=torch.where(keep, samples.depth, nan),

@@ -153,7 +153,8 @@ def side_by_colour(
 
 def _gradient_energy(grey: Tensor, width_px: float, window_px: float, noise: float) -> tuple[Tensor, float]:
     """Mean squared gradient (B, H, W) in a window, and what of it is expected of noise (already taken off)."""
-    smooth, slope = gaussian_taps(width_px), gaussian_taps(width_px, derivative=True)
+    smooth = gaussian_taps(width_px)
+    slope = gaussian_taps(width_px, derivative=True)
     across, down = separable(grey, smooth, slope), separable(grey, slope, smooth)
     expected = 2 * noise * noise * sum([w * w for w in smooth]) * sum([w * w for w in slope])
     return (gaussian(across * across + down * down, window_px) - expected)[:, 0], expected

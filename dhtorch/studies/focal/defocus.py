@@ -96,7 +96,9 @@ def run(
             blur = local_blur(frame.image, noise=noise, window_px=window_px)
             return {"natural": _unsigned(frame, uv, blur, recording.sparse)}
         lens = lens_of(float(frame.camera.f[0, 0]), **optics).to(settings.dtype)
-        return _through_lens(frame, uv, lens, axial_colour_dpt, noise, window_px, settings.seed)
+        return _through_lens(
+            frame, uv, lens, colour=axial_colour_dpt, noise=noise, window_px=window_px, seed=settings.seed
+        )
 
     outcome = screen(recordings, lambda _r: [(0, 0)], ask, VARIANTS, truth="full", progress=progress)
     outcome.summary |= {k: _entry(v) for k, v in ambiguities(noise=noise, window_px=window_px).items()}
@@ -139,7 +141,8 @@ def ambiguities(*, noise: float = 0.0, window_px: float = 6.0, seed: int = 0) ->
         ratio of the two claims, 1 = nothing tells them apart.
     """
     hw, focus = (120, 160), torch.tensor([[2.0]])
-    lens, draw = lens_of(265.0, f_number=0.35), torch.Generator().manual_seed(seed)
+    lens = lens_of(265.0, f_number=0.35)
+    draw = torch.Generator().manual_seed(seed)
     blocks = torch.rand(1, 1, 8, 10, generator=draw).repeat_interleave(15, 2).repeat_interleave(16, 3)
     shadow = torch.linspace(0.3, 0.7, hw[1]).expand(1, 1, *hw)
 
@@ -164,7 +167,7 @@ def ambiguities(*, noise: float = 0.0, window_px: float = 6.0, seed: int = 0) ->
 
 
 def _through_lens(
-    frame: Frame, uv: Tensor, lens: Lens, colour: float, noise: float, window_px: float, seed: int
+    frame: Frame, uv: Tensor, lens: Lens, *, colour: float, noise: float, window_px: float, seed: int
 ) -> dict[str, Row]:
     """Variant → numbers of one picture, focused on its middle."""
     depth, (h, w) = frame.depth, frame.hw
@@ -218,7 +221,8 @@ class _Sites:
     def numbers(self, valid: Tensor, claim: Tensor, blur: Tensor) -> Row:
         """How a claim of inverse depth (1, H, W), and the blur under it, go with the true one."""
         use = self.candidate & self.at(valid)
-        enough, n = int(use.sum()) >= MIN_SITES, int(self.candidate.sum())
+        enough = int(use.sum()) >= MIN_SITES
+        n = int(self.candidate.sum())
         x, y = self.at(claim)[use].double(), 1 / self.depth[use]
         return {
             "n_candidates": n,

@@ -166,7 +166,8 @@ def _frame(
 def _numbers(x: Tensor, y: Tensor, plain: Tensor, edge: Tensor) -> Row:
     """Claims, truth and plain interpolation (P,) m, and which lie at an edge."""
     error = (x - y).abs() / y
-    some, at_edge = bool(len(y)), bool(edge.any())
+    some = bool(len(y))
+    at_edge = bool(edge.any())
     return {
         "n_candidates": len(y),
         "corr": pearson(x, y),
@@ -191,7 +192,8 @@ def _add_ratios(outcome: Outcome) -> None:
     for name in VARIANTS[1:]:
         ratios = []
         for scene, row in outcome.scenes(name, "left_out").items():
-            mine, theirs = row.get("mean_rel"), plain.get(scene, {}).get("mean_rel")
+            mine = row.get("mean_rel")
+            theirs = plain.get(scene, {}).get("mean_rel")
             if mine is not None and theirs:
                 row["mean_rel_ratio"] = mine / theirs
                 ratios.append(mine / theirs)

@@ -195,7 +195,8 @@ def _explain(inverse: Tensor, sigma: Tensor, use: Tensor, steps: int) -> tuple[T
         x = (inverse - focus[:, None, None]).abs()
         mean_x, mean_y = ((use * v).sum((1, 2)) / total for v in (x, sigma))
         dx, dy = x - mean_x[:, None, None], sigma - mean_y[:, None, None]
-        sxx, sxy = (use * dx * dx).sum((1, 2)).clamp_min(1e-12), (use * dx * dy).sum((1, 2))
+        sxx = (use * dx * dx).sum((1, 2)).clamp_min(1e-12)
+        sxy = (use * dx * dy).sum((1, 2))
         gain = (sxy / sxx).clamp_min(0)
         explained = gain * sxy
         fits.append(torch.stack((explained, focus, mean_y - gain * mean_x, gain)))

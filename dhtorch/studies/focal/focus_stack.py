@@ -257,7 +257,9 @@ def _numbers(
     known = y > 0
     x, y, sure = x[known], y[known], sure[known]
     kept = sure >= sure.sort().values[int((1 - KEPT) * (len(sure) - 1))] if len(sure) else known[:0]
-    r, gated, rank = pearson(1 / x, 1 / y), pearson(1 / x[kept], 1 / y[kept]), spearman(1 / x, 1 / y)
+    r = pearson(1 / x, 1 / y)
+    gated = pearson(1 / x[kept], 1 / y[kept])
+    rank = spearman(1 / x, 1 / y)
     return {
         "n_candidates": len(y),
         "rank_corr": rank,

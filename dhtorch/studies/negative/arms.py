@@ -64,7 +64,8 @@ def read_arm(
     x = torch.minimum(arm.clamp_min(0), limit)
     low = torch.minimum(x.detach().floor(), (limit - 1).clamp_min(0))
     a, b = (x - low).unbind(-1)
-    flat, first = grey.flatten(1), (low[:, 1] * W + low[:, 0]).long()
+    flat = grey.flatten(1)
+    first = (low[:, 1] * W + low[:, 0]).long()
     right, below = (1 if W > 1 else 0), (W if H > 1 else 0)
     top = flat[:, first] * (1 - a) + flat[:, first + right] * a
     bottom = flat[:, first + below] * (1 - a) + flat[:, first + below + right] * a

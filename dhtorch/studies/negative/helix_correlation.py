@@ -103,7 +103,7 @@ def run(
         lag = max(2, round(max_lag_share * views[0].hw[1]))
         arms = partial(arms_of, turns=turns, foveation=foveation, gaze=gaze, round_arms=round_arms)
         correlated = partial(correlate, window=window, max_lag=lag, min_peak=min_peak)
-        return _pair(recording, method, views[0], views[1], correlated, blur_px, arms)
+        return _pair(recording, method, views[0], views[1], correlated=correlated, blur_px=blur_px, wind=arms)
 
     outcome = screen(recordings, pairs, ask, VARIANTS, truth="full", progress=progress)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
@@ -162,7 +162,7 @@ def _even(uv: Tensor, turn: Tensor, like: Tensor) -> Arm:
 
 
 def _pair(
-    recording: Any, method: Method, frame_0: Frame, frame_1: Frame, correlated: Any, blur_px: float, wind: Any
+    recording: Any, method: Method, frame_0: Frame, frame_1: Frame, *, correlated: Any, blur_px: float, wind: Any
 ) -> dict[str, Row]:
     """Variant → numbers of one pair."""
     n = method.n
@@ -178,8 +178,11 @@ def _pair(
     tracks = method.track(frame_0.image, frame_1.image, samples.uv, hint=TrackHint.of(recording))
     flow = (tracks.uv_1 - tracks.uv_0)[0]
 
-    own = [_against(signals, arms, sites, k, k, 0.0, correlated) for k in (0, 1)]
-    other = [[_against(signals, arms, sites, k, 1 - k, step, correlated) for k in (0, 1)] for step in (-1.0, 1.0)]
+    own = [_against(signals, arms, sites, a=k, b=k, step=0.0, correlated=correlated) for k in (0, 1)]
+    other = [
+        [_against(signals, arms, sites, a=k, b=1 - k, step=step, correlated=correlated) for k in (0, 1)]
+        for step in (-1.0, 1.0)
+    ]
     along, lags, peaks = (torch.cat([part[i] for part in own]) for i in (0, 1, 2))
     neighbours = [[torch.cat([part[i] for part in parts]) for i in (0, 1, 2)] for parts in other]
     (in_way, in_lag, in_peak), (out_way, out_lag, out_peak) = neighbours
@@ -194,12 +197,12 @@ def _pair(
         "flow_along_arm": ((flow * tangent).sum(-1).abs(), tracks.valid[0]),
     }
     common = candidate & (peaks > 0) & tracks.valid[0]
-    plain = (flow.norm(dim=-1), found["flow_along_arm"][0])
-    return {name: _numbers(*shift, samples.depth[0], candidate, common, *plain) for name, shift in found.items()}
+    plain = {"common": common, "flow": flow.norm(dim=-1), "along": found["flow_along_arm"][0]}
+    return {name: _numbers(*shift, samples.depth[0], candidate, **plain) for name, shift in found.items()}
 
 
 def _against(
-    signals: Any, arms: Any, sites: Any, a: int, b: int, step: float, correlated: Any
+    signals: Any, arms: Any, sites: Any, *, a: int, b: int, step: float, correlated: Any
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Arm a of view 0 against arm b of view 1, ``step`` half turns on: way in the picture, lag and peak (K,).
 
@@ -218,14 +221,15 @@ def _against(
 
 
 def _numbers(
-    shift: Tensor, answered: Tensor, depth: Tensor, candidate: Tensor, common: Tensor, flow: Tensor, along: Tensor
+    shift: Tensor, answered: Tensor, depth: Tensor, candidate: Tensor, *, common: Tensor, flow: Tensor, along: Tensor
 ) -> Row:
     """How the size of the shift (K,) goes with inverse depth."""
     mine = candidate & answered
     same = mine & common
 
     def over(mask: Tensor, how: Any) -> float | None:
-        x, y = shift[mask].double(), 1 / depth[mask].double()
+        x = shift[mask].double()
+        y = 1 / depth[mask].double()
         found: float | None = how(x, y) if x.numel() >= MIN_SITES else None
         return found
 

@@ -128,7 +128,8 @@ def _count(samples: Samples, before: Samples, cluster: Cluster, hw: tuple[int, i
     nearest = torch.cdist(samples.uv, before.uv).argmin(-1)
     inside = cluster.member.gather(1, nearest)
     found = inside & (samples.hole == Hole.NONE)
-    n, n_holes = int(inside.sum()), int((before.hole != Hole.NONE).sum())
+    n = int(inside.sum())
+    n_holes = int((before.hole != Hole.NONE).sum())
     middle = torch.tensor([(hw[1] - 1) / 2, (hw[0] - 1) / 2]).to(cluster.gaze)
     way = float((cluster.gaze[0] - middle).norm())
     return row | {

@@ -165,7 +165,8 @@ class _Sets:
         J = torch.cat((-se3.hat(Y), torch.eye(3, dtype=Y.dtype, device=Y.device).expand(*Y.shape, 3)), -1)
         if self.normals is not None:
             m = _at(self.normals, index).double()
-            r, J = (m * r).sum(-1, keepdim=True), (m[..., None] * J).sum(-2, keepdim=True)
+            r = (m * r).sum(-1, keepdim=True)
+            J = (m[..., None] * J).sum(-2, keepdim=True)
         w = taking_part.double()[..., None, None]
         Jw = J * w
         H = (Jw[..., :, None] * J[..., None, :]).sum((1, 2))

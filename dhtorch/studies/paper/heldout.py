@@ -98,7 +98,8 @@ def verdict(outcome: Outcome, method: str) -> tuple[bool | None, str]:
     if not both:
         return None, "no scene on which both protocols have answers"
     ratios = torch.tensor([honest[s]["median_rel"] / max(naive[s]["median_rel"], 1e-9) for s in both])
-    flatters, n_passes = int((ratios > 1).sum()), sum(r["passes"] for r in honest.values())
+    flatters = int((ratios > 1).sum())
+    n_passes = sum(r["passes"] for r in honest.values())
     typical = bootstrap.interval(ratios.tolist()).value
     holds = flatters > len(both) / 2 and n_passes >= len(honest) / 2
     return holds, (

@@ -170,7 +170,8 @@ def judge(
     for cohort in (MOVING, ALL):
         found.counts[cohort] = torch.zeros(len(groups), dtype=torch.float64)
         found.squares |= {(arm, cohort): torch.zeros(len(groups), dtype=torch.float64) for arm in (*arms, *told)}
-    grid, scale = torch.tensor(list(penalties), dtype=torch.float64), _spread(shards)
+    grid = torch.tensor(list(penalties), dtype=torch.float64)
+    scale = _spread(shards)
     for fold in probe.folds(groups, n_folds, seed=seed):
         fitted = _fit(shards, fold, arms, grid, scale)
         for arm, (_, _, chosen) in fitted.probes.items():
@@ -218,16 +219,19 @@ def _spread(shards: Shards) -> Tensor:
 
 
 def _fit(shards: Shards, fold: probe.Fold, arms: Mapping[str, Sequence[str]], grid: Tensor, scale: Tensor) -> _Fitted:
-    stream, fitted = probe.Stream(sum(shards.widths.values()), len(scale)), _Fitted(scale)
+    stream = probe.Stream(sum(shards.widths.values()), len(scale))
+    fitted = _Fitted(scale)
     for shard in shards.read(fold.train):
         stream.add(shard.features(), shard.target)
-    shared = _choose(shards, fold, stream.moments, fitted, CONTEXT, (), grid[:, None])
+    shared = _choose(shards, fold, stream.moments, fitted, arm=CONTEXT, blocks=(), penalties=grid[:, None])
     base = shared[0] if shared else float(grid[0])
     for arm, blocks in arms.items():
         if blocks:
             asked = torch.cartesian_prod(*[grid] * len(blocks)).view(-1, len(blocks))
             context = torch.full((len(asked), 1), base, dtype=grid.dtype)
-            _choose(shards, fold, stream.moments, fitted, arm, blocks, torch.cat((context, asked), 1))
+            _choose(
+                shards, fold, stream.moments, fitted, arm=arm, blocks=blocks, penalties=torch.cat((context, asked), 1)
+            )
     return fitted
 
 
@@ -236,6 +240,7 @@ def _choose(
     fold: probe.Fold,
     moments: probe.Moments,
     fitted: _Fitted,
+    *,
     arm: str,
     blocks: Sequence[str],
     penalties: Tensor,  # (P, 1 + blocks), the context's first

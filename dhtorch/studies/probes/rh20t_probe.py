@@ -115,7 +115,7 @@ def run(
                 continue
             options: dict[str, Any] = {"cells": depth_cells, "seed": settings.seed}
             two, one = (front_ends.adapted(method, recording, views=v, **options) for v in (2, 1))
-            look = partial(_look, recording, settings, two, one, network, rgb_side)
+            look = partial(_look, recording, settings, two=two, one=one, network=network, rgb_side=rgb_side)
             looked = progress(list(zip(index, before, strict=True)), recording.name, len(index))
             rows = [look(i, j) for i, j in looked]
             blocks = {name: torch.cat([row[name] for row in rows]) for name in rows[0]}
@@ -180,7 +180,8 @@ def robot(
 
 def verdict(judged: Judged, real: bool, margin: float) -> tuple[bool | None, str]:
     """Equivalent over all samples and over those that move? Never decided without DINOv2's own weights."""
-    n, own = len(judged.groups), judged.mean(OURS, ALL).value or 0.0
+    n = len(judged.groups)
+    own = judged.mean(OURS, ALL).value or 0.0
     times = judged.ratio(OURS, CONTEXT, ALL)
     text = f"error {own:.3f} of the targets' variance, {_interval(times)} times that of the context alone ({n} tasks)"
     if (REFERENCE, ALL) not in judged.squares:
@@ -210,12 +211,13 @@ def _left_out(recording: Any) -> Row:
 def _look(
     recording: Any,
     settings: Settings,
+    i: int,
+    j: int,
+    *,
     two: front_ends.DepthTokens,
     one: front_ends.DepthTokens,
     network: front_ends.PatchTokens | None,
     rgb_side: int,
-    i: int,
-    j: int,
 ) -> dict[str, Tensor]:
     """Features of frame ``i`` with frame ``j`` as its second view."""
     frame, other = (recording[k].to(settings.dtype).to(settings.device) for k in (i, j))
