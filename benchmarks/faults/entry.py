@@ -166,7 +166,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_pose", "ok = fit.ok & paired", "ok = fit.ok"),
         ("_pose", "[[0.0, 0.0, 0.0, 1.0]]", "[[0.0, 0.0, 0.0, 0.0]]"),
         ("_pose", "torch.where(paired, fit.code, torch.zeros_like(fit.code))", "fit.code"),
-        ("_silent", "code + Gate.NO_TRACK", "code"),
+        ("_silent", "gate=torch.full_like(samples.flag, Gate.NO_TRACK)", "gate=torch.zeros_like(samples.flag)"),
     ],
     "closure": [
         ("targets", "settings = list(settings.values())", "settings = []"),

@@ -58,11 +58,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ),
         ("undistort_tracks", "cam.undistort_jacobian(camera_1,", "cam.undistort_jacobian(camera_0,"),
         ("undistort_tracks", "cam.undistort(camera_1, torch.where", "cam.undistort(camera_0, torch.where"),
-        (
-            "undistort_tracks",
-            "half[..., :, None, :] * J[..., None, :, :]",
-            "half[..., :, None, :] * J.mT[..., None, :, :]",
-        ),
+        ("undistort_tracks", "tracks.cov, 0)), J.mT)", "tracks.cov, 0)), J)"),
         ("undistort_tracks", "valid=tracks.valid & fine", "valid=tracks.valid"),
         ("uniform_draws", "torch.tensor([seed])", "torch.tensor([0])"),
         ("_drawn", "manual_seed(int(s)) for s in seed.tolist()", "manual_seed(k) for k, s in enumerate(seed.tolist())"),
@@ -136,7 +132,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     "window": [
         ("key_views", "good_sigma_rel * estimates.depth", "good_sigma_rel"),
         ("key_views", ".square().flip(0)", ".square()"),
-        ("key_views", "known = known + (worth * best[..., None]).sum(0)", "known = known"),
+        ("key_views", "known = known + torch.where(best[..., None], worth, 0.0).sum(0)", "known = known"),
         ("key_views", "steady(torch.log1p, known + worth)", "(known + worth)"),
         ("ask_window", "thin = samples[:, :: max(1, method.n // PROBES)]", "thin = samples"),
         ("ask_window", "len(others.image) > method.views", "len(others.image) >= method.views"),
