@@ -121,7 +121,8 @@ def levels(image: Tensor, n: int, window: int) -> list[Level]:
 
     Half the size: smoothed by (1 4 6 4 1) / 16 along x and y, every other pixel. Slopes: Scharr's filter.
     """
-    grey, found = luma(image).double()[None], list[Level]()
+    grey = luma(image).double()[None]
+    found = list[Level]()
     binomial = torch.tensor([1.0, 4, 6, 4, 1], dtype=torch.float64) / 16
     side, ahead = torch.tensor([3.0, 10, 3]).double() / 16, torch.tensor([-1.0, 0, 1]).double() / 2
     across, down = side[:, None] * ahead, ahead[:, None] * side
@@ -209,7 +210,8 @@ def search(
     ``alike``: all points start alike; then those of a cell of 4 × 4 pixels, of level 2 and above, share one search.
     """
     H, W = levels_0[0].hw
-    top, rough = len(levels_0) - 1, o._replace(epsilon_px=4 * o.epsilon_px)
+    top = len(levels_0) - 1
+    rough = o._replace(epsilon_px=4 * o.epsilon_px)
     place, found = x, list[Found]()
     starts = {0: x}
     for level in range(1, top + 1):
@@ -250,13 +252,14 @@ def descend(
     g, T = template(level_0, x, o)
     A = g @ g.T
     if torch.linalg.eigvalsh(A)[0] <= o.min_eigenvalue * o.window**2:
-        return Found(d, False, A, True)
+        return Found(d, found=False, A=A, stayed=True)
     held = stayed = True
     for spell, r in enumerate(reach):
         steps = min(8, o.iterations - 8 * spell)
         if steps <= 0:
             break
-        corner, step = (x + d).floor() - r, torch.zeros_like(d)
+        corner = (x + d).floor() - r
+        step = torch.zeros_like(d)
         for k in range(1, steps + 1):
             last, step = step, one_step(level_1, x + d, g, T, o)
             if finest and k == 6 and k < steps:
@@ -276,7 +279,8 @@ def template(level: Level, x: Tensor, o: Options) -> tuple[Tensor, Tensor]:
     g = torch.stack([level.window(k, x, o.window) for k in (SLOPE_X, SLOPE_Y)])
     if o.normalise == "none":
         return g, T
-    g, T = g - g.mean(-1, keepdim=True), T - T.mean()
+    g = g - g.mean(-1, keepdim=True)
+    T = T - T.mean()
     if o.normalise == "gain_bias":
         g = g - (g @ T)[:, None] / (T @ T) * T
     return g, T
@@ -426,12 +430,13 @@ def register(
     """
     eye = torch.eye(2).double()
     if not (within(x, levels_0[0].hw) and within(x_1, levels_1[0].hw)):
-        return Registered(x_1, eye, 0.0, eye, 0.0, False)
+        return Registered(x_1, eye, rms=0.0, cov=eye, shift_px=0.0, ok=False)
     w = Regression(levels_0[0], x, window)
     m, M, fit, first = _steps(w, levels_1[0], 1.0, x_1 - (x - w.q), eye, iterations=iterations, epsilon_px=epsilon_px)
     if len(levels_1) > 1 and torch.linalg.det(M) > 1.5**2:
         m, M, fit, _ = _steps(w, levels_1[1], 0.5, m, M, iterations=iterations, epsilon_px=epsilon_px)
-    end, size = m + M @ (x - w.q), float(torch.linalg.det(M))
+    end = m + M @ (x - w.q)
+    size = float(torch.linalg.det(M))
     shift = float((end - x_1).norm())
     shift = shift if math.isfinite(shift) else max_shift_px
     sane = SCALE[0] ** 2 < size < SCALE[1] ** 2 and GAIN[0] < fit.gain < GAIN[1] and shift <= max_shift_px

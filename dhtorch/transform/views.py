@@ -122,7 +122,7 @@ class Views:
     def image_hw(self, sample: Mapping[str, Any]) -> tuple[int, int] | None:
         """Size of the anchor's image, None where it cannot be read."""
         try:
-            images = Leaves(sample, False, torch.float32).images(self.image, self.layout)
+            images = Leaves(sample, batched=False, dtype=torch.float32).images(self.image, self.layout)
         except SampleError:
             return None
         return images.shape[-2], images.shape[-1]
