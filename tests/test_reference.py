@@ -111,3 +111,18 @@ def test_patches_agree_bit_for_bit_and_grey_values_to_the_last_bit(dtype):
     for n, x in enumerate(uv[0]):
         want, exists = reference.nearest(image[0].float(), x)
         assert value[0, n] == want and bool(inside[0, n]) == exists
+
+
+def test_a_round_trip_of_the_limit_or_more_is_not_believed():
+    src, dst = waves(1, H, W, shortest=6.0), waves(1, H, W, (2.0, -1.3), shortest=6.0)
+    views = [reference.levels(image[0], 2, WINDOW) for image in (src, dst)]
+    o = reference.Options(WINDOW, iterations=2, epsilon_px=0.0)
+    found = [reference.lucas_kanade(*views, x, o, max_round_trip_px=9.0) for x in places(1, 12, H, W, margin=12)[0]]
+    known = [
+        (t, x) for t, x in zip(found, places(1, 12, H, W, margin=12)[0], strict=True) if t.valid and t.error > 1e-6
+    ]
+    assert len(known) > 5
+    for track, x in known:
+        for limit, valid in ((0.6 * track.error, False), (track.error, False), (1.01 * track.error, True)):
+            again = reference.lucas_kanade(*views, x, o, max_round_trip_px=limit)
+            assert again.valid is valid and again.error == track.error
