@@ -10,6 +10,8 @@ pixels, and the sum over the window is linear in J; so sum g J(d) is the same we
 C[o] = sum_p g(p) J(p + o), o an offset in whole pixels. This *map* C is computed once for a small square of offsets, by
 a depthwise convolution whose channels are the points. After that a step touches eight numbers per point, and no pixel.
 Coarse levels only provide a start: there the points of a small *cell* of the image share one search.
+
+The same without maps, one point at a time: :func:`dhtorch.geometry.reference.search`.
 """
 
 from __future__ import annotations
