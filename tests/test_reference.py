@@ -126,3 +126,14 @@ def test_a_round_trip_of_the_limit_or_more_is_not_believed():
         for limit, valid in ((0.6 * track.error, False), (track.error, False), (1.01 * track.error, True)):
             again = reference.lucas_kanade(*views, x, o, max_round_trip_px=limit)
             assert again.valid is valid and again.error == track.error
+
+
+def test_points_beside_the_border_of_a_cell_share_the_search_of_their_own():
+    """Cells are 16 px wide on level 2 and begin half a pixel before the first pixel's middle."""
+    src, dst = waves(1, H, W), waves(1, H, W, (0.6, -0.4))
+    uv = torch.tensor([[[15.3, 40.0], [15.7, 40.0], [40.0, 31.2], [40.0, 31.8], [47.6, 47.6]]]).double()
+    fast = lucas_kanade(src, dst, uv, window=WINDOW, levels=3, iterations=1, epsilon_px=0.0)
+    views = [reference.levels(image[0], 3, WINDOW) for image in (src, dst)]
+    slow = [reference.lucas_kanade(*views, x, reference.Options(WINDOW, 1, 0.0)) for x in uv[0]]
+    assert all(t.stayed for t in slow)
+    torch.testing.assert_close(fast.uv_1[0], torch.stack([t.uv_1 for t in slow]), rtol=0, atol=1e-12)

@@ -69,11 +69,11 @@ def pnp_ransac(
     carries the gradient.
 
     Args:
-        samples: near points are those with finite ``xyz`` (camera 0, m); the others are ignored here.
-        tracks: ``uv_1`` in ideal pixels of camera 1; only ``valid`` ones are used.
+        samples: near points are those with finite ``xyz`` (B, N, 3), m in camera 0; the others are ignored here.
+        tracks: ``uv_1`` (B, N, 2) in ideal pixels of camera 1; only ``valid`` (B, N) ones are used.
         camera_0: not needed, ``xyz`` is metric; here because seats share their arguments.
-        camera_1: intrinsics of view 1, ideal.
-        draws: the randomness, H hypotheses per pair.
+        camera_1: intrinsics of view 1, ideal: focal lengths and principal point, (B, 2) px each.
+        draws: (B, H, 3), the randomness: H hypotheses per pair.
         threshold_px: largest reprojection error of an inlier.
         min_inlier: fewer inliers (or fewer than 4) make no pose.
         local_optimisation: steps for each of the best two hypotheses.
@@ -82,10 +82,12 @@ def pnp_ransac(
         kernel_px: where the kernel bends.
 
     Returns:
-        PoseFit; ``cov`` = sigma_px² (Jᵀ W J)⁻¹, with sigma_px from the inliers' residuals (2 n − 6 degrees of freedom)
-        and first-order, so it knows nothing of errors in ``xyz``. Where there is no pose, R, t, cov, rms_px, sigma_px
-        and t_snr are NaN, no point is an inlier and ``n_inlier`` is what was counted. Codes: TOO_FEW near points or
-        inliers; DEGENERATE: the points lie on a line or leave the pose undetermined. Points in one plane are fine.
+        PoseFit: ``T_1_from_0`` with R (B, 3, 3) and t (B, 3) m, which carry points from camera 0 to camera 1;
+        ``inlier`` (B, N); ``code`` (B,); ``cov`` (B, 6, 6) = sigma_px² (Jᵀ W J)⁻¹ of (rotation rad, translation m),
+        with sigma_px from the inliers' residuals (2 n − 6 degrees of freedom) and first-order, so it knows nothing of
+        errors in ``xyz``. Where there is no pose, R, t, cov, rms_px, sigma_px and t_snr are NaN, no point is an inlier
+        and ``n_inlier`` is what was counted. Codes: TOO_FEW near points or inliers; DEGENERATE: the points lie on a
+        line or leave the pose undetermined. Points in one plane are fine.
 
     Raises:
         ValueError: wrong shapes, no hypothesis, an unknown kernel.
@@ -301,10 +303,11 @@ def map_pose(
     the residuals, rows of the image get a rotation each, as a rolling shutter gives them.
 
     Args:
-        samples: near points are those with finite ``xyz`` (camera 0, m) and their noise ``sigma`` (m).
-        tracks: ``uv_0``, ``uv_1`` in ideal pixels, ``cov`` up to scale (px²); only ``valid`` ones are used.
+        samples: near points are those with finite ``xyz`` (B, N, 3), m in camera 0, and their noise ``sigma`` (B, N) m.
+        tracks: ``uv_0``, ``uv_1`` (B, N, 2) in ideal pixels, ``cov`` (B, N, 2, 2) up to scale (px²); only ``valid``
+            (B, N) ones are used.
         camera_0, camera_1: intrinsics, ideal; they may differ.
-        draws: the randomness of ``start``.
+        draws: (B, H, 3), the randomness of ``start``.
         start: another function of this seat.
         far_weight: weight of a far track's cost: not its inverse variance, because neighbours share their errors.
         max_rise: share by which the near cost may rise over that of the near tracks alone.
@@ -318,11 +321,11 @@ def map_pose(
         threshold_px: largest reprojection error of a near track that is reported as an inlier.
 
     Returns:
-        PoseFit with ``shutter``. ``cov`` is the sandwich of an M-estimator with inverse depths and turn eliminated, in
-        which residuals with heavy tails widen the answer; ``sigma_px`` is the scale of the noise of the far tracks, to
-        be multiplied with their shape. Codes: those of ``start`` where it found no pose; DEGENERATE: the near tracks
-        leave the pose undetermined; NO_BASELINE: a pure rotation explains the tracks nearly as well; KEPT_PNP: far
-        tracks contradict the near ones, which alone are answered.
+        PoseFit with ``shutter``, shapes as of :func:`pnp_ransac`. ``cov`` is the sandwich of an M-estimator with
+        inverse depths and turn eliminated, in which residuals with heavy tails widen the answer; ``sigma_px`` is the
+        scale of the noise of the far tracks, to be multiplied with their shape. Codes: those of ``start`` where it
+        found no pose; DEGENERATE: the near tracks leave the pose undetermined; NO_BASELINE: a pure rotation explains
+        the tracks nearly as well; KEPT_PNP: far tracks contradict the near ones, which alone are answered.
 
     Raises:
         ValueError: wrong shapes, an unknown kernel; else as ``start``.

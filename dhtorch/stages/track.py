@@ -58,13 +58,14 @@ def lucas_kanade(
         min_eigenvalue: of A / window² (grey values in [0, 1]); a window with less has too little texture.
 
     Returns:
-        Tracks in the dtype of ``uv_0``. ``error`` is the round trip (the way there where it led nowhere);
-        ``photometric`` the rms grey difference of the windows, in grey values of image 0, after normalisation; ``cov``
-        is s² A⁻¹ with s² the residual variance, not below that of 8-bit rounding, and the small eigenvalue of A kept
-        from vanishing: always finite, large without texture. It understates white noise, which reading between pixels
-        smooths out of the residual. ``valid``: inside image 1 on the finest level from start to end, not running away
-        at either end, textured, round trip below its limit. Not valid: ``uv_1`` is the last position; for a ``uv_0``
-        outside the image the start of the search, with 0 for what is not finite.
+        Tracks in the dtype of ``uv_0``: ``uv_1`` (B, N, 2) px; ``error`` (B, N) px, the round trip (the way there where
+        it led nowhere); ``cov`` (B, N, 2, 2) px²; ``valid`` (B, N). ``photometric`` (B, N) is the rms grey difference
+        of the windows, in grey values of image 0, after normalisation; ``cov`` is s² A⁻¹ with s² the residual variance,
+        not below that of 8-bit rounding, and the small eigenvalue of A kept from vanishing: always finite, large
+        without texture. It understates white noise, which reading between pixels smooths out of the residual.
+        ``valid``: inside image 1 on the finest level from start to end, not running away at either end, textured, round
+        trip below its limit. Not valid: ``uv_1`` is the last position; for a ``uv_0`` outside the image the start of
+        the search, with 0 for what is not finite.
 
     Raises:
         ValueError: wrong shapes or options, an image no larger than the window, pyramids of another image.
