@@ -2,8 +2,8 @@
 
 No method calls this module. It says in one reading what :mod:`~dhtorch.geometry.lucas_kanade`,
 :mod:`~dhtorch.geometry.affine` and :mod:`~dhtorch.geometry.lookup` compute, and tests hold these against it: every
-window is read from its pixels in every step, every system of equations is solved by itself, in float64. Constants are
-written again and not imported, so that they are checked as well. No maps, chunks, lanes or cells in memory; no graph.
+window is read from its pixels in every step, every system of equations is solved by itself, in float64. Constants
+and options are written again and not imported, so that they are checked as well. No maps, chunks, lanes or graph.
 
 Alphabet: ``x`` (2,) a point of image 0, ``d`` (2,) its displacement, px; T the window at x, g = (dT/dx, dT/dy) (2, w²),
 J (w²,) what image 1 shows; ``p`` (2, w²) a pixel's offset in the window.
