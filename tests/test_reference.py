@@ -137,3 +137,13 @@ def test_points_beside_the_border_of_a_cell_share_the_search_of_their_own():
     slow = [reference.lucas_kanade(*views, x, reference.Options(WINDOW, 1, 0.0)) for x in uv[0]]
     assert all(t.stayed for t in slow)
     torch.testing.assert_close(fast.uv_1[0], torch.stack([t.uv_1 for t in slow]), rtol=0, atol=1e-12)
+
+
+def test_a_window_needs_more_texture_than_the_limit_times_its_pixels():
+    (level,) = reference.levels(picture(), 1, WINDOW)
+    x, still = torch.tensor([50.0, 40.0]).double(), torch.zeros(2).double()
+    g, _ = reference.template(level, x, reference.Options(WINDOW))
+    texture = float(torch.linalg.eigvalsh(g @ g.T)[0]) / WINDOW**2
+    for limit, found in ((0.999 * texture, True), (1.001 * texture, False)):
+        o = reference.Options(WINDOW, min_eigenvalue=limit)
+        assert reference.search([level], [level], x, still, o, alike=True).found is found
