@@ -212,7 +212,8 @@ def module(dotted: str) -> str:
 
 def reader(name: str) -> str:
     """What a reader of ``dhtorch.data`` says of its format, and how its options are named."""
-    home = "dhtorch.synthetic.recording" if name == "synthetic" else f"dhtorch.data.{name}"
+    wing = "dhtorch.studies.focal" if name in ("fod500", "ddff12") else "dhtorch.data"
+    home = "dhtorch.synthetic.recording" if name == "synthetic" else f"{wing}.{name}"
     text = f"**`{home}`** — {module(home)}\n"
     options = REPO / "conf" / "data" / f"{name}.yaml"
     if not options.is_file():

@@ -32,7 +32,7 @@ from mutations import EXECUTED, Capture, mutate
 
 from dhtorch import data
 from dhtorch.data import FormatError, files
-from dhtorch.data.stacks import FocalStack
+from dhtorch.studies.focal.stacks import FocalStack
 
 SECONDS = 2  # of a processor for one mutant, whatever else the machine does
 PATIENCE = 60.0  # wall clock after which it hangs

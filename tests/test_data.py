@@ -237,7 +237,7 @@ def test_nothing_there_or_unknown(tmp_path: Path, named: Path) -> None:
     fails(r"nowhere: path: found no such file or folder, expected a capture", tmp_path / "nowhere")
     fails(r"nowhere: path: found no such file or folder, expected a tum capture", tmp_path / "nowhere", "tum")
     (tmp_path / "empty").mkdir()
-    every = ", ".join((*data.FORMATS, *data.STACK_FORMATS))
+    every = ", ".join(data.FORMATS)
     fails(rf"format: found an empty folder, expected one of {every}", tmp_path / "empty")
     (tmp_path / "scan.xyz").write_text("1 2 3")
     fails(r"scan.xyz: format: found a .xyz file, expected one of", tmp_path / "scan.xyz")

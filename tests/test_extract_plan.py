@@ -12,10 +12,10 @@ from tiny_dicts import H, K, N, Stub, Told, W, added, tiny
 
 from dhtorch import extract
 from dhtorch.data import Recording
-from dhtorch.data.stacks import Stacks
 from dhtorch.extract import columns, plan
 from dhtorch.extract.rows import Rows
 from dhtorch.records import Camera, Frame
+from dhtorch.studies.focal.stacks import Stacks
 
 P = 6
 

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
 
 from dhtorch.data import pairs
 from dhtorch.data.recording import Recording, numbers
-from dhtorch.data.stacks import Stacks
 from dhtorch.records import Frame, Pose
 
 
@@ -107,14 +104,3 @@ def test_views_between_are_different_and_end_at_the_other() -> None:
         assert len(set(found)) == n and found[-1] == 9 and min(found) > 2 and found == sorted(found)
     with pytest.raises(ValueError, match=r"views: found 4 for frames 0 to 3, expected 1 to 3"):
         pairs.between(0, 3, 4)
-
-
-@pytest.mark.parametrize(
-    "choose", [pairs.by_gap, partial(pairs.by_time, seconds=1.0), partial(pairs.by_baseline, metres=1.0)]
-)
-def test_focal_stacks_have_no_pairs(choose: Callable[[object], object]) -> None:
-    stacks = Stacks("fs_6", "fod500", _no_frame, ("0",))
-    with pytest.raises(
-        ValueError, match=r"pairs: fs_6 holds focal stacks \(fod500\), pictures of one view, expected a"
-    ):
-        choose(stacks)

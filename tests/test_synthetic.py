@@ -11,7 +11,7 @@ from dhtorch.synthetic.paths import PATHS
 from dhtorch.synthetic.raycast import DARK, MIRROR, ORDINARY, WINDOW
 from dhtorch.synthetic.recording import SURFACES, SyntheticRoom, phone_lidar
 from dhtorch.synthetic.room import BACK, FRONT, HEIGHT, LEFT, RIGHT, furnished_room
-from dhtorch.synthetic.shading import Light, Scene
+from dhtorch.synthetic.shading import Light, ShadedRoom
 from dhtorch.tree import collate
 
 SMALL = {"hw": (120, 160), "depth_hw": (48, 64)}
@@ -144,7 +144,7 @@ def test_number_of_threads_changes_no_bit():
     for threads in (1, 2):
         torch.set_num_threads(threads)
         try:
-            scene = Scene([whole[0], whole[1], next(s for s in whole if s.ball)], [light], ambient=0.4, seed=0)
+            scene = ShadedRoom([whole[0], whole[1], next(s for s in whole if s.ball)], [light], ambient=0.4, seed=0)
             room = SyntheticRoom(n_frames=1, **SMALL)
             seen.append([scene.light.values, room[0].image, room[0].depth, room[0].conf, room.truth(0)["depth"]])
         finally:

@@ -30,7 +30,7 @@ from dhtorch.studies.protocol import Settings
 from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.viewer import again, points, rrd
 from dhtorch.viewer import html as pages
-from dhtorch.viewer.scene import DENSE, look
+from dhtorch.viewer.exhibit import DENSE, look
 
 CUTOFF, N = 2.0, 700
 HOSTILE = "</script><script>document.title='taken'</script><!-- & \u2028 ' \" ünï"

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from dhtorch import archive
-from dhtorch.data import Recordings
 from dhtorch.data.files import need
+from dhtorch.data.scene import Scene, scenes_of
 from dhtorch.extract import columns, engines, plan, shards
 from dhtorch.extract.features import Features, JoinedDataset
 from dhtorch.extract.rows import Answer, Rows
@@ -76,7 +76,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Call
 
     Args:
         settings: ``out``, ``workers``, ``seed``, ``choices`` and the groups' options, as plain values.
-        parts: ``data`` (a recording or many), ``method`` and ``extract`` (:class:`Options`).
+        parts: ``data`` (scenes or recordings, one or many), ``method`` and ``extract`` (:class:`Options`).
         progress: wraps the loop over rows: (items, text, number of items) → items.
 
     Raises:
@@ -88,9 +88,9 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Call
     need("pyarrow.parquet", extra="scale")
     if not isinstance(settings["workers"], int) or settings["workers"] < 0:
         raise ValueError(f"workers: found {settings['workers']!r}, expected a whole number of at least 0")
-    recordings = parts["data"] if isinstance(parts["data"], list | Recordings) else [parts["data"]]
-    whole = plan.make(recordings, options.gap, parts["method"].views)
-    rows = _rows(recordings, whole, parts["method"], settings["seed"], options)
+    scenes = scenes_of(parts["data"])
+    whole = plan.make(scenes, options.gap, parts["method"].views)
+    rows = _rows(scenes, whole, parts["method"], settings["seed"], options)
     shared = _shared(settings, options, whole, rows)
     folder = _folder(settings["out"])
     every = whole.shards(options.shard_rows)
@@ -112,12 +112,12 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Call
     return 0
 
 
-def _rows(recordings: Sequence[Any], whole: plan.Plan, method: Method, seed: int, options: Options) -> Rows:
+def _rows(scenes: Sequence[Scene], whole: plan.Plan, method: Method, seed: int, options: Options) -> Rows:
     hw = (int(options.tokens_hw[0]), int(options.tokens_hw[1]))
     rows, across = grid(hw, patch=options.patch, tokens_hw=hw)
     every = columns.columns(method.n, rows * across, half=options.half)
     return Rows(
-        recordings,
+        scenes,
         whole,
         columns.choose(every, options.columns),
         method=method,

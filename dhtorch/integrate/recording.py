@@ -18,13 +18,15 @@ from torch import Tensor
 
 from dhtorch.codes import Source
 from dhtorch.data.pairs import between
+from dhtorch.data.recording import Recording
+from dhtorch.data.scene import Given, Scene
 from dhtorch.evaluate.holdout import range_split
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import cells, se3
 from dhtorch.geometry.lookup import nearest
 from dhtorch.integrate.volume import View, Volume, fuse, splat
 from dhtorch.method import Method
-from dhtorch.records import Camera, Estimate, Frame, Pose, PoseFit, Samples, TrackHint, Tracks
+from dhtorch.records import Camera, Estimate, Frame, Pose, PoseFit, Samples, Tracks
 from dhtorch.tree import stack
 
 POSES = ("device", "anchored")
@@ -68,7 +70,7 @@ class Places:
 
 
 def ask(
-    recording: Any,
+    scene: Given,
     method: Method,
     pairs: Iterable[tuple[int, int]],
     *,
@@ -80,7 +82,7 @@ def ask(
     """The method's answer to each pair, one after the other.
 
     Args:
-        recording, pairs: see ``dhtorch.data``.
+        scene, pairs: see ``dhtorch.data``.
         method: of one view or several; the others lie between the two of the pair.
         cutoff: m; returns beyond it are hidden from the method. None hides nothing.
         seed, device, dtype: of the method's run; answers come back on the CPU.
@@ -88,7 +90,8 @@ def ask(
     Raises:
         ValueError: as the method, the readers and the hold-out raise it.
     """
-    views, hint = method.views, TrackHint.of(recording)
+    scene = Scene.of(scene)
+    views, hint, recording = method.views, scene.hint, scene.recording
     for i, j in pairs:
         shown = [range_split(recording[k].to(dtype).to(device), cutoff) for k in (i, *between(i, j, views))]
         trace: dict[str, Any] = {}
@@ -100,7 +103,7 @@ def ask(
         yield Answer((i, j), samples, estimate.to("cpu"), tracks, fit, rgb.cpu(), camera, shown[0].hw)
 
 
-def place(recording: Any, answers: Sequence[Answer], *, poses: str = "device") -> Places:
+def place(recording: Recording, answers: Sequence[Answer], *, poses: str = "device") -> Places:
     """Where the frames stand that the answers speak of.
 
     Args:
@@ -154,7 +157,7 @@ def chain(pairs: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def build(
-    recording: Any,
+    recording: Recording,
     volume: Volume,
     answers: Sequence[Answer],
     places: Places,
@@ -251,9 +254,9 @@ def recovered(answer: Answer, T_world_from_cam: Pose, *, radius: float) -> View:
     )
 
 
-def _own(recording: Any, k: int) -> Pose:
-    pose: Pose = recording.poses[k : k + 1]
-    return pose.to(torch.float64)
+def _own(recording: Recording, k: int) -> Pose:
+    assert recording.poses is not None
+    return recording.poses[k : k + 1].to(torch.float64)
 
 
 def _reached(first: int, start: Pose, links: dict[int, list[tuple[int, Pose]]]) -> dict[int, Pose]:

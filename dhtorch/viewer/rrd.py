@@ -13,7 +13,7 @@ import numpy as np
 
 from dhtorch.codes import Gate, Source, names, words
 from dhtorch.drawing import GATE_COLOURS, RECOVERED, SENSOR, SILENT
-from dhtorch.viewer.scene import Cloud, Scene, Shot, View
+from dhtorch.viewer.exhibit import Cloud, Exhibit, Shot, View
 
 ENDINGS = (".rrd",)
 
@@ -24,7 +24,7 @@ SMALLEST, LARGEST = 0.004, 0.15
 SENSED = 100
 
 
-def save(path: Path, scene: Scene) -> Path:
+def save(path: Path, scene: Exhibit) -> Path:
     """Write the scene as an ``.rrd`` file.
 
     Raises:
@@ -41,7 +41,7 @@ def save(path: Path, scene: Scene) -> Path:
     return path
 
 
-def spawn(scene: Scene) -> None:
+def spawn(scene: Exhibit) -> None:
     """Show the scene in a viewer of its own.
 
     Raises:
@@ -80,7 +80,7 @@ def _blueprint() -> Any:
     return b.Blueprint(b.Horizontal(left, pictures, column_shares=[2, 1]), collapse_panels=True)
 
 
-def _log(rr: Any, stream: Any, scene: Scene) -> None:
+def _log(rr: Any, stream: Any, scene: Exhibit) -> None:
     classes = [(SENSED, "sensor", _rgb(SENSOR)), (Gate.ANSWER, "recovered", _rgb(RECOVERED))]
     classes += [(code, words(names(Gate)[code]), _rgb(colour)) for code, colour in GATE_COLOURS.items()]
     stream.log("/", rr.AnnotationContext(classes), static=True)

@@ -17,11 +17,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
 
+from dhtorch.data.recording import Recording
+from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import bootstrap
 from dhtorch.geometry import cells, se3
 from dhtorch.records import Frame, Pose
@@ -43,7 +44,7 @@ MIN_POINTS = 16
 
 
 def run(
-    recordings: Sequence[Any],
+    scenes: Sequence[Given],
     methods: Mapping[str, Method],
     pairs: Pairs,
     settings: Settings,
@@ -70,7 +71,7 @@ def run(
     reference, its drift zero by definition, and where it is loose some of ICP's drift is the reference's own.
 
     Args:
-        recordings, settings, progress: as :func:`dhtorch.studies.protocol.run`. Scenes without a trajectory or with
+        scenes, settings, progress: as :func:`dhtorch.studies.protocol.run`. Scenes without a trajectory or with
             depth in one frame only have nothing to ask.
         methods: name → method; of the first the seats 1 and 2 are asked, its sampler with another gaze in every frame.
         pairs: not used: links follow the recording, evenly.
@@ -85,8 +86,8 @@ def run(
     method = next(iter(methods.values())).replace(n=n)
     worlds: dict[str, _Chain] = {}
 
-    def ask(recording: Any, item: Item) -> dict[str, Row]:
-        chain = worlds.setdefault(recording.name, _Chain(recording, method, settings, voxel))
+    def ask(scene: Scene, item: Item) -> dict[str, Row]:
+        chain = worlds.setdefault(scene.name, _Chain(scene.recording, method, settings, voxel))
         if not all(chain.cloud(k)[0].isfinite().all(-1).sum() >= MIN_POINTS for k in item):
             return {}
         starts = {"good": chain.relative(item), "none": se3.identity(1, chain.cloud(item[0]).double())}
@@ -103,14 +104,14 @@ def run(
                 found[source + solver] = _link(chain, item, T, fit, sure)
         return found
 
-    def whole(recording: Any, found: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
-        chain = worlds.pop(recording.name, None)
+    def whole(scene: Scene, found: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
+        chain = worlds.pop(scene.name, None)
         return {v: chain.summary(v) for v in VARIANTS} if chain and any(found) else {}
 
-    def items(recording: Any) -> list[Item]:
-        return chain_of(recording, links)
+    def items(scene: Scene) -> list[Item]:
+        return chain_of(scene.recording, links)
 
-    outcome = screen(recordings, items, ask, VARIANTS, truth=TRUTH, whole=whole, progress=progress)
+    outcome = screen(scenes_of(scenes), items, ask, VARIANTS, truth=TRUTH, whole=whole, progress=progress)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 
 
@@ -134,7 +135,7 @@ def verdict(outcome: Outcome) -> tuple[bool | None, str]:
     return fewer > len(covered) / 2 and nearer > len(lost) / 2, why
 
 
-def chain_of(recording: Any, links: int) -> list[Item]:
+def chain_of(recording: Recording, links: int) -> list[Item]:
     """Consecutive frames, evenly spread; none without a trajectory.
 
     Raises:
@@ -152,15 +153,16 @@ def chain_of(recording: Any, links: int) -> list[Item]:
 class _Chain:
     """The sparse sets of a recording, its trajectory, and where each variant has put the frames so far."""
 
-    def __init__(self, recording: Any, method: Method, settings: Settings, voxel: float) -> None:
+    def __init__(self, recording: Recording, method: Method, settings: Settings, voxel: float) -> None:
         self.recording, self.method, self.settings = recording, method, settings
         self.clouds: dict[int, Tensor] = {}
         self.placed: dict[str, dict[int, tuple[Pose, bool]]] = {v: {} for v in VARIANTS}
         depth = self.cloud(0)[0, :, 2]
         self.scale = float(depth[depth.isfinite()].median()) if bool(depth.isfinite().any()) else 1.0  # m
         self.voxel = voxel * self.scale
-        self.poses = recording.poses
-        self.true_poses = getattr(recording, "true_poses", recording.poses)
+        assert recording.poses is not None  # else it has no links
+        self.poses: Pose = recording.poses
+        self.true_poses: Pose = getattr(recording, "true_poses", recording.poses)
 
     def cloud(self, i: int) -> Tensor:
         """Points (1, n, 3) that frame ``i`` drew for itself."""

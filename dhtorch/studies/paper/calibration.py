@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from dhtorch.data.scene import Given
 from dhtorch.evaluate import bootstrap, calibrate, errors, risk
 from dhtorch.studies import protocol
 from dhtorch.studies.cohorts import HeldOut, everything
@@ -22,7 +23,7 @@ EXPECTATION = "It orders (AURC below the mean risk) without being calibrated (EC
 
 
 def run(
-    recordings: Sequence[Any],
+    scenes: Sequence[Given],
     methods: Mapping[str, Method],
     pairs: Pairs,
     settings: Settings,
@@ -37,17 +38,17 @@ def run(
     adds ``<method>.ece_pooled``: all scenes in one reliability table, each of equal weight.
 
     Args:
-        recordings, methods, pairs, settings, progress: as :func:`dhtorch.studies.protocol.run`.
+        scenes, methods, pairs, settings, progress: as :func:`dhtorch.studies.protocol.run`.
         thresholds: on the score.
 
     Source: paper, "Calibration" and the figure on selective risk–coverage.
     """
     split = Protocol({name: Variant(m) for name, m in methods.items()})
-    parts = [protocol.run(recordings, split, pairs, settings, progress=progress)]
+    parts = [protocol.run(scenes, split, pairs, settings, progress=progress)]
     for name, method in methods.items():
         held = HeldOut(method, settings.seed)
         asked = Protocol({name: held.variant()}, {"heldout": held.heldout}, everything)
-        parts.append(protocol.run(recordings, asked, pairs, settings, progress=progress))
+        parts.append(protocol.run(scenes, asked, pairs, settings, progress=progress))
     outcome = protocol.join(parts)
     for row in outcome.rows:
         key = (row["scene"], row["method"], row["truth"])
