@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from dhtorch import data
-from dhtorch import testing as writers
 from dhtorch.commands import run
 from dhtorch.data import FormatError
 from dhtorch.data.codecs import hdf5, npy, tiff
@@ -347,7 +346,7 @@ def test_bad_fod500(tmp_path: Path) -> None:
     good = (tmp_path / "000000Dpt.exr").read_bytes()
     (tmp_path / "000000Dpt.exr").write_bytes(good[:-20])
     fails(r"000000Dpt.exr: chunk 0: found bytes beyond", tmp_path)
-    (tmp_path / "000000_03All.tif").write_bytes(writers.focal_stacks.rgb_tiff(np.zeros((12, 17, 3), np.uint8)))
+    (tmp_path / "000000_03All.tif").write_bytes(stack_writers.rgb_tiff(np.zeros((12, 17, 3), np.uint8)))
     fails(r"000000_03All.tif: picture: found 17x12", tmp_path)
 
 

@@ -444,7 +444,7 @@ def test_coverage_counts_cells_and_islands():
 @pytest.fixture(scope="module")
 def walked():
     """A small recording of the built-in room, its pairs and what the method says about them."""
-    room = SyntheticRoom(hw=(240, 320), n_frames=5, gap=4, supersample=1, step_m=0.03)
+    room = SyntheticRoom(hw=(240, 320), n_frames=5, supersample=1, step_m=0.03)
     method = extend.replace(n=1024)
     return room, list(recording.ask(room, method, [(0, 4)], cutoff=2.0))
 

@@ -7,6 +7,7 @@ from functools import partial
 
 import pytest
 import torch
+from rooms import noted
 
 from dhtorch import archive, extend
 from dhtorch.codes import Gate
@@ -198,7 +199,7 @@ def room():
 def asked(room, installed, **options):
     models = {name: partial(ADAPTERS[name], weights=installed[name]) for name in ADAPTERS}
     pairs = partial(by_gap, gap=6)
-    return learned.run([room], {"paper": PAPER}, pairs, Settings(), **{"models": models, **options})
+    return learned.run([noted(room)], {"paper": PAPER}, pairs, Settings(), **{"models": models, **options})
 
 
 def test_networks_are_measured_on_our_candidates(room, installed):

@@ -12,6 +12,7 @@ from rooms import room as rendered
 import dhtorch
 from dhtorch import MAP, PAPER, WINDOW, TrackHint, tree
 from dhtorch.data.pairs import by_gap
+from dhtorch.data.scene import Scene
 from dhtorch.extract import plan
 from dhtorch.extract.rows import Rows
 from dhtorch.geometry import camera as cam
@@ -71,7 +72,7 @@ PLAIN, USUAL = PAPER.replace(**SEATS, n=N), PAPER.replace(n=N)
 
 @pytest.fixture(scope="module")
 def room():
-    return rendered(hw=(192, 256), n_frames=7, gap=3, near=2.0)
+    return rendered(hw=(192, 256), n_frames=7)
 
 
 def alike(a, b):
@@ -89,16 +90,15 @@ def test_a_plain_function_in_every_seat_answers_as_the_stage_itself(room):
 
 @pytest.mark.parametrize("views", [1, 3])
 def test_it_runs_in_the_protocol_with_the_levels_of_the_scene(room, views):
-    scene = rendered(hw=(192, 256), n_frames=7, gap=3, near=2.0)
-    scene.levels = 2
+    scene = Scene(room, near=2.0, levels=2)
     methods = {"plain": PLAIN.replace(views=views), "usual": USUAL.replace(views=views)}
     outcome = pairs.run([scene], methods, partial(by_gap, gap=3), protocol.Settings())
     plain, usual = (
         {k: v for k, v in outcome.scenes(m)["synthetic_room"].items() if k not in ("ms", "method")} for m in methods
     )
     assert plain == usual and plain["n_kept"] > 20
-    direct = PLAIN(protocol.holdout.range_split(scene[0], 2.0), scene[3], hint=TrackHint(levels=2))
-    other = PLAIN(protocol.holdout.range_split(scene[0], 2.0), scene[3])
+    direct = PLAIN(protocol.holdout.range_split(room[0], 2.0), room[3], hint=TrackHint(levels=2))
+    other = PLAIN(protocol.holdout.range_split(room[0], 2.0), room[3])
     assert not alike(direct, other), "two levels of a pyramid see less far than four"
 
 
@@ -110,7 +110,10 @@ def test_it_runs_in_a_transform_and_in_rows_for_a_data_set(room):
     for key in ("depth", "gate", "score"):
         assert torch.equal(*(a[f"dhtorch.{key}"] for a in answers))
     columns = {"depth": SimpleNamespace(kind="float32"), "gate": SimpleNamespace(kind="int32")}
-    rows = [Rows([room], plan.make([room], 3, 1), columns, method=m, gap=3)[4].features for m in (PLAIN, USUAL)]
+    rows = [
+        Rows([Scene(room)], plan.make([Scene(room)], 3, 1), columns, method=m, gap=3)[4].features
+        for m in (PLAIN, USUAL)
+    ]
     assert all((rows[0][k] == rows[1][k]).all() for k in columns)
 
 

@@ -9,7 +9,7 @@ import torch
 from dhtorch.geometry import camera, se3
 from dhtorch.synthetic.paths import PATHS
 from dhtorch.synthetic.raycast import DARK, MIRROR, ORDINARY, WINDOW
-from dhtorch.synthetic.recording import SURFACES, SyntheticRoom, phone_lidar
+from dhtorch.synthetic.recording import SURFACES, SyntheticRoom, open_room, phone_lidar
 from dhtorch.synthetic.room import BACK, FRONT, HEIGHT, LEFT, RIGHT, furnished_room
 from dhtorch.synthetic.shading import Light, ShadedRoom
 from dhtorch.tree import collate
@@ -233,7 +233,8 @@ def test_lidar_range_limit_is_along_the_ray(room):
 
 @pytest.mark.parametrize("path", PATHS)
 def test_paths_stay_in_the_room_and_keep_their_word(path):
-    room = SyntheticRoom(path=path, n_frames=300, seed=3)
+    scene = open_room(path=path, n_frames=300, seed=3)
+    room = scene.recording
     R, t = room.poses.R, room.poses.t
     torch.testing.assert_close(R @ R.mT, torch.eye(3, dtype=torch.float64).expand(300, 3, 3), atol=1e-12, rtol=0)
     assert (torch.linalg.det(R) > 0).all()
@@ -242,10 +243,10 @@ def test_paths_stay_in_the_room_and_keep_their_word(path):
     way = (t[6:] - t[:-6]).norm(dim=-1)
     assert turn.max() < 15 and way.max() < 0.25
     if path in ("rotation", "static"):
-        assert way.max() == 0 and room.role == "rotation"
+        assert way.max() == 0 and scene.role == "rotation"
         assert turn.median() > 2 if path == "rotation" else turn.max() == 0
     else:
-        assert way[:6].min() > 0.08 and way[:6].max() < 0.2 and room.role is None
+        assert way[:6].min() > 0.08 and way[:6].max() < 0.2 and scene.role is None
     if path in ("lateral", "forward"):
         assert turn.max() < 1e-5
         along = ((t[6] - t[0]) / way[0]) @ R[0]  # direction of motion in the camera
@@ -253,11 +254,12 @@ def test_paths_stay_in_the_room_and_keep_their_word(path):
 
 
 def test_every_default_frame_has_a_near_and_a_far_part():
-    room = SyntheticRoom(**SMALL)
-    assert len(room) - room.gap >= 6
+    scene = open_room(**SMALL)
+    room = scene.recording
+    assert len(room) - scene.gap >= 6
     for i in range(len(room)):
         depth = room.truth(i)["depth"]
-        assert 0.2 < (depth < room.near).double().mean() < 0.5
+        assert 0.2 < (depth < scene.near).double().mean() < 0.5
         assert depth.max() < 6
 
 

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 from PIL import Image
+from rooms import Changed, noted
 from rooms import room as rendered
 
 from dhtorch import archive, closure, drawing, viewer
@@ -99,26 +100,17 @@ def test_what_was_held_back_is_apart(scene):
         assert shot.depth_map.depth.max() <= CUTOFF and shot.seen.rgb.std() > 10
 
 
-class Untold(SyntheticRoom):
-    """The room without a trajectory."""
-
-    def __getitem__(self, index):
-        return super().__getitem__(index).replace(T_world_from_cam=None)
-
-
 def test_without_a_trajectory_every_pair_stands_alone():
-    room = Untold(hw=(60, 80), n_frames=4)
-    for i in range(4):
-        room[i]  # rendered with its pose
-    room.poses = None
-    found = look(room, METHODS["paper"], lambda r: by_gap(r, 2), Settings())
+    whole = SyntheticRoom(hw=(60, 80), n_frames=4)
+    room = Changed(whole, lambda frame: frame.replace(T_world_from_cam=None), poses=None)
+    found = look(noted(room), METHODS["paper"], lambda r: by_gap(r, 2), Settings())
     assert found.path is None and not found.placed and len(found.shots) == 2
     assert all((shot.T_world_from_0 == np.eye(4)).all() for shot in found.shots)
 
 
 def test_of_many_pairs_some_are_shown():
     room = SyntheticRoom(hw=(40, 60), n_frames=8)
-    found = look(room, METHODS["paper"], lambda r: by_gap(r, 1), Settings(), most=3)
+    found = look(noted(room), METHODS["paper"], lambda r: by_gap(r, 1), Settings(), most=3)
     assert [shot.label for shot in found.shots] == ["0 → 1", "3 → 4", "6 → 7"]
 
 
