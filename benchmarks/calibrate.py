@@ -43,10 +43,10 @@ def main() -> int:
     parser.add_argument("--output", type=Path, default=None)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    method, recordings = settings(options.method)
+    method, chosen = settings(options.method)
     variants = {f"{k}": protocol.Variant(method, seed=k) for k in range(options.seeds)}
-    outcome = protocol.run(recordings, protocol.Protocol(variants), by_gap, protocol.Settings())
-    scenes = [r.name for r in recordings if r.role is None]
+    outcome = protocol.run(chosen, protocol.Protocol(variants), by_gap, protocol.Settings())
+    scenes = [scene.name for scene in chosen if scene.role is None]
     found = {s: [p for (name, _, _), p in outcome.points.items() if name == s] for s in scenes}
     pooled = {s: tree.collate(points) for s, points in found.items() if points}
     commit = subprocess.run(

@@ -40,23 +40,16 @@ from dhtorch.stages.sample import spiral
 from dhtorch.studies.baselines import opencv
 from dhtorch.synthetic.recording import SyntheticRoom
 
-#: Real pairs: folder, near limit, gap; all 640x480.
-SCENES = (
-    ("tum_fr1_desk9", 1.0, 4),
-    ("7s_redkitchen_000", 2.0, 20),
-    ("7s_redkitchen_200", 2.0, 20),
-    ("7s_redkitchen_600", 2.0, 20),
-)
+#: Real pairs: folder → gap; all 640x480.
+SCENES = {"tum_fr1_desk9": 4, "7s_redkitchen_000": 20, "7s_redkitchen_200": 20, "7s_redkitchen_600": 20}
 LEVELS = 4
 
 
 def pairs(count: int) -> tuple[Tensor, Tensor]:
     """Grey images 0 and 1 (count, 1, H, W) uint8, taken from the scenes in turn."""
     root = os.environ.get("DHTORCH_DATA")
-    recordings: list[Any] = (
-        [data.open(Path(root) / name, near=near, gap=gap) for name, near, gap in SCENES] if root else [SyntheticRoom()]
-    )
-    chosen = [(recording, by_gap(recording)) for recording in recordings]
+    asked = [(data.open(Path(root) / name), gap) for name, gap in SCENES.items()] if root else [(SyntheticRoom(), 6)]
+    chosen = [(recording, by_gap(recording, gap)) for recording, gap in asked]
     views: list[list[Tensor]] = [[], []]
     for k in range(count):
         recording, found = chosen[k % len(chosen)]

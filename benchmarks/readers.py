@@ -30,6 +30,7 @@ from dhtorch import testing as writers
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame, Pose
+from dhtorch.studies.focal import formats
 from dhtorch.studies.focal import writers as stack_writers
 from dhtorch.studies.focal.stacks import FocalStack
 
@@ -158,11 +159,12 @@ FORMATS: dict[str, Callable[[Path, int], Path | None]] = {
 def measure(name: str, path: Path) -> dict[str, Any]:
     """Open and stream one capture; run in a process of its own."""
     torch.set_num_threads(1)
-    _ = data.open(path)[0]  # imports and file-system caches are not the reader's
+    opener = formats.open_stacks if name in formats.STACK_FORMATS else data.open
+    _ = opener(path)[0]  # imports and file-system caches are not the reader's
     before = _resident()
     _reset_peak()
     start = time.perf_counter()
-    recording = data.open(path)
+    recording = opener(path)
     opened = time.perf_counter() - start
     first = 0
     start = time.perf_counter()

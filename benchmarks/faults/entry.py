@@ -273,7 +273,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("Plan.place", "(self.ends[k - 1] if k else 0)", "self.ends[k - 1]"),
         ("Plan.place", "self.order[k], self.episodes[k]", "k, self.episodes[k]"),
         ("Plan.shards", "min(i + rows, len(self))", "i + rows"),
-        ("steps_back", "recording.gap if gap is None else gap", "recording.gap or gap"),
+        ("steps_back", "scene.gap if gap is None else gap", "scene.gap or gap"),
         ("steps_back", "between(0, gap, views) if gap else []", "between(0, gap, 1) if gap else []"),
         ("make", "k if number is None else number", "k"),
         ("make", "episodes = sorted(found)", "episodes = list(found)"),

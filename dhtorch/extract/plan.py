@@ -79,7 +79,8 @@ def make(scenes: Sequence[Scene], gap: int | None, views: int) -> Plan:
     for k, scene in enumerate(scenes):
         recording = scene.recording
         steps_back(scene, gap, views)
-        number = k if recording.episode is None else recording.episode
+        number = recording.episode
+        number = k if number is None else number
         if number in found:
             both = f"{found[number][1]} and {recording.name}"
             raise ValueError(f"data: {both} are one episode, expected one camera of it (data.camera=KEY)")
