@@ -45,6 +45,7 @@ ALIASES = {
     "dhtorch.window.extend_window": "dhtorch.method.Method",
     "dhtorch.window.inverse_variance": "dhtorch.stages.fuse.inverse_variance",
     "dhtorch.data.open_all": "dhtorch.data.open_capture",
+    "dhtorch.extract.Options": "dhtorch.extract.ExtractOptions",
     "dhtorch.data.synthetic.SyntheticRoom": "dhtorch.synthetic.recording.open_room",
     "dhtorch.synthetic.recording.SyntheticRoom": "dhtorch.synthetic.recording.open_room",
     "dhtorch.data.synthetic": "dhtorch.synthetic.recording",

@@ -434,10 +434,10 @@ ELSEWHERE = {
         for name in ("curve", "risk_coverage", "measure", "capped", "realised", "surest")
     ),
     *(
-        f"dhtorch.evaluate.calibrate.{n}"
-        for n in ("reliability", "pool", "measure", "ece_interval", "leave_one_room_out")
+        f"dhtorch.evaluate.reliability.{n}"
+        for n in ("diagram", "pool", "measure", "ece_interval", "leave_one_room_out")
     ),
-    *(f"dhtorch.evaluate.recalibrate.{name}" for name in ("fit", "fit_sigma", "from_json")),
+    *(f"dhtorch.evaluate.score_calibration.{name}" for name in ("fit", "fit_sigma", "from_json")),
     *(f"dhtorch.evaluate.monotone.{name}" for name in ("isotonic", "pool_adjacent_violators", "platt")),
     *(f"dhtorch.evaluate.control.{name}" for name in ("plug_in", "conformal", "scenes_needed", "p_value")),
     *(f"dhtorch.evaluate.compare.{name}" for name in ("method_ratios", "ratio_over_seeds", "equal_coverage")),

@@ -13,7 +13,7 @@ from tiny_dicts import H, K, N, Stub, Told, W, added, tiny
 from dhtorch import extract
 from dhtorch.data import Recording, Scene
 from dhtorch.extract import columns, plan
-from dhtorch.extract.rows import Rows
+from dhtorch.extract.dataset import Rows
 from dhtorch.records import Camera, Frame
 
 P = 6
@@ -258,5 +258,7 @@ def test_options_of_an_extraction_are_checked():
         ({"tokens_hw": 224}, "extract.tokens_hw: found 224"),
     ):
         with pytest.raises(ValueError, match=message):
-            extract.Options(**options)
-    assert extract.Options(gap=0, patch=1, shard_rows=1).gap == 0 and extract.Options(gap=None).gap is None
+            extract.ExtractOptions(**options)
+    assert (
+        extract.ExtractOptions(gap=0, patch=1, shard_rows=1).gap == 0 and extract.ExtractOptions(gap=None).gap is None
+    )

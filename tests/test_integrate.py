@@ -344,7 +344,7 @@ def answered(i, j, T, ok=True):
     estimate = Estimate(samples.uv, zero + 2, zero + 0.1, zero, zero, zero, code, zero, code)
     tracks = Tracks(samples.uv, samples.uv, zero, zero, torch.zeros(1, n, 2, 2), code == 0)
     fit = given_pose(T if ok else T.map(lambda v: v * math.nan), n)
-    return recording.Answer((i, j), samples, estimate, tracks, fit, torch.zeros(1, n, 3), wall().camera, (60, 80))
+    return recording.PairEstimate((i, j), samples, estimate, tracks, fit, torch.zeros(1, n, 3), wall().camera, (60, 80))
 
 
 class Trajectory:

@@ -14,7 +14,7 @@ from dhtorch import MAP, PAPER, WINDOW, TrackHint, tree
 from dhtorch.data.pairs import by_gap
 from dhtorch.data.scene import Scene
 from dhtorch.extract import plan
-from dhtorch.extract.rows import Rows
+from dhtorch.extract.dataset import Rows
 from dhtorch.geometry import camera as cam
 from dhtorch.method import Method, networks
 from dhtorch.stages.backproject import backproject

@@ -127,7 +127,10 @@ def test_memory_is_no_part_of_a_file(name: str, lay: Lay, tmp_path: Path, monkey
 
 
 def test_every_writer_is_asked() -> None:
-    assert {f"write_{name.split()[0]}" for name in WRITERS} == {*writers.__all__, *(n for n in vars(stack_writers) if n.startswith("write_"))}
+    assert {f"write_{name.split()[0]}" for name in WRITERS} == {
+        *writers.__all__,
+        *(n for n in vars(stack_writers) if n.startswith("write_")),
+    }
 
 
 def test_expanded_depth_of_a_focal_stack_is_written_where_it_belongs(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ TESTS: dict[str, list[str]] = {
     "extract.engines": ["tests/test_shards.py"],
     "extract.features": ["tests/test_shards.py"],
     "extract.plan": ["tests/test_extract_plan.py"],
-    "extract.rows": ["tests/test_extract_plan.py"],
+    "extract.dataset": ["tests/test_extract_plan.py"],
     "extract.shards": ["tests/test_shards.py"],
 }
 
@@ -128,7 +128,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_cells", "column < columns", "column <= columns"),
     ],
     "transform.problems": [
-        ("Problem", "NO_SECOND_VIEW: Final = 1", "NO_SECOND_VIEW: Final = 4"),
+        ("SampleProblem", "NO_SECOND_VIEW: Final = 1", "NO_SECOND_VIEW: Final = 4"),
         ("Tally.add", "1 + worker.id % (_ROWS - 1)", "worker.id % (_ROWS - 1)"),
         ("Tally.add", "1 + worker.id % (_ROWS - 1)", "1 + worker.id"),
         ("Tally.report", "self.counts.sum(0)", "self.counts[0]"),
@@ -143,7 +143,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
             "self.tokens_hw or self.views.image_hw(sample) or self._seen_hw",
             "self.tokens_hw or self._seen_hw or self.views.image_hw(sample)",
         ),
-        ("ExtendDepth.left_out", "self.tally.add(torch.tensor([Problem.UNREADABLE]))", "pass"),
+        ("ExtendDepth.left_out", "self.tally.add(torch.tensor([SampleProblem.UNREADABLE]))", "pass"),
         ("ExtendDepth._answer", "torch.where(paired[:, None], estimate.gate, Gate.NO_TRACK)", "estimate.gate"),
         ("ExtendDepth._answer", "tokens_hw=self.tokens_hw, fit=self.fit", "tokens_hw=self.tokens_hw"),
         ("ExtendDepth._answer", "frame.depth.flatten(1).amax(1) > 0", "frame.depth.flatten(1).amin(1) > 0"),
@@ -158,7 +158,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
             "x.masked_fill(bad.view(-1, *[1] * (x.ndim - 1)), 0)",
             "torch.where(bad.view(-1, *[1] * (x.ndim - 1)), 0, x)",
         ),
-        ("ExtendDepth._answer", "problem = torch.where(bad, Problem.UNREADABLE, problem)", "pass"),
+        ("ExtendDepth._answer", "problem = torch.where(bad, SampleProblem.UNREADABLE, problem)", "pass"),
         ("ExtendDepth._answer", "hint=self.hint, ", ""),
         ("ExtendDepth._seeds", "index.long().cpu() + self.seed", "index.long().cpu()"),
         ("ExtendDepth._seeds", "index.shape[0] != batch or index.is_floating_point()", "index.shape[0] != batch"),
@@ -220,8 +220,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     ],
     "extract": [
         ("_UNKEYED", '"engine", "address"', '"engine", "address", "half"'),
-        ("Options.__post_init__", "len(self.tokens_hw) == 2", "len(self.tokens_hw) >= 2"),
-        ("Options.__post_init__", '"gap": 0', '"gap": 1'),
+        ("ExtractOptions.__post_init__", "len(self.tokens_hw) == 2", "len(self.tokens_hw) >= 2"),
+        ("ExtractOptions.__post_init__", '"gap": 0', '"gap": 1'),
         ("run", "if shard.name not in done", "if True"),
         ("run", "counts = dict(done)", "counts = {}"),
         ("_rows", "half=options.half", "half=False"),
@@ -244,7 +244,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("columns", '"T_1_from_0": Column(f, (4, 4)', '"T_1_from_0": Column(f, (3, 4)'),
         ("columns", '"timestamp": Column("float64"', '"timestamp": Column("float32"'),
         ("choose", '{*PLACE, "problem"}', "{*PLACE}"),
-        ("blank", "Problem.UNREADABLE", "Problem.NO_DEPTH"),
+        ("blank", "SampleProblem.UNREADABLE", "SampleProblem.NO_DEPTH"),
         ("table", "reversed(column.shape)", "column.shape"),
         ("schema", '"about": c.about', '"about": c.unit'),
     ],
@@ -278,7 +278,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("make", "k if number is None else number", "k"),
         ("make", "episodes = sorted(found)", "episodes = list(found)"),
     ],
-    "extract.rows": [
+    "extract.dataset": [
         ("_TRUSTED", '"max_depth": np.inf', '"max_depth": 100.0'),
         ("_TRUSTED", '"min_depth": 0.0', '"min_depth": 0.01'),
         ("_TRUSTED", '"max_offset": np.inf', '"max_offset": 0.2'),

@@ -21,7 +21,7 @@ from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.integrate import recording as recordings
 from dhtorch.integrate.picture import draw_map
-from dhtorch.integrate.recording import Answer, Places
+from dhtorch.integrate.recording import PairEstimate, Places
 from dhtorch.method import Method
 from dhtorch.pair import merge
 from dhtorch.records import Camera, Frame
@@ -39,7 +39,7 @@ class MappedScene:
     """The map of one recording and what it was made of."""
 
     recording: Recording
-    answers: Sequence[Answer]
+    answers: Sequence[PairEstimate]
     places: Places
     volume: integrate.Volume
     surface: integrate.Surface
@@ -175,7 +175,7 @@ def _write_colmap(folder: Path, scene: MappedScene) -> None:
     export.write_colmap(folder, shots, *map(torch.cat, zip(*(pieces or [none]), strict=True)))
 
 
-def _triangulated(answer: Answer, number: Mapping[int, int], poses: Mapping[int, Any]) -> list[Tensor]:
+def _triangulated(answer: PairEstimate, number: Mapping[int, int], poses: Mapping[int, Any]) -> list[Tensor]:
     """World points, colours, errors, views and pixels of what one pair answered."""
     keep = answer.estimate.keep[0]
     xyz = cameras.unproject(answer.camera, answer.estimate.uv, answer.estimate.depth.nan_to_num(1.0))
@@ -209,7 +209,7 @@ def _said(row: Row, voxel: float) -> str:
     )
 
 
-def _n_recovered(answers: Iterable[Answer]) -> int:
+def _n_recovered(answers: Iterable[PairEstimate]) -> int:
     return sum(int(answer.recovered.sum()) for answer in answers)
 
 

@@ -36,7 +36,7 @@ PATCH = 1.5
 
 
 @dataclass(frozen=True)
-class Answer:
+class PairEstimate:
     """What the method said about one pair, and what of the pictures a map needs."""
 
     pair: tuple[int, int]
@@ -78,7 +78,7 @@ def ask(
     seed: int = 0,
     device: str = "cpu",
     dtype: torch.dtype = torch.float32,
-) -> Iterator[Answer]:
+) -> Iterator[PairEstimate]:
     """The method's answer to each pair, one after the other.
 
     Args:
@@ -100,10 +100,10 @@ def ask(
             samples, rgb = trace["samples"].to("cpu"), _colour(shown[0], trace["samples"].uv)
         tracks, fit = (trace[k].to("cpu") for k in ("tracks", "fit"))
         camera = shown[0].camera.to("cpu")
-        yield Answer((i, j), samples, estimate.to("cpu"), tracks, fit, rgb.cpu(), camera, shown[0].hw)
+        yield PairEstimate((i, j), samples, estimate.to("cpu"), tracks, fit, rgb.cpu(), camera, shown[0].hw)
 
 
-def place(recording: Recording, answers: Sequence[Answer], *, poses: str = "device") -> Places:
+def place(recording: Recording, answers: Sequence[PairEstimate], *, poses: str = "device") -> Places:
     """Where the frames stand that the answers speak of.
 
     Args:
@@ -159,7 +159,7 @@ def chain(pairs: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
 def build(
     recording: Recording,
     volume: Volume,
-    answers: Sequence[Answer],
+    answers: Sequence[PairEstimate],
     places: Places,
     *,
     sources: Sequence[int] = (Source.SENSOR, Source.RECOVERED),
@@ -244,7 +244,7 @@ def sensed(
     return View(depth, sigma, features.view(1, *hw, 4), camera, T_world_from_cam)
 
 
-def recovered(answer: Answer, T_world_from_cam: Pose, *, radius: float) -> View:
+def recovered(answer: PairEstimate, T_world_from_cam: Pose, *, radius: float) -> View:
     """The recovered points of a pair as patches of ``radius`` metres."""
     estimate = answer.estimate
     depth = torch.where(answer.recovered, estimate.depth, 0.0)

@@ -23,9 +23,9 @@ from dhtorch.data import FormatError
 from dhtorch.data.scene import scenes_of
 from dhtorch.studies.protocol import Progress, Settings
 from dhtorch.viewer import again, html, points, rrd
-from dhtorch.viewer.exhibit import Cloud, DepthMap, Exhibit, Shot, View, look
+from dhtorch.viewer.exhibit import Cloud, DepthMap, Exhibit, Picture, Shot, look
 
-__all__ = ["Cloud", "DepthMap", "Exhibit", "Shot", "View", "look", "run"]
+__all__ = ["Cloud", "DepthMap", "Exhibit", "Picture", "Shot", "look", "run"]
 
 
 def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:

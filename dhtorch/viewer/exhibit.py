@@ -32,7 +32,7 @@ LONGEST, QUALITY = 800, 82
 
 
 @dataclass(frozen=True)
-class View:
+class Picture:
     """A picture and where it was taken."""
 
     number: int  # place of the frame in the recording
@@ -100,7 +100,7 @@ class Exhibit:
 
     name: str
     shots: Sequence[Shot]
-    views: Sequence[View] = ()
+    views: Sequence[Picture] = ()
     path: np.ndarray | None = None  # (n, 3) m, camera centres of the whole recording; None = no trajectory
     facts: Mapping[str, str] = field(default_factory=dict)
 
@@ -135,7 +135,7 @@ def look(
     shown = Scene.of(given)
     recording = shown.recording
     shots: list[Shot] = []
-    views: dict[int, View] = {}
+    views: dict[int, Picture] = {}
 
     def keep(answer: Answer) -> protocol.Row:
         batch = answer.batch
@@ -194,9 +194,9 @@ def _shot(answer: Answer, shown: Sequence[int]) -> Shot:
     )
 
 
-def _view(recording: Recording, k: int, frame: Frame) -> View:
+def _view(recording: Recording, k: int, frame: Frame) -> Picture:
     time = None if recording.times is None else float(recording.times[k] - recording.times[0])
-    return View(int(recording.number[k]), time, *_jpeg(_pixels(frame)), frame.hw, *_intrinsics(frame.camera))
+    return Picture(int(recording.number[k]), time, *_jpeg(_pixels(frame)), frame.hw, *_intrinsics(frame.camera))
 
 
 def _depth_map(frame: Frame, cutoff: float) -> DepthMap:

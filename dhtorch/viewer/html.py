@@ -18,7 +18,7 @@ import numpy as np
 from dhtorch import archive
 from dhtorch.codes import Gate, Hole, names, words
 from dhtorch.drawing import GATE_COLOURS, HOLE_COLOURS, RECOVERED, SENSOR, SILENT
-from dhtorch.viewer.exhibit import Cloud, Exhibit, Shot, View
+from dhtorch.viewer.exhibit import Cloud, Exhibit, Picture, Shot
 
 ENDINGS = (".html", ".htm")
 
@@ -104,7 +104,7 @@ def _shot(shot: Shot) -> dict[str, Any]:
     return made | {k: None if T is None else [float(x) for x in T[:3].ravel()] for k, T in poses.items()}
 
 
-def _view(view: View) -> dict[str, Any]:
+def _view(view: Picture) -> dict[str, Any]:
     facts = {"number": view.number, "time": view.time, "hw": list(view.hw), "f": list(view.f), "c": list(view.c)}
     return facts | {"jpeg": base64.b64encode(view.jpeg).decode("ascii")}
 

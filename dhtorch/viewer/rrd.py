@@ -13,7 +13,7 @@ import numpy as np
 
 from dhtorch.codes import Gate, Source, names, words
 from dhtorch.drawing import GATE_COLOURS, RECOVERED, SENSOR, SILENT
-from dhtorch.viewer.exhibit import Cloud, Exhibit, Shot, View
+from dhtorch.viewer.exhibit import Cloud, Exhibit, Picture, Shot
 
 ENDINGS = (".rrd",)
 
@@ -133,7 +133,7 @@ def _log_points(rr: Any, stream: Any, shot: Shot) -> None:
         stream.log(f"world/map/{name}", rr.Points3D(_moved(T, cloud.xyz), colors=cloud.rgb, radii=SMALLEST))
 
 
-def _log_views(rr: Any, stream: Any, shot: Shot, view_0: View, view_1: View) -> None:
+def _log_views(rr: Any, stream: Any, shot: Shot, view_0: Picture, view_1: Picture) -> None:
     s = shot.samples
     _log_camera(rr, stream, "anchor", shot.T_world_from_0, view_0)
     if shot.depth_map is not None:
@@ -158,7 +158,7 @@ def _log_views(rr: Any, stream: Any, shot: Shot, view_0: View, view_1: View) -> 
     stream.log("world/other/picture/samples", rr.Points2D(at_1[found], class_ids=classes[found], radii=2.0))
 
 
-def _log_camera(rr: Any, stream: Any, name: str, T: np.ndarray, view: View) -> None:
+def _log_camera(rr: Any, stream: Any, name: str, T: np.ndarray, view: Picture) -> None:
     h, w = view.jpeg_hw
     s = (w / view.hw[1], h / view.hw[0])
     c = [(view.c[k] + 0.5) * s[k] for k in range(2)]
@@ -169,7 +169,7 @@ def _log_camera(rr: Any, stream: Any, name: str, T: np.ndarray, view: View) -> N
     stream.log(f"world/{name}/picture", rr.EncodedImage(contents=view.jpeg, media_type="image/jpeg"))
 
 
-def _shown(view: View, uv: np.ndarray) -> np.ndarray:
+def _shown(view: Picture, uv: np.ndarray) -> np.ndarray:
     """Pixels of the full picture in those of the JPEG, where (0, 0) is the corner of the first."""
     (h, w), (H, W) = view.jpeg_hw, view.hw
     return (uv + 0.5) * np.array([w / W, h / H], uv.dtype)

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from dhtorch.data.scene import Given
-from dhtorch.evaluate import bootstrap, calibrate, errors, risk
+from dhtorch.evaluate import bootstrap, errors, reliability, risk
 from dhtorch.studies import protocol
 from dhtorch.studies.cohorts import HeldOut, everything
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
@@ -85,6 +85,6 @@ def _at_thresholds(points: errors.Points, thresholds: Sequence[float]) -> Row:
 def _pooled(outcome: Outcome, method: str) -> dict[str, Any]:
     apart = {r["scene"] for r in outcome.rows if r.get("role")}
     scenes = [p for (s, m, t), p in outcome.points.items() if (m, t) == (method, "full") and s not in apart]
-    value = calibrate.measure(scenes)["ece"]
+    value = reliability.measure(scenes)["ece"]
     entry = {"value": value, "low": None, "high": None, "n": len(scenes), "unit": "1"}
     return {f"{method}.ece_pooled": entry}

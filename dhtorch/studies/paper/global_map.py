@@ -25,7 +25,7 @@ from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import bootstrap
 from dhtorch.geometry import cells
-from dhtorch.integrate.recording import POSES, Answer, Places, build, chain, coverage, place
+from dhtorch.integrate.recording import POSES, PairEstimate, Places, build, chain, coverage, place
 from dhtorch.integrate.recording import ask as ask_pairs
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
 from dhtorch.studies.rows import Row
@@ -66,7 +66,7 @@ def run(
     Source: paper, "Global integration (scope note)" and the limitation "map fragmentation".
     """
     method = next(iter(methods.values())).replace(n=n)
-    answers: dict[str, dict[Item, Answer]] = {}
+    answers: dict[str, dict[Item, PairEstimate]] = {}
 
     def items(scene: Scene) -> list[Item]:
         chosen = list(pairs(scene))
@@ -119,7 +119,7 @@ def verdict(outcome: Outcome) -> tuple[bool | None, str]:
 class _Maps:
     """The maps of one recording."""
 
-    def __init__(self, recording: Recording, answers: list[Answer], cutoff: float | None, voxel: float) -> None:
+    def __init__(self, recording: Recording, answers: list[PairEstimate], cutoff: float | None, voxel: float) -> None:
         self.recording, self.answers, self.cutoff = recording, answers, cutoff
         depth = recording[0].depth
         there = depth[depth.isfinite() & (depth > 0)]

@@ -22,7 +22,7 @@ from dhtorch.transform import ExtendDepth
 _TRUSTED = {"depth_unit": "m", "layout": "chw", "max_depth": np.inf, "min_depth": 0.0, "max_offset": np.inf}
 
 
-class Answer(NamedTuple):
+class Extracted(NamedTuple):
     """What came of one row of the plan."""
 
     place: Row  # the columns that say where it belongs
@@ -30,7 +30,7 @@ class Answer(NamedTuple):
     complaint: str = ""  # why
 
 
-class Rows(Dataset[Answer]):
+class Rows(Dataset[Extracted]):
     """Position in the plan → answer. Depends on nothing but the position: not on the worker, its engine or the order.
 
     The sample is what a robot's data loader with ``delta_timestamps`` makes: the picture ``gap`` frames earlier (for a
@@ -63,7 +63,7 @@ class Rows(Dataset[Answer]):
     def __len__(self) -> int:
         return len(self.plan)
 
-    def __getitem__(self, position: int) -> Answer:
+    def __getitem__(self, position: int) -> Extracted:
         k, episode, i = self.plan.place(position)
         if self._opened is None or self._opened[0] != k:
             self._opened = (k, _Opened(self.scenes[k], self.method, self.gap, self.options))
@@ -78,9 +78,9 @@ class Rows(Dataset[Answer]):
             if isinstance(error, MemoryError | torch.OutOfMemoryError):
                 raise
             text = f"{recording.name}, frame {place['frame_index']}: {error}"
-            return Answer(place, None, " ".join(text.split()))
+            return Extracted(place, None, " ".join(text.split()))
         keep = {k: c for k, c in self.wanted.items() if k not in PLACE}
-        return Answer(place, {k: added[k].numpy().astype(c.kind) for k, c in keep.items()})
+        return Extracted(place, {k: added[k].numpy().astype(c.kind) for k, c in keep.items()})
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_opened": None}
