@@ -30,6 +30,7 @@ from dhtorch.studies.negative.registration import Registration, normals, registe
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
 from dhtorch.studies.rows import Row
 from dhtorch.studies.screening import Item, paired, screen
+from dhtorch.synthetic.recording import SyntheticRoom
 
 QUESTION = "Does ICP between independently sampled sparse sets add anything to a good device pose?"
 EXPECTATION = "No: it covers fewer voxels than the pose alone; without a pose it ends nearer to the truth than nothing."
@@ -162,7 +163,7 @@ class _Chain:
         self.voxel = voxel * self.scale
         assert recording.poses is not None  # else it has no links
         self.poses: Pose = recording.poses
-        self.true_poses: Pose = getattr(recording, "true_poses", recording.poses)
+        self.true_poses: Pose = recording.true_poses if isinstance(recording, SyntheticRoom) else recording.poses
 
     def cloud(self, i: int) -> Tensor:
         """Points (1, n, 3) that frame ``i`` drew for itself."""
