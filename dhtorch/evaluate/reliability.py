@@ -57,7 +57,7 @@ def diagram(
 
     Source: C. Guo et al., "On calibration of modern neural networks", 2017.
     """
-    check("diagram", claimed=(claimed, "n"), good=(good, "n"), weight=(weight, "n"))
+    check("reliability", claimed=(claimed, "n"), good=(good, "n"), weight=(weight, "n"))
     if bins < 1:
         raise ValueError(f"reliability: found bins={bins}, expected at least 1")
     claimed = claimed.double().clamp(0, 1)
