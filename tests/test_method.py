@@ -127,7 +127,7 @@ def test_it_runs_in_the_viewer_and_its_result_in_the_report(room, tmp_path):
     settings = {"threads": None, "resume": False, "figures": False, "seed": 0, "device": "cpu", "dtype": "float32"}
     settings |= {"batch": 1, "workers": 0, "holdout": {"cutoff": None, "truth": "full"}, "method": {}, "data": {}}
     settings |= {"pairs": {}, "experiment": {}}
-    parts = {"data": room, "method": PLAIN, "pairs": partial(by_gap, gap=3), "experiment": pairs.run}
+    parts = {"data": Scene(room, near=2.0), "method": PLAIN, "pairs": partial(by_gap, gap=3), "experiment": pairs.run}
     choices = dict.fromkeys(job.GROUPS, "mine") | {"experiment": "pair", "method": "plain"}
     ended = job.run(settings, parts, choices, tmp_path, progress=lambda items, *_: items)
     assert ended.state == "finished"
