@@ -64,7 +64,7 @@ def forward(image_0: Tensor, image_1: Tensor, uv: Tensor, window: int, pyramid_0
     """Positions (B, N, 2) and whether they were found (B, N)."""
     B, N, _ = uv.shape
     assert B * N % LANES == 0
-    o = lk.Options(window, 30, 0.01, track.MIN_EIGENVALUE, "none")
+    o = lk.SearchOptions(window, 30, 0.01, track.MIN_EIGENVALUE, "none")
     with torch.no_grad():
         source = build_pyramid(image_0, LEVELS, window) if pyramid_0 is None else pyramid_0
         target = build_pyramid(image_1, LEVELS, window, gradients=False)

@@ -152,7 +152,9 @@ def test_a_scene_without_pairs_keeps_a_row_that_says_so():
 
 
 def test_curves_of_a_scene_are_what_its_points_say():
-    outcome = pair.run([noted(small(lidar="exact"))], {"paper": method("paper")}, partial(by_gap, gap=2), pair.Settings())
+    outcome = pair.run(
+        [noted(small(lidar="exact"))], {"paper": method("paper")}, partial(by_gap, gap=2), pair.Settings()
+    )
     row, points = scene_row(outcome), outcome.points["synthetic_room", "paper", "full"]
     curve = row["curves"]["risk_coverage"]
     five_digits = partial(pytest.approx, rel=1e-4)
@@ -167,7 +169,9 @@ def test_curves_of_a_scene_are_what_its_points_say():
 
 def test_candidates_do_not_depend_on_the_method():
     methods = {name: method(name) for name in ("paper", "opencv")}
-    outcome = opencv_twin.run([noted(small(lidar="exact"))], {}, partial(by_gap, gap=2), pair.Settings(), methods=methods)
+    outcome = opencv_twin.run(
+        [noted(small(lidar="exact"))], {}, partial(by_gap, gap=2), pair.Settings(), methods=methods
+    )
     for truth in ("raw", "5x5", "full"):
         a, b = (scene_row(outcome, method=m, truth=truth) for m in methods)
         assert a["n_candidates"] == b["n_candidates"] and a["n_dropped"] == b["n_dropped"]

@@ -13,7 +13,7 @@ TESTS: dict[str, list[str]] = {
     "geometry.pyramid": ["tests/test_pyramid.py", "tests/test_contract.py"],
     "geometry.filters": ["tests/test_filters.py", "tests/test_contract.py"],
     "geometry.thin_lens": ["tests/test_thin_lens.py", "tests/test_contract.py"],
-    "geometry.cells": ["tests/test_cells.py", "tests/test_contract.py"],
+    "geometry.sparse_grid": ["tests/test_sparse_grid.py", "tests/test_contract.py"],
 }
 
 FAULTS: dict[str, list[tuple[str, ...]]] = {
@@ -127,7 +127,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("depth_of_spot", "1 / focus_m[:, None] - diameter", "1 / focus_m[:, None] - diameter.abs()"),
         ("depth_of_spot", "known = inverse > 0", "known = inverse >= 0"),
     ],
-    "geometry.cells": [
+    "geometry.sparse_grid": [
         ("pack", "(shifted >= 0)", "(shifted > 0)"),
         ("pack", "(shifted < 2 * REACH)", "(shifted <= 2 * REACH)"),
         ("pack", "(x << 2 * BITS) + (y << BITS) + z", "(z << 2 * BITS) + (y << BITS) + x"),
@@ -164,12 +164,12 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
             "(y.split(CHUNK, -1) for y in (x, x + d, batch))",
             "(y.split(CHUNK, -1) for y in (x, x - d, batch))",
         ),
-        ("covariance", "torch.stack([c, -b, -b, a])", "torch.stack([a, -b, -b, c])"),
-        ("covariance", "torch.stack([c, -b, -b, a])", "torch.stack([c, b, b, a])"),
-        ("covariance", "clamp_min(QUANTISATION)", "sqrt().clamp_min(QUANTISATION)"),
-        ("covariance", "clamp_min(QUANTISATION)", "clamp_min(0)"),
-        ("covariance", "(a * c - b * b)", "(a * c + b * b)"),
-        ("covariance", "(a + c - small).clamp_min(1e-4)", "(a + c - small)"),
+        ("window_covariance", "torch.stack([c, -b, -b, a])", "torch.stack([a, -b, -b, c])"),
+        ("window_covariance", "torch.stack([c, -b, -b, a])", "torch.stack([c, b, b, a])"),
+        ("window_covariance", "clamp_min(QUANTISATION)", "sqrt().clamp_min(QUANTISATION)"),
+        ("window_covariance", "clamp_min(QUANTISATION)", "clamp_min(0)"),
+        ("window_covariance", "(a * c - b * b)", "(a * c + b * b)"),
+        ("window_covariance", "(a + c - small).clamp_min(1e-4)", "(a + c - small)"),
         ("for_some", "old.index_copy(-1, some, n)", "n"),
         ("_by_cell", "(place + 0.5) * size", "place * size"),
         ("_by_cell", "cell // columns % rows", "cell // rows % columns"),
@@ -310,8 +310,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("lucas_kanade", "image_0.requires_grad or image_1.requires_grad", "image_0.requires_grad"),
         (
             "lucas_kanade",
-            "lk.Options(window, iterations, epsilon_px, min_eigenvalue, normalise)",
-            'lk.Options(window, iterations, epsilon_px, min_eigenvalue, "none")',
+            "lk.SearchOptions(window, iterations, epsilon_px, min_eigenvalue, normalise)",
+            'lk.SearchOptions(window, iterations, epsilon_px, min_eigenvalue, "none")',
         ),
         (
             "refine",

@@ -49,7 +49,7 @@ TOP, BETWEEN, FINEST = (2, 2, 2, 2), (1, 2, 2), (1, 2, 2, 2)
 GAIN = (0.2, 5.0)
 
 
-class Options(NamedTuple):
+class SearchOptions(NamedTuple):
     """How to search; see :func:`dhtorch.stages.track.lucas_kanade`."""
 
     window: int
@@ -70,7 +70,7 @@ class _Pair(NamedTuple):
 
 
 def search(
-    source: Pyramid, target: Pyramid, o: Options, alike: bool, x: Tensor, d: Tensor, batch: Tensor, known: Tensor
+    source: Pyramid, target: Pyramid, o: SearchOptions, alike: bool, x: Tensor, d: Tensor, batch: Tensor, known: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Coarse to fine from ``d`` for the points that are ``known`` (M,), M a multiple of ``LANES``.
 
@@ -101,7 +101,9 @@ def search(
     return d, known & textured & held & within(x + d, pair.low, pair.high), A
 
 
-def step(source: Pyramid, target: Pyramid, o: Options, x: Tensor, x_1: Tensor, batch: Tensor) -> tuple[Tensor, Tensor]:
+def step(
+    source: Pyramid, target: Pyramid, o: SearchOptions, x: Tensor, x_1: Tensor, batch: Tensor
+) -> tuple[Tensor, Tensor]:
     """One Gauss-Newton step (2, M), to be subtracted from ``x_1``, read from pixels of the finest level and carrying a
     graph; and who is textured (M,)."""
     G = _project(source.windows(0, x, batch, o.window), o.normalise)
@@ -112,7 +114,7 @@ def step(source: Pyramid, target: Pyramid, o: Options, x: Tensor, x_1: Tensor, b
     return found if o.normalise != "gain_bias" else found[:2] / found[2].clamp(*GAIN), textured
 
 
-def squares(source: Pyramid, target: Pyramid, o: Options, x: Tensor, d: Tensor, batch: Tensor) -> Tensor:
+def squares(source: Pyramid, target: Pyramid, o: SearchOptions, x: Tensor, d: Tensor, batch: Tensor) -> Tensor:
     """Squared grey differences between the windows at ``x`` and ``x + d`` after normalisation, summed: (M,)."""
     sums = []
     for p, q, b in zip(*(y.split(CHUNK, -1) for y in (x, x + d, batch)), strict=True):
@@ -127,7 +129,7 @@ def squares(source: Pyramid, target: Pyramid, o: Options, x: Tensor, d: Tensor, 
     return torch.where(total.isfinite(), total, torch.full_like(total, o.window**2))
 
 
-def covariance(A: Tensor, variance: Tensor) -> Tensor:
+def window_covariance(A: Tensor, variance: Tensor) -> Tensor:
     """s² A⁻¹ (2, 2, M). The small eigenvalue of A is raised to 1e-5 of the large one, which float32 can represent."""
     a, b, c = torch.where(A.isfinite(), A, torch.zeros_like(A)).double()
     small = _small_eigenvalue(a, b, c)
@@ -181,7 +183,7 @@ def _by_cell(pyramid: Pyramid, level: int, fn: Callable, x: Tensor, d: Tensor, b
     return search(cells).index_select(-1, (wanted.cumsum(0) - 1)[own])
 
 
-def _descend(pair: _Pair, o: Options, radii: tuple[int, ...], x: Tensor, d: Tensor, batch: Tensor, known: Tensor):
+def _descend(pair: _Pair, o: SearchOptions, radii: tuple[int, ...], x: Tensor, d: Tensor, batch: Tensor, known: Tensor):
     """One level: all points on a first map, then those that need it on further ones.
 
     Returns the displacement; who stayed on the last map, and whose window is textured (both (M,)); and A (3, M).
@@ -200,7 +202,7 @@ def _descend(pair: _Pair, o: Options, radii: tuple[int, ...], x: Tensor, d: Tens
     return d, held, textured, moments[2:5]
 
 
-def _on_new_map(pair: _Pair, o: Options, radius: int, steps: int, x, d, live, held, batch, moments, A_inv):  # noqa: PLR0917
+def _on_new_map(pair: _Pair, o: SearchOptions, radius: int, steps: int, x, d, live, held, batch, moments, A_inv):  # noqa: PLR0917
     """:func:`_on_map` with a map around where the points are, of windows whose moments are known."""
     corner = pair.target.corner(pair.level, x + d) - radius
     C, _ = _map(pair, o, radius, x, corner, batch, moments)
@@ -209,7 +211,7 @@ def _on_new_map(pair: _Pair, o: Options, radius: int, steps: int, x, d, live, he
 
 def _on_map(
     pair: _Pair,
-    o: Options,
+    o: SearchOptions,
     steps: int,
     field: Tensor,  # (2 or 3, n, n, M) see _steps
     corner: Tensor,  # (2, M) the target's pixel where the map begins
@@ -256,7 +258,9 @@ def _steps(C: Tensor, moments: Tensor, A_inv: Tensor) -> Tensor:
     return steps if len(C) == 2 else torch.cat([steps, _gain(C[2:], moments[5])])
 
 
-def _map(pair: _Pair, o: Options, radius: int, x: Tensor, corner: Tensor, batch: Tensor, moments: Tensor | None = None):
+def _map(
+    pair: _Pair, o: SearchOptions, radius: int, x: Tensor, corner: Tensor, batch: Tensor, moments: Tensor | None = None
+):
     """Map (K, n, n, M) of the windows at ``x`` (2, M) that begins at the target's pixels ``corner``; the moments."""
     w, side = o.window, o.window + 2 * radius + 1
     planes = (GRAD_X, GRAD_Y) if moments is not None and o.normalise != "gain_bias" else (GRAD_X, GRAD_Y, GREY)

@@ -22,7 +22,7 @@ from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Given, Scene
 from dhtorch.evaluate.holdout import range_split
 from dhtorch.geometry import camera as cameras
-from dhtorch.geometry import cells, se3
+from dhtorch.geometry import se3, sparse_grid
 from dhtorch.geometry.lookup import nearest
 from dhtorch.integrate.volume import View, Volume, fuse, splat
 from dhtorch.method import Method
@@ -202,10 +202,10 @@ def coverage(xyz: Tensor, cell: float) -> dict[str, Any]:
 
     ``n_voxels`` covered; ``n_islands`` of touching ones; ``largest_island``, its share; None without any.
     """
-    key = cells.occupied(xyz, cell)
+    key = sparse_grid.occupied(xyz, cell)
     if not len(key):
         return {"n_voxels": 0, "n_islands": 0, "largest_island": None}
-    sizes = cells.components(key).bincount()
+    sizes = sparse_grid.components(key).bincount()
     return {"n_voxels": len(key), "n_islands": len(sizes), "largest_island": int(sizes.max()) / len(key)}
 
 

@@ -24,7 +24,7 @@ from torch import Tensor
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import bootstrap
-from dhtorch.geometry import cells, se3
+from dhtorch.geometry import se3, sparse_grid
 from dhtorch.records import Frame, Pose
 from dhtorch.studies.negative.registration import Registration, normals, register
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
@@ -208,7 +208,7 @@ class _Chain:
     def voxels(self, placed: Mapping[int, tuple[Pose, bool]], sure_only: bool) -> Tensor:
         """Numbers (V,) of the cells that the points of the frames fall into."""
         points = [se3.apply(T, self.cloud(i).double())[0] for i, (T, sure) in placed.items() if sure or not sure_only]
-        return cells.occupied(torch.cat(points), self.voxel)
+        return sparse_grid.occupied(torch.cat(points), self.voxel)
 
     def summary(self, variant: str) -> Row:
         """What a variant's chain covers and where it ends."""
@@ -223,7 +223,7 @@ class _Chain:
             "n_voxels": len(covered),
             "voxels_vs_pose": len(covered) / max(len(alone), 1),
             "n_voxels_all": len(self.voxels(placed, sure_only=False)),
-            "right_share": float(cells.near(covered, real).double().mean()) if len(covered) else None,
+            "right_share": float(sparse_grid.near(covered, real).double().mean()) if len(covered) else None,
             "confident_share": sum(links) / len(links),
             "drift_deg": drift[0],
             "drift_rel": drift[1] / self.scale,

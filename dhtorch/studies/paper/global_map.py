@@ -24,7 +24,7 @@ from dhtorch.codes import Source
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import bootstrap
-from dhtorch.geometry import cells
+from dhtorch.geometry import sparse_grid
 from dhtorch.integrate.recording import POSES, PairEstimate, Places, build, chain, coverage, place
 from dhtorch.integrate.recording import ask as ask_pairs
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
@@ -136,7 +136,7 @@ class _Maps:
         for what, volume in (("sensor", near), ("fused", both)):
             found = self.covered(volume)
             row = common | coverage(integrate.points(volume).xyz, self.voxel)
-            row["right_share"] = float(cells.near(found, everything).double().mean()) if len(found) else None
+            row["right_share"] = float(sparse_grid.near(found, everything).double().mean()) if len(found) else None
             row["voxel_m"] = self.voxel
             rows[f"{what} {poses}"] = row
         alone = rows[f"sensor {poses}"]["n_voxels"]
@@ -150,4 +150,4 @@ class _Maps:
 
     def covered(self, volume: integrate.Volume) -> Tensor:
         """Numbers of the voxels that the surface passes through."""
-        return cells.occupied(integrate.points(volume).xyz, self.voxel)
+        return sparse_grid.occupied(integrate.points(volume).xyz, self.voxel)
