@@ -253,6 +253,15 @@ def test_paths_stay_in_the_room_and_keep_their_word(path):
         assert along[0].abs() > 0.95 if path == "lateral" else along[2] > 0.95
 
 
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [({"near": 0}, "near is 0"), ({"gap": 0}, "gap is 0, expected a positive"), ({"seeed": 2}, "found option 'seeed'")],
+)
+def test_a_scene_of_the_room_with_wrong_notes(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        open_room(**SMALL, **wrong)
+
+
 def test_every_default_frame_has_a_near_and_a_far_part():
     scene = open_room(**SMALL)
     room = scene.recording

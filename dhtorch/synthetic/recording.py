@@ -7,6 +7,7 @@ other frames, the order of access, the process or the number of threads.
 
 from __future__ import annotations
 
+import inspect
 import itertools
 import math
 from collections.abc import Sequence
@@ -189,8 +190,12 @@ def open_room(*, near: float = 2.0, gap: int = 6, **options: Any) -> Scene:
         options: of :class:`SyntheticRoom`.
 
     Raises:
-        ValueError: near or gap is not positive; else as :class:`SyntheticRoom`.
+        ValueError: near or gap is not positive, or an option that there is not; else as :class:`SyntheticRoom`.
     """
+    known = inspect.signature(SyntheticRoom).parameters
+    for option in options:
+        if option not in known:
+            raise ValueError(f"synthetic room: found option {option!r}, expected one of {', '.join(known)}")
     return as_scene(SyntheticRoom(**options), near, gap)
 
 
