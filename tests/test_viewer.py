@@ -20,7 +20,7 @@ from PIL import Image
 from rooms import Changed, noted
 from rooms import room as rendered
 
-from dhtorch import archive, closure, drawing, viewer
+from dhtorch import archive, closure, data, drawing, viewer
 from dhtorch.codes import Gate, Source, names
 from dhtorch.commands import run
 from dhtorch.data.pairs import by_gap
@@ -417,6 +417,16 @@ def test_functions_are_found_where_older_results_name_them(job):
     result["config"]["method"]["fuse"] = {"_target_": "dhtorch.window.inverse_variance", "_partial_": True}
     method = again.parts(result)["method"]
     assert isinstance(method, Method) and method.views == 3 and method.fuse.func is inverse_variance
+
+
+def test_what_older_results_call_a_recording_with_notes_is_a_scene(job):
+    result = archive.read(job)
+    asked = {"hw": [60, 80], "n_frames": 2, "near": 1.5, "gap": 1}
+    result["config"]["data"] = {"_target_": "dhtorch.data.synthetic.SyntheticRoom", **asked}
+    scene = again.parts(result)["data"]
+    assert (scene.near, scene.gap, scene.recording.hw) == (1.5, 1, (60, 80))
+    result["config"]["data"] = {"_target_": "dhtorch.data.open_all", "root": "x", "near": 1.5, "_partial_": True}
+    assert again.parts(result)["data"].func is data.open_capture
 
 
 def test_null_stands_for_what_strict_json_cannot_hold(job):
