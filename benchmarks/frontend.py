@@ -41,7 +41,7 @@ SIZES = {"224": (224, 224), "1440": (1440, 1920)}
 def view(hw: tuple[int, int], batch: int = 1) -> Frame:
     """One view of the room with its near returns, as often as asked for."""
     room = SyntheticRoom()
-    frame = holdout.range_split(room[0], room.near)
+    frame = holdout.range_split(room[0], 2.0)
     image = interpolate(frame.image / 255, hw, mode="bilinear", antialias=True, align_corners=False).clamp(0, 1)
     image = (image * 255).round().to(torch.uint8).repeat(batch, 1, 1, 1).contiguous(memory_format=torch.channels_last)
     frame = frame.map(lambda x: x.repeat(batch, *[1] * (x.ndim - 1)))

@@ -40,23 +40,16 @@ from dhtorch.stages.sample import spiral
 from dhtorch.studies.baselines import opencv
 from dhtorch.synthetic.recording import SyntheticRoom
 
-#: Real pairs: folder, near limit, gap; all 640x480.
-SCENES = (
-    ("tum_fr1_desk9", 1.0, 4),
-    ("7s_redkitchen_000", 2.0, 20),
-    ("7s_redkitchen_200", 2.0, 20),
-    ("7s_redkitchen_600", 2.0, 20),
-)
+#: Real pairs: folder → gap; all 640x480.
+SCENES = {"tum_fr1_desk9": 4, "7s_redkitchen_000": 20, "7s_redkitchen_200": 20, "7s_redkitchen_600": 20}
 LEVELS = 4
 
 
 def pairs(count: int) -> tuple[Tensor, Tensor]:
     """Grey images 0 and 1 (count, 1, H, W) uint8, taken from the scenes in turn."""
     root = os.environ.get("DHTORCH_DATA")
-    recordings: list[Any] = (
-        [data.open(Path(root) / name, near=near, gap=gap) for name, near, gap in SCENES] if root else [SyntheticRoom()]
-    )
-    chosen = [(recording, by_gap(recording)) for recording in recordings]
+    asked = [(data.open(Path(root) / name), gap) for name, gap in SCENES.items()] if root else [(SyntheticRoom(), 6)]
+    chosen = [(recording, by_gap(recording, gap)) for recording, gap in asked]
     views: list[list[Tensor]] = [[], []]
     for k in range(count):
         recording, found = chosen[k % len(chosen)]
@@ -71,7 +64,7 @@ def forward(image_0: Tensor, image_1: Tensor, uv: Tensor, window: int, pyramid_0
     """Positions (B, N, 2) and whether they were found (B, N)."""
     B, N, _ = uv.shape
     assert B * N % LANES == 0
-    o = lk.Options(window, 30, 0.01, track.MIN_EIGENVALUE, "none")
+    o = lk.SearchOptions(window, 30, 0.01, track.MIN_EIGENVALUE, "none")
     with torch.no_grad():
         source = build_pyramid(image_0, LEVELS, window) if pyramid_0 is None else pyramid_0
         target = build_pyramid(image_1, LEVELS, window, gradients=False)

@@ -95,13 +95,13 @@ def encoded() -> tuple[str, tuple[int, int], list[dict[str, Any]]]:
     """Name, image size and eight pairs."""
     root = os.environ.get("DHTORCH_DATA")
     if root:
-        recording: Any = data.open(Path(root) / "tum_fr1_desk9", near=1.0, gap=4)
+        recording, near, gap = data.open(Path(root) / "tum_fr1_desk9"), 1.0, 4
     else:
-        recording = SyntheticRoom(n_frames=9, lidar="exact")
+        recording, near, gap = SyntheticRoom(n_frames=9, lidar="exact"), 2.0, 6
     pairs = []
-    for i in range(min(8, len(recording) - recording.gap)):
-        a, b = recording[i], recording[i + recording.gap]
-        mm = torch.where(a.depth[0] <= recording.near, a.depth[0] * 1000, 0.0).round().numpy().astype(np.uint16)
+    for i in range(min(8, len(recording) - gap)):
+        a, b = recording[i], recording[i + gap]
+        mm = torch.where(a.depth[0] <= near, a.depth[0] * 1000, 0.0).round().numpy().astype(np.uint16)
         pictures = {"image": a.image[0], "other": b.image[0]}
         pair = {
             k: cv2.imencode(".jpg", v.permute(1, 2, 0).numpy()[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])[1]

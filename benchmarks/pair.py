@@ -43,13 +43,12 @@ def load(batch: int) -> tuple[str, Frame, Frame, Frame, float]:
     """Name, near views 0 and 1, view 0 with all its returns, cutoff: ``batch`` pairs, repeated if need be."""
     root = os.environ.get("DHTORCH_DATA")
     if root:
-        recording: Any = data.open(Path(root) / "tum_fr1_desk9", near=1.0, gap=4)
+        recording, near, gap = data.open(Path(root) / "tum_fr1_desk9"), 1.0, 4
     else:
-        recording = SyntheticRoom()
-    chosen = by_gap(recording)
+        recording, near, gap = SyntheticRoom(), 2.0, 6
+    chosen = by_gap(recording, gap)
     chosen = [chosen[k % len(chosen)] for k in range(batch)]
     anchor, other = (tree.collate([recording[p[k]] for p in chosen]) for k in (0, 1))
-    near = recording.near
     return recording.name, holdout.range_split(anchor, near), holdout.range_split(other, near), anchor, near
 
 

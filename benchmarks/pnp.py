@@ -35,7 +35,7 @@ from dhtorch.stages.pose import pnp_ransac
 
 HW, FOCAL, THRESHOLD_PX, HYPOTHESES = (480, 640), 525.0, 3.0, 64
 K = np.array([[FOCAL, 0, HW[1] / 2], [0, FOCAL, HW[0] / 2], [0, 0, 1]])
-Answer = tuple[np.ndarray, np.ndarray]
+PeerPose = tuple[np.ndarray, np.ndarray]
 #: pycolmap is optional, and its import takes a while: only where it is asked.
 HAS_COLMAP = importlib.util.find_spec("pycolmap") is not None
 
@@ -62,14 +62,14 @@ def scene(batch: int, n: int, outliers: float, seed: int) -> tuple[Samples, Trac
     return samples, Tracks(uv_0.float(), uv_1.float(), 0 * one, 0 * one, eye, one > 0), camera.to(torch.float32), T
 
 
-def ap3p(xyz: np.ndarray, uv: np.ndarray) -> Answer:
+def ap3p(xyz: np.ndarray, uv: np.ndarray) -> PeerPose:
     """OpenCV: AP3P in RANSAC, refined on the inliers."""
     options: Any = {"reprojectionError": THRESHOLD_PX, "iterationsCount": 1000, "confidence": 0.999}
     _, r, t, inlier = cv2.solvePnPRansac(xyz, uv, K, None, flags=cv2.SOLVEPNP_AP3P, **options)
     return refined(xyz, uv, r, t, inlier)
 
 
-def magsac(xyz: np.ndarray, uv: np.ndarray) -> Answer:
+def magsac(xyz: np.ndarray, uv: np.ndarray) -> PeerPose:
     """OpenCV: USAC with the MAGSAC score, refined on the inliers."""
     params = cv2.UsacParams()
     params.score, params.sampler = cv2.SCORE_METHOD_MAGSAC, cv2.SAMPLING_UNIFORM
@@ -78,14 +78,14 @@ def magsac(xyz: np.ndarray, uv: np.ndarray) -> Answer:
     return refined(xyz, uv, r, t, inlier)
 
 
-def refined(xyz: np.ndarray, uv: np.ndarray, r: Any, t: Any, inlier: Any) -> Answer:
+def refined(xyz: np.ndarray, uv: np.ndarray, r: Any, t: Any, inlier: Any) -> PeerPose:
     """Levenberg-Marquardt on the inliers."""
     index = inlier[:, 0]
     r, t = cv2.solvePnPRefineLM(xyz[index], uv[index], K, None, r, t)
     return cv2.Rodrigues(r)[0], t[:, 0]
 
 
-def pose_lib(xyz: np.ndarray, uv: np.ndarray) -> Answer:
+def pose_lib(xyz: np.ndarray, uv: np.ndarray) -> PeerPose:
     """PoseLib's robust absolute pose."""
     camera = {"model": "PINHOLE", "width": HW[1], "height": HW[0], "params": [FOCAL, FOCAL, HW[1] / 2, HW[0] / 2]}
     pose, _ = poselib.estimate_absolute_pose(
@@ -94,7 +94,7 @@ def pose_lib(xyz: np.ndarray, uv: np.ndarray) -> Answer:
     return pose.R, pose.t
 
 
-def colmap(xyz: np.ndarray, uv: np.ndarray) -> Answer:
+def colmap(xyz: np.ndarray, uv: np.ndarray) -> PeerPose:
     """COLMAP's robust absolute pose, refined."""
     import pycolmap
 
@@ -106,7 +106,7 @@ def colmap(xyz: np.ndarray, uv: np.ndarray) -> Answer:
     return matrix[:, :3], matrix[:, 3]
 
 
-PEERS: dict[str, Callable[[np.ndarray, np.ndarray], Answer]] = {"opencv_ap3p": ap3p, "opencv_magsac": magsac}
+PEERS: dict[str, Callable[[np.ndarray, np.ndarray], PeerPose]] = {"opencv_ap3p": ap3p, "opencv_magsac": magsac}
 PEERS |= {"poselib": pose_lib} | ({"pycolmap": colmap} if HAS_COLMAP else {})
 
 
@@ -115,7 +115,7 @@ def arrays(samples: Samples, tracks: Tracks) -> list[tuple[np.ndarray, np.ndarra
     return [(x.double().numpy(), u.double().numpy()) for x, u in zip(samples.xyz, tracks.uv_1, strict=True)]
 
 
-def each(peer: Callable[..., Answer], pairs: list[tuple[np.ndarray, np.ndarray]]) -> Pose:
+def each(peer: Callable[..., PeerPose], pairs: list[tuple[np.ndarray, np.ndarray]]) -> Pose:
     """A peer's answers to some pairs."""
     R, t = zip(*(peer(*pair) for pair in pairs), strict=True)
     return Pose(torch.from_numpy(np.stack(R)), torch.from_numpy(np.stack(t)))

@@ -27,10 +27,12 @@ import torch
 
 from dhtorch import archive, data
 from dhtorch import testing as writers
-from dhtorch.data.stacks import FocalStack
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame, Pose
+from dhtorch.studies.focal import formats
+from dhtorch.studies.focal import writers as stack_writers
+from dhtorch.studies.focal.stacks import FocalStack
 
 PERIOD = 20
 HW, LOW_HW = (480, 640), (192, 256)
@@ -128,11 +130,11 @@ def _stack(seed: int, slices: int, hw: tuple[int, int]) -> FocalStack:
 
 
 def _fod500(root: Path, n: int) -> None:
-    writers.write_fod500(root, {i: _stack(i % PERIOD, 5, (256, 256)) for i in range(n)})
+    stack_writers.write_fod500(root, {i: _stack(i % PERIOD, 5, (256, 256)) for i in range(n)})
 
 
 def _ddff12(root: Path, n: int) -> Path:
-    writers.write_ddff12(
+    stack_writers.write_ddff12(
         root / "ddff12.h5", {"val": [_stack(i % PERIOD, 10, (192, 276)) for i in range(n)]}, dtype="uint8"
     )
     return root / "ddff12.h5"
@@ -157,11 +159,12 @@ FORMATS: dict[str, Callable[[Path, int], Path | None]] = {
 def measure(name: str, path: Path) -> dict[str, Any]:
     """Open and stream one capture; run in a process of its own."""
     torch.set_num_threads(1)
-    _ = data.open(path)[0]  # imports and file-system caches are not the reader's
+    opener = formats.open_stacks if name in formats.STACK_FORMATS else data.open
+    _ = opener(path)[0]  # imports and file-system caches are not the reader's
     before = _resident()
     _reset_peak()
     start = time.perf_counter()
-    recording = data.open(path)
+    recording = opener(path)
     opened = time.perf_counter() - start
     first = 0
     start = time.perf_counter()

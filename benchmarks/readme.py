@@ -163,7 +163,7 @@ def picture(path: Path) -> None:
     torch.set_num_threads(1)
     recording = SyntheticRoom()
     whole = recording[0]
-    near, other = holdout.range_split(whole, 2.0), holdout.range_split(recording[recording.gap], 2.0)
+    near, other = holdout.range_split(whole, 2.0), holdout.range_split(recording[6], 2.0)
     trace: dict[str, Any] = {}
     estimate = extend(near, other, trace=trace)
     merged = merge(trace["samples"], estimate)

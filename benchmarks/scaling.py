@@ -38,8 +38,8 @@ MOST = 1.05
 def views(count: int) -> list[Frame]:
     """The anchor's near returns and ``count`` further views of the built-in room, 240x320."""
     room = SyntheticRoom()
-    step = max(room.gap // count, 1)
-    frames = [holdout.range_split(room[k * step], room.near) for k in range(count + 1)]
+    step = max(6 // count, 1)
+    frames = [holdout.range_split(room[k * step], 2.0) for k in range(count + 1)]
     return [resized(frame, (240, 320)) for frame in frames]
 
 

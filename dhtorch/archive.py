@@ -44,8 +44,17 @@ ALIASES = {
     "dhtorch.pair.extend": "dhtorch.method.Method",
     "dhtorch.window.extend_window": "dhtorch.method.Method",
     "dhtorch.window.inverse_variance": "dhtorch.stages.fuse.inverse_variance",
+    "dhtorch.data.open_all": "dhtorch.data.open_capture",
+    "dhtorch.extract.Options": "dhtorch.extract.ExtractOptions",
+    "dhtorch.data.synthetic.SyntheticRoom": "dhtorch.synthetic.recording.open_room",
+    "dhtorch.synthetic.recording.SyntheticRoom": "dhtorch.synthetic.recording.open_room",
     "dhtorch.data.synthetic": "dhtorch.synthetic.recording",
     "dhtorch.data.synthetic_robot": "dhtorch.synthetic.robot",
+    "dhtorch.data.focal_stacks": "dhtorch.studies.focal.formats",
+    **{
+        f"dhtorch.data.{name}": f"dhtorch.studies.focal.{name}"
+        for name in ("ddff12", "fod500", "image_folder", "light_field", "stacks")
+    },
     "dhtorch.data.stress": "dhtorch.synthetic.stress",
     "dhtorch.data.viewpoints": "dhtorch.synthetic.viewpoints",
     "dhtorch.experiments.pair": "dhtorch.studies.pair",

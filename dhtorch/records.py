@@ -78,11 +78,6 @@ class TrackHint:
     pyramid: Pyramids | None = None  # of image 0, shared by all who search in it
     levels: int | None = None  # pyramid levels that the motion in this scene asks for; None = the tracker's own
 
-    @classmethod
-    def of(cls, recording: Any) -> TrackHint:
-        """What a recording knows of the motion in it."""
-        return cls(levels=recording.levels)
-
     def replace(self, **changes: Any) -> TrackHint:
         """A copy with some fields replaced."""
         return replace(self, **changes)

@@ -211,8 +211,9 @@ def module(dotted: str) -> str:
 
 
 def reader(name: str) -> str:
-    """What a reader of ``dhtorch.data`` says of its format, and how its options are named."""
-    home = "dhtorch.synthetic.recording" if name == "synthetic" else f"dhtorch.data.{name}"
+    """What a reader says of its format, and how its options are named."""
+    wing = "dhtorch.data" if (REPO / "dhtorch" / "data" / f"{name}.py").is_file() else "dhtorch.studies.focal"
+    home = "dhtorch.synthetic.recording" if name == "synthetic" else f"{wing}.{name}"
     text = f"**`{home}`** — {module(home)}\n"
     options = REPO / "conf" / "data" / f"{name}.yaml"
     if not options.is_file():

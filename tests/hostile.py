@@ -22,7 +22,7 @@ import sys
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,7 +32,9 @@ from mutations import EXECUTED, Capture, mutate
 
 from dhtorch import data
 from dhtorch.data import FormatError, files
-from dhtorch.data.stacks import FocalStack
+from dhtorch.data.recording import Recording
+from dhtorch.studies.focal import formats
+from dhtorch.studies.focal.stacks import FocalStack, Stacks
 
 SECONDS = 2  # of a processor for one mutant, whatever else the machine does
 PATIENCE = 60.0  # wall clock after which it hangs
@@ -51,7 +53,7 @@ class Outcome(NamedTuple):
 
 def read_all(path: Path) -> None:
     """Open everything at ``path``, decode every frame, truth and stack, hold them against what they promise."""
-    for found in data.open_all(path):
+    for found in _opened(path):
         truth = getattr(found, "truth", None)
         for i, each in enumerate(found):
             if isinstance(each, FocalStack):
@@ -62,6 +64,14 @@ def read_all(path: Path) -> None:
                 depth = truth(i)["depth"]
                 assert depth.shape[1:] == each.hw
                 assert bool(torch.isfinite(depth).all()) and bool((depth >= 0).all())
+
+
+def _opened(path: Path) -> Sequence[Recording] | list[Stacks]:
+    try:
+        data.recognise(path)
+    except FormatError:
+        return [formats.open_stacks(path)]
+    return data.open_all(path)
 
 
 def check_stack(stack: FocalStack) -> None:

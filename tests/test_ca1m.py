@@ -227,11 +227,13 @@ def test_a_folder_of_archives_is_listed_and_none_is_opened(tmp_path: Path) -> No
     """A hundred gigabytes are a hundred archives; one that is damaged leaves the others alone."""
     file, frames = archive(tmp_path, n=2)[:2]
     (tmp_path / "ca1m-val-99.tar").write_bytes(b"no archive")
-    recordings = data.open_all(tmp_path, gap=1)
+    recordings = data.open_all(tmp_path)
     assert list(recordings.names) == [file.stem, "ca1m-val-99"]
-    assert recordings[0].name == file.stem and recordings[0].gap == 1 and len(recordings[0]) == len(frames)
+    assert recordings[0].name == file.stem and len(recordings[0]) == len(frames)
     with pytest.raises(FormatError, match=r"ca1m-val-99.tar: "):
         recordings[1]
+    scenes = data.open_capture(tmp_path, gap=1)
+    assert len(scenes) == 2 and (scenes[0].name, scenes[0].gap) == (file.stem, 1)
 
 
 # -------------------------------------------------------------------------------------------------------------- tar

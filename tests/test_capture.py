@@ -25,9 +25,12 @@ from dhtorch.commands import inspect as capture
 from dhtorch.commands import run
 from dhtorch.data import FormatError
 from dhtorch.data.recording import Recording
-from dhtorch.data.survey import Survey, survey_recording, survey_stacks
+from dhtorch.data.survey import Survey, survey_recording
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame, Pose
+from dhtorch.studies.focal import formats
+from dhtorch.studies.focal import writers as stack_writers
+from dhtorch.studies.focal.survey import survey_stacks
 
 ROOT = os.environ.get("DHTORCH_DATA")
 real = pytest.mark.skipif(not ROOT, reason="DHTORCH_DATA is not set")
@@ -106,9 +109,9 @@ RECORDED: dict[str, tuple[Callable[[Path, int], object], str, int]] = {
 }
 WRITTEN: dict[str, tuple[Callable[[Path], object], str, int]] = {
     **{name: (partial(write, n=3), format, count) for name, (write, format, count) in RECORDED.items()},
-    "fod500": (lambda root: writers.write_fod500(root, {0: stack(0), 1: stack(1)}), "fod500", 1),
-    "ddff12": (lambda root: writers.write_ddff12(root / "a.h5", {"val": [stack(0, 10)]}), "ddff12", 1),
-    "images": (lambda root: writers.write_image_folder(root, stack(0, 5)), "images", 1),
+    "fod500": (lambda root: stack_writers.write_fod500(root, {0: stack(0), 1: stack(1)}), "fod500", 1),
+    "ddff12": (lambda root: stack_writers.write_ddff12(root / "a.h5", {"val": [stack(0, 10)]}), "ddff12", 1),
+    "images": (lambda root: stack_writers.write_image_folder(root, stack(0, 5)), "images", 1),
 }
 
 
@@ -167,14 +170,14 @@ def test_facts_of_confidence_and_of_frames_left_out(tmp_path: Path) -> None:
 
 
 def test_facts_of_stacks(tmp_path: Path) -> None:
-    writers.write_fod500(tmp_path, {3: stack(3), 4: stack(4)})
-    survey = survey_stacks(data.open_stacks(tmp_path))
+    stack_writers.write_fod500(tmp_path, {3: stack(3), 4: stack(4)})
+    survey = survey_stacks(formats.open_stacks(tmp_path))
     said = facts(survey)
     assert said["focal stacks"] == "2, of 5 pictures each" and said["in focus at"] == "0.1, 0.15, 0.3, 0.7, 1.5 m"
     assert said["lens"] == "f = 2.9 mm, N = 1" and said["holes"].startswith("0.5 %") and survey.warnings == []
     same = stack(0, 1).images.expand(1, 4, 3, 12, 16)
-    writers.write_image_folder(tmp_path / "b", stack(0).replace(images=same))
-    survey = survey_stacks(data.open_stacks(tmp_path / "b"))
+    stack_writers.write_image_folder(tmp_path / "b", stack(0).replace(images=same))
+    survey = survey_stacks(formats.open_stacks(tmp_path / "b"))
     assert survey.warnings == [
         "no focus distances: the order of the pictures is all that is known",
         "all pictures that were read are the same picture",

@@ -60,7 +60,7 @@ MAIN = ("data=synthetic",)
         (MAIN, "viewer/html.py", False),
         (MAIN, "studies/negative/icp.py", False),
         (MAIN, "studies/negative/registration.py", False),
-        (MAIN, "extract/rows.py", False),
+        (MAIN, "extract/dataset.py", False),
         (MAIN, "studies/report/page.py", False),
         (MAIN, "commands/run.py", False),
         (MAIN, "calibration/map.json", False),
@@ -91,7 +91,7 @@ def test_tables_that_travel_with_a_module_count_with_it(package):
 
 def test_further_roots_count(package):
     config = {"method": {"_target_": "dhtorch.method.Method"}}
-    roots = {"roots": ["dhtorch.extract.rows"], "code_dir": package}
+    roots = {"roots": ["dhtorch.extract.dataset"], "code_dir": package}
     before = archive.result_key(config, "d", **roots)
     assert before != archive.result_key(config, "d", code_dir=package)
     with edited(package / "extract" / "rows.py"):

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from dhtorch import tree
-from dhtorch.evaluate import bootstrap, calibrate, compare, errors, recalibrate, risk
+from dhtorch.evaluate import bootstrap, compare, errors, reliability, risk, score_calibration
 
 
 def scene_of(n, seed=0, spread=1.0, silent=0.2, boast=1.0, floor=0.0):
@@ -93,7 +93,7 @@ def test_promises_equal_plain_loops():
     applied, sigmoid, realised = {}, {}, {5: [], 10: []}
     for scene, row in zip("abcd", found.rows, strict=True):
         others = [joined[s] for s in "abcd" if room.get(s, s) != room.get(scene, scene)]
-        learnt = recalibrate.fit(others, targets=(10, 5))
+        learnt = score_calibration.fit(others, targets=(10, 5))
         applied[scene] = learnt.apply(joined[scene])
         claimed = learnt.sigmoid(joined[scene].score)
         sigmoid[scene] = joined[scene].replace(score=torch.where(joined[scene].keep, claimed, 0.0))
@@ -113,7 +113,7 @@ def test_promises_equal_plain_loops():
         assert found.summary[f"map.within_target_{percent}"]["value"] == pytest.approx(met)
         assert found.silent[f"map.{percent}"] == [s for s, v in zip("abcd", values, strict=True) if v is None]
     for name, scenes in (("ece", applied), ("ece_sigmoid", sigmoid), ("ece_raw", joined)):
-        wanted = calibrate.ece_interval(list(scenes.values()), draws=200, seed=2)
+        wanted = reliability.ece_interval(list(scenes.values()), draws=200, seed=2)
         assert list(found.summary[f"map.{name}"].values())[:3] == list(wanted[:3]), name
 
 

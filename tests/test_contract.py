@@ -14,7 +14,6 @@ from dhtorch.evaluate import holdout, probe
 from dhtorch.geometry import (
     affine,
     camera,
-    cells,
     covariance,
     epipolar,
     exact,
@@ -28,6 +27,7 @@ from dhtorch.geometry import (
     ransac,
     se3,
     small,
+    sparse_grid,
     thin_lens,
 )
 from dhtorch.methods import MAP, PAPER, WINDOW
@@ -323,10 +323,10 @@ ROWS = [
     Row(lookup.pixels, lambda b, n, d: (pixels(b, n, d),), "batch vmap capture empty shuffle padding nan", (0,)),
     Row(lookup.fits, lambda b, n, d: (pixels(b, n, d).int(), HW, 5), "batch vmap capture empty shuffle padding", (0,)),
     Row(lookup.round_half_up, lambda b, n, d: (pixels(b, n, d),), "dtype batch vmap capture empty shuffle padding nan", (0,)),
-    Row(cells.pack, lambda b, n, d: (places(b, n),), "batch vmap capture empty shuffle padding raises", (0,), bad=wrong_last_axis(0)),
-    Row(cells.unpack, lambda b, n, d: (cells.pack(places(b, n)),), "batch vmap capture empty shuffle padding", (0,)),
-    Row(cells.find, lambda b, n, d: (cells.pack(places(b, 40)).unique(), cells.pack(places(b, n))), "batch capture empty shuffle padding raises", (1,), shared=(0,), bad=lambda a: (a[0][None], a[1])),
-    Row(cells.near, lambda b, n, d: (cells.pack(places(1, n)[0]), cells.pack(places(b, 9)).unique()), "capture empty raises", bad=lambda a: (a[0][None], a[1])),
+    Row(sparse_grid.pack, lambda b, n, d: (places(b, n),), "batch vmap capture empty shuffle padding raises", (0,), bad=wrong_last_axis(0)),
+    Row(sparse_grid.unpack, lambda b, n, d: (sparse_grid.pack(places(b, n)),), "batch vmap capture empty shuffle padding", (0,)),
+    Row(sparse_grid.find, lambda b, n, d: (sparse_grid.pack(places(b, 40)).unique(), sparse_grid.pack(places(b, n))), "batch capture empty shuffle padding raises", (1,), shared=(0,), bad=lambda a: (a[0][None], a[1])),
+    Row(sparse_grid.near, lambda b, n, d: (sparse_grid.pack(places(1, n)[0]), sparse_grid.pack(places(b, 9)).unique()), "capture empty raises", bad=lambda a: (a[0][None], a[1])),
     Row(epipolar.triangulate, two_views, ALL, (0, 1), (0, 1, 2, 3, 4), bad=wrong_last_axis(0), leaks=True),
     Row(epipolar.depths, two_views, ALL, (0, 1), (0, 1, 2, 3, 4), bad=wrong_last_axis(0), leaks=True),
     Row(epipolar.describe, lambda b, n, d: (camera.unproject(two_views(b, n, d)[2], two_views(b, n, d)[0], uniform(b, n, dtype=d, low=1, high=2)), *two_views(b, n, d)), ALL, (0, 1, 2), (0, 1, 2, 3, 4, 5), bad=wrong_last_axis(0), leaks=True),
@@ -379,8 +379,8 @@ ROWS = [
     Row(with_options(near_far.normal, kernel="geman_mcclure", bend=2.0), weighed, "dtype batch vmap capture"),
     Row(near_far.prior, lambda b, n, d: (uniform(b, dtype=d),), POINTLESS, grad=(0,)),
     Row(most_probable.noise_scale, lambda b, n, d: problems(b, n, d)[:2], "dtype batch vmap capture"),
-    Row(most_probable.most_probable, lambda b, n, d: (problems(b, n, d)[0], problems(b, n, d)[1].T, most_probable.Options()), "batch vmap capture", slow="capture"),
-    Row(most_probable.covariance, lambda b, n, d: (problems(b, n, d)[0], most_probable.Solution(*weighed(b, n, d)[1:], torch.ones(b, dtype=torch.bool)), most_probable.Options()), "batch vmap capture"),
+    Row(most_probable.most_probable, lambda b, n, d: (problems(b, n, d)[0], problems(b, n, d)[1].T, most_probable.FitOptions()), "batch vmap capture", slow="capture"),
+    Row(most_probable.pose_covariance, lambda b, n, d: (problems(b, n, d)[0], most_probable.Solution(*weighed(b, n, d)[1:], torch.ones(b, dtype=torch.bool)), most_probable.FitOptions()), "batch vmap capture"),
     Row(covariance.noise_shape, lambda b, n, d: (tracked(b, n, d)[1].cov * uniform(b, n, 1, 1, dtype=d, low=0.5), torch.ones(b, n, dtype=torch.bool), 0.1), "dtype batch vmap capture gradcheck empty shuffle raises", (0, 1), (0,), bad=wrong_last_axis(0)),
     Row(covariance.median, lambda b, n, d: (uniform(b, n, dtype=d), uniform(b, n, dtype=d, seed=1) > 0.3), "dtype batch vmap capture gradcheck empty shuffle raises", (0, 1), (0,), bad=wrong_last_axis(1)),
     Row(covariance.from_normal, lambda b, n, d: (positive(b, n, d), uniform(b, dtype=d, low=0.1)), "dtype batch vmap capture"),
@@ -438,7 +438,7 @@ ELSEWHERE = {
         f"dhtorch.geometry.reference.{name}"
         for name in ("register", "register_step", "composed", "believed", "nearest_inside")
     ),
-    *(f"dhtorch.geometry.cells.{name}" for name in ("occupied", "components")),
+    *(f"dhtorch.geometry.sparse_grid.{name}" for name in ("occupied", "components")),
     *(f"dhtorch.integrate.volume.{name}" for name in ("empty", "fuse", "splat")),
     *(f"dhtorch.integrate.surface.{name}" for name in ("points", "mesh")),
     "dhtorch.integrate.picture.draw_map",
@@ -454,7 +454,10 @@ ELSEWHERE = {
     "dhtorch.stages.fuse.inverse_variance",
     "dhtorch.geometry.exact.filled",
     "dhtorch.geometry.least_squares.minimise",
-    *(f"dhtorch.geometry.lucas_kanade.{n}" for n in ("search", "step", "squares", "covariance", "for_some", "within")),
+    *(
+        f"dhtorch.geometry.lucas_kanade.{n}"
+        for n in ("search", "step", "squares", "window_covariance", "for_some", "within")
+    ),
     *(f"dhtorch.geometry.ransac.{name}" for name in ("msac_cost", "search")),
     *(f"dhtorch.evaluate.errors.{name}" for name in ("points", "select", "measure", "summarise", "unit")),
     *(
@@ -462,10 +465,10 @@ ELSEWHERE = {
         for name in ("curve", "risk_coverage", "measure", "capped", "realised", "surest")
     ),
     *(
-        f"dhtorch.evaluate.calibrate.{n}"
-        for n in ("reliability", "pool", "measure", "ece_interval", "leave_one_room_out")
+        f"dhtorch.evaluate.reliability.{n}"
+        for n in ("diagram", "pool", "measure", "ece_interval", "leave_one_room_out")
     ),
-    *(f"dhtorch.evaluate.recalibrate.{name}" for name in ("fit", "fit_sigma", "from_json")),
+    *(f"dhtorch.evaluate.score_calibration.{name}" for name in ("fit", "fit_sigma", "from_json")),
     *(f"dhtorch.evaluate.monotone.{name}" for name in ("isotonic", "pool_adjacent_violators", "platt")),
     *(f"dhtorch.evaluate.control.{name}" for name in ("plug_in", "conformal", "scenes_needed", "p_value")),
     *(f"dhtorch.evaluate.compare.{name}" for name in ("method_ratios", "ratio_over_seeds", "equal_coverage")),

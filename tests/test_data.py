@@ -24,6 +24,7 @@ from dhtorch.data import convert, driving, files, frames_dir, rectified, tum
 from dhtorch.data.codecs import npy
 from dhtorch.data.files import FormatError
 from dhtorch.data.recording import numbers
+from dhtorch.data.scene import Scene
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Pose
@@ -75,7 +76,7 @@ def test_rectified_pairs_give_back_the_scene(tmp_path: Path) -> None:
     writers.write_npz_pair(tmp_path / "npz", left, right)
     for name in ("calib", "npz"):
         recording = data.open(tmp_path / name)
-        assert recording.format == "rectified" and recording.gap == 1 and recording.times is None
+        assert recording.format == "rectified" and Scene.of(recording).gap == 1 and recording.times is None
         assert len(recording) == 2
         check_same(recording, [left], 1e-5)
         frame = recording[1]
@@ -125,8 +126,9 @@ def test_opening_decodes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 def test_recording_is_a_sequence(tmp_path: Path) -> None:
     writers.write_named_frames(tmp_path, walk())
-    recording = data.open(tmp_path, near=1.5, gap=2, levels=6, role="rotation")
-    assert (recording.near, recording.gap, recording.levels, recording.role) == (1.5, 2, 6, "rotation")
+    (scene,) = data.open_capture(tmp_path, near=1.5, gap=2, levels=6, role="rotation")
+    assert (scene.near, scene.gap, scene.levels, scene.role, scene.root) == (1.5, 2, 6, "rotation", tmp_path)
+    recording = scene.recording
     assert len(list(recording)) == 4
     assert torch.equal(recording[-1].image, recording[3].image)
     with pytest.raises(IndexError):
@@ -237,7 +239,7 @@ def test_nothing_there_or_unknown(tmp_path: Path, named: Path) -> None:
     fails(r"nowhere: path: found no such file or folder, expected a capture", tmp_path / "nowhere")
     fails(r"nowhere: path: found no such file or folder, expected a tum capture", tmp_path / "nowhere", "tum")
     (tmp_path / "empty").mkdir()
-    every = ", ".join((*data.FORMATS, *data.STACK_FORMATS))
+    every = ", ".join(data.FORMATS)
     fails(rf"format: found an empty folder, expected one of {every}", tmp_path / "empty")
     (tmp_path / "scan.xyz").write_text("1 2 3")
     fails(r"scan.xyz: format: found a .xyz file, expected one of", tmp_path / "scan.xyz")

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from dhtorch import tree
-from dhtorch.evaluate import bootstrap, calibrate, correlation, curves, errors, holdout, risk
+from dhtorch.evaluate import bootstrap, correlation, curves, errors, holdout, reliability, risk
 from dhtorch.evaluate.holdout import Rule
 from dhtorch.records import Estimate
 
@@ -57,7 +57,7 @@ def test_undefined_numbers_are_none():
     one = errors.measure(errors.points(torch.tensor([1.1]), torch.ones(1)))
     assert one["corr"] is None and one["within_sigma"] is None and one["residual_px"] is None
     assert one["median_rel"] == pytest.approx(0.1, abs=1e-6)
-    assert calibrate.measure([silent]) == calibrate.measure([]) == {"ece": None, "ece_equal_mass": None}
+    assert reliability.measure([silent]) == reliability.measure([]) == {"ece": None, "ece_equal_mass": None}
 
 
 def test_points_of_an_estimate_are_its_candidates():
@@ -309,7 +309,7 @@ def test_curves_equal_plain_loops(n, ties):
     assert found["distance"]["coverage"] == [five(keep[k].mean()) for k in tenths]
     medians = [np.median(error[k][keep[k]]) if keep[k].any() else None for k in tenths]
     assert found["distance"]["median_rel"] == [five(x) for x in medians]
-    table = calibrate.reliability(a.score, a.error < 0.1, bins=10)
+    table = reliability.diagram(a.score, a.error < 0.1, bins=10)
     for name in ("claimed", "realised", "weight"):
         assert found["reliability"][name] == [five(x) for x in getattr(table, name).tolist()]
 

@@ -14,7 +14,7 @@ import dhtorch
 from dhtorch.codes import Gate, Source
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.holes import classify
-from dhtorch.transform import ExtendDepth, Problem, SampleError, patch_tokens
+from dhtorch.transform import ExtendDepth, SampleError, SampleProblem, patch_tokens
 from dhtorch.transform.problems import Tally
 
 QUIET = {"none": 0, "no_second_view": 0, "no_depth": 0, "unreadable": 0}
@@ -54,7 +54,7 @@ def test_every_answer_has_its_place():
     for k, (u, v) in enumerate(mine["uv"].tolist()):
         z = wanted[k]
         assert mine["xyz"][k].tolist() == pytest.approx([(u - K[2]) / K[0] * z, (v - K[3]) / K[1] * z, z], abs=1e-6)
-    assert mine["problem"] == Problem.NONE
+    assert mine["problem"] == SampleProblem.NONE
 
 
 def test_points_lie_on_bent_rays_where_the_lens_bends_them():
@@ -192,7 +192,7 @@ def test_without_a_second_view_the_front_end_runs_alone(alone):
     method = Told()
     extender = tiny(method, n=40, **alone)
     mine, samples = added(extender(given)), front_end(given, 40)
-    assert method.calls == 0 and mine["problem"] == Problem.NO_SECOND_VIEW
+    assert method.calls == 0 and mine["problem"] == SampleProblem.NO_SECOND_VIEW
     usable = samples.usable[0]
     assert 5 < usable.sum() < 35
     assert torch.equal(mine["uv"], samples.uv[0]) and torch.equal(mine["valid"], usable)
@@ -234,7 +234,7 @@ def test_rows_of_a_batch_without_a_view_are_silent_beside_the_others():
     given = {**batch(3), "before_is_pad": torch.tensor([[False], [True], [False]])}
     method = Told([0, 0, 2])
     mine = added(tiny(method, batched=True)(given))
-    assert mine["problem"].tolist() == [0, Problem.NO_SECOND_VIEW, 0]
+    assert mine["problem"].tolist() == [0, SampleProblem.NO_SECOND_VIEW, 0]
     assert mine["gate"][0].tolist() == mine["gate"][2].tolist() == [6, 6, 0, 0, 0, 6]
     assert mine["gate"][1].tolist() == [Gate.NO_TRACK] * N and mine["source"][1].tolist() == [1, 1, 0, 0, 1, 0]
     assert mine["pose_ok"].tolist() == [True, False, False] and mine["pose_code"].tolist() == [0, 0, 2]
@@ -246,19 +246,24 @@ def test_rows_of_a_batch_without_a_view_are_silent_beside_the_others():
 def test_the_worst_problem_is_told():
     none = 0 * sample()["depth"]
     for changes, options, problem in (
-        ({}, {}, Problem.NONE),
-        ({"before_is_pad": [True]}, {}, Problem.NO_SECOND_VIEW),
-        ({"depth": none}, {}, Problem.NO_DEPTH),
-        ({"depth": none, "before_is_pad": [True]}, {}, Problem.NO_DEPTH),
-        ({"depth": none, "intrinsics": [1.0, 1, 90, 90]}, {"on_error": "flag"}, Problem.UNREADABLE),
+        ({}, {}, SampleProblem.NONE),
+        ({"before_is_pad": [True]}, {}, SampleProblem.NO_SECOND_VIEW),
+        ({"depth": none}, {}, SampleProblem.NO_DEPTH),
+        ({"depth": none, "before_is_pad": [True]}, {}, SampleProblem.NO_DEPTH),
+        ({"depth": none, "intrinsics": [1.0, 1, 90, 90]}, {"on_error": "flag"}, SampleProblem.UNREADABLE),
     ):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             assert added(tiny(**options)(sample(**changes)))["problem"] == problem
     one = none.copy()
     one[3, 4] = 900
-    assert added(tiny()(sample(depth=one)))["problem"] == Problem.NONE, "one return is a return"
-    assert (Problem.NONE, Problem.NO_SECOND_VIEW, Problem.NO_DEPTH, Problem.UNREADABLE) == (0, 1, 2, 3)
+    assert added(tiny()(sample(depth=one)))["problem"] == SampleProblem.NONE, "one return is a return"
+    assert (SampleProblem.NONE, SampleProblem.NO_SECOND_VIEW, SampleProblem.NO_DEPTH, SampleProblem.UNREADABLE) == (
+        0,
+        1,
+        2,
+        3,
+    )
 
 
 # ---------------------------------------------------------------------------------------------------- bad samples
@@ -303,7 +308,7 @@ def test_bad_samples_say_what_is_wrong(name):
         if policy == "skip":
             assert out is None
         else:
-            assert added(out)["problem"] == Problem.UNREADABLE and not added(out)["valid"].any()
+            assert added(out)["problem"] == SampleProblem.UNREADABLE and not added(out)["valid"].any()
             assert default_collate([added(out), added(good)])["depth"].shape == (2, N)
 
 
@@ -315,7 +320,7 @@ def test_a_flagged_sample_has_the_shapes_of_a_good_one_and_no_number():
             bad = added(extender(sample(**wrong)))
         assert len(caught) == 1
         assert {k: (v.shape, v.dtype) for k, v in bad.items()} == {k: (v.shape, v.dtype) for k, v in good.items()}
-        assert bad.pop("problem") == Problem.UNREADABLE and not any(v.any() for v in bad.values())
+        assert bad.pop("problem") == SampleProblem.UNREADABLE and not any(v.any() for v in bad.values())
     assert extender.report() == {**QUIET, "none": 1, "unreadable": 2}
 
 

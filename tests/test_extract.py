@@ -26,7 +26,7 @@ from dhtorch.commands.run import config_dir, main
 from dhtorch.extract import Features, JoinedDataset, columns, engines, shards
 from dhtorch.geometry import camera as cam
 from dhtorch.synthetic.recording import SyntheticRoom
-from dhtorch.transform import ExtendDepth, ExtendedDataset, Problem
+from dhtorch.transform import ExtendDepth, ExtendedDataset, SampleProblem
 
 HW, GAP, N, NEAR = (72, 96), 2, 128, 2.5
 LENGTHS = (5, 4, 3)
@@ -257,7 +257,7 @@ def test_a_corrupt_frame_is_flagged_with_zeros(damaged, command):
     features = Features("features")
     assert [int(row["dhtorch.problem"]) for row in features] == [1, 1, 0, 3, 0, 1, 0, 0]
     row = features.at(0, 3)
-    assert int(row.pop("dhtorch.problem")) == Problem.UNREADABLE and all(not x.any() for x in row.values())
+    assert int(row.pop("dhtorch.problem")) == SampleProblem.UNREADABLE and all(not x.any() for x in row.values())
     assert np.isnan(features.place["timestamp"]).all(), "counted frames have no times"
 
 
@@ -356,6 +356,6 @@ def test_a_method_of_many_views_looks_back_several_times(command):
 
 def test_settings_are_the_defaults():
     cfg = OmegaConf.to_container(OmegaConf.load(config_dir() / "extract.yaml"))["extract"]
-    assert cfg.pop("_target_") == "dhtorch.extract.Options"
-    defaults = {k: f.default for k, f in extract.Options.__dataclass_fields__.items()}
+    assert cfg.pop("_target_") == "dhtorch.extract.ExtractOptions"
+    defaults = {k: f.default for k, f in extract.ExtractOptions.__dataclass_fields__.items()}
     assert cfg == {k: list(v) if isinstance(v, tuple) else v for k, v in defaults.items()}

@@ -11,10 +11,9 @@ import torch
 from tiny_dicts import H, K, N, Stub, Told, W, added, tiny
 
 from dhtorch import extract
-from dhtorch.data import Recording
-from dhtorch.data.stacks import Stacks
+from dhtorch.data import Recording, Scene
 from dhtorch.extract import columns, plan
-from dhtorch.extract.rows import Rows
+from dhtorch.extract.dataset import Rows
 from dhtorch.records import Camera, Frame
 
 P = 6
@@ -46,9 +45,10 @@ class Load:
         return frame(self.first + i, **self.options)
 
 
-def recording(n=4, numbers=None, name="one", load=None, **options):
+def recording(n=4, numbers=None, name="one", load=None, gap=None, levels=None, **options):
     number = torch.tensor(numbers if numbers is not None else list(range(n)))
-    return Recording(name=name, format="made", load=load or Load(), number=number, **options)
+    made = Recording(name=name, format="made", load=load or Load(), number=number, **options)
+    return Scene(made, gap=gap, levels=levels)
 
 
 def rows(recordings, gap, method=None, wanted=None, **options):
@@ -113,13 +113,9 @@ def test_roots_are_named_once_in_order():
     assert made.roots == (Path("/b"), Path("/a"))
 
 
-def test_two_recordings_of_one_episode_and_focal_stacks_are_refused():
+def test_two_recordings_of_one_episode_are_refused():
     with pytest.raises(ValueError, match="data: left and right are one episode, expected one camera of it"):
         plan.make([recording(name="left", episode=3), recording(name="x"), recording(name="right", episode=3)], 0, 1)
-    stacks = Stacks.__new__(Stacks)
-    object.__setattr__(stacks, "name", "piles")
-    with pytest.raises(ValueError, match="data: piles holds focal stacks, expected recordings with depth"):
-        plan.make([stacks], 0, 1)
 
 
 def test_steps_go_back_by_the_gap_evenly_for_many_views():
@@ -262,5 +258,7 @@ def test_options_of_an_extraction_are_checked():
         ({"tokens_hw": 224}, "extract.tokens_hw: found 224"),
     ):
         with pytest.raises(ValueError, match=message):
-            extract.Options(**options)
-    assert extract.Options(gap=0, patch=1, shard_rows=1).gap == 0 and extract.Options(gap=None).gap is None
+            extract.ExtractOptions(**options)
+    assert (
+        extract.ExtractOptions(gap=0, patch=1, shard_rows=1).gap == 0 and extract.ExtractOptions(gap=None).gap is None
+    )

@@ -30,7 +30,7 @@ def made(tmp_path, capsys):
 
         asked = {"shard_rows": 4, "tokens_hw": (28, 42), **(options or {})}
         plain = {"data": {"name": "made"}, "method": {"n": 6}, "seed": 0, "workers": 0, "out": str(tmp_path / out)}
-        parts = {"data": recordings, "method": Stub(answer=Told(), n=N), "extract": extract.Options(**asked)}
+        parts = {"data": recordings, "method": Stub(answer=Told(), n=N), "extract": extract.ExtractOptions(**asked)}
         code = extract.run({**plain, "choices": {"data": "made"}, **settings}, parts, progress=progress)
         return SimpleNamespace(code=code, said=capsys.readouterr().out, shown=shown, folder=tmp_path / out)
 

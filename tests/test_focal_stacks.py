@@ -16,12 +16,13 @@ import torch
 from torch import Tensor
 
 from dhtorch import data
-from dhtorch import testing as writers
 from dhtorch.commands import run
-from dhtorch.data import FormatError, ddff12, fod500, image_folder
+from dhtorch.data import FormatError
 from dhtorch.data.codecs import hdf5, npy, tiff
-from dhtorch.data.light_field import refocus
-from dhtorch.data.stacks import FocalStack, Stacks
+from dhtorch.studies.focal import ddff12, fod500, formats, image_folder
+from dhtorch.studies.focal import writers as stack_writers
+from dhtorch.studies.focal.light_field import refocus
+from dhtorch.studies.focal.stacks import FocalStack, Stacks
 
 ROOT = os.environ.get("DHTORCH_DATA")
 real = pytest.mark.skipif(not ROOT, reason="DHTORCH_DATA is not set")
@@ -39,7 +40,7 @@ def stack(seed: int, slices: int = 5, hw: tuple[int, int] = (12, 16), depth: boo
 
 def fails(message: str, root: Path, **options: object) -> None:
     with pytest.raises(FormatError, match=message):
-        stacks = data.open_stacks(root, **options)
+        stacks = formats.open_stacks(root, **options)
         for i in range(len(stacks)):
             stacks[i]
 
@@ -49,32 +50,32 @@ def fails(message: str, root: Path, **options: object) -> None:
 
 def test_fod500_gives_back_pictures_depth_and_lens(tmp_path: Path) -> None:
     want = {0: stack(0), 7: stack(7), 400: stack(400)}
-    writers.write_fod500(tmp_path, want)
-    stacks = data.open_stacks(tmp_path)
+    stack_writers.write_fod500(tmp_path, want)
+    stacks = formats.open_stacks(tmp_path)
     assert stacks.format == "fod500" and stacks.names == ("000000", "000007", "000400") and stacks.report == ()
     for got, made in zip(stacks, want.values(), strict=True):
         assert torch.equal(got.images, made.images) and torch.equal(got.depth, made.depth)  # half floats are exact
         assert got.focus_m.tolist() == [[pytest.approx(x) for x in FOCUS]] and got.camera is None
         assert float(got.focal_length_m) == pytest.approx(2.9e-3) and got.f_number.tolist() == [1.0]
-    assert data.open_stacks(tmp_path, split="val").names == ("000400",)
-    assert data.open_stacks(tmp_path, split="train").names == ("000000", "000007")
+    assert formats.open_stacks(tmp_path, split="val").names == ("000400",)
+    assert formats.open_stacks(tmp_path, split="train").names == ("000000", "000007")
 
 
 def test_fod500_clips_and_masks_depth(tmp_path: Path) -> None:
     made = stack(0)
     depth = made.depth.clone()
     depth[0, 0, :4] = torch.tensor([5.0, math.nan, -1.0, math.inf])
-    writers.write_fod500(tmp_path, {0: made.replace(depth=depth)})
-    assert data.open_stacks(tmp_path)[0].depth[0, 0, :4].tolist() == [3, 0, 0, 0]
-    assert data.open_stacks(tmp_path, max_depth=None)[0].depth[0, 0, 0] == 5
+    stack_writers.write_fod500(tmp_path, {0: made.replace(depth=depth)})
+    assert formats.open_stacks(tmp_path)[0].depth[0, 0, :4].tolist() == [3, 0, 0, 0]
+    assert formats.open_stacks(tmp_path, max_depth=None)[0].depth[0, 0, 0] == 5
 
 
 def test_fod500_sample_that_lacks_something_is_left_out_and_shifts_nothing(tmp_path: Path) -> None:
     want = {i: stack(i) for i in range(4)}
-    writers.write_fod500(tmp_path, want)
+    stack_writers.write_fod500(tmp_path, want)
     (tmp_path / "000001_02All.tif").unlink()
     (tmp_path / "000002Dpt.exr").unlink()
-    stacks = data.open_stacks(tmp_path)
+    stacks = formats.open_stacks(tmp_path)
     assert stacks.names == ("000000", "000003")
     assert stacks.report == (
         "sample 000001: 4 pictures and 1 depth maps: left out",
@@ -83,18 +84,18 @@ def test_fod500_sample_that_lacks_something_is_left_out_and_shifts_nothing(tmp_p
     assert torch.equal(stacks[1].images, want[3].images) and torch.equal(stacks[1].depth, want[3].depth)
     for file in tmp_path.glob("*.exr"):
         file.unlink()
-    assert data.open_stacks(tmp_path)[1].depth is None  # pictures alone are a stack, too
+    assert formats.open_stacks(tmp_path)[1].depth is None  # pictures alone are a stack, too
 
 
 def test_fod500_reads_the_red_channel_of_pictures_of_any_kind(tmp_path: Path) -> None:
-    writers.write_fod500(tmp_path, {0: stack(0)})
+    stack_writers.write_fod500(tmp_path, {0: stack(0)})
     planes = {c: np.full((12, 16), v, np.float16) for c, v in (("R", 1.5), ("G", 2.5), ("B", 0.5))}
     OpenEXR.File({"compression": OpenEXR.PIZ_COMPRESSION, "type": OpenEXR.scanlineimage}, planes).write(
         str(tmp_path / "000000Dpt.exr")
     )
     picture = stack(3).images[0, 0].permute(1, 2, 0).numpy()
     tifffile.imwrite(tmp_path / "000000_00All.tif", picture, compression="lzw", predictor=True, photometric="rgb")
-    got = data.open_stacks(tmp_path)[0]
+    got = formats.open_stacks(tmp_path)[0]
     assert bool((got.depth == 1.5).all()) and torch.equal(got.images[0, 0], stack(3).images[0, 0])
 
 
@@ -104,11 +105,11 @@ def test_ddff12_gives_back_stacks_and_depth(dtype: str, compression: str | None,
     train, val = [stack(i, 10) for i in range(3)], [stack(9, 10)]
     test = [stack(20, 10, depth=False)]
     file = tmp_path / "ddff.h5"
-    writers.write_ddff12(file, {"train": train, "val": val, "test": test}, dtype=dtype, compression=compression)
-    stacks = data.open_stacks(file)
+    stack_writers.write_ddff12(file, {"train": train, "val": val, "test": test}, dtype=dtype, compression=compression)
+    stacks = formats.open_stacks(file)
     assert stacks.format == "ddff12" and sorted(stacks.names)[:2] == ["test/0000", "train/0000"] and len(stacks) == 5
     for split, want in (("train", train), ("val", val), ("test", test)):
-        for got, made in zip(data.open_stacks(tmp_path, split=split), want, strict=True):
+        for got, made in zip(formats.open_stacks(tmp_path, split=split), want, strict=True):
             assert got.images.dtype == torch.uint8 and torch.equal(got.images, made.images) and got.camera is None
             if made.depth is None:
                 assert got.depth is None
@@ -129,7 +130,7 @@ def test_ddff12_in_full_size_has_its_camera_and_opening_reads_no_picture(
     read: list[object] = []
     take = h5py.Dataset.__getitem__
     monkeypatch.setattr(h5py.Dataset, "__getitem__", lambda self, key: read.append(key) or take(self, key))
-    stacks = data.open_stacks(file)
+    stacks = formats.open_stacks(file)
     assert len(stacks) == 400 and read == []
     assert not bool(stacks[7].depth.any()) and len(read) > 0
     assert torch.equal(stacks[399].camera.f, torch.tensor([[521.4052, 521.4052]])) and stacks[0].hw == (383, 552)
@@ -142,7 +143,7 @@ def test_ddff12_values_and_keys_as_they_come(tmp_path: Path) -> None:
         group["stacks_train"] = pixels.astype("f8") / 255  # the name in the authors' notes
         group["stack_val"] = pixels + 0.25 * (pixels < 255)
         group["AiF_train"] = pixels[:, 0]
-    train, val = data.open_stacks(tmp_path / "a.h5", split="train")[0], data.open_stacks(tmp_path, split="val")[0]
+    train, val = formats.open_stacks(tmp_path / "a.h5", split="train")[0], formats.open_stacks(tmp_path, split="val")[0]
     assert train.images.dtype == val.images.dtype == torch.float32
     torch.testing.assert_close(train.images, made.images / 255)
     torch.testing.assert_close(val.images[0, 0], (made.images[0, 0] + 0.25 * (made.images[0, 0] < 255)) / 255)
@@ -150,14 +151,14 @@ def test_ddff12_values_and_keys_as_they_come(tmp_path: Path) -> None:
 
 def test_image_folder_counts_as_people_do(tmp_path: Path) -> None:
     made = stack(0, 12)
-    writers.write_image_folder(tmp_path, made)
-    stacks = data.open_stacks(tmp_path)
+    stack_writers.write_image_folder(tmp_path, made)
+    stacks = formats.open_stacks(tmp_path)
     assert stacks.format == "images" and len(stacks) == 1
     got = stacks[0]
     assert torch.equal(got.images, made.images)  # image2 before image10
     assert got.depth is None and got.focus_m is None and got.camera is None
     focus = [0.1 * k for k in range(1, 13)]
-    assert data.open_stacks(tmp_path, focus_m=focus)[0].focus_m.shape == (1, 12)
+    assert formats.open_stacks(tmp_path, focus_m=focus)[0].focus_m.shape == (1, 12)
     fails(r"option focus_m: found \[0.1, 0.2\], expected 12 finite numbers", tmp_path, focus_m=[0.1, 0.2])
 
 
@@ -167,7 +168,7 @@ def test_image_folder_of_sixteen_bits_and_alpha(tmp_path: Path) -> None:
         tifffile.imwrite(
             tmp_path / f"{k}.tif", deep, compression="zlib", photometric="rgb", extrasamples=["unassalpha"]
         )
-    images = data.open_stacks(tmp_path)[0].images
+    images = formats.open_stacks(tmp_path)[0].images
     torch.testing.assert_close(
         images[0, 1], torch.from_numpy(deep[..., :3].astype(np.float32) / 65535).permute(2, 0, 1)
     )
@@ -222,11 +223,11 @@ def test_ddff12_raw_light_fields_are_sharpest_at_their_depth(tmp_path: Path) -> 
     depth = torch.full((1, *hw), 0.558)
     depth[:, :, 48:] = 1.8
     depth[:, :4, :4] = 0
-    writers.write_light_field(
+    stack_writers.write_light_field(
         tmp_path, "train/kitchen", 3, light_field(constant / depth[0].clamp(min=0.5).double(), hw), depth
     )
-    writers.write_light_field(tmp_path, "test/cafeteria", 1, light_field(torch.tensor(0.1), hw))
-    stacks = data.open_stacks(tmp_path)
+    stack_writers.write_light_field(tmp_path, "test/cafeteria", 1, light_field(torch.tensor(0.1), hw))
+    stacks = formats.open_stacks(tmp_path)
     assert stacks.format == "ddff12" and stacks.names == ("test/cafeteria/0001", "train/kitchen/0003")
     assert stacks[0].depth is None
     got = stacks[1]
@@ -241,19 +242,19 @@ def test_ddff12_raw_light_fields_are_sharpest_at_their_depth(tmp_path: Path) -> 
 def test_ddff12_stacks_of_one_room_are_one_scene(tmp_path: Path) -> None:
     lf = light_field(torch.tensor(0.1), (12, 16), 3)
     for scene, number in (("train/kitchen", 0), ("train/kitchen", 4), ("test/library", 4), ("train/studentlab", 0)):
-        writers.write_light_field(tmp_path / "raw", scene, number, lf)
-    raw = data.open_stacks(tmp_path / "raw")
+        stack_writers.write_light_field(tmp_path / "raw", scene, number, lf)
+    raw = formats.open_stacks(tmp_path / "raw")
     assert raw.by_scene() == {"test/library": [0], "train/kitchen": [1, 2], "train/studentlab": [3]}
-    assert data.open_stacks(tmp_path / "raw", split="test").by_scene() == {"test/library": [0]}
+    assert formats.open_stacks(tmp_path / "raw", split="test").by_scene() == {"test/library": [0]}
 
     file = tmp_path / "a.h5"
-    writers.write_ddff12(file, {"train": [stack(i, 10) for i in range(5)], "val": [stack(9, 10)]})
-    assert data.open_stacks(file).by_scene() == {"train": [0, 1, 2, 3, 4], "val": [5]}, "which rooms is not said"
-    known = data.open_stacks(file, per_scene=2, split="train").by_scene()
+    stack_writers.write_ddff12(file, {"train": [stack(i, 10) for i in range(5)], "val": [stack(9, 10)]})
+    assert formats.open_stacks(file).by_scene() == {"train": [0, 1, 2, 3, 4], "val": [5]}, "which rooms is not said"
+    known = formats.open_stacks(file, per_scene=2, split="train").by_scene()
     assert known == {"train/scene_00": [0, 1], "train/scene_01": [2, 3], "train/scene_02": [4]}
     fails("option per_scene: found 0, expected at least 1", file, per_scene=0)
-    writers.write_fod500(tmp_path / "fod", {0: stack(0), 7: stack(7)})
-    assert data.open_stacks(tmp_path / "fod").by_scene() == {"000000": [0], "000007": [1]}, "each a scene of its own"
+    stack_writers.write_fod500(tmp_path / "fod", {0: stack(0), 7: stack(7)})
+    assert formats.open_stacks(tmp_path / "fod").by_scene() == {"000000": [0], "000007": [1]}, "each a scene of its own"
     with pytest.raises(ValueError, match="found 1 scenes of 2 stacks, expected one for each"):
         Stacks("x", "images", raw.load, ("a", "b"), scenes=("room",))
 
@@ -261,9 +262,9 @@ def test_ddff12_stacks_of_one_room_are_one_scene(tmp_path: Path) -> None:
 def test_ddff12_raw_without_its_depth_is_left_out(tmp_path: Path) -> None:
     lf, depth = light_field(torch.tensor(0.1), (12, 16), 3), torch.ones(1, 12, 16)
     for number in range(3):
-        writers.write_light_field(tmp_path, "train/kitchen", number, lf, depth)
+        stack_writers.write_light_field(tmp_path, "train/kitchen", number, lf, depth)
     (tmp_path / "DepthRegistered/train/kitchen/DEPTH_0001.png").unlink()
-    stacks = data.open_stacks(tmp_path)
+    stacks = formats.open_stacks(tmp_path)
     assert stacks.names == ("train/kitchen/0000", "train/kitchen/0002")
     assert stacks.report == ("train/kitchen/0001: no DEPTH_0001.png: left out",)
 
@@ -272,43 +273,44 @@ def test_ddff12_raw_without_its_depth_is_left_out(tmp_path: Path) -> None:
 
 
 def test_opening_decodes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    writers.write_fod500(tmp_path / "a", {0: stack(0)})
-    writers.write_ddff12(tmp_path / "b.h5", {"train": [stack(0, 10)]})
+    stack_writers.write_fod500(tmp_path / "a", {0: stack(0)})
+    stack_writers.write_ddff12(tmp_path / "b.h5", {"train": [stack(0, 10)]})
     for module, name in ((tiff, "read_tiff"), (fod500.exr, "read_exr"), (hdf5.Hdf5Array, "row")):
         monkeypatch.setattr(module, name, lambda *a, **k: 1 / 0)
-    assert len(data.open_stacks(tmp_path / "a")) == len(data.open_stacks(tmp_path / "b.h5")) == 1
+    assert len(formats.open_stacks(tmp_path / "a")) == len(formats.open_stacks(tmp_path / "b.h5")) == 1
 
 
 WRITTEN = {
-    "fod500": lambda root: writers.write_fod500(root, {0: stack(0), 1: stack(1)}),
-    "ddff12": lambda root: writers.write_ddff12(root / "a.h5", {"val": [stack(0, 10)]}),
-    "images": lambda root: writers.write_image_folder(root, stack(0, 5)),
+    "fod500": lambda root: stack_writers.write_fod500(root, {0: stack(0), 1: stack(1)}),
+    "ddff12": lambda root: stack_writers.write_ddff12(root / "a.h5", {"val": [stack(0, 10)]}),
+    "images": lambda root: stack_writers.write_image_folder(root, stack(0, 5)),
 }
 
 
 @pytest.mark.parametrize("name", WRITTEN)
-def test_open_gives_stacks_and_a_job_of_pairs_says_why_not(
+def test_a_job_of_pairs_says_why_not(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root = tmp_path / "sweep"
     root.mkdir()
     WRITTEN[name](root)
-    assert data.recognise(root)[0] == name
-    got, want = data.open(root), data.open_stacks(root)
-    assert isinstance(got, Stacks) and (got.names, got.format, len(got)) == (want.names, name, len(want))
-    assert torch.equal(got[0].images, want[0].images)
-    with pytest.raises(ValueError, match=rf"data: near, gap given for .*sweep, which holds focal stacks \({name}\)"):
-        data.open(root, near=1.0, gap=3)
+    assert formats.recognise_stacks(root)[0] == name and formats.open_stacks(root).format == name
+    with pytest.raises(FormatError, match=r"sweep: format: found .*, expected one of record3d, tum"):
+        data.open(root)
     monkeypatch.chdir(tmp_path)
     assert run.main(["data=auto", f"data.root={root}", "pairs.gap=1", "holdout.cutoff=1.0"]) != 0
     said = " ".join(capsys.readouterr().err.split())
-    assert f"holds focal stacks ({name}), pictures of one view, expected a recording whose camera moves" in said
+    expected = "expected a recording whose camera moves; experiment=focus_stack data=stacks reads them"
+    assert f"sweep holds focal stacks ({name}), pictures of one view, {expected}" in said
+    assert run.main(["data=stacks", f"data.root={root}", "pairs.gap=1", "holdout.cutoff=1.0"]) != 0
+    said += " ".join(capsys.readouterr().err.split())
+    assert f"data: found Stacks('{formats.open_stacks(root).name}', {name}, " in said
     assert "Traceback" not in said and not list(tmp_path.rglob("result.json"))
 
 
 def test_stacks_are_a_sequence_and_pickle(tmp_path: Path) -> None:
-    writers.write_fod500(tmp_path, {0: stack(0), 1: stack(1)})
-    stacks = pickle.loads(pickle.dumps(data.open_stacks(tmp_path)))
+    stack_writers.write_fod500(tmp_path, {0: stack(0), 1: stack(1)})
+    stacks = pickle.loads(pickle.dumps(formats.open_stacks(tmp_path)))
     assert torch.equal(stacks[-1].images, stack(1).images) and len(list(stacks)) == 2
     with pytest.raises(IndexError, match="stack 2 of 2"):
         stacks[2]
@@ -322,11 +324,11 @@ def test_bad_stacks(tmp_path: Path) -> None:
     fails(r": format: found tum, expected auto, fod500", tmp_path, format="tum")
     fails(r": pictures: found 0, expected at least two", tmp_path, format="images")
     with pytest.raises(ValueError, match="format images has no option 'split', expected one of focus_m"):
-        data.open_stacks(tmp_path, "images", split="train")
-    writers.write_image_folder(tmp_path, stack(0, 1))
+        formats.open_stacks(tmp_path, "images", split="train")
+    stack_writers.write_image_folder(tmp_path, stack(0, 1))
     fails(r": pictures: found 1, expected at least two, at different focus", tmp_path, format="images")
-    writers.write_image_folder(tmp_path, stack(0, 3))
-    writers.write_image_folder(tmp_path / "b", stack(0, 2, hw=(12, 17)))
+    stack_writers.write_image_folder(tmp_path, stack(0, 3))
+    stack_writers.write_image_folder(tmp_path / "b", stack(0, 2, hw=(12, 17)))
     (tmp_path / "b/image2.png").rename(tmp_path / "image2.png")
     fails(
         r"image2.png: picture: found 17x12, 3 channels, .*, expected 16x12.* as image1.png", tmp_path, format="images"
@@ -336,7 +338,7 @@ def test_bad_stacks(tmp_path: Path) -> None:
 
 
 def test_bad_fod500(tmp_path: Path) -> None:
-    writers.write_fod500(tmp_path, {0: stack(0)})
+    stack_writers.write_fod500(tmp_path, {0: stack(0)})
     fails(r"option split: found test, expected train or val", tmp_path, split="test")
     fails(r"samples: found none whole among 1, expected 4 \*All.tif and one \*Dpt.exr", tmp_path, focus_m=FOCUS[:4])
     fails(r"option f_number: found 0.0, expected a positive number", tmp_path, f_number=0)
@@ -344,7 +346,7 @@ def test_bad_fod500(tmp_path: Path) -> None:
     good = (tmp_path / "000000Dpt.exr").read_bytes()
     (tmp_path / "000000Dpt.exr").write_bytes(good[:-20])
     fails(r"000000Dpt.exr: chunk 0: found bytes beyond", tmp_path)
-    (tmp_path / "000000_03All.tif").write_bytes(writers.focal_stacks.rgb_tiff(np.zeros((12, 17, 3), np.uint8)))
+    (tmp_path / "000000_03All.tif").write_bytes(stack_writers.rgb_tiff(np.zeros((12, 17, 3), np.uint8)))
     fails(r"000000_03All.tif: picture: found 17x12", tmp_path)
 
 
@@ -363,7 +365,7 @@ def test_bad_ddff12(tmp_path: Path) -> None:
     fails(r"a.h5: stack_train: found shape \(10, 12, 16, 3\), expected stacks, slices", file)
     written(stack_train=good[:, :7])
     fails(r"a.h5: slices: found 7, expected 10, one for each focus distance", file)
-    assert data.open_stacks(file, focus_m=[0.5, 0.6, 0.7, 0.8, 1, 2, 7])[0].images.shape[1] == 7
+    assert formats.open_stacks(file, focus_m=[0.5, 0.6, 0.7, 0.8, 1, 2, 7])[0].images.shape[1] == 7
     written(stack_train=good * 1.5)
     fails(r"a.h5: stack_train: found 0 to 38.*, expected values from 0 to 255", file)
     written(stack_train=good, elsewhere=h5py.ExternalLink("/etc/hostname", "/x"))
@@ -381,7 +383,7 @@ def test_bad_ddff12(tmp_path: Path) -> None:
 
 
 def test_bad_light_field(tmp_path: Path) -> None:
-    writers.write_light_field(
+    stack_writers.write_light_field(
         tmp_path, "train/a", 1, light_field(torch.tensor(0.1), (12, 16), 3), torch.ones(1, 12, 16)
     )
     file = tmp_path / "LightField/train/a/LF_0001.npy"
@@ -396,29 +398,29 @@ def test_bad_light_field(tmp_path: Path) -> None:
 
 
 def test_a_missing_library_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    writers.write_ddff12(tmp_path / "a.h5", {"train": [stack(0, 10)]})
+    stack_writers.write_ddff12(tmp_path / "a.h5", {"train": [stack(0, 10)]})
     monkeypatch.setitem(__import__("sys").modules, "h5py", None)
     with pytest.raises(ImportError, match=r"h5py, which is not installed: pip install 'dhtorch\[data\]'"):
-        data.open_stacks(tmp_path / "a.h5")
+        formats.open_stacks(tmp_path / "a.h5")
 
 
 # ------------------------------------------------------------------------------------------------------------ hostile
 
 
 def _ddff12(root: Path) -> Path:
-    writers.write_ddff12(
+    stack_writers.write_ddff12(
         root / "a.h5", {"train": [stack(0, 10), stack(1, 10)], "val": [stack(2, 10)]}, compression="gzip"
     )
     return root / "a.h5"
 
 
 HOSTILE = {
-    "fod500": lambda root: writers.write_fod500(root, {0: stack(0), 1: stack(1)}),
+    "fod500": lambda root: stack_writers.write_fod500(root, {0: stack(0), 1: stack(1)}),
     "ddff12": _ddff12,
-    "light_field": lambda root: writers.write_light_field(
+    "light_field": lambda root: stack_writers.write_light_field(
         root, "train/a", 1, light_field(torch.tensor(0.1), (12, 16), 3), torch.ones(1, 12, 16)
     ),
-    "images": lambda root: writers.write_image_folder(root, stack(0, 3)),
+    "images": lambda root: stack_writers.write_image_folder(root, stack(0, 3)),
 }
 
 
@@ -428,9 +430,9 @@ HOSTILE = {
 @pytest.mark.data
 @real
 def test_real_focus_sweeps() -> None:
-    room = data.open_stacks(Path(ROOT) / "focus_stack_room")
+    room = formats.open_stacks(Path(ROOT) / "focus_stack_room")
     assert room.format == "images" and room[0].images.shape == (1, 6, 3, 768, 1024)
-    heatsink = data.open_stacks(Path(ROOT) / "focus_stack_heatsink" / "assets" / "9")
+    heatsink = formats.open_stacks(Path(ROOT) / "focus_stack_heatsink" / "assets" / "9")
     order = [int("".join(c for c in file.stem if c.isdigit())) for file in heatsink.load.pictures]
     assert order == list(range(1, 50))
     # A sweep moves the focus steadily: the next picture is sharp in nearly the same places. Measured 0.97 for the order

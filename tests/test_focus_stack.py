@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from dhtorch import data
-from dhtorch import testing as writers
-from dhtorch.data.stacks import FocalStack
 from dhtorch.geometry.filters import gaussian
 from dhtorch.studies.focal import focus_stack as experiment
+from dhtorch.studies.focal import formats
+from dhtorch.studies.focal import writers as stack_writers
 from dhtorch.studies.focal.sharpness import MEASURES, align, depth_at, sharpest, sharpness
+from dhtorch.studies.focal.stacks import FocalStack
 from dhtorch.studies.protocol import Outcome, Settings
 from dhtorch.synthetic.thin_lens import lens_of, photograph
 from dhtorch.synthetic.viewpoints import open_viewpoints
@@ -119,10 +119,10 @@ def test_stacks_in_the_formats_of_the_data_sets(tmp_path: Path):
     lens = lens_of(64.0, f_number=2.0)
     shot = photograph(paint(48, 64), near, lens, 1 / steps[None])[0].expand(-1, 3, -1, -1)
     images = (255 * shot).round().to(torch.uint8)[None]
-    writers.write_fod500(
+    stack_writers.write_fod500(
         tmp_path / "fod", {0: FocalStack(images, depth=near), 1: FocalStack(images.flip(-1), depth=near.flip(-1))}
     )
-    outcome = experiment.run([data.open_stacks(tmp_path / "fod")], {}, None, Settings(), stride_px=1, window_px=3.0)
+    outcome = experiment.run([formats.open_stacks(tmp_path / "fod")], {}, None, Settings(), stride_px=1, window_px=3.0)
     assert set(given(outcome)) == {"fod/000000", "fod/000001"} and outcome.verdict == "undecided"
     assert all(row["rank_corr"] > 0.9 and row["flip_share"] == 0 for row in given(outcome).values())
     assert outcome.summary["given.flip_share"]["value"] == 0
@@ -131,8 +131,8 @@ def test_stacks_in_the_formats_of_the_data_sets(tmp_path: Path):
     far = slope(48, 64, near=0.6, far=6.0)
     shot = photograph(paint(48, 64), far, lens_of(64.0, f_number=0.2), ten)[0].expand(-1, 3, -1, -1)
     stack = FocalStack((255 * shot).round().to(torch.uint8)[None], depth=far)
-    writers.write_ddff12(tmp_path / "d.h5", {"val": [stack]})
-    outcome = experiment.run([data.open_stacks(tmp_path / "d.h5")], {}, None, Settings(), stride_px=1, window_px=3.0)
+    stack_writers.write_ddff12(tmp_path / "d.h5", {"val": [stack]})
+    outcome = experiment.run([formats.open_stacks(tmp_path / "d.h5")], {}, None, Settings(), stride_px=1, window_px=3.0)
     (row,) = given(outcome).values()
     assert row["rank_corr"] > 0.9 and row["gated_corr"] > 0.9
 
@@ -149,11 +149,11 @@ def room(near, seed, invert=False):
 def test_intervals_resample_rooms_and_not_stacks_of_one_room(tmp_path: Path):
     """Three stacks of one room, two of another: two scenes, whichever room has more stacks."""
     made = [room(0.6, 0), room(0.7, 1), room(0.8, 2, invert=True), room(0.6, 3, invert=True), room(0.9, 4, invert=True)]
-    writers.write_ddff12(tmp_path / "d.h5", {"train": made})
+    stack_writers.write_ddff12(tmp_path / "d.h5", {"train": made})
     asked = {"stride_px": 1, "window_px": 3.0, "measures": ("modified_laplacian",)}
 
     def run(**options):
-        return experiment.run([data.open_stacks(tmp_path / "d.h5", **options)], {}, None, Settings(), **asked)
+        return experiment.run([formats.open_stacks(tmp_path / "d.h5", **options)], {}, None, Settings(), **asked)
 
     rooms, unknown = run(per_scene=3), run()
     assert set(given(rooms)) == {"d/train/scene_00", "d/train/scene_01"} and rooms.n_pairs == 5
@@ -200,6 +200,6 @@ def test_verdict_goes_either_way():
 @pytest.mark.data
 @pytest.mark.skipif(not ROOT, reason="DHTORCH_DATA is not set")
 def test_the_order_of_the_real_sweep_is_recovered():
-    stacks = data.open_stacks(Path(ROOT) / "focus_stack_heatsink" / "assets" / "9")
+    stacks = formats.open_stacks(Path(ROOT) / "focus_stack_heatsink" / "assets" / "9")
     images = stacks[0].images[:, :, 1:2, ::2, ::2]
     assert experiment.order(sharpness(images)) > 0.95

@@ -17,12 +17,13 @@ from dhtorch.records import Camera, Frame, Samples
 ROOT = os.environ.get("DHTORCH_DATA")
 
 
-def frame_of(depth, hw=None, depth_camera=None):
+def frame_of(depth, hw=None, depth_camera=None, sparse=False):
     """A view with the depth map (h, w) or (B, h, w) and a grey image of size hw."""
     depth = depth if depth.dim() == 3 else depth[None]
     B, (h, w) = depth.shape[0], hw or depth.shape[-2:]
     camera = Camera(torch.full((B, 2), 50.0), torch.tensor([(w - 1) / 2, (h - 1) / 2]).expand(B, 2))
-    return Frame(torch.full((B, 1, h, w), 0.5), depth, camera, depth_camera)
+    about = torch.ones(B, dtype=torch.bool) if sparse else None
+    return Frame(torch.full((B, 1, h, w), 0.5), depth, camera, depth_camera, sparse=about)
 
 
 def at(*uv):
@@ -99,12 +100,12 @@ def test_sparse_truth_takes_the_nearest_return():
     depth[10, 10], depth[10, 13] = 8.0, 9.0  # 12.5 % apart: close fails
     depth[50, 10], depth[50, 17] = 8.0, 9.5  # 7 px apart: only the wide window sees both
     uv = at((31, 31), (32.6, 32.6), (10, 11), (10, 50), (60, 30), (34, 33))
-    truth = holdout.truth_at(frame_of(depth), uv, sparse=True)
+    truth = holdout.truth_at(frame_of(depth, sparse=True), uv)
     assert truth.code[0].tolist() == [0, 0, Rule.CLOSE, Rule.WIDE, Rule.NO_RETURN, 0]
     torch.testing.assert_close(truth.depth[0], torch.tensor([8.0, 8.2, 8.0, 8.0, 0.0, 8.2]))
-    raw = holdout.truth_at(frame_of(depth), uv, sparse=True, truth="raw")
+    raw = holdout.truth_at(frame_of(depth, sparse=True), uv, truth="raw")
     assert raw.ok[0].tolist() == [True, True, True, True, False, True]
-    close = holdout.truth_at(frame_of(depth), uv, sparse=True, truth="5x5")
+    close = holdout.truth_at(frame_of(depth, sparse=True), uv, truth="5x5")
     assert close.ok[0].tolist() == [True, True, False, True, False, True]
 
 
@@ -130,11 +131,12 @@ def test_truth_of_a_pair_does_not_depend_on_its_batch():
     depth = 3 + torch.rand(5, 40, 50, generator=torch.Generator().manual_seed(0)) * 0.3
     depth[depth < 3.02] = 0
     uv = torch.rand(5, 203, 2, generator=torch.Generator().manual_seed(1)) * 45
-    frame = frame_of(depth)
-    for sparse in (False, True):
-        together = holdout.truth_at(frame, uv, sparse=sparse)
+    frames = [frame_of(depth, sparse=sparse) for sparse in (False, True)]
+    frames.append(frames[0].replace(sparse=torch.tensor([True, False, True, True, False])))
+    for frame in frames:
+        together = holdout.truth_at(frame, uv)
         for b in range(5):
-            alone = holdout.truth_at(frame[b : b + 1], uv[b : b + 1], sparse=sparse)
+            alone = holdout.truth_at(frame[b : b + 1], uv[b : b + 1])
             assert torch.equal(alone.depth, together.depth[b : b + 1])
             assert torch.equal(alone.code, together.code[b : b + 1])
 
@@ -175,7 +177,7 @@ def test_every_held_back_return_of_a_real_frame_is_accounted_for(name, cutoff):
     textured = samples_of(torch.rand(1, uv.shape[1], generator=torch.Generator().manual_seed(0)))
     kept = []
     for rule in holdout.TESTS:
-        truth = holdout.truth_at(frame, uv, truth=rule, sparse=recording.sparse)
+        truth = holdout.truth_at(frame, uv, truth=rule)
         found = holdout.candidates(textured, truth, cutoff)
         assert int(found.ok.sum()) + sum(found.dropped().values()) == int((truth.depth > cutoff).sum())
         kept.append(found.ok)
@@ -241,7 +243,7 @@ def test_the_truth_test_equals_plain_loops(truth, sparse, scale):
     depth[empty > 0.994], depth[empty > 0.997] = math.nan, math.inf
     depth[:, w // 3 :] *= 1.08  # a step that the wide window alone takes for smooth
     uv = torch.rand(150, 2, generator=g, dtype=torch.float64) * torch.tensor([66.0, 46.0]) - 3
-    found = holdout.truth_at(frame_of(depth, hw=(40, 60)), uv[None], truth=truth, sparse=sparse, window=13)
+    found = holdout.truth_at(frame_of(depth, hw=(40, 60), sparse=sparse), uv[None], truth=truth, window=13)
     expected = loop_truth(depth, uv, truth, sparse, scale, window=13)
     assert found.depth[0].tolist() == [z for z, _ in expected]
     assert found.code[0].tolist() == [code for _, code in expected]
@@ -256,7 +258,7 @@ def test_a_spread_of_exactly_the_limit_fails_and_one_just_below_does_not(apart, 
     for z, code in ((high, rule), (math.nextafter(high, 0), Rule.CANDIDATE)):
         depth = torch.full((40, 40), 0.0 if sparse else 2.0, dtype=torch.float64)
         depth[20, 20], depth[20, 20 + apart] = 2.0, z
-        assert int(holdout.truth_at(frame_of(depth), at((20, 20)).double(), sparse=sparse).code) == code
+        assert int(holdout.truth_at(frame_of(depth, sparse=sparse), at((20, 20)).double()).code) == code
 
 
 def test_the_default_windows_are_5_and_25_pixels_wide_and_7_and_15_where_returns_are_sparse():
@@ -266,7 +268,7 @@ def test_the_default_windows_are_5_and_25_pixels_wide_and_7_and_15_where_returns
         for d in range(1, 20):
             depth = torch.full((60, 60), 0.0 if sparse else 2.0)
             depth[30, 30], depth[30 + d, 30] = 2.0, 2 * step
-            far = d if int(holdout.truth_at(frame_of(depth), at((30, 30)), sparse=sparse).code) == rule else far
+            far = d if int(holdout.truth_at(frame_of(depth, sparse=sparse), at((30, 30))).code) == rule else far
         return far
 
     assert [reach(False, Rule.CLOSE, 1.06), reach(False, Rule.WIDE, 1.2)] == [2, 12]
@@ -287,7 +289,7 @@ def test_what_is_no_depth_is_no_return():
 def test_the_gradient_of_the_truth_is_one_at_the_pixel_it_was_read_from(sparse):
     depth = torch.full((20, 30), 2.0)
     depth.requires_grad_()
-    holdout.truth_at(frame_of(depth), at((12.2, 7.4)), sparse=sparse).depth.sum().backward()
+    holdout.truth_at(frame_of(depth, sparse=sparse), at((12.2, 7.4))).depth.sum().backward()
     assert depth.grad.nonzero().tolist() == [[7, 12]] and depth.grad[7, 12] == 1
 
 

@@ -2,7 +2,8 @@
 
 import pytest
 import torch
-from test_protocols import Changed, method, room, rows
+from rooms import Changed
+from test_protocols import method, room, rows
 
 from dhtorch.stages.sample import grid, spiral
 from dhtorch.studies.negative import hole_attention as experiment

@@ -4,7 +4,8 @@ import math
 
 import pytest
 import torch
-from test_protocols import Changed, method, room, rows
+from rooms import Changed
+from test_protocols import method, room, rows
 
 from dhtorch.geometry import se3
 from dhtorch.records import Pose

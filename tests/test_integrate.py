@@ -11,7 +11,7 @@ from room_truth import room_distance
 from dhtorch import extend
 from dhtorch.codes import Source
 from dhtorch.geometry import camera as cameras
-from dhtorch.geometry import cells, se3
+from dhtorch.geometry import se3, sparse_grid
 from dhtorch.integrate import View, empty, fuse, mesh, points, recording, splat
 from dhtorch.records import Camera, Estimate, Pose, Samples, Tracks
 from dhtorch.studies.baselines.device_pose import given_pose
@@ -115,17 +115,17 @@ def test_the_furnished_room_is_found_exactly_and_completely(room):
     surface = mesh(volume)
     error = room_distance(surface.xyz)
     assert float(error.median()) < 0.002 and float(error.mean()) < 0.006 and float(error.quantile(0.99)) < 0.05
-    there, found = cells.occupied(seen, 0.03), cells.occupied(surface.xyz, 0.03)
-    assert float(cells.near(there, found).double().mean()) > 0.97, "complete: what was seen is in the map"
+    there, found = sparse_grid.occupied(seen, 0.03), sparse_grid.occupied(surface.xyz, 0.03)
+    assert float(sparse_grid.near(there, found).double().mean()) > 0.97, "complete: what was seen is in the map"
 
 
 def test_no_surface_where_nothing_was_seen(room):
     pytest.importorskip("skimage")
     _, volume, seen = room
-    reach = cells.occupied(seen, volume.truncation + volume.voxel)
+    reach = sparse_grid.occupied(seen, volume.truncation + volume.voxel)
     for surface in (mesh(volume), points(volume)):
-        assert bool(cells.near(cells.occupied(surface.xyz, volume.truncation + volume.voxel), reach).all())
-        near = cells.near(cells.occupied(surface.xyz, 0.03), cells.occupied(seen, 0.03))
+        assert bool(sparse_grid.near(sparse_grid.occupied(surface.xyz, volume.truncation + volume.voxel), reach).all())
+        near = sparse_grid.near(sparse_grid.occupied(surface.xyz, 0.03), sparse_grid.occupied(seen, 0.03))
         assert float(near.double().mean()) > 0.97, "nor far beside what was seen"
 
 
@@ -179,7 +179,7 @@ def test_a_batch_of_views_is_one_after_the_other_bit_for_bit():
     again = fuse(empty(0.02, channels=1), both)
     for name in ("key", "distance", "weight", "features"):
         assert torch.equal(getattr(together, name), getattr(again, name)), "the same every time"
-    at, found = cells.find(together.key, apart.key)
+    at, found = sparse_grid.find(together.key, apart.key)
     assert bool(found.all())
     known = apart.weight.sum(-1) > 0
     torch.testing.assert_close(together.distance[at][known], apart.distance[known], atol=0.02, rtol=0)
@@ -346,7 +346,7 @@ def answered(i, j, T, ok=True):
     estimate = Estimate(samples.uv, zero + 2, zero + 0.1, zero, zero, zero, code, zero, code)
     tracks = Tracks(samples.uv, samples.uv, zero, zero, torch.zeros(1, n, 2, 2), code == 0)
     fit = given_pose(T if ok else T.map(lambda v: v * math.nan), n)
-    return recording.Answer((i, j), samples, estimate, tracks, fit, torch.zeros(1, n, 3), wall().camera, (60, 80))
+    return recording.PairEstimate((i, j), samples, estimate, tracks, fit, torch.zeros(1, n, 3), wall().camera, (60, 80))
 
 
 class Trajectory:
@@ -446,7 +446,7 @@ def test_coverage_counts_cells_and_islands():
 @pytest.fixture(scope="module")
 def walked():
     """A small recording of the built-in room, its pairs and what the method says about them."""
-    room = SyntheticRoom(hw=(240, 320), n_frames=5, gap=4, supersample=1, step_m=0.03)
+    room = SyntheticRoom(hw=(240, 320), n_frames=5, supersample=1, step_m=0.03)
     method = extend.replace(n=1024)
     return room, list(recording.ask(room, method, [(0, 4)], cutoff=2.0))
 

@@ -5,6 +5,7 @@ from functools import partial
 
 import pytest
 import torch
+from rooms import noted
 from rooms import room as rendered
 
 from dhtorch import archive, extend
@@ -25,7 +26,7 @@ def measured(**options):
     fast = {"rounds": 2, "front_end_repeats": 10, "pair_repeats": 1, "dinov2_repeats": 1, "peak": False}
     chosen = {"paper": PAPER}
     options = {**fast, "sizes": SIZES, "n": 64, "dinov2": partial(dinov2.load, **TINY), **options}
-    return latency.run([room], chosen, partial(by_gap, gap=2), Settings(), **options)
+    return latency.run([noted(room)], chosen, partial(by_gap, gap=2), Settings(), **options)
 
 
 def test_every_stage_has_a_row_at_every_size():

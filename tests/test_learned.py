@@ -7,6 +7,7 @@ from functools import partial
 
 import pytest
 import torch
+from rooms import noted
 
 from dhtorch import archive, extend
 from dhtorch.codes import Gate
@@ -159,11 +160,11 @@ def test_the_scale_rests_on_pixels_that_no_sample_reads():
     lying = frame.depth.clone()
     lying[0, at[:, 1], at[:, 0]] = 99.0
     assert (lying == 99).float().mean() > 0.4, "the test would pass with samples counted"
-    scale = learned.fit_scale(found, frame.replace(depth=lying), uv, n_pixels=4096, sparse=False, seed=0)
+    scale = learned.fit_scale(found, frame.replace(depth=lying), uv, n_pixels=4096, seed=0)
     assert abs(float(scale.factor) - UNIT) < 1e-4 and 1000 < int(scale.n_pixels) < 3000
-    again = learned.fit_scale(found, frame.replace(depth=lying), uv, n_pixels=4096, sparse=False, seed=0)
+    again = learned.fit_scale(found, frame.replace(depth=lying), uv, n_pixels=4096, seed=0)
     assert torch.equal(scale.factor, again.factor)
-    empty = learned.fit_scale(found, frame.replace(depth=0 * lying), uv, n_pixels=4096, sparse=False, seed=0)
+    empty = learned.fit_scale(found, frame.replace(depth=0 * lying), uv, n_pixels=4096, seed=0)
     assert empty.factor.isnan().all() and int(empty.n_pixels) == 0
 
 
@@ -172,11 +173,12 @@ def test_in_a_sparse_map_the_return_of_a_sample_does_not_count():
     uv = torch.tensor([[[80.0, 60.0]]])
     lone = torch.zeros_like(frame.depth)
     lone[0, 60:63, 80:83] = 5.0  # within the search of the sample
+    frame = frame.replace(sparse=torch.ones(1, dtype=torch.bool))
     found = relative.RelativeDepth(frame.depth / UNIT, frame.depth, torch.ones(1, 2), torch.zeros(1, 2))
-    scale = learned.fit_scale(found, frame.replace(depth=lone), uv, n_pixels=50000, sparse=True, seed=0)
-    far = learned.fit_scale(found, frame.replace(depth=lone), uv - 50, n_pixels=50000, sparse=True, seed=0)
+    scale = learned.fit_scale(found, frame.replace(depth=lone), uv, n_pixels=50000, seed=0)
+    far = learned.fit_scale(found, frame.replace(depth=lone), uv - 50, n_pixels=50000, seed=0)
     assert int(far.n_pixels) > int(scale.n_pixels)
-    reads = holdout.truth_at(frame.replace(depth=lone), uv, truth="raw", sparse=True).depth
+    reads = holdout.truth_at(frame.replace(depth=lone), uv, truth="raw").depth
     assert float(reads) == 5.0 and scale.factor.isnan().all()
 
 
@@ -198,7 +200,7 @@ def room():
 def asked(room, installed, **options):
     models = {name: partial(ADAPTERS[name], weights=installed[name]) for name in ADAPTERS}
     pairs = partial(by_gap, gap=6)
-    return learned.run([room], {"paper": PAPER}, pairs, Settings(), **{"models": models, **options})
+    return learned.run([noted(room)], {"paper": PAPER}, pairs, Settings(), **{"models": models, **options})
 
 
 def test_networks_are_measured_on_our_candidates(room, installed):

@@ -4,6 +4,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
+from rooms import noted
 
 from dhtorch.commands.run import config_dir
 from dhtorch.data.pairs import by_gap
@@ -23,7 +24,7 @@ class Room(SyntheticRoom):
     """One pair of views of the room that other tests draw, too, drawn once."""
 
     def __init__(self, **options):
-        super().__init__(hw=(120, 160), supersample=1, path="orbit", n_frames=17, gap=16, **options)
+        super().__init__(hw=(120, 160), supersample=1, path="orbit", n_frames=17, **options)
         self.drawn = {}
 
     def __getitem__(self, i):
@@ -35,20 +36,18 @@ class Room(SyntheticRoom):
 @pytest.fixture(scope="module")
 def rooms():
     """Two, which differ in how far their views lie apart."""
-    found = [Room(), Room(step_m=0.025)]
-    for k, recording in enumerate(found):
-        recording.name = f"room{k}"
-    return found
+    return [noted(room, gap=16) for room in (Room(name="room0"), Room(name="room1", step_m=0.025))]
 
 
-def held_out(recording, method):
+def held_out(scene, method):
     """(trace, points) of the pair."""
+    recording = scene.recording
     frame = recording[0]
     trace = {}
-    near, other = (holdout.range_split(recording[k], recording.near) for k in (0, 16))
+    near, other = (holdout.range_split(recording[k], scene.near) for k in (0, 16))
     estimate = method(near, other, trace=trace)
     known = frame.replace(depth=recording.truth(0)["depth"], depth_camera=None)
-    truth = holdout.candidates(trace["samples"], holdout.truth_at(known, trace["samples"].uv), recording.near)
+    truth = holdout.candidates(trace["samples"], holdout.truth_at(known, trace["samples"].uv), scene.near)
     return trace, select(estimate, truth)
 
 

@@ -313,7 +313,7 @@ def test_squares_are_those_of_the_windows(normalise):
     src, dst = two_views(gain=6.5, bias=-0.3)
     x, d = places(1, 9, H, W, margin=0)[0].T.contiguous(), places(1, 9, 3, 3, 0, seed=3)[0].T - 1.0
     batch = torch.arange(9) % 2
-    o = lk.Options(WINDOW, 1, 0.0, 0.0, normalise)
+    o = lk.SearchOptions(WINDOW, 1, 0.0, 0.0, normalise)
     pyramids = (build_pyramid(y, 1, WINDOW) for y in (src, dst))
     found = lk.squares(*pyramids, o, x, d, batch)
     for n in range(9):
@@ -338,7 +338,7 @@ def test_the_covariance_is_variance_over_texture_kept_from_vanishing():
     ]
     cases += [(1e-5, 1e-10, 0.5)]
     A = [turn @ np.diag([large, small]) @ turn.T for large, small, _ in cases]
-    found = lk.covariance(
+    found = lk.window_covariance(
         torch.tensor([[a[0, 0], a[0, 1], a[1, 1]] for a in A], dtype=torch.float64).T,
         torch.tensor([c[2] for c in cases], dtype=torch.float64),
     )
@@ -346,7 +346,7 @@ def test_the_covariance_is_variance_over_texture_kept_from_vanishing():
         lift = max(1e-5 * max(large, 1e-4) - small, 0)
         values = max(variance, 1 / (12 * 255**2)) / np.array([large + lift, small + lift])
         np.testing.assert_allclose(found[..., n].numpy(), turn @ np.diag(values) @ turn.T, rtol=1e-6, atol=1e-6)
-    broken = lk.covariance(torch.full((3, 1), math.nan), torch.tensor([0.5]))
+    broken = lk.window_covariance(torch.full((3, 1), math.nan), torch.tensor([0.5]))
     np.testing.assert_allclose(broken[..., 0].numpy(), np.eye(2) * 0.5 / 1e-9, rtol=1e-5)
 
 

@@ -147,7 +147,7 @@ def newton_step(args, fit, o, isotropic):
 def test_the_answer_is_the_optimum_of_the_problem_that_its_options_describe(isotropic, options):
     """And not the optimum of the default's, so every option reaches the problem."""
     args, *_ = pairs(1, 20, 40, depth=0.01 if "bend" in options else 0.03, turn=0.002, seed=2)
-    base = most_probable.Options(max_rise=10.0, near_steps=8, steps=16, turn_sigma=0.0, translation_gain=-9.0)
+    base = most_probable.FitOptions(max_rise=10.0, near_steps=8, steps=16, turn_sigma=0.0, translation_gain=-9.0)
     o = base._replace(**options)
     fit = map_pose(*args, isotropic=isotropic, **o._asdict())
     assert fit.code.tolist() == [PoseCode.OK] and (fit.shutter.turn.abs().amax() > 1e-5) == (o.turn_sigma > 0)
@@ -162,7 +162,7 @@ def test_the_near_cost_may_rise_by_the_share_that_is_allowed():
     args, *_ = pairs(1, 12, 60, noise=0.3, depth=0.003, baseline=0.3, seed=4)
     shift = torch.tensor([3.3, 2.1], dtype=D) * (torch.arange(72) >= 12)[:, None]
     args = put(args, uv_1=args[1].uv_1 + shift)
-    o = most_probable.Options(far_weight=0.5, turn_sigma=0.0, translation_gain=-9.0, near_steps=12, steps=12)
+    o = most_probable.FitOptions(far_weight=0.5, turn_sigma=0.0, translation_gain=-9.0, near_steps=12, steps=12)
     ask = lambda rise: map_pose(*args, **o._replace(max_rise=rise)._asdict())  # noqa: E731
     problem, start = dense.problem_of(args, 0.1), pnp_ransac(*args).T_1_from_0
     places = [most_probable.most_probable(problem, start, o._replace(max_rise=x)).at for x in (-9.0, 1e9)]
@@ -403,7 +403,7 @@ def test_gradients_stay_finite_whatever_the_input():
 
 
 def test_options_have_one_default():
-    options, conf = most_probable.Options()._asdict(), Path(__file__).parents[1] / "conf" / "method"
+    options, conf = most_probable.FitOptions()._asdict(), Path(__file__).parents[1] / "conf" / "method"
     written = yaml.safe_load((conf / "map.yaml").read_text())["pose"]
     defaults = {k: v for k, v in map_pose.__kwdefaults__.items() if k != "start"}
     assert defaults == options | {k: defaults[k] for k in ("isotropic", "threshold_px")}

@@ -147,7 +147,7 @@ def test_ctrl_c_keeps_the_scenes_that_are_whole(tmp_path, monkeypatch):
             raise KeyboardInterrupt
         made.append(source)
         row = {"seconds": 0.0, "scene": source.name, "method": "map", "truth": "device"}
-        return mapping.Scene(source, [], None, None, None, row)
+        return mapping.MappedScene(source.recording, [], None, None, None, row)
 
     monkeypatch.setattr(mapping, "make", make)
     monkeypatch.setattr(mapping, "write", lambda *_: [])

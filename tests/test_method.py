@@ -12,8 +12,9 @@ from rooms import room as rendered
 import dhtorch
 from dhtorch import MAP, PAPER, WINDOW, TrackHint, tree
 from dhtorch.data.pairs import by_gap
+from dhtorch.data.scene import Scene
 from dhtorch.extract import plan
-from dhtorch.extract.rows import Rows
+from dhtorch.extract.dataset import Rows
 from dhtorch.geometry import camera as cam
 from dhtorch.method import Method, networks
 from dhtorch.stages.backproject import backproject
@@ -71,7 +72,7 @@ PLAIN, USUAL = PAPER.replace(**SEATS, n=N), PAPER.replace(n=N)
 
 @pytest.fixture(scope="module")
 def room():
-    return rendered(hw=(192, 256), n_frames=7, gap=3, near=2.0)
+    return rendered(hw=(192, 256), n_frames=7)
 
 
 def alike(a, b):
@@ -89,16 +90,15 @@ def test_a_plain_function_in_every_seat_answers_as_the_stage_itself(room):
 
 @pytest.mark.parametrize("views", [1, 3])
 def test_it_runs_in_the_protocol_with_the_levels_of_the_scene(room, views):
-    scene = rendered(hw=(192, 256), n_frames=7, gap=3, near=2.0)
-    scene.levels = 2
+    scene = Scene(room, near=2.0, levels=2)
     methods = {"plain": PLAIN.replace(views=views), "usual": USUAL.replace(views=views)}
     outcome = pairs.run([scene], methods, partial(by_gap, gap=3), protocol.Settings())
     plain, usual = (
         {k: v for k, v in outcome.scenes(m)["synthetic_room"].items() if k not in ("ms", "method")} for m in methods
     )
     assert plain == usual and plain["n_kept"] > 20
-    direct = PLAIN(protocol.holdout.range_split(scene[0], 2.0), scene[3], hint=TrackHint(levels=2))
-    other = PLAIN(protocol.holdout.range_split(scene[0], 2.0), scene[3])
+    direct = PLAIN(protocol.holdout.range_split(room[0], 2.0), room[3], hint=TrackHint(levels=2))
+    other = PLAIN(protocol.holdout.range_split(room[0], 2.0), room[3])
     assert not alike(direct, other), "two levels of a pyramid see less far than four"
 
 
@@ -110,7 +110,10 @@ def test_it_runs_in_a_transform_and_in_rows_for_a_data_set(room):
     for key in ("depth", "gate", "score"):
         assert torch.equal(*(a[f"dhtorch.{key}"] for a in answers))
     columns = {"depth": SimpleNamespace(kind="float32"), "gate": SimpleNamespace(kind="int32")}
-    rows = [Rows([room], plan.make([room], 3, 1), columns, method=m, gap=3)[4].features for m in (PLAIN, USUAL)]
+    rows = [
+        Rows([Scene(room)], plan.make([Scene(room)], 3, 1), columns, method=m, gap=3)[4].features
+        for m in (PLAIN, USUAL)
+    ]
     assert all((rows[0][k] == rows[1][k]).all() for k in columns)
 
 
@@ -124,7 +127,7 @@ def test_it_runs_in_the_viewer_and_its_result_in_the_report(room, tmp_path):
     settings = {"threads": None, "resume": False, "figures": False, "seed": 0, "device": "cpu", "dtype": "float32"}
     settings |= {"batch": 1, "workers": 0, "holdout": {"cutoff": None, "truth": "full"}, "method": {}, "data": {}}
     settings |= {"pairs": {}, "experiment": {}}
-    parts = {"data": room, "method": PLAIN, "pairs": partial(by_gap, gap=3), "experiment": pairs.run}
+    parts = {"data": Scene(room, near=2.0), "method": PLAIN, "pairs": partial(by_gap, gap=3), "experiment": pairs.run}
     choices = dict.fromkeys(job.GROUPS, "mine") | {"experiment": "pair", "method": "plain"}
     ended = job.run(settings, parts, choices, tmp_path, progress=lambda items, *_: items)
     assert ended.state == "finished"

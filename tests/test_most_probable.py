@@ -13,11 +13,11 @@ from dhtorch.geometry.most_probable import (
     MEDIAN_1D,
     MEDIAN_2D,
     MIN_NOISE_PX,
-    Options,
+    FitOptions,
     Solution,
-    covariance,
     most_probable,
     noise_scale,
+    pose_covariance,
 )
 
 D = torch.float64
@@ -113,11 +113,11 @@ def plain_covariance(problem, solution, o, b):
 @pytest.mark.parametrize(
     "o",
     [
-        Options(far_weight=0.1),
-        Options(far_weight=0.7, kernel="huber", bend=1.0, turn_sigma=1e-3),
-        Options(far_weight=1.0, kernel="cauchy", bend=1.5, turn_sigma=0.0),
-        Options(far_weight=0.3, kernel=None, turn_sigma=0.1),
-        Options(far_weight=0.3, kernel="geman_mcclure", bend=0.3),  # all residuals beyond the bend
+        FitOptions(far_weight=0.1),
+        FitOptions(far_weight=0.7, kernel="huber", bend=1.0, turn_sigma=1e-3),
+        FitOptions(far_weight=1.0, kernel="cauchy", bend=1.5, turn_sigma=0.0),
+        FitOptions(far_weight=0.3, kernel=None, turn_sigma=0.1),
+        FitOptions(far_weight=0.3, kernel="geman_mcclure", bend=0.3),  # all residuals beyond the bend
     ],
 )
 def test_the_covariance_is_the_sandwich_of_an_m_estimator(o):
@@ -128,7 +128,7 @@ def test_the_covariance_is_the_sandwich_of_an_m_estimator(o):
     noise = torch.where(tracks.far, 0.5, 0.3).to(D) * torch.tensor([[1.0], [1.7]], dtype=D)
     far = torch.tensor([o.far_weight, 0.25 * o.far_weight], dtype=D)
     solution = Solution(at, noise, far, torch.full((2,), 7.0, dtype=D), torch.ones(2) > 0)
-    cov, ok = covariance(tracks, solution, o)
+    cov, ok = pose_covariance(tracks, solution, o)
     assert ok.all() and torch.equal(cov, cov.mT)
     for b in range(2):
         wanted = plain_covariance(tracks, solution, o, b)
@@ -142,7 +142,7 @@ def test_a_pose_that_is_not_determined_has_no_covariance():
     tracks.near[1, 0] = True
     noise = torch.full_like(tracks.inverse, 0.1)
     one = torch.ones(2, dtype=D)
-    cov, ok = covariance(tracks, Solution(at, noise, one, one, one > 0), Options())
+    cov, ok = pose_covariance(tracks, Solution(at, noise, one, one, one > 0), FitOptions())
     assert ok.tolist() == [True, False] and cov[0].any() and not cov[1].any()
 
 
@@ -168,7 +168,7 @@ def contradiction():
 
 def test_far_tracks_are_believed_up_to_the_rise_of_the_near_cost_that_is_allowed():
     tracks, at = contradiction()
-    o = Options(far_weight=0.5, turn_sigma=0.0, **LONG)
+    o = FitOptions(far_weight=0.5, turn_sigma=0.0, **LONG)
     near, both = (most_probable(tracks, at.T, o._replace(max_rise=x)) for x in (-9.0, 1e9))
     assert float(near.far_weight) == 0 and float(both.far_weight) == 0.5
     noise = noise_scale(tracks, both.at)
@@ -184,7 +184,7 @@ def test_far_tracks_are_believed_up_to_the_rise_of_the_near_cost_that_is_allowed
 
 def test_a_turn_is_believed_from_the_share_of_the_cost_that_is_asked():
     tracks, at = problem(1, 30, 40, noise=0.3, depth=0.003, turn=0.002, seed=6)
-    o = Options(far_weight=0.5, max_rise=1e9, turn_sigma=0.003, translation_gain=-1e9, **LONG)
+    o = FitOptions(far_weight=0.5, max_rise=1e9, turn_sigma=0.003, translation_gain=-1e9, **LONG)
     rigid, turned = (most_probable(tracks, at.T, o._replace(turn_gain=x)) for x in (1e9, -1e9))
     assert float(rigid.turn_precision) > 1e12 and rigid.at.turn.abs().max() < 1e-9
     assert float(turned.turn_precision) == pytest.approx(0.003**-2) and turned.at.turn.abs().max() > 1e-4
@@ -202,7 +202,7 @@ def test_a_prior_holds_the_turn_to_its_standard_deviation():
     tracks, at = problem(1, 30, 40, noise=0.3, depth=0.003, turn=0.002, seed=6)
     sizes = []
     for sigma in (1e-4, 1e-3, 0.1):
-        o = Options(turn_sigma=sigma, turn_gain=-1e9, max_rise=1e9, **LONG)
+        o = FitOptions(turn_sigma=sigma, turn_gain=-1e9, max_rise=1e9, **LONG)
         sizes.append(float(most_probable(tracks, at.T, o).at.turn.norm()))
     assert sizes[0] < 0.2 * sizes[1] < 0.2 * sizes[2]
 
@@ -210,7 +210,7 @@ def test_a_prior_holds_the_turn_to_its_standard_deviation():
 def test_a_translation_is_believed_from_the_share_that_no_rotation_takes_away():
     """The best pure rotation by scipy, from the written-out cost."""
     tracks, at = problem(1, 14, 30, noise=0.5, depth=0.003, baseline=0.004, seed=8)
-    o = Options(far_weight=0.5, max_rise=1e9, turn_sigma=0.0, **LONG)
+    o = FitOptions(far_weight=0.5, max_rise=1e9, turn_sigma=0.0, **LONG)
     solution = most_probable(tracks, at.T, o)
     noise = noise_scale(tracks, solution.at)
     ray, uv, xx_xy_yy = (getattr(tracks, k)[0].numpy() for k in ("ray", "uv", "shape"))
@@ -236,7 +236,7 @@ def test_steps_are_counted():
     start = se3.retract(at.T, torch.full((1, 6), 0.01, dtype=D))
 
     def off(**options):
-        found = most_probable(tracks, start, Options(turn_sigma=0.0, max_rise=1e9, **options)).at.T
+        found = most_probable(tracks, start, FitOptions(turn_sigma=0.0, max_rise=1e9, **options)).at.T
         return float((found.t - at.T.t).norm())
 
     still = off(near_steps=0, steps=0)
@@ -255,7 +255,7 @@ def test_where_they_stand_and_who_stands_beside_them_does_not_matter_to_tracks()
     wide = tracks.map(place)
     empty = order >= 32
     wide = wide.replace(near=wide.near & ~empty, far=wide.far & ~empty)
-    plain, mixed = most_probable(tracks, at.T, Options()), most_probable(wide, at.T, Options())
+    plain, mixed = most_probable(tracks, at.T, FitOptions()), most_probable(wide, at.T, FitOptions())
     torch.testing.assert_close(mixed.at.T.t, plain.at.T.t, rtol=0, atol=1e-9)
     torch.testing.assert_close(mixed.noise[:, ~empty], plain.noise[:, order[~empty]], rtol=1e-6, atol=0)
     noise = noise_scale(tracks, plain.at)
@@ -267,7 +267,7 @@ def test_where_they_stand_and_who_stands_beside_them_does_not_matter_to_tracks()
 def test_a_few_near_tracks_behind_very_many_far_ones_are_the_first_to_be_solved():
     tracks, at = problem(1, 12, 300, seed=5)
     turned = tracks.map(lambda x: x.flip(-1) if x.shape[-1] == 312 else x)
-    o = Options(max_rise=-9.0, turn_sigma=0.0)  # the near tracks alone are answered
+    o = FitOptions(max_rise=-9.0, turn_sigma=0.0)  # the near tracks alone are answered
     first, last = most_probable(tracks, at.T, o), most_probable(turned, at.T, o)
     alone = most_probable(tracks.replace(far=tracks.far & False), at.T, o)
     for found in (first, last):

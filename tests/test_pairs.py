@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -10,8 +9,8 @@ import pytest
 import torch
 
 from dhtorch.data import pairs
-from dhtorch.data.recording import Recording, numbers
-from dhtorch.data.stacks import Stacks
+from dhtorch.data.recording import Recording, Recordings, numbers
+from dhtorch.data.scene import Scene, Scenes, scenes_of
 from dhtorch.records import Frame, Pose
 
 
@@ -33,7 +32,9 @@ def test_by_gap_steps_by_two_from_25_frames_on() -> None:
     assert pairs.by_gap(line(24), 20) == [(0, 20), (1, 21), (2, 22), (3, 23)]
     assert pairs.by_gap(line(25), 20) == [(0, 20), (2, 22), (4, 24)]
     assert pairs.by_gap(line(25), 20, stride=3) == [(0, 20), (3, 23)]
-    assert pairs.by_gap(line(5, gap=4)) == [(0, 4)]
+    assert pairs.by_gap(Scene(line(5), gap=4)) == [(0, 4)]
+    assert pairs.by_gap(line(2)) == [(0, 1)], "two frames are one pair"
+    assert pairs.by_gap(line(2, number=torch.tensor([3, 8]))) == [(0, 1)]
 
 
 def test_a_lost_frame_does_not_shift_pairs() -> None:
@@ -91,10 +92,10 @@ def test_impossible_pairs_say_why(call: object, message: str) -> None:
 
 
 def test_scaled_gaps_of_a_short_recording_are_missing_not_fatal() -> None:
-    assert pairs.by_scaled_gap(line(5, gap=2), 0.5) == [(0, 1), (1, 2), (2, 3), (3, 4)]
-    assert pairs.by_scaled_gap(line(5, gap=1), 0.5) == pairs.by_gap(line(5), 1), "at least one frame"
-    assert pairs.by_scaled_gap(line(5, gap=3), 2.0) == []
-    assert pairs.by_scaled_gap(line(3, gap=3, number=torch.tensor([0, 2, 4])), 1.0) == []
+    assert pairs.by_scaled_gap(Scene(line(5), gap=2), 0.5) == [(0, 1), (1, 2), (2, 3), (3, 4)]
+    assert pairs.by_scaled_gap(Scene(line(5), gap=1), 0.5) == pairs.by_gap(line(5), 1), "at least one frame"
+    assert pairs.by_scaled_gap(Scene(line(5), gap=3), 2.0) == []
+    assert pairs.by_scaled_gap(Scene(line(3, number=torch.tensor([0, 2, 4])), gap=3), 1.0) == []
     with pytest.raises(ValueError, match=r"pairs.factor: line knows no gap"):
         pairs.by_scaled_gap(line(5), 1.0)
 
@@ -109,12 +110,29 @@ def test_views_between_are_different_and_end_at_the_other() -> None:
         pairs.between(0, 3, 4)
 
 
-@pytest.mark.parametrize(
-    "choose", [pairs.by_gap, partial(pairs.by_time, seconds=1.0), partial(pairs.by_baseline, metres=1.0)]
-)
-def test_focal_stacks_have_no_pairs(choose: Callable[[object], object]) -> None:
-    stacks = Stacks("fs_6", "fod500", _no_frame, ("0",))
-    with pytest.raises(
-        ValueError, match=r"pairs: fs_6 holds focal stacks \(fod500\), pictures of one view, expected a"
-    ):
-        choose(stacks)
+def test_what_is_no_recording_has_no_pairs() -> None:
+    for choose in (pairs.by_gap, partial(pairs.by_time, seconds=1.0), partial(pairs.by_baseline, metres=1.0)):
+        with pytest.raises(ValueError, match=r"data: found \[\], expected a recording whose camera moves"):
+            choose([])
+
+
+def test_a_recording_of_two_frames_knows_its_step() -> None:
+    assert Scene.of(line(2, number=torch.tensor([3, 8]))).gap == 5 and Scene(line(2), gap=7).gap == 7
+    assert Scene.of(line(3)).gap is None
+
+
+def test_scenes_are_opened_when_they_are_asked_for() -> None:
+    opened = []
+
+    def make(i: int) -> Recording:
+        opened.append(i)
+        return line(i + 3)
+
+    whole = scenes_of(Recordings(("a", "b", "c"), make))
+    assert len(whole) == 3 and opened == [] and len(whole[1].recording) == 4 and opened == [1]
+    noted = Scenes(whole.recordings, partial(Scene, near=2.0, room="hall"))
+    assert [(s.near, s.gap, s.place, s.hint.levels) for s in noted[1:]] == [(2.0, None, "hall", None)] * 2
+    assert scenes_of(noted) is noted and Scene(line(3), levels=6).hint.levels == 6 and Scene(line(3)).place == "line"
+    first = noted[0]
+    assert scenes_of(first) == [first] and scenes_of([first, line(4)])[0] is first
+    assert [s.recording.name for s in scenes_of(line(4))] == ["line"]

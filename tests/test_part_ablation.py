@@ -6,7 +6,7 @@ from functools import partial
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
-from rooms import room
+from rooms import noted, room
 
 from dhtorch.commands.run import config_dir
 from dhtorch.data.pairs import by_gap
@@ -76,7 +76,7 @@ def test_gates_and_sigma_are_told_apart(methods):
 
 def test_every_variant_runs_and_tells_its_cost(methods):
     outcome = part_ablation.run(
-        [room(n_frames=4, hw=(192, 256), gap=3, lidar="exact")], methods, by_gap, Settings(), seeds=1
+        [noted(room(n_frames=4, hw=(192, 256), lidar="exact"), gap=3)], methods, by_gap, Settings(), seeds=1
     )
     variants = part_ablation.taken_apart(*methods.values())
     assert {r["method"] for r in outcome.rows} == set(variants)

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import os
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -13,10 +14,12 @@ import numpy as np
 import pytest
 import torch
 from room_truth import room_distance
+from rooms import noted
 
 from dhtorch import data
 from dhtorch.data import rh20t_set
 from dhtorch.data.codecs.video import close_videos
+from dhtorch.data.scene import Scene
 from dhtorch.evaluate import probe
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
@@ -275,21 +278,28 @@ def test_the_tables_quote_the_paper_and_name_random_weights():
 
 
 def test_blocks_share_no_frame_and_pairs_keep_their_distance():
-    room = SyntheticRoom(hw=(60, 80), n_frames=31, gap=9)
-    blocks = vo_probe.in_blocks(room, 3, 3)
+    room = SyntheticRoom(hw=(60, 80), n_frames=31)
+    scene = Scene(room, gap=9)
+    blocks = vo_probe.in_blocks(scene, 3, 3)
     frames = [{i for pair in block for i in pair} for block in blocks]
     assert not frames[0] & frames[1] and not frames[1] & frames[2] and len(blocks) == 3
     assert all(j - i == 3 for block in blocks for i, j in block) and sum(map(len, blocks)) == 31 - 3 * 3
-    room.role = "rotation"
-    assert vo_probe.in_blocks(room, 3, 3) == []
+    assert vo_probe.in_blocks(replace(scene, role="rotation"), 3, 3) == []
 
 
 def test_visual_odometry_within_the_room():
     pytest.importorskip("transformers")
-    room, short = SyntheticRoom(hw=(120, 160), n_frames=12, step_m=0.04), SyntheticRoom(hw=(60, 80), n_frames=6)
-    short.name = "short"
+    room = SyntheticRoom(hw=(120, 160), n_frames=12, step_m=0.04)
+    short = SyntheticRoom(hw=(60, 80), n_frames=6, name="short")
     outcome = vo_probe.run(
-        [room, short], {"map": small()}, None, Settings(), dinov2=NETWORK, blocks=3, min_pairs=6, penalties=(0.01, 1.0)
+        [noted(room), noted(short)],
+        {"map": small()},
+        None,
+        Settings(),
+        dinov2=NETWORK,
+        blocks=3,
+        min_pairs=6,
+        penalties=(0.01, 1.0),
     )
     assert outcome.verdict == "undecided" and "random weights" in outcome.why
     error = {arm: outcome.scenes(arm, probing.TRUTH)["synthetic_room"]["mse"] for arm in vo_probe.EVERY}
@@ -301,6 +311,6 @@ def test_visual_odometry_within_the_room():
 @pytest.mark.data
 @pytest.mark.skipif(not ROOT, reason="DHTORCH_DATA is unset")
 def test_pairs_of_real_sequences_share_no_frame_between_blocks():
-    recording = data.open(Path(ROOT) / "holo_a", gap=3)
-    blocks = vo_probe.in_blocks(recording, 3, 5)
+    (scene,) = data.open_capture(Path(ROOT) / "holo_a", gap=3)
+    blocks = vo_probe.in_blocks(scene, 3, 5)
     assert sum(map(len, blocks)) == 35 and all(j == i + 1 for block in blocks for i, j in block)

@@ -6,6 +6,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
+from rooms import Changed, noted, untold
 from rooms import room as rendered
 
 from dhtorch import archive
@@ -42,29 +43,12 @@ def method(name="paper"):
 
 def room(**options):
     """Two pairs."""
-    return rendered(**{"hw": (192, 256), "n_frames": 5, "gap": 3, **options})
-
-
-class Changed:
-    """A recording of which a frame, an attribute or a whole method is another, or missing."""
-
-    def __init__(self, recording, change=lambda frame: frame, *, lacks=None, **instead):
-        self.recording, self.change, self.lacks, self.instead = recording, change, lacks, instead
-
-    def __getattr__(self, name):
-        if name == self.lacks:
-            raise AttributeError(name)
-        return self.instead[name] if name in self.instead else getattr(self.recording, name)
-
-    def __getitem__(self, i):
-        return self.change(self.recording[i])
-
-    def __len__(self):
-        return len(self.recording)
+    return rendered(**{"hw": (192, 256), "n_frames": 5, **options})
 
 
 def asked(experiment, *rooms, **options):
-    return experiment.run(list(rooms) or [room()], {"paper": method()}, by_gap, Settings(), **options)
+    scenes = [noted(each, gap=3) for each in rooms or [room()]]
+    return experiment.run(scenes, {"paper": method()}, by_gap, Settings(), **options)
 
 
 def scene(outcome, variant, cohort="full"):
@@ -74,7 +58,9 @@ def scene(outcome, variant, cohort="full"):
 
 def batch_of(recording, i=0, j=3):
     nothing = torch.full((1,), torch.nan)
-    return Batch(recording, [(i, j)], 2.0, recording[i], (recording[j],), recording[i], nothing.view(1, 1, 1), nothing)
+    return Batch(
+        noted(recording), [(i, j)], 2.0, recording[i], (recording[j],), recording[i], nothing.view(1, 1, 1), nothing
+    )
 
 
 def test_set_b_is_hidden_from_the_method_and_judged_by_its_returns():
@@ -177,7 +163,7 @@ def test_a_scene_without_a_trajectory_or_truth_says_so():
     outcome = asked(range_split, blind, cutoff_factors=())
     assert scene(outcome, "device_raw")["note"] == "no device trajectory"
     assert scene(outcome, "gated")["n_candidates"] > 0
-    outcome = asked(real_holes, Changed(room(), lacks="truth"))
+    outcome = asked(real_holes, untold(room()))
     assert outcome.verdict == "undecided" and scene(outcome, "gated", "real_holes")["note"] == "no independent truth"
 
 
@@ -249,7 +235,7 @@ def test_gates_and_gaps():
 
 def test_recovery_rises_with_the_baseline():
     rooms = [
-        Changed(room(n_frames=6, hw=(144, 192), gap=2, path=path), name=f"synthetic_{path}")
+        noted(Changed(room(n_frames=6, hw=(144, 192), path=path), name=f"synthetic_{path}"), gap=2)
         for path in ("walk", "static")
     ]
     outcome = asked(motion, *rooms, factors=(0.5, 1.0, 2.0))

@@ -18,9 +18,9 @@ from pyarrow import parquet
 from dhtorch.codes import Flag, Gate, Hole, PoseCode, Source, names
 from dhtorch.data import FormatError
 from dhtorch.extract import Features, JoinedDataset, columns, engines, shards
+from dhtorch.extract.dataset import Extracted
 from dhtorch.extract.plan import Shard
-from dhtorch.extract.rows import Answer
-from dhtorch.transform import CHANNELS, ExtendDepth, Problem
+from dhtorch.transform import CHANNELS, ExtendDepth, SampleProblem
 
 N, P = 5, 6
 SHARED = {
@@ -109,7 +109,14 @@ def test_every_key_of_the_transform_has_a_column():
 
 def test_codes_fit_a_byte_and_are_named():
     tables = columns.code_tables()
-    wanted = {"source": Source, "flag": Flag, "hole": Hole, "gate": Gate, "pose_code": PoseCode, "problem": Problem}
+    wanted = {
+        "source": Source,
+        "flag": Flag,
+        "hole": Hole,
+        "gate": Gate,
+        "pose_code": PoseCode,
+        "problem": SampleProblem,
+    }
     assert tables == {k: names(t) for k, t in wanted.items()}
     assert sum(tables["flag"]) == 255 and max(max(t) for t in tables.values()) == 128
     assert tables["problem"] == {0: "NONE", 1: "NO_SECOND_VIEW", 2: "NO_DEPTH", 3: "UNREADABLE"}
@@ -378,7 +385,7 @@ class Counted(torch.utils.data.Dataset):
         return 50
 
     def __getitem__(self, i):
-        return Answer({"at": i, "threads": torch.get_num_threads()}, None, str(i))
+        return Extracted({"at": i, "threads": torch.get_num_threads()}, None, str(i))
 
 
 class Ray:
@@ -427,7 +434,7 @@ def test_answers_come_in_the_order_of_their_positions():
     order = [7, 3, 3, 20]
     answers = list(engines.here(Counted(), order, 0))
     assert [a.place["at"] for a in answers] == order and {a.place["threads"] for a in answers} == {1}
-    assert all(type(a) is Answer and a.features is None and a.complaint == str(a.place["at"]) for a in answers)
+    assert all(type(a) is Extracted and a.features is None and a.complaint == str(a.place["at"]) for a in answers)
 
 
 def test_arrays_of_an_answer_come_as_they_are():
@@ -451,7 +458,7 @@ def test_an_error_that_is_no_dead_worker_stays_what_it_is():
 def test_ray_is_given_blocks_and_gives_the_same_answers(ray):
     order = list(range(49, 9, -1))
     answers = list(engines.on_ray(Counted(), order, None))
-    assert [a.place["at"] for a in answers] == order and all(type(a) is Answer for a in answers)
+    assert [a.place["at"] for a in answers] == order and all(type(a) is Extracted for a in answers)
     assert [name for name, _ in ray.log] == ["init", "blocks", "shutdown"] and ray.log[1][1] == [16, 16, 8]
     options = ray.log[0][1]
     assert options["address"] is None and options["include_dashboard"] is False and options["log_to_driver"] is False

@@ -36,7 +36,7 @@ def near(frame):
 def test_one_recording_for_each_stress():
     rooms = open_stress(hw=(48, 64), n_frames=7)
     assert [r.name for r in rooms] == [f"stress_{name}" for name in STRESSES]
-    assert {r.stress for r in rooms if r.role == "rotation"} == {"rotation", "rotation_exact"}
+    assert {r.recording.stress for r in rooms if r.role == "rotation"} == {"rotation", "rotation_exact"}
     with pytest.raises(ValueError, match="earthquake"):
         open_stress(["earthquake"])
 

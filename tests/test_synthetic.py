@@ -9,9 +9,9 @@ import torch
 from dhtorch.geometry import camera, se3
 from dhtorch.synthetic.paths import PATHS
 from dhtorch.synthetic.raycast import DARK, MIRROR, ORDINARY, WINDOW
-from dhtorch.synthetic.recording import SURFACES, SyntheticRoom, phone_lidar
+from dhtorch.synthetic.recording import SURFACES, SyntheticRoom, open_room, phone_lidar
 from dhtorch.synthetic.room import BACK, FRONT, HEIGHT, LEFT, RIGHT, furnished_room
-from dhtorch.synthetic.shading import Light, Scene
+from dhtorch.synthetic.shading import Light, ShadedRoom
 from dhtorch.tree import collate
 
 SMALL = {"hw": (120, 160), "depth_hw": (48, 64)}
@@ -144,7 +144,7 @@ def test_number_of_threads_changes_no_bit():
     for threads in (1, 2):
         torch.set_num_threads(threads)
         try:
-            scene = Scene([whole[0], whole[1], next(s for s in whole if s.ball)], [light], ambient=0.4, seed=0)
+            scene = ShadedRoom([whole[0], whole[1], next(s for s in whole if s.ball)], [light], ambient=0.4, seed=0)
             room = SyntheticRoom(n_frames=1, **SMALL)
             seen.append([scene.light.values, room[0].image, room[0].depth, room[0].conf, room.truth(0)["depth"]])
         finally:
@@ -233,7 +233,8 @@ def test_lidar_range_limit_is_along_the_ray(room):
 
 @pytest.mark.parametrize("path", PATHS)
 def test_paths_stay_in_the_room_and_keep_their_word(path):
-    room = SyntheticRoom(path=path, n_frames=300, seed=3)
+    scene = open_room(path=path, n_frames=300, seed=3)
+    room = scene.recording
     R, t = room.poses.R, room.poses.t
     torch.testing.assert_close(R @ R.mT, torch.eye(3, dtype=torch.float64).expand(300, 3, 3), atol=1e-12, rtol=0)
     assert (torch.linalg.det(R) > 0).all()
@@ -242,22 +243,32 @@ def test_paths_stay_in_the_room_and_keep_their_word(path):
     way = (t[6:] - t[:-6]).norm(dim=-1)
     assert turn.max() < 15 and way.max() < 0.25
     if path in ("rotation", "static"):
-        assert way.max() == 0 and room.role == "rotation"
+        assert way.max() == 0 and scene.role == "rotation"
         assert turn.median() > 2 if path == "rotation" else turn.max() == 0
     else:
-        assert way[:6].min() > 0.08 and way[:6].max() < 0.2 and room.role is None
+        assert way[:6].min() > 0.08 and way[:6].max() < 0.2 and scene.role is None
     if path in ("lateral", "forward"):
         assert turn.max() < 1e-5
         along = ((t[6] - t[0]) / way[0]) @ R[0]  # direction of motion in the camera
         assert along[0].abs() > 0.95 if path == "lateral" else along[2] > 0.95
 
 
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [({"near": 0}, "near is 0"), ({"gap": 0}, "gap is 0, expected a positive"), ({"seeed": 2}, "found option 'seeed'")],
+)
+def test_a_scene_of_the_room_with_wrong_notes(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        open_room(**SMALL, **wrong)
+
+
 def test_every_default_frame_has_a_near_and_a_far_part():
-    room = SyntheticRoom(**SMALL)
-    assert len(room) - room.gap >= 6
+    scene = open_room(**SMALL)
+    room = scene.recording
+    assert len(room) - scene.gap >= 6
     for i in range(len(room)):
         depth = room.truth(i)["depth"]
-        assert 0.2 < (depth < room.near).double().mean() < 0.5
+        assert 0.2 < (depth < scene.near).double().mean() < 0.5
         assert depth.max() < 6
 
 

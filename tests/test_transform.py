@@ -21,8 +21,8 @@ from dhtorch.stages import score
 from dhtorch.transform import (
     ExtendDepth,
     ExtendedDataset,
-    Problem,
     SampleError,
+    SampleProblem,
     Views,
     collate_kept,
     one_thread,
@@ -124,9 +124,13 @@ def test_shapes_are_fixed_and_numbers_finite(sample, what):
     assert all(v.isfinite().all() for v in out.values())
     for key in ("depth", "sigma", "score", "xyz"):
         assert (out[key][~out["valid"]] == 0).all(), key
-    expected = {"no depth": Problem.NO_DEPTH, "nan depth": Problem.NO_DEPTH, "unreadable": Problem.UNREADABLE}
-    expected |= {"one view": Problem.NO_SECOND_VIEW, "padded": Problem.NO_SECOND_VIEW}
-    assert out["problem"] == expected.get(what, Problem.NONE)
+    expected = {
+        "no depth": SampleProblem.NO_DEPTH,
+        "nan depth": SampleProblem.NO_DEPTH,
+        "unreadable": SampleProblem.UNREADABLE,
+    }
+    expected |= {"one view": SampleProblem.NO_SECOND_VIEW, "padded": SampleProblem.NO_SECOND_VIEW}
+    assert out["problem"] == expected.get(what, SampleProblem.NONE)
     if what in ("no depth", "nan depth"):
         assert not out["valid"].any() and not out["pose_ok"] and (out["flag"] & Flag.NO_DEPTH).bool().all()
     if what in ("one view", "padded"):
@@ -367,7 +371,7 @@ def test_corrupt_samples_in_the_middle(items):
     flagging = transform(on_error="flag", other_image=None)
     batches, _ = loaded(ExtendedDataset(Frames(items, corrupt), flagging), 2, "fork")
     rows = in_rows(batches)
-    assert (rows["dhtorch.problem"] == Problem.UNREADABLE).nonzero()[:, 0].tolist() == sorted(corrupt)
+    assert (rows["dhtorch.problem"] == SampleProblem.UNREADABLE).nonzero()[:, 0].tolist() == sorted(corrupt)
     assert flagging.report() == {"none": 0, "no_second_view": 10, "no_depth": 0, "unreadable": 2}
     assert batches[0]["image"].shape[1:] == (SIDE, SIDE, 3) and batches[1]["image"][1].sum() == 0
 

@@ -15,9 +15,9 @@ from dhtorch.transform import (
     ExtendedDataset,
     ExtendedStream,
     NumpyTransform,
-    Problem,
     RldsBatchTransform,
     SampleError,
+    SampleProblem,
     collate_kept,
     one_thread,
 )
@@ -94,7 +94,7 @@ def test_lerobot_frames_along_time(items):
     plain = ExtendDepth(depth_unit="mm", other_image="before", index_key="index", n=N)
     assert equal(out, plain({**items[GAP], "before": items[0]["image"]})), "the lost zeros are no returns"
     padded = [dataset[i] for i in (0, 3, 9, 11)]
-    assert [int(p["dhtorch.problem"]) for p in padded] == [Problem.NO_SECOND_VIEW] * 4
+    assert [int(p["dhtorch.problem"]) for p in padded] == [SampleProblem.NO_SECOND_VIEW] * 4
     assert not any((p["dhtorch.source"] == Source.RECOVERED).any() for p in padded)
 
 

@@ -17,9 +17,10 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 from PIL import Image
+from rooms import Changed, noted
 from rooms import room as rendered
 
-from dhtorch import archive, closure, drawing, viewer
+from dhtorch import archive, closure, data, drawing, viewer
 from dhtorch.codes import Gate, Source, names
 from dhtorch.commands import run
 from dhtorch.data.pairs import by_gap
@@ -30,7 +31,7 @@ from dhtorch.studies.protocol import Settings
 from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.viewer import again, points, rrd
 from dhtorch.viewer import html as pages
-from dhtorch.viewer.scene import DENSE, look
+from dhtorch.viewer.exhibit import DENSE, look
 
 CUTOFF, N = 2.0, 700
 HOSTILE = "</script><script>document.title='taken'</script><!-- & \u2028 ' \" ünï"
@@ -99,26 +100,17 @@ def test_what_was_held_back_is_apart(scene):
         assert shot.depth_map.depth.max() <= CUTOFF and shot.seen.rgb.std() > 10
 
 
-class Untold(SyntheticRoom):
-    """The room without a trajectory."""
-
-    def __getitem__(self, index):
-        return super().__getitem__(index).replace(T_world_from_cam=None)
-
-
 def test_without_a_trajectory_every_pair_stands_alone():
-    room = Untold(hw=(60, 80), n_frames=4)
-    for i in range(4):
-        room[i]  # rendered with its pose
-    room.poses = None
-    found = look(room, METHODS["paper"], lambda r: by_gap(r, 2), Settings())
+    whole = SyntheticRoom(hw=(60, 80), n_frames=4)
+    room = Changed(whole, lambda frame: frame.replace(T_world_from_cam=None), poses=None)
+    found = look(noted(room), METHODS["paper"], lambda r: by_gap(r, 2), Settings())
     assert found.path is None and not found.placed and len(found.shots) == 2
     assert all((shot.T_world_from_0 == np.eye(4)).all() for shot in found.shots)
 
 
 def test_of_many_pairs_some_are_shown():
     room = SyntheticRoom(hw=(40, 60), n_frames=8)
-    found = look(room, METHODS["paper"], lambda r: by_gap(r, 1), Settings(), most=3)
+    found = look(noted(room), METHODS["paper"], lambda r: by_gap(r, 1), Settings(), most=3)
     assert [shot.label for shot in found.shots] == ["0 → 1", "3 → 4", "6 → 7"]
 
 
@@ -425,6 +417,16 @@ def test_functions_are_found_where_older_results_name_them(job):
     result["config"]["method"]["fuse"] = {"_target_": "dhtorch.window.inverse_variance", "_partial_": True}
     method = again.parts(result)["method"]
     assert isinstance(method, Method) and method.views == 3 and method.fuse.func is inverse_variance
+
+
+def test_what_older_results_call_a_recording_with_notes_is_a_scene(job):
+    result = archive.read(job)
+    asked = {"hw": [60, 80], "n_frames": 2, "near": 1.5, "gap": 1}
+    result["config"]["data"] = {"_target_": "dhtorch.data.synthetic.SyntheticRoom", **asked}
+    scene = again.parts(result)["data"]
+    assert (scene.near, scene.gap, scene.recording.hw) == (1.5, 1, (60, 80))
+    result["config"]["data"] = {"_target_": "dhtorch.data.open_all", "root": "x", "near": 1.5, "_partial_": True}
+    assert again.parts(result)["data"].func is data.open_capture
 
 
 def test_null_stands_for_what_strict_json_cannot_hold(job):

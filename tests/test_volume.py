@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from dhtorch.codes import Source
-from dhtorch.geometry import cells, se3
+from dhtorch.geometry import se3, sparse_grid
 from dhtorch.integrate import View, empty, fuse, points, recording, splat
 from dhtorch.integrate.volume import Volume
 from dhtorch.records import Camera, Frame
@@ -30,7 +30,7 @@ def looked(seed, sigma=0.02, far=2.0):
 def voxels(volume):
     """Whole numbers (K, 512, 3) of every voxel."""
     local = torch.tensor(list(itertools.product(range(8), repeat=3)))
-    return cells.unpack(volume.key)[:, None] * 8 + local
+    return sparse_grid.unpack(volume.key)[:, None] * 8 + local
 
 
 def loop_fuse(volume, looks, max_reach=3.0, carve=True):
@@ -100,7 +100,7 @@ def test_blocks_are_where_the_surface_and_what_is_kept_around_it_are():
     T, there = view.T_world_from_cam, view.depth[0] > 0
     for along in (-0.25, 0.0, 0.25):
         xyz = (ray * (view.depth[0] + along / ray.norm(dim=-1))[..., None])[there] @ T.R[0].T + T.t[0]
-        key = cells.pack((xyz / 0.8).floor().long())
+        key = sparse_grid.pack((xyz / 0.8).floor().long())
         assert torch.isin(key, volume.key).all(), along
     assert len(volume.key) < 80 and torch.equal(volume.key, volume.key.sort().values)
 
@@ -108,7 +108,7 @@ def test_blocks_are_where_the_surface_and_what_is_kept_around_it_are():
 def scattered(seed=0):
     """A volume of three blocks, two of them neighbours, with random distances and unknown voxels."""
     g = torch.Generator().manual_seed(seed)
-    key = cells.pack(torch.tensor([[0, 0, 0], [1, 0, 0], [3, -2, 1]])).sort().values
+    key = sparse_grid.pack(torch.tensor([[0, 0, 0], [1, 0, 0], [3, -2, 1]])).sort().values
     distance = 0.3 * (torch.rand(3, 512, generator=g) - 0.5)
     weight = torch.rand(3, 512, 2, generator=g) * 100
     weight[torch.rand(3, 512, generator=g) < 0.3] = 0

@@ -14,9 +14,9 @@ from dhtorch.transform import (
     ExtendedDataset,
     ExtendedStream,
     NumpyTransform,
-    Problem,
     RldsBatchTransform,
     SampleError,
+    SampleProblem,
     collate_kept,
     one_thread,
 )
@@ -59,13 +59,13 @@ def test_the_other_view_is_so_many_items_back_in_the_same_episode():
         for i in range(7):
             method.asked = {}
             out = dataset[i]
-            assert (out["dhtorch.problem"] == Problem.NONE) == (i in pairs), (gap, i)
+            assert (out["dhtorch.problem"] == SampleProblem.NONE) == (i in pairs), (gap, i)
             assert out["index"] == i and "before" not in out and "before_is_pad" not in out
             if i in pairs:
                 assert np.array_equal(method.asked["other"].image[0].permute(1, 2, 0), sample(pairs[i])["image"])
                 assert np.array_equal(method.asked["anchor"].image[0].permute(1, 2, 0), sample(i)["image"])
             else:
-                assert out["dhtorch.problem"] == Problem.NO_SECOND_VIEW and not method.asked
+                assert out["dhtorch.problem"] == SampleProblem.NO_SECOND_VIEW and not method.asked
 
 
 def test_episodes_are_told_by_a_key_or_are_one():
@@ -90,7 +90,7 @@ def test_samples_that_hold_both_views_are_taken_as_they_are():
     items.__class__ = type("Both", (Items,), {"__getitem__": lambda self, i: sample(i)})
     dataset = ExtendedDataset(items, tiny())
     out = dataset[2]
-    assert out["dhtorch.problem"] == Problem.NONE and np.array_equal(out["before"], sample(2)["before"])
+    assert out["dhtorch.problem"] == SampleProblem.NONE and np.array_equal(out["before"], sample(2)["before"])
 
 
 def test_the_rest_is_the_data_sets_own():
@@ -109,7 +109,7 @@ def test_an_item_that_cannot_be_loaded_is_zeros_like_its_neighbour():
         dataset = ExtendedDataset(items, tiny(on_error="flag", other_image=None))
         out = dataset[asked]
         assert items.read[-1] == source, "the nearest, the later one first"
-        assert out["dhtorch.problem"] == Problem.UNREADABLE and not out["image"].any()
+        assert out["dhtorch.problem"] == SampleProblem.UNREADABLE and not out["image"].any()
         assert (out["image"].shape, out["image"].dtype) == (sample()["image"].shape, np.uint8)
         assert torch.equal(out["episode_index"], torch.tensor(0)) and out["nested"] == {"part": 0}
         assert (out["words"], out["flag"], out["number"], out["ratio"]) == (["", b""], False, 0, 0.0)
@@ -123,7 +123,7 @@ def test_neighbours_are_asked_within_fifteen_places():
         items = Items(40, corrupt=set(range(20 - lost + 1, 20 + lost)) if found else set(range(5, 36)))
         dataset = ExtendedDataset(items, tiny(on_error="flag", other_image=None))
         if found:
-            assert dataset[20]["dhtorch.problem"] == Problem.UNREADABLE
+            assert dataset[20]["dhtorch.problem"] == SampleProblem.UNREADABLE
         else:
             with pytest.raises(SampleError, match="neither item 20 nor its neighbours can be loaded: item 20 is cut"):
                 dataset[20]

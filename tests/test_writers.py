@@ -13,8 +13,9 @@ from torch import Tensor
 
 from dhtorch import testing as writers
 from dhtorch.data.codecs import exr
-from dhtorch.data.stacks import FocalStack
 from dhtorch.records import Camera, Frame, Pose
+from dhtorch.studies.focal import writers as stack_writers
+from dhtorch.studies.focal.stacks import FocalStack
 from dhtorch.testing.lossless import write_lossless
 
 HW = (16, 24)
@@ -80,7 +81,7 @@ def _driving(root: Path, lay: Lay) -> None:
 
 def _light_field(root: Path, lay: Lay) -> None:
     views = (256 * torch.rand(3, 3, 3, *HW, generator=torch.Generator().manual_seed(0))).to(torch.uint8)
-    writers.write_light_field(root, "train/a", 0, lay(views).movedim(2, -1), frame(lay).depth)
+    stack_writers.write_light_field(root, "train/a", 0, lay(views).movedim(2, -1), frame(lay).depth)
 
 
 WRITERS: dict[str, Callable[[Path, Lay], None]] = {
@@ -88,10 +89,10 @@ WRITERS: dict[str, Callable[[Path, Lay], None]] = {
     "ca1m": lambda root, lay: writers.write_ca1m(root / "ca1m-val-1.tar", shots(lay), shots(lay)),
     "calib_pair": _two(writers.write_calib_pair),
     "counted_frames": lambda root, lay: writers.write_counted_frames(root, shots(lay)),
-    "ddff12": lambda root, lay: writers.write_ddff12(root / "a.h5", {"val": [stack(lay)]}),
+    "ddff12": lambda root, lay: stack_writers.write_ddff12(root / "a.h5", {"val": [stack(lay)]}),
     "driving": _driving,
-    "fod500": lambda root, lay: writers.write_fod500(root, {0: stack(lay)}),
-    "image_folder": lambda root, lay: writers.write_image_folder(root, stack(lay)),
+    "fod500": lambda root, lay: stack_writers.write_fod500(root, {0: stack(lay)}),
+    "image_folder": lambda root, lay: stack_writers.write_image_folder(root, stack(lay)),
     "lerobot array": _lerobot(image="image", depth="array"),
     "lerobot png": _lerobot(image="image", depth="png"),
     "lerobot tiff": _lerobot(image="image", depth="tiff"),
@@ -126,13 +127,16 @@ def test_memory_is_no_part_of_a_file(name: str, lay: Lay, tmp_path: Path, monkey
 
 
 def test_every_writer_is_asked() -> None:
-    assert {f"write_{name.split()[0]}" for name in WRITERS} == set(writers.__all__)
+    assert {f"write_{name.split()[0]}" for name in WRITERS} == {
+        *writers.__all__,
+        *(n for n in vars(stack_writers) if n.startswith("write_")),
+    }
 
 
 def test_expanded_depth_of_a_focal_stack_is_written_where_it_belongs(tmp_path: Path) -> None:
     depth = torch.linspace(0.5, 2.0, HW[1]).half().float().expand(1, *HW)
     images = torch.zeros(1, 5, 3, *HW, dtype=torch.uint8)
-    writers.write_fod500(tmp_path, {0: FocalStack(images, depth=depth)})
+    stack_writers.write_fod500(tmp_path, {0: FocalStack(images, depth=depth)})
     found = exr.read_exr(tmp_path / "000000Dpt.exr")
     np.testing.assert_array_equal(found, depth[0].numpy())
 

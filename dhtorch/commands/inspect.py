@@ -23,7 +23,9 @@ from torch import Tensor
 from dhtorch import data
 from dhtorch.console import EPILOG, progress
 from dhtorch.data import FormatError, files
-from dhtorch.data.survey import Survey, survey_pictures, survey_recording, survey_stacks
+from dhtorch.data.survey import Survey, survey_pictures, survey_recording
+from dhtorch.studies.focal import formats
+from dhtorch.studies.focal.survey import survey_stacks
 
 _LEVELS = 2  # folders below the path
 _MOST = 12  # recordings that are shown of one capture
@@ -94,8 +96,8 @@ def find(path: Path) -> list[Found]:
             if found:
                 return found
         level = [entry for entry in inside if entry.is_dir()]
-    formats = ", ".join((*data.FORMATS, *data.STACK_FORMATS))
-    raise FormatError(path, "content", "no capture here or two folders below", f"one of {formats}, or pictures")
+    known = ", ".join((*data.FORMATS, *formats.STACK_FORMATS))
+    raise FormatError(path, "content", "no capture here or two folders below", f"one of {known}, or pictures")
 
 
 def surveys(capture: Found, frames: int = 8) -> Iterator[Survey]:
@@ -123,16 +125,16 @@ def _full_name(asked: Path, found: Path, name: str) -> str:
 
 
 def _named(path: Path, format: str) -> Found:
-    if format in data.STACK_FORMATS:
+    if format in formats.STACK_FORMATS:
         return Found(path, "stacks", format, "as told")
     if format not in data.FORMATS:
-        raise FormatError(path, "format", format, ", ".join(("auto", *data.FORMATS, *data.STACK_FORMATS)))
+        raise FormatError(path, "format", format, ", ".join(("auto", *data.FORMATS, *formats.STACK_FORMATS)))
     return Found(path, "recording", format, "as told")
 
 
 def _recognised(path: Path) -> Found | None:
     """What stands at this very path: a recording wins over focal stacks, these over loose pictures."""
-    for name, reader in (data.FORMATS | data.STACK_FORMATS).items():
+    for name, reader in (data.FORMATS | formats.STACK_FORMATS).items():
         if evidence := reader.recognise(path):
             return Found(path, "recording" if name in data.FORMATS else "stacks", name, evidence)
     if path.is_dir() and (count := sum(file.suffix.lower() in _PICTURES for file in path.iterdir())):
@@ -158,7 +160,7 @@ def _recordings(capture: Found, frames: int) -> Iterator[Survey]:
 
 
 def _stacks(capture: Found, frames: int) -> Iterator[Survey]:
-    yield survey_stacks(data.open_stacks(capture.path, capture.format), frames)
+    yield survey_stacks(formats.open_stacks(capture.path, capture.format), frames)
 
 
 def _classified(folder: Path) -> tuple[list[Path], list[Path]]:

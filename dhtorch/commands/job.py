@@ -6,7 +6,7 @@ The result is written last, after its pictures: a folder with a valid ``result.j
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,11 @@ from typing import Any
 import torch
 
 from dhtorch import archive, drawing
-from dhtorch.data import Recordings
 from dhtorch.data import files as data_files
+from dhtorch.data import scenes_of
+from dhtorch.data.scene import Scene
 from dhtorch.studies import report
+from dhtorch.studies.focal.stacks import Stacks
 from dhtorch.studies.protocol import MIN_CANDIDATES, Outcome, Settings
 
 _LOG = logging.getLogger(__name__)
@@ -58,23 +60,24 @@ def run(
         torch.set_num_threads(settings["threads"])
         data_files.set_opencv_threads(settings["threads"])
     names = {group: choices[group] for group in GROUPS}
-    recordings = parts["data"] if isinstance(parts["data"], list | Recordings) else [parts["data"]]
-    digest = archive.data_digest({**_files(recordings), **_named_files(settings)})
+    asked = _asked(parts["data"])
+    digest = archive.data_digest({**_files(asked), **_named_files(settings)})
     key = archive.result_key({**settings, "choices": names}, digest)
     target = folder / "result.json"
-    for recording in recordings if _LOG.isEnabledFor(logging.DEBUG) else ():
-        _LOG.debug("data: %s, %d of %s", recording.name, len(recording), recording.format)
+    for each in asked if _LOG.isEnabledFor(logging.DEBUG) else ():
+        what = each.recording if isinstance(each, Scene) else each
+        _LOG.debug("data: %s, %d of %s", each.name, len(what), what.format)
     _LOG.debug("digest %s, key %s", digest, key)
     archive.clear(target)
     if settings["resume"] and archive.finished(target, key):
         print(f"{target}: finished and valid, left untouched")
         return Ended(str(folder), "untouched")
     methods = {names["method"]: parts["method"]}
-    outcome = parts["experiment"](recordings, methods, parts["pairs"], _common(settings), progress=progress)
+    outcome = parts["experiment"](asked, methods, parts["pairs"], _common(settings), progress=progress)
     _LOG.debug("%d pairs answered", outcome.n_pairs)
     examples = outcome.examples if settings["figures"] else []
     drawn = [path for example in examples for path in drawing.draw_example(folder / example.scene, example)]
-    scenes = [r.name for r in recordings]
+    scenes = [each.name for each in asked]
     data = {"name": names["data"], "scenes": scenes, "n_pairs": outcome.n_pairs, "digest": digest}
     result = _result(settings, names["experiment"], key, data, outcome)
     archive.write(target, result)
@@ -134,9 +137,17 @@ def _common(settings: Mapping[str, Any]) -> Settings:
     )
 
 
-def _files(recordings: Iterable[Any]) -> dict[str, Path]:
-    """Name → file of all data below the recordings' folders."""
-    return archive.files_below(r.root for r in recordings)
+def _asked(data: Any) -> Sequence[Scene] | Sequence[Stacks]:
+    """What the data of a job are: scenes, or focal stacks for the experiments that read them."""
+    given = data if isinstance(data, list) else [data]
+    if given and all(isinstance(each, Stacks) for each in given):
+        return given
+    return scenes_of(data)
+
+
+def _files(asked: Iterable[Scene | Stacks]) -> dict[str, Path]:
+    """Name → file of all data below their folders."""
+    return archive.files_below(each.root for each in asked)
 
 
 def _named_files(settings: Mapping[str, Any]) -> dict[str, Path]:

@@ -125,7 +125,6 @@ def _run_configured(word: str, argv: list[str]) -> int:
     import hydra  # noqa: PLC0415
     from hydra.core.hydra_config import HydraConfig  # noqa: PLC0415
     from hydra.errors import HydraException  # noqa: PLC0415
-    from hydra.utils import instantiate  # noqa: PLC0415
     from omegaconf import OmegaConf  # noqa: PLC0415
     from omegaconf.errors import OmegaConfBaseException  # noqa: PLC0415
 
@@ -143,7 +142,7 @@ def _run_configured(word: str, argv: list[str]) -> int:
         del cfg["hydra"]
         settings: Any = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
         named = [k for k, v in settings.items() if isinstance(v, dict) and "_target_" in v]
-        parts = {k: instantiate(cfg[k], _convert_="all") for k in named}
+        parts = _parts(cfg, named)
     except (HydraException, OmegaConfBaseException) as error:
         return _fail(_cause(error), show="traceback=true" in argv)
     module = importlib.import_module(CONFIGURED[word])
@@ -245,7 +244,6 @@ def _job(cfg: Any) -> Any:
     """One job, in whatever process a launcher runs it: build what the settings name and run it. Never raises."""
     from hydra.core.hydra_config import HydraConfig  # noqa: PLC0415
     from hydra.errors import InstantiationException  # noqa: PLC0415
-    from hydra.utils import instantiate  # noqa: PLC0415
     from omegaconf import OmegaConf  # noqa: PLC0415
     from omegaconf.errors import OmegaConfBaseException  # noqa: PLC0415
 
@@ -257,7 +255,7 @@ def _job(cfg: Any) -> Any:
     alone = runtime.choices["hydra/launcher"] == "basic"
     try:
         settings: Any = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
-        parts = {k: instantiate(cfg[k], _convert_="all") for k in ("data", "method", "pairs", "experiment")}
+        parts = _parts(cfg, ("data", "method", "pairs", "experiment"))
         progress = console.progress if alone else lambda items, _text, _total: items
         _LOG.debug("job in %s: %s", runtime.output_dir, HydraConfig.get().job.override_dirname or "defaults")
         with console.unsaid():
@@ -272,6 +270,30 @@ def _job(cfg: Any) -> Any:
         with contextlib.suppress(OSError):
             Path(runtime.output_dir).rmdir()  # where nothing is in it
         return job.Ended(runtime.output_dir, "failed", _line(cause))
+
+
+def _parts(cfg: Any, names: Iterable[str]) -> dict[str, Any]:
+    """What groups of the settings name, built."""
+    from hydra.utils import instantiate  # noqa: PLC0415
+
+    try:
+        return {name: instantiate(cfg[name], _convert_="all") for name in names}
+    except Exception as error:
+        _refuse_stacks(_cause(error), cfg.data.get("root"))
+        raise
+
+
+def _refuse_stacks(error: BaseException, root: Any) -> None:
+    """Focal stacks given as a recording: say what they are, and who reads them."""
+    from dhtorch.data.files import FormatError  # noqa: PLC0415
+    from dhtorch.studies.focal.formats import recognise_stacks  # noqa: PLC0415
+
+    if not isinstance(error, FormatError) or error.args[:2] != (str(root), "format"):
+        return
+    with contextlib.suppress(FormatError):
+        found = f"data: {root} holds focal stacks ({recognise_stacks(root)[0]}), pictures of one view"
+        expected = "a recording whose camera moves; experiment=focus_stack data=stacks reads them"
+        raise ValueError(f"{found}, expected {expected}") from error
 
 
 def _output(cfg: Any, overrides: Iterable[str], sweep: bool) -> Path:

@@ -1,42 +1,57 @@
 """Files to frames: the only place with file decoding, unit changes and axis changes.
 
-``open(path)`` recognises a capture by its content and returns its :class:`Recording`, a lazy sequence of frames; for
-focal stacks, which show one view without depth of their own, it returns :class:`Stacks`. A format is one module with
-``recognise(root)`` and ``read(root, *, options)``, and one line in the table below or in ``STACK_FORMATS``.
+``open(path)`` recognises a capture by its content and returns its :class:`Recording`, a lazy sequence of frames. A
+format is one module with ``recognise(root)`` and ``read(root, *, options)``, and one line in the table below. Focal
+stacks show one view without depth of their own: ``dhtorch.studies.focal`` reads them.
 """
 
 from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from types import ModuleType
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from dhtorch.data import arkitscenes, ca1m, driving, frames_dir, lerobot, record3d, rectified, rh20t, stray, tum
 from dhtorch.data.files import FormatError
-from dhtorch.data.focal_stacks import STACK_FORMATS, open_stacks
 from dhtorch.data.recording import Recording, Recordings
-from dhtorch.data.stacks import Stacks
+from dhtorch.data.scene import Given, Scene, Scenes, scenes_of
 
 __all__ = [
     "FORMATS",
-    "STACK_FORMATS",
     "FormatError",
+    "Given",
+    "Reader",
     "Recording",
     "Recordings",
-    "Stacks",
+    "Scene",
+    "Scenes",
     "open",
     "open_all",
+    "open_capture",
     "open_scenes",
-    "open_stacks",
     "recognise",
+    "scenes_of",
+    "scenes_root",
 ]
 
+
+class Reader(Protocol):
+    """A format: the two functions of its module."""
+
+    @property
+    def recognise(self) -> Callable[[Path], str | None]:
+        """What makes a folder or file one of its captures, in words; None if nothing does."""
+
+    @property
+    def read(self) -> Callable[..., Sequence[Recording]]:
+        """Open the recordings at a path; keyword options of its own."""
+
+
 #: Name → reader, asked in this order; the first that recognises a folder reads it.
-FORMATS: Final[dict[str, ModuleType]] = {
+FORMATS: Final[dict[str, Reader]] = {
     "record3d": record3d,  # before tum: its folder, too, holds rgb/ and depth/
     "tum": tum,
     "driving": driving,
@@ -55,8 +70,8 @@ ROOT_VARIABLE: Final = "DHTORCH_DATA"
 _SHOWN = 4  # names of many recordings in a message
 
 
-def open(root: str | Path, format: str = "auto", **options: Any) -> Recording | Stacks:
-    """The one recording at ``root``, or its focal stacks; see :func:`open_all` for the arguments.
+def open(root: str | Path, format: str = "auto", **options: object) -> Recording:
+    """The one recording at ``root``; see :func:`open_all` for the arguments.
 
     Raises:
         FormatError: as :func:`open_all`, and where there are several recordings (a car with many cameras).
@@ -72,29 +87,18 @@ def open(root: str | Path, format: str = "auto", **options: Any) -> Recording | 
 def open_all(
     root: str | Path,
     format: str = "auto",
-    *,
-    near: float | None = None,
-    gap: int | None = None,
-    levels: int | None = None,
-    room: str | None = None,
-    role: str | None = None,
-    **options: Any,
-) -> Sequence[Recording] | Sequence[Stacks]:
+    **options: object,
+) -> Sequence[Recording]:
     """Every recording at ``root``, opened lazily: nothing is decoded before a frame is asked for.
 
     Args:
         root: a folder (or file) of one of the known formats.
-        format: a name of ``FORMATS`` or ``STACK_FORMATS``, or ``"auto"`` to recognise it by its content.
-        near: m, cutoff for a range split; kept in the recording.
-        gap: frame step with a usable baseline; kept in the recording.
-        levels: pyramid levels for the motion in this scene; kept in the recording.
-        room: name shared by the recordings of one place; kept in the recording.
-        role: ``"rotation"`` for a scene without baseline; kept in the recording.
+        format: a name of ``FORMATS``, or ``"auto"`` to recognise it by its content.
         options: keyword options of the reader, see ``dhtorch.data.<format>.read``.
 
     Returns:
         One recording for each camera (and episode), at least one; where there may be tens of thousands each is opened
-        when it is asked for. For focal stacks: the one collection of them.
+        when it is asked for.
 
     Raises:
         FormatError: nothing there, an unknown format, or a file that is not what its format promises.
@@ -103,29 +107,44 @@ def open_all(
     root = Path(root)
     if format == "auto":
         format = recognise(root)[0]
-    elif format not in FORMATS and format not in STACK_FORMATS:
-        raise FormatError(root, "format", format, f"auto, {', '.join((*FORMATS, *STACK_FORMATS))}")
+    elif format not in FORMATS:
+        raise FormatError(root, "format", format, f"auto, {', '.join(FORMATS)}")
     elif not root.exists():
         raise FormatError(root, "path", "no such file or folder", f"a {format} capture")
-    facts = {"near": near, "gap": gap, "levels": levels, "room": room, "role": role}
-    kept = {name: value for name, value in facts.items() if value is not None}
-    if format in STACK_FORMATS:
-        if kept:
-            raise ValueError(f"data: {', '.join(kept)} given for {root}, which holds focal stacks ({format})")
-        return [open_stacks(root, format, **options)]
     read = FORMATS[format].read
     known = list(inspect.signature(read).parameters)[1:]
     for option in options:
         if option not in known:
             raise ValueError(f"data: format {format} has no option {option!r}, expected one of {', '.join(known)}")
-    found = read(root, **options)
-    if isinstance(found, Recordings):
-        return found.replaced(kept)
-    return [replace(recording, **kept) for recording in found]
+    return read(root, **options)
+
+
+def open_capture(
+    root: str | Path,
+    format: str = "auto",
+    *,
+    near: float | None = None,
+    gap: int | None = None,
+    levels: int | None = None,
+    room: str | None = None,
+    role: str | None = None,
+    **options: object,
+) -> Scenes:
+    """Every recording at ``root`` as a scene, with the same notes, opened lazily.
+
+    Args:
+        root, format, options: as :func:`open_all`.
+        near, gap, levels, room, role: notes of the :class:`Scene`.
+
+    Raises:
+        FormatError, ValueError: as :func:`open_all`.
+    """
+    noted = partial(Scene, near=near, gap=gap, levels=levels, room=room, role=role)
+    return Scenes(open_all(root, format, **options), noted)
 
 
 def recognise(root: str | Path) -> tuple[str, str]:
-    """(format, what makes it one, in words) of a capture: a recording wins over focal stacks.
+    """(format, what makes it one, in words) of a capture.
 
     Raises:
         FormatError: nothing there, or no format recognises it.
@@ -133,38 +152,49 @@ def recognise(root: str | Path) -> tuple[str, str]:
     root = Path(root)
     if not root.exists():
         raise FormatError(root, "path", "no such file or folder", "a capture")
-    for name, reader in (FORMATS | STACK_FORMATS).items():
+    for name, reader in FORMATS.items():
         if evidence := reader.recognise(root):
             return name, evidence
     inside = (
         sorted(entry.name for entry in root.iterdir())[:6] if root.is_dir() else [f"a {root.suffix or 'plain'} file"]
     )
-    expected = f"one of {', '.join((*FORMATS, *STACK_FORMATS))} (dhtorch inspect looks further down)"
+    expected = f"one of {', '.join(FORMATS)} (dhtorch inspect looks further down)"
     raise FormatError(root, "format", ", ".join(inside) or "an empty folder", expected)
 
 
-def open_scenes(root: str | Path | None = None, scenes: Sequence[Mapping[str, Any]] = ()) -> list[Recording | Stacks]:
-    """Recordings of a list of scenes below one folder.
+def open_scenes(root: str | Path | None = None, scenes: Sequence[Mapping[str, Any]] = ()) -> list[Scene]:
+    """A list of scenes below one folder.
 
     Args:
         root: folder that the scenes' paths start from. None = the environment variable ``DHTORCH_DATA``.
-        scenes: for each scene ``path``, and the arguments of :func:`open_all` that it needs (``format``, ``near``, …).
+        scenes: for each scene ``path``, and the arguments of :func:`open_capture` that it needs (``format``, ``near``,
+            …).
 
     Raises:
         FormatError: no folder given and ``DHTORCH_DATA`` unset, no scene, a scene without a path; else as
-            :func:`open_all`.
+            :func:`open_capture`.
+    """
+    root = scenes_root(root)
+    if not scenes:
+        raise FormatError(root, "scenes", "none", "a list of scenes, each with a path")
+    found: list[Scene] = []
+    for scene in scenes:
+        options = dict(scene)
+        if "path" not in options:
+            raise FormatError(root, "scenes", options, "an entry with a path")
+        found += open_capture(root / str(options.pop("path")), **options)
+    return found
+
+
+def scenes_root(root: str | Path | None) -> Path:
+    """The folder that the paths of scenes start from; None = the environment variable ``DHTORCH_DATA``.
+
+    Raises:
+        FormatError: none given and the variable unset, or no such folder.
     """
     root = root if root is not None else os.environ.get(ROOT_VARIABLE)
     if not root:
         raise FormatError(ROOT_VARIABLE, "environment variable", "nothing", "the folder that holds the scenes")
     if not Path(root).is_dir():
         raise FormatError(root, "path", "no such folder", f"the folder that holds the scenes ({ROOT_VARIABLE})")
-    if not scenes:
-        raise FormatError(root, "scenes", "none", "a list of scenes, each with a path")
-    recordings: list[Recording | Stacks] = []
-    for scene in scenes:
-        options = dict(scene)
-        if "path" not in options:
-            raise FormatError(root, "scenes", options, "an entry with a path")
-        recordings += open_all(Path(root) / str(options.pop("path")), **options)
-    return recordings
+    return Path(root)

@@ -26,7 +26,7 @@ from dhtorch.data import convert, files
 from dhtorch.data.clocks import nearest, poses_at
 from dhtorch.data.files import FormatError
 from dhtorch.data.laser import judged
-from dhtorch.data.recording import Recording, TruthRecording
+from dhtorch.data.recording import MeasuredRecording, Recording
 from dhtorch.geometry.camera import resize
 from dhtorch.records import Camera, Frame
 
@@ -130,7 +130,7 @@ def read(
     load_truth = _truth_loader(places, laser, times, load, max_truth_gap, max_disagreement)
     if (without := load_truth.depths.count(None)) > 0:
         report.append(f"{without} frames without laser depth within {max_truth_gap} s: no truth")
-    return [TruthRecording(**fields, load_truth=load_truth, report=tuple(report))]
+    return [MeasuredRecording(**fields, load_truth=load_truth, report=tuple(report))]
 
 
 # ---------------------------------------------------------------------------------------------------------- one frame

@@ -25,7 +25,7 @@ from dhtorch.data import convert, files
 from dhtorch.data.codecs import tarballs, tiff
 from dhtorch.data.files import FormatError
 from dhtorch.data.laser import judged
-from dhtorch.data.recording import Recording, Recordings, TruthRecording
+from dhtorch.data.recording import MeasuredRecording, Recording, Recordings
 from dhtorch.geometry.camera import resize
 from dhtorch.records import Camera, Frame
 
@@ -214,7 +214,7 @@ def _recording(
         return Recording(**fields, report=tuple(report))
     if (without := int((spans["gt/depth"][:, 0] < 0).sum())) > 0:
         report.append(f"{without} frames without gt/depth: no truth")
-    return TruthRecording(**fields, load_truth=_LoadTruth(load, max_disagreement), report=tuple(report))
+    return MeasuredRecording(**fields, load_truth=_LoadTruth(load, max_disagreement), report=tuple(report))
 
 
 def _matrix(data: bytes, file: Path, n: int) -> np.ndarray:

@@ -9,25 +9,25 @@ from __future__ import annotations
 import torch
 
 from dhtorch.data.recording import Recording
-from dhtorch.data.stacks import Stacks
+from dhtorch.data.scene import Given, Scene
 
 #: From this many frames on, neighbouring anchors are nearly the same picture: take every other one.
 _MANY = 25
 
 
-def by_gap(recording: Recording, gap: int | None = None, stride: int | None = None) -> list[tuple[int, int]]:
+def by_gap(scene: Given, gap: int | None = None, stride: int | None = None) -> list[tuple[int, int]]:
     """Pairs whose frame numbers differ by ``gap``.
 
     Args:
-        recording: the frames.
-        gap: step in frames. None = the recording's own.
+        scene: its recording's frames.
+        gap: step in frames. None = the scene's own.
         stride: step from anchor to anchor. None = 2 where there are 25 frames or more, else 1.
 
     Raises:
         ValueError: no gap given and none known, gap or stride below 1, or no two frames that far apart.
     """
-    _refuse_stacks(recording)
-    gap = recording.gap if gap is None else gap
+    scene = Scene.of(scene)
+    recording, gap = scene.recording, scene.gap if gap is None else gap
     if gap is None:
         raise ValueError(f"pairs.gap: {recording.name} knows no gap of its own, expected a number of frames")
     gap = _positive_int("pairs.gap", gap)
@@ -41,12 +41,12 @@ def by_gap(recording: Recording, gap: int | None = None, stride: int | None = No
 
 
 def by_time(
-    recording: Recording, seconds: float, tolerance: float | None = None, stride: int | None = None
+    scene: Given, seconds: float, tolerance: float | None = None, stride: int | None = None
 ) -> list[tuple[int, int]]:
     """Pairs whose stamps differ by ``seconds``, give or take ``tolerance``; the closest frame counts.
 
     Args:
-        recording: the frames; needs time stamps.
+        scene: its recording's frames; needs time stamps.
         seconds: time from anchor to partner.
         tolerance: s. None = half the median step from frame to frame.
         stride: step from anchor to anchor. None = 2 where there are 25 frames or more, else 1.
@@ -54,7 +54,7 @@ def by_time(
     Raises:
         ValueError: no time stamps, seconds not positive, tolerance negative, or no two frames that far apart.
     """
-    _refuse_stacks(recording)
+    recording = Scene.of(scene).recording
     if recording.times is None:
         raise ValueError(f"pairs.seconds: {recording.name} has no time stamps, expected a recording with them")
     _positive("pairs.seconds", seconds)
@@ -69,14 +69,14 @@ def by_time(
 
 
 def by_baseline(
-    recording: Recording, metres: float, tolerance: float | None = None, stride: int | None = None
+    scene: Given, metres: float, tolerance: float | None = None, stride: int | None = None
 ) -> list[tuple[int, int]]:
     """Pairs whose camera centres lie ``metres`` apart, give or take ``tolerance``; the earliest such frame counts.
 
     The earliest, because a camera that comes back later has seldom the same view.
 
     Args:
-        recording: the frames; needs poses.
+        scene: its recording's frames; needs poses.
         metres: distance of the two camera centres.
         tolerance: m. None = a quarter of ``metres``.
         stride: step from anchor to anchor. None = 2 where there are 25 frames or more, else 1.
@@ -84,7 +84,7 @@ def by_baseline(
     Raises:
         ValueError: no poses, metres not positive, tolerance negative, or no two frames that far apart.
     """
-    _refuse_stacks(recording)
+    recording = Scene.of(scene).recording
     if recording.poses is None:
         raise ValueError(f"pairs.metres: {recording.name} has no poses, expected a recording with them")
     _positive("pairs.metres", metres)
@@ -98,18 +98,20 @@ def by_baseline(
     return _some(pairs, recording, f"{metres} m ± {tolerance:g} m")
 
 
-def by_scaled_gap(recording: Recording, factor: float, stride: int | None = None) -> list[tuple[int, int]]:
-    """Pairs at ``factor`` times the recording's own gap, rounded, at least one frame; none where it is too short.
+def by_scaled_gap(scene: Given, factor: float, stride: int | None = None) -> list[tuple[int, int]]:
+    """Pairs at ``factor`` times the scene's own gap, rounded, at least one frame; none where it is too short.
 
     Raises:
         ValueError: no gap known, factor not positive, or stride below 1.
     """
-    if recording.gap is None:
+    scene = Scene.of(scene)
+    recording = scene.recording
+    if scene.gap is None:
         raise ValueError(f"pairs.factor: {recording.name} knows no gap of its own, expected one with a gap")
-    gap = max(1, int(_positive("pairs.factor", factor) * recording.gap + 0.5))
+    gap = max(1, int(_positive("pairs.factor", factor) * scene.gap + 0.5))
     span = int(recording.number[-1] - recording.number[0])
     try:
-        return by_gap(recording, gap, stride) if gap <= span else []
+        return by_gap(scene, gap, stride) if gap <= span else []
     except ValueError:  # frames were lost: no two of those left are that far apart
         return []
 
@@ -123,13 +125,6 @@ def between(i: int, j: int, views: int) -> list[int]:
     if not 1 <= views <= j - i:
         raise ValueError(f"views: found {views} for frames {i} to {j}, expected 1 to {j - i}")
     return [i + round((j - i) * (k + 1) / views) for k in range(views)]
-
-
-def _refuse_stacks(recording: object) -> None:
-    """Focal stacks open like recordings, but their pictures are of one view, without depth from a sensor."""
-    if isinstance(recording, Stacks):
-        found = f"{recording.name} holds focal stacks ({recording.format}), pictures of one view"
-        raise ValueError(f"pairs: {found}, expected a recording whose camera moves; dhtorch inspect shows stacks")
 
 
 def _stride(recording: Recording, stride: int | None) -> int:

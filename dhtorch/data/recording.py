@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, overload
+from typing import ClassVar, overload
 
 import torch
 from torch import Tensor
@@ -22,9 +22,11 @@ from dhtorch.records import Frame, Pose
 class Recording(Sequence[Frame]):
     """A lazy sequence of frames (B = 1) of one scene.
 
-    A reader supplies ``load``, which decodes image, depth and cameras of position ``i``; the recording adds what is
-    known for the whole sequence (time, pose). ``number`` keeps the place of every frame in the capture: where a frame
-    was skipped the numbers have a gap, so that pairs never shift silently.
+    A reader must give ``name``, ``format``, ``load``, which decodes image, depth and cameras of position ``i``, and
+    ``number``, the place of every frame in the capture: where a frame was skipped the numbers have a gap, so that pairs
+    never shift silently. It may give ``root``, ``times``, ``poses`` with their ``pose_axes``, ``rate_hz``, ``sparse``,
+    ``episode`` and ``report``, where the capture says so; the recording adds time, pose and ``sparse`` to its frames.
+    What a benchmark makes of a recording is no property of it: see :class:`dhtorch.data.scene.Scene`.
 
     Raises:
         ValueError: no frame, or fields of unequal length.
@@ -40,11 +42,6 @@ class Recording(Sequence[Frame]):
     pose_axes: str = "cv"  # axes in which the capture writes its trajectory, cv or gl; ``poses`` are cv in any case
     rate_hz: float | None = None  # nominal frame rate
     sparse: bool = False  # depth is a projected LiDAR sweep: mostly empty between returns
-    near: float | None = None  # m, the cutoff to use for a range split on this scene
-    gap: int | None = None  # frame step that gives a usable baseline
-    levels: int | None = None  # pyramid levels that the motion in this scene asks for
-    room: str | None = None  # recordings of one place bear one name: what is learnt on one says little about the others
-    role: str | None = None  # "rotation" = almost no baseline: never enters a mean
     episode: int | None = None  # its number in the data set, where episodes have one
     report: tuple[str, ...] = ()  # what was left out, and why
 
@@ -86,20 +83,34 @@ class Recording(Sequence[Frame]):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class TruthRecording(Recording):
-    """A recording that also knows the depth measured by another, better instrument: its own sensor is not its judge."""
+    """A recording that also knows what is really there: its own sensor is not its judge."""
 
     surfaces: ClassVar[dict[int, str]] = {0: "ordinary"}  # values of ``truth(i)["surface"]``
-    odd_surfaces: ClassVar[tuple[str, ...]] = ()
+    odd_surfaces: ClassVar[tuple[str, ...]] = ()  # where triangulation rightly finds something else than the surface
+
+    def truth(self, index: int) -> dict[str, Tensor]:
+        """What is really there at the centre of every image pixel of frame ``index``, as far as it is known.
+
+        Returns:
+            ``depth`` (1, H, W) m float32, 0 where it is not known; ``surface`` (1, H, W) uint8, a key of ``surfaces``;
+            where an instrument measured it ``disagreement`` (1,), its median relative difference from the frame's
+            own sensor.
+        """
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MeasuredRecording(TruthRecording):
+    """A recording with depth measured by another, better instrument."""
 
     load_truth: Callable[[int], tuple[Tensor, float]] = field(kw_only=True)  # position → depth (H, W), disagreement
 
     def truth(self, index: int) -> dict[str, Tensor]:
-        """What is really there at the centre of every image pixel of frame ``index``, as far as it was measured.
+        """As :meth:`TruthRecording.truth`, as far as it was measured.
 
         Returns:
-            ``depth`` (1, H, W) m float32, 0 where it is not known; ``surface`` (1, H, W) uint8, all 0: kinds of
-            surface are not told apart; ``disagreement`` (1,), median relative difference from the frame's own sensor
-            where both answer, NaN where they share no pixel. A truth that was rejected for it is 0 everywhere.
+            ``surface`` is all 0: kinds of surface are not told apart. ``disagreement`` counts where both instruments
+            answer, NaN where they share no pixel. A truth that was rejected for it is 0 everywhere.
         """
         depth, disagreement = self.load_truth(self._position(index))
         surface = torch.zeros(1, *depth.shape, dtype=torch.uint8)
@@ -117,7 +128,6 @@ class Recordings(Sequence[Recording]):
 
     names: Sequence[str]  # of the recordings
     make: Callable[[int], Recording]  # picklable; position → recording of that name
-    kept: dict[str, Any] = field(default_factory=dict)  # fields of every recording that the caller has set
 
     def __len__(self) -> int:
         return len(self.names)
@@ -130,14 +140,10 @@ class Recordings(Sequence[Recording]):
         places = range(len(self))
         if isinstance(index, slice):
             return [self[i] for i in places[index]]
-        return replace(self.make(places[index]), **self.kept)
+        return self.make(places[index])
 
     def __repr__(self) -> str:
         return f"Recordings({len(self)}, {self.names[0]!r} …)"
-
-    def replaced(self, fields: dict[str, Any]) -> Recordings:
-        """The same with some fields set in every recording."""
-        return replace(self, kept=self.kept | fields)
 
 
 def numbers(n: int) -> Tensor:

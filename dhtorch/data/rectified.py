@@ -57,7 +57,6 @@ def read(root: str | Path) -> list[Recording]:
             number=numbers(2),
             root=root,
             poses=Pose(eye, t),
-            gap=1,
         )
     ]
 

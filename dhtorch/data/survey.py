@@ -9,13 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from dhtorch.data.files import FormatError
-from dhtorch.data.stacks import FocalStack, Stacks
+from dhtorch.data.recording import Recording
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import lookup, se3
 from dhtorch.records import Camera, Frame, Pose
@@ -27,6 +26,7 @@ _FAST = 5.0  # m/s; nobody carries a phone so fast
 _MANY_HOLES = 0.5
 _FAR = 200.0  # m; more is millimetres taken for metres
 _DISAGREE = 0.02  # median relative difference of depth carried from frame to frame; sound captures have 0.3 to 1.3 %
+_STEP = 5  # frames from one to the other that is held against it
 _SAMPLED = 200_000  # depth values a frame that enter the percentiles
 
 
@@ -62,9 +62,12 @@ class Survey:
 
 
 def survey_recording(
-    recording: Any, frames: int = 8, *, progress: Callable[..., Iterable[int]] = lambda items, _text, _total: items
+    recording: Recording,
+    frames: int = 8,
+    *,
+    progress: Callable[..., Iterable[int]] = lambda items, _text, _total: items,
 ) -> Survey:
-    """Facts of a recording (or what looks like one), from its tables and ``frames`` of its frames.
+    """Facts of a recording, from its tables and ``frames`` of its frames.
 
     ``progress`` wraps the loop that decodes them: (items, text, number of items) → items.
     """
@@ -95,33 +98,6 @@ def survey_recording(
     return out
 
 
-def survey_stacks(stacks: Stacks, shown: int = 8) -> Survey:
-    """Facts of focal stacks, from the first of them."""
-    out = Survey(stacks.name, stacks.format)
-    stack: FocalStack = stacks[0]
-    images = stack.images[0]
-    s, c, h, w = images.shape
-    out.say("focal stacks", f"{len(stacks)}, of {s} pictures each")
-    out.say("pictures", f"{w}x{h}, {_kind(c, images)}")
-    if stack.focus_m is None:
-        out.warn("no focus distances: the order of the pictures is all that is known")
-    else:
-        out.say("in focus at", ", ".join(f"{x:.3g}" for x in stack.focus_m[0].tolist()) + " m")
-    if stack.focal_length_m is not None and stack.f_number is not None:
-        out.say("lens", f"f = {1e3 * float(stack.focal_length_m):g} mm, N = {float(stack.f_number):g}")
-    if stack.camera is not None:
-        out.say("intrinsics", _camera(stack.camera, (h, w)))
-    if stack.depth is not None:
-        _depth_facts([stack.depth[0]], out)
-    _duplicates(list(images), out, "pictures")
-    out.warnings.extend(stacks.report)
-    for k in sorted({round(k * (s - 1) / max(shown - 1, 1)) for k in range(shown)}):
-        out.tiles.append(Tile(f"picture {k + 1}", images[k]))
-    if stack.depth is not None:
-        out.tiles.append(Tile("truth", depth=stack.depth[0]))
-    return out
-
-
 def survey_pictures(name: str, images: dict[str, Tensor], depths: dict[str, Tensor]) -> Survey:
     """Facts of loose pictures and depth maps that no format claims: no intrinsics, no poses, no order."""
     out = Survey(name, "loose pictures")
@@ -130,7 +106,7 @@ def survey_pictures(name: str, images: dict[str, Tensor], depths: dict[str, Tens
             sizes = sorted({f"{x.shape[-1]}x{x.shape[-2]}" for x in found.values()})
             out.say(what, f"{len(found)}, {', '.join(sizes)}")
     if depths:
-        _depth_facts(list(depths.values()), out)
+        say_depths(list(depths.values()), out)
     out.warn("no intrinsics and no poses: nothing can be measured in it")
     out.tiles.extend(Tile(title, image=image) for title, image in images.items())
     out.tiles.extend(Tile(title, depth=depth) for title, depth in depths.items())
@@ -166,28 +142,31 @@ def _pictures(shots: Sequence[Frame], out: Survey) -> None:
         out.warn("depth only: there are no pictures")
         return
     h, w = shots[0].hw
-    out.say("pictures", f"{w}x{h}, {_kind(image.shape[1], image)}")
-    _duplicates([s.image[0] for s in shots], out, "frames")
+    out.say("pictures", f"{w}x{h}, {pixel_kind(image.shape[1], image)}")
+    warn_of_duplicates([s.image[0] for s in shots], out, "frames")
     grey = torch.stack([lookup.luma(s.image[:, :, ::4, ::4], 1).mean() for s in shots])
     if float(grey.max()) < 0.02:
         out.warn("all pictures are black")
 
 
-def _kind(channels: int, images: Tensor) -> str:
+def pixel_kind(channels: int, images: Tensor) -> str:
+    """Colour and depth of pixels, in words."""
     return f"{'colour' if channels == 3 else 'grey'}, {'8 bits' if images.dtype == torch.uint8 else 'float'}"
 
 
-def _duplicates(images: Sequence[Tensor], out: Survey, what: str) -> None:
+def warn_of_duplicates(images: Sequence[Tensor], out: Survey, what: str) -> None:
+    """A warning where all of several pictures are the same."""
     if len(images) > 1 and all(x.shape == images[0].shape and torch.equal(x, images[0]) for x in images[1:]):
         out.warn(f"all {what} that were read are the same picture")
 
 
 def _depths(shots: Sequence[Frame], sparse: bool, out: Survey) -> None:
     remark = ", not registered to the picture" if shots[0].depth_camera is not None else ""
-    _depth_facts([s.depth[0] for s in shots], out, remark + ", sparse returns" * sparse, sparse)
+    say_depths([s.depth[0] for s in shots], out, remark + ", sparse returns" * sparse, sparse)
 
 
-def _depth_facts(depths: Sequence[Tensor], out: Survey, remark: str = "", sparse: bool = False) -> None:
+def say_depths(depths: Sequence[Tensor], out: Survey, remark: str = "", sparse: bool = False) -> None:
+    """Sizes, holes and percentiles of depth maps (h, w), m."""
     sizes = sorted({f"{d.shape[1]}x{d.shape[0]}" for d in depths})
     out.say("depth", ", ".join(sizes) + remark)
     holes = torch.stack([(d == 0).double().mean() for d in depths])
@@ -231,12 +210,12 @@ def _cameras(shots: Sequence[Frame], out: Survey) -> None:
     hw, first = shots[0].hw, shots[0].camera
     if min(hw) == 0 and shots[0].depth_camera is not None:
         first, hw = shots[0].depth_camera, (shots[0].depth.shape[-2], shots[0].depth.shape[-1])
-    out.say("intrinsics", _camera(first, hw))
+    out.say("intrinsics", camera_words(first, hw))
     f = torch.cat([s.camera.f for s in shots])
     if float((f.amax(0) / f.amin(0)).max()) > 1 + 1e-6:
         out.say("focal length", _span(f[:, 0].tolist(), "{:.2f}") + " px: it changes from frame to frame")
     if shots[0].depth_camera is not None and min(shots[0].hw) > 0:
-        out.say("of the depth", _camera(shots[0].depth_camera, tuple(shots[0].depth.shape[-2:])))  # type: ignore[arg-type]
+        out.say("of the depth", camera_words(shots[0].depth_camera, tuple(shots[0].depth.shape[-2:])))  # type: ignore[arg-type]
     fx, fy = first.f[0].tolist()
     if not 0.95 < fx / fy < 1.05:
         out.warn(f"focal lengths {fx:.1f} and {fy:.1f} px: pixels are not square")
@@ -245,7 +224,8 @@ def _cameras(shots: Sequence[Frame], out: Survey) -> None:
         out.warn("the principal point is far from the middle of the picture")
 
 
-def _camera(camera: Camera, hw: tuple[int, int]) -> str:
+def camera_words(camera: Camera, hw: tuple[int, int]) -> str:
+    """A camera in words."""
     (fx, fy), (cx, cy) = camera.f[0].tolist(), camera.c[0].tolist()
     view = [2 * math.degrees(math.atan(n / 2 / f)) for n, f in ((hw[1], fx), (hw[0], fy))]
     lens = "no distortion" if camera.distortion is None else f"{camera.distortion.shape[-1]} distortion coefficients"
@@ -260,7 +240,7 @@ def _span(values: Sequence[float], form: str) -> str:
 # -------------------------------------------------------------------------------------------------------------- poses
 
 
-def _poses(recording: Any, out: Survey) -> None:
+def _poses(recording: Recording, out: Survey) -> None:
     poses: Pose | None = recording.poses
     if poses is None:
         out.say("poses", "none")
@@ -293,11 +273,11 @@ def _degrees(angle: Tensor) -> float:
     return math.degrees(float(angle))
 
 
-def _agreement(recording: Any, shots: dict[int, Frame], out: Survey) -> None:
+def _agreement(recording: Recording, shots: dict[int, Frame], out: Survey) -> None:
     """Depth carried by the poses into a later frame against the depth there, and against poses that do not move."""
     if recording.poses is None or recording.sparse or len(recording) < 2:
         return
-    step = min(recording.gap or 5, len(recording) - 1)  # at least 1
+    step = min(_STEP, len(recording) - 1)  # at least 1
     found: list[tuple[float, float]] = []
     for i in list(shots)[:: max(1, len(shots) // 3)]:
         j = i + step if i + step < len(recording) else max(i - step, 0)

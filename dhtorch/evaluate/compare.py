@@ -15,10 +15,10 @@ from typing import Any
 import torch
 
 from dhtorch import tree
-from dhtorch.evaluate import bootstrap, calibrate, errors, risk
+from dhtorch.evaluate import bootstrap, errors, reliability, risk
 from dhtorch.evaluate.bootstrap import Interval
 from dhtorch.evaluate.errors import Points
-from dhtorch.evaluate.recalibrate import fit
+from dhtorch.evaluate.score_calibration import fit
 
 #: A scene on which either method answers fewer points says nothing about their ratio.
 MIN_ANSWERS = 20
@@ -156,7 +156,7 @@ def _promises(
     """What was promised in every room by what the other rooms taught."""
     pooled = {scene: tree.collate(points) for scene, points in ours.items()}
     table, sigmoid = {}, {}
-    for others, held in calibrate.leave_one_room_out(pooled, rooms):
+    for others, held in reliability.leave_one_room_out(pooled, rooms):
         if not any(bool(s.keep.any()) for s in others.values()):
             continue  # nothing to learn from: these scenes have no such number
         learnt = fit(list(others.values()), targets=TARGETS)
@@ -178,7 +178,7 @@ def _promises(
         numbers[f"realised_risk_{percent}"] = mean(realised)
         numbers[f"within_target_{percent}"] = mean([float(r <= percent / 100) for r in realised])
     for name, scenes in (("ece", table), ("ece_sigmoid", sigmoid), ("ece_raw", pooled)):
-        numbers[name] = calibrate.ece_interval([scenes[s] for s in table], draws=draws, seed=seed)
+        numbers[name] = reliability.ece_interval([scenes[s] for s in table], draws=draws, seed=seed)
     return numbers
 
 

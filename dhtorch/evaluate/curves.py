@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from dhtorch.evaluate import calibrate, risk
+from dhtorch.evaluate import reliability, risk
 from dhtorch.evaluate.errors import Points
 
 #: Points of a risk–coverage curve and bins of the other two.
@@ -57,7 +57,7 @@ def _by_distance(pooled: Points) -> dict[str, list[float | None]]:
 
 
 def _reliability(pooled: Points) -> dict[str, list[float | None]]:
-    table = calibrate.reliability(*calibrate.pool([pooled]), bins=BINS)
+    table = reliability.diagram(*reliability.pool([pooled]), bins=BINS)
     return {name: _rounded(getattr(table, name).tolist()) for name in ("claimed", "realised", "weight")}
 
 

@@ -132,21 +132,20 @@ def truth_at(
     uv: Tensor,  # (B, N, 2) px
     *,
     truth: str = "full",
-    sparse: bool = False,
     window: int = 25,
 ) -> Truth:
     """The return at every sample, and whether the depth around it is smooth enough to be held against an answer.
 
     Dense map: the return of the nearest pixel; the 5×5 pixels around it must all have one and spread by less than
-    5 % (CLOSE), and those that have one in the wide window by less than 15 % (WIDE). Sparse map (projected LiDAR): the
-    nearest return within 7×7 pixels, spread there less than 5 %, within 15×15 less than 15 %.
+    5 % (CLOSE), and those that have one in the wide window by less than 15 % (WIDE). Where the frame says that its map
+    is sparse (projected LiDAR): the nearest return within 7×7 pixels, spread there less than 5 %, within 15×15 less
+    than 15 %.
 
     Args:
         frame: the views with their full depth, before the hold-out. For truth from elsewhere replace ``depth`` (and
             ``depth_camera``, where the map has intrinsics of its own).
         uv: sample pixels.
         truth: ``full`` asks both tests, ``5x5`` the close one only, ``raw`` none.
-        sparse: most depth pixels are empty.
         window: side of a dense map's wide window, px of the image: the LK window and two pixels around it.
 
     Returns:
@@ -165,18 +164,28 @@ def truth_at(
         raise ValueError(f"holdout.truth: found {truth!r}, expected one of {', '.join(TESTS)}")
     scale = sizes["w"] / sizes["W"]
     place = cam.depth_pixels(frame.camera, frame.hw, frame.depth_camera, (sizes["h"], sizes["w"]), uv)
-    close, u, v = _window(frame.depth, place, _side(CLOSE_SPARSE if sparse else CLOSE, scale))
-    depth = _nearest_return(close, u, v, place) if sparse else _nearest_pixel(frame.depth, place)
-    fails_close, fails_wide = torch.zeros_like(depth, dtype=torch.bool), torch.zeros_like(depth, dtype=torch.bool)
+    dense = _tested(frame.depth, place, truth, scale, window)
+    if frame.sparse is None:
+        return Truth(*dense)
+    sparse = _tested(frame.depth, place, truth, scale, None)
+    depth, code = (torch.where(frame.sparse[:, None], a, b) for a, b in zip(sparse, dense, strict=True))
+    return Truth(depth, code)
+
+
+def _tested(depth: Tensor, place: Tensor, truth: str, scale: float, window: int | None) -> tuple[Tensor, Tensor]:
+    """The return (B, N) of each place in maps (B, h, w), and its code; ``window`` None: the maps are sparse."""
+    close, u, v = _window(depth, place, _side(CLOSE_SPARSE if window is None else CLOSE, scale))
+    found = _nearest_return(close, u, v, place) if window is None else _nearest_pixel(depth, place)
+    fails_close, fails_wide = torch.zeros_like(found, dtype=torch.bool), torch.zeros_like(found, dtype=torch.bool)
     if truth != "raw":
         fails_close = _spreads(close, CLOSE_SPREAD)
-        if not sparse:
+        if window is not None:
             fails_close = fails_close | (close <= 0).flatten(-2).any(-1)
     if truth == "full":
-        wide, _, _ = _window(frame.depth, place, _side(WIDE_SPARSE if sparse else window, scale))
+        wide, _, _ = _window(depth, place, _side(WIDE_SPARSE if window is None else window, scale))
         fails_wide = _spreads(wide, WIDE_SPREAD)
-    code = first_reason((depth <= 0, Rule.NO_RETURN), (fails_close, Rule.CLOSE), (fails_wide, Rule.WIDE))
-    return Truth(depth, code)
+    code = first_reason((found <= 0, Rule.NO_RETURN), (fails_close, Rule.CLOSE), (fails_wide, Rule.WIDE))
+    return found, code
 
 
 def candidates(

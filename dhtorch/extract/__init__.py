@@ -18,22 +18,22 @@ from pathlib import Path
 from typing import Any
 
 from dhtorch import archive
-from dhtorch.data import Recordings
 from dhtorch.data.files import need
+from dhtorch.data.scene import Scene, scenes_of
 from dhtorch.extract import columns, engines, plan, shards
+from dhtorch.extract.dataset import Extracted, Rows
 from dhtorch.extract.features import Features, JoinedDataset
-from dhtorch.extract.rows import Answer, Rows
 from dhtorch.method import Method
 from dhtorch.transform import CHANNELS, SampleError, grid
 from dhtorch.transform.extend_depth import ON_ERROR
 from dhtorch.transform.tokens import FITS
 
-__all__ = ["Features", "JoinedDataset", "Options", "run"]
+__all__ = ["ExtractOptions", "Features", "JoinedDataset", "run"]
 
 #: Of the files: raised when a reader of older ones would be wrong.
 FORMAT = 1
 
-#: Options that change where and how fast rows are made, and no row.
+#: ExtractOptions that change where and how fast rows are made, and no row.
 _UNKEYED = ("engine", "address")
 
 #: Frames that cannot be read, named in the report.
@@ -41,7 +41,7 @@ _SHOWN = 3
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options:
+class ExtractOptions:
     """What to extract, where it is made, and how it is stored.
 
     Raises:
@@ -76,7 +76,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Call
 
     Args:
         settings: ``out``, ``workers``, ``seed``, ``choices`` and the groups' options, as plain values.
-        parts: ``data`` (a recording or many), ``method`` and ``extract`` (:class:`Options`).
+        parts: ``data`` (scenes or recordings, one or many), ``method`` and ``extract`` (:class:`ExtractOptions`).
         progress: wraps the loop over rows: (items, text, number of items) → items.
 
     Raises:
@@ -84,13 +84,13 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Call
             extraction, a library that is missing.
         KeyboardInterrupt: Ctrl-C; what is finished stays.
     """
-    options: Options = parts["extract"]
+    options: ExtractOptions = parts["extract"]
     need("pyarrow.parquet", extra="scale")
     if not isinstance(settings["workers"], int) or settings["workers"] < 0:
         raise ValueError(f"workers: found {settings['workers']!r}, expected a whole number of at least 0")
-    recordings = parts["data"] if isinstance(parts["data"], list | Recordings) else [parts["data"]]
-    whole = plan.make(recordings, options.gap, parts["method"].views)
-    rows = _rows(recordings, whole, parts["method"], settings["seed"], options)
+    scenes = scenes_of(parts["data"])
+    whole = plan.make(scenes, options.gap, parts["method"].views)
+    rows = _rows(scenes, whole, parts["method"], settings["seed"], options)
     shared = _shared(settings, options, whole, rows)
     folder = _folder(settings["out"])
     every = whole.shards(options.shard_rows)
@@ -112,12 +112,12 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Call
     return 0
 
 
-def _rows(recordings: Sequence[Any], whole: plan.Plan, method: Method, seed: int, options: Options) -> Rows:
+def _rows(scenes: Sequence[Scene], whole: plan.Plan, method: Method, seed: int, options: ExtractOptions) -> Rows:
     hw = (int(options.tokens_hw[0]), int(options.tokens_hw[1]))
     rows, across = grid(hw, patch=options.patch, tokens_hw=hw)
     every = columns.columns(method.n, rows * across, half=options.half)
     return Rows(
-        recordings,
+        scenes,
         whole,
         columns.choose(every, options.columns),
         method=method,
@@ -129,13 +129,13 @@ def _rows(recordings: Sequence[Any], whole: plan.Plan, method: Method, seed: int
     )
 
 
-def _engine(options: Options, rows: Rows, positions: Sequence[int], workers: int) -> Iterator[Answer]:
+def _engine(options: ExtractOptions, rows: Rows, positions: Sequence[int], workers: int) -> Iterator[Extracted]:
     if options.engine == "ray":
         return engines.on_ray(rows, positions, options.address)
     return engines.here(rows, positions, workers)
 
 
-def _kept(answers: Iterable[Answer], on_error: str, rows: Rows, complaints: list[str]) -> Iterator[columns.Row]:
+def _kept(answers: Iterable[Extracted], on_error: str, rows: Rows, complaints: list[str]) -> Iterator[columns.Row]:
     """Rows to write: what becomes of a frame that cannot be read is decided here, for every engine alike."""
     for place, features, complaint in answers:
         if features is None and on_error == "raise":
@@ -146,7 +146,7 @@ def _kept(answers: Iterable[Answer], on_error: str, rows: Rows, complaints: list
             yield {**place, **(columns.blank(rows.wanted) if features is None else features)}
 
 
-def _shared(settings: Mapping[str, Any], options: Options, whole: plan.Plan, rows: Rows) -> dict[str, Any]:
+def _shared(settings: Mapping[str, Any], options: ExtractOptions, whole: plan.Plan, rows: Rows) -> dict[str, Any]:
     """Metadata of all shards: what the columns mean and where they come from."""
     asked = {k: v for k, v in asdict(options).items() if k not in _UNKEYED}
     config = {**{k: settings[k] for k in ("data", "method", "seed")}, "extract": asked}

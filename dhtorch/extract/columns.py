@@ -12,7 +12,7 @@ import numpy as np
 
 from dhtorch.codes import Flag, Gate, Hole, PoseCode, Source, names
 from dhtorch.data.files import need
-from dhtorch.transform import CHANNELS, Problem
+from dhtorch.transform import CHANNELS, SampleProblem
 
 Row = dict[str, Any]  # column → number, text or array
 
@@ -26,7 +26,7 @@ CODES: dict[str, type] = {
     "hole": Hole,
     "gate": Gate,
     "pose_code": PoseCode,
-    "problem": Problem,
+    "problem": SampleProblem,
 }
 
 #: Columns of floats that keep their meaning with eleven bits; pixels and poses do not.
@@ -88,7 +88,7 @@ def choose(found: Mapping[str, Column], wanted: Sequence[str] | None) -> dict[st
 def blank(wanted: Mapping[str, Column]) -> Row:
     """The features of a frame that cannot be read: zeros, and a ``problem`` that says so."""
     zeros = {k: np.zeros(c.shape, c.kind) for k, c in wanted.items() if k not in PLACE}
-    return {**zeros, "problem": np.asarray(Problem.UNREADABLE, wanted["problem"].kind)}
+    return {**zeros, "problem": np.asarray(SampleProblem.UNREADABLE, wanted["problem"].kind)}
 
 
 def code_tables() -> dict[str, dict[int, str]]:

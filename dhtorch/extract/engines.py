@@ -16,7 +16,7 @@ import numpy as np
 from torch.utils.data import DataLoader
 
 from dhtorch.data.files import need, set_opencv_threads
-from dhtorch.extract.rows import Answer, Rows
+from dhtorch.extract.dataset import Extracted, Rows
 from dhtorch.transform import one_thread
 
 #: Rows of one Ray task: what is done again where a node is lost.
@@ -29,7 +29,7 @@ STORE_BYTES = 300_000_000
 PATIENCE_S = 10
 
 
-def here(rows: Rows, positions: Sequence[int], workers: int) -> Iterator[Answer]:
+def here(rows: Rows, positions: Sequence[int], workers: int) -> Iterator[Extracted]:
     """In this process, or in so many data-loader workers.
 
     Raises:
@@ -53,7 +53,7 @@ def here(rows: Rows, positions: Sequence[int], workers: int) -> Iterator[Answer]
         raise ChildProcessError(f"{error}; is there memory for {workers} workers?") from error
 
 
-def on_ray(rows: Rows, positions: Sequence[int], address: str | None) -> Iterator[Answer]:
+def on_ray(rows: Rows, positions: Sequence[int], address: str | None) -> Iterator[Extracted]:
     """In the tasks of a Ray cluster, through Ray Data; lost nodes are made up for.
 
     Args:

@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
-from typing import Any
 
-from dhtorch.data import Stacks
 from dhtorch.data.pairs import between
+from dhtorch.data.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -50,38 +49,37 @@ class Plan:
         return [Shard(k, len(starts), range(i, min(i + rows, len(self)))) for k, i in enumerate(starts)]
 
 
-def steps_back(recording: Any, gap: int | None, views: int) -> list[int]:
+def steps_back(scene: Scene, gap: int | None, views: int) -> list[int]:
     """How many frames before a frame its other views are, the farthest last; none with gap 0.
 
     Raises:
         ValueError: no gap is known, or there are not that many frames between.
     """
-    gap = recording.gap if gap is None else gap
+    gap = scene.gap if gap is None else gap
     if gap is None:
         raise ValueError(
-            f"extract.gap: {recording.name} knows no gap of its own, expected a number of frames; 0 = front end alone"
+            f"extract.gap: {scene.name} knows no gap of its own, expected a number of frames; 0 = front end alone"
         )
     return between(0, gap, views) if gap else []
 
 
-def make(recordings: Sequence[Any], gap: int | None, views: int) -> Plan:
+def make(scenes: Sequence[Scene], gap: int | None, views: int) -> Plan:
     """The plan of a data set; opens each recording once, for its length.
 
     Args:
-        recordings: of the data set.
+        scenes: of the data set.
         gap, views: see :func:`steps_back`.
 
     Raises:
-        ValueError: focal stacks, two recordings of one episode, or no gap.
+        ValueError: two recordings of one episode, or no gap.
         FormatError: a recording that cannot be opened.
     """
     found: dict[int, tuple[int, str, int]] = {}
     roots: dict[Path, None] = {}
-    for k, recording in enumerate(recordings):
-        if isinstance(recording, Stacks):
-            raise ValueError(f"data: {recording.name} holds focal stacks, expected recordings with depth")
-        steps_back(recording, gap, views)
-        number = getattr(recording, "episode", None)
+    for k, scene in enumerate(scenes):
+        recording = scene.recording
+        steps_back(scene, gap, views)
+        number = recording.episode
         number = k if number is None else number
         if number in found:
             both = f"{found[number][1]} and {recording.name}"

@@ -53,7 +53,7 @@ TOP, BETWEEN, FINEST = (2, 2, 2, 2), (1, 2, 2), (1, 2, 2, 2)
 GAIN = (0.2, 5.0)
 
 
-class Options(NamedTuple):
+class SearchOptions(NamedTuple):
     """How to search; see :func:`dhtorch.stages.track.lucas_kanade`."""
 
     window: int
@@ -68,7 +68,7 @@ class _Pair(NamedTuple):
 
     source: Pyramid
     target: Pyramid
-    o: Options
+    o: SearchOptions
     level: int
     low: Tensor  # (2, 1) px of the level
     high: Tensor  # (2, 1) px of the level
@@ -94,7 +94,7 @@ class _State(NamedTuple):
 def search(
     source: Pyramid,
     target: Pyramid,
-    o: Options,
+    o: SearchOptions,
     x: Tensor,  # (2, M) px, M a multiple of LANES
     d: Tensor,  # (2, M) px, the start
     batch: Tensor,  # (M,)
@@ -130,7 +130,9 @@ def search(
     return d, known & textured & held & within(x + d, pair.low, pair.high), A
 
 
-def step(source: Pyramid, target: Pyramid, o: Options, x: Tensor, x_1: Tensor, batch: Tensor) -> tuple[Tensor, Tensor]:
+def step(
+    source: Pyramid, target: Pyramid, o: SearchOptions, x: Tensor, x_1: Tensor, batch: Tensor
+) -> tuple[Tensor, Tensor]:
     """One Gauss-Newton step (2, M), to be subtracted from ``x_1``, read from pixels of the finest level and carrying a
     graph; and who is textured (M,)."""
     G = _project(source.windows(0, x, batch, o.window), o.normalise)
@@ -141,7 +143,7 @@ def step(source: Pyramid, target: Pyramid, o: Options, x: Tensor, x_1: Tensor, b
     return found if o.normalise != "gain_bias" else found[:2] / found[2].clamp(*GAIN), textured
 
 
-def squares(source: Pyramid, target: Pyramid, o: Options, x: Tensor, d: Tensor, batch: Tensor) -> Tensor:
+def squares(source: Pyramid, target: Pyramid, o: SearchOptions, x: Tensor, d: Tensor, batch: Tensor) -> Tensor:
     """Squared grey differences between the windows at ``x`` and ``x + d`` after normalisation, summed: (M,)."""
     sums = []
     for p, q, b in zip(*(y.split(CHUNK, -1) for y in (x, x + d, batch)), strict=True):
@@ -156,7 +158,7 @@ def squares(source: Pyramid, target: Pyramid, o: Options, x: Tensor, d: Tensor, 
     return torch.where(total.isfinite(), total, torch.full_like(total, o.window**2))
 
 
-def covariance(A: Tensor, variance: Tensor) -> Tensor:
+def window_covariance(A: Tensor, variance: Tensor) -> Tensor:
     """s² A⁻¹ (2, 2, M). The small eigenvalue of A is raised to 1e-5 of the large one, which float32 can represent."""
     a, b, c = torch.where(A.isfinite(), A, torch.zeros_like(A)).double()
     small, _ = eigenvalues(a, b, c)

@@ -55,7 +55,7 @@ MIN_RISE = 0.1
 SLACK = 1.0
 
 
-class Options(NamedTuple):
+class FitOptions(NamedTuple):
     """What the solution of one problem may be told; see ``stages.pose.map_pose``."""
 
     far_weight: float = 0.1
@@ -80,7 +80,7 @@ class Solution(NamedTuple):
 
 
 @torch.no_grad()
-def most_probable(problem: Problem, start: Pose, o: Options) -> Solution:
+def most_probable(problem: Problem, start: Pose, o: FitOptions) -> Solution:
     """Solve for the near tracks, then for all, then for all with a turn; go on only where that is borne out.
 
     *Far tracks* are believed unless the near tracks' robust cost rises by more than ``max_rise`` with them. A *turn* is
@@ -149,7 +149,7 @@ def _used_first(problem: Problem) -> tuple[Problem, Problem]:
     return some(used), some(problem.near)
 
 
-def _translates(problem: Problem, at: Unknowns, noise: Tensor, far: Tensor, precision: Tensor, o: Options) -> Tensor:
+def _translates(problem: Problem, at: Unknowns, noise: Tensor, far: Tensor, precision: Tensor, o: FitOptions) -> Tensor:
     """Whether (B,) the cost is far below that of the best rotation without translation, under the same noise."""
 
     free = at.turn.new_tensor([1.0] * 3 + [0.0] * 3 + [1.0] * 3)  # a trace of t would be a baseline to a far track
@@ -183,7 +183,7 @@ def noise_scale(problem: Problem, at: Unknowns, rounds: int = 3) -> Tensor:
 
 
 @torch.no_grad()
-def covariance(problem: Problem, solution: Solution, o: Options) -> tuple[Tensor, Tensor]:
+def pose_covariance(problem: Problem, solution: Solution, o: FitOptions) -> tuple[Tensor, Tensor]:
     """Covariance (B, 9, 9) of (rotation, translation, turn), and ``ok`` (B,); zero where not ok.
 
     Neither the far weight nor a robust weight is an inverse variance, so this is the sandwich A⁻¹ M A⁻¹ of an
@@ -215,13 +215,13 @@ def covariance(problem: Problem, solution: Solution, o: Options) -> tuple[Tensor
     return 0.5 * (whole + whole.transpose(1, 2)), ok
 
 
-def _near_cost(problem: Problem, at: Unknowns, noise: Tensor, o: Options) -> Tensor:
+def _near_cost(problem: Problem, at: Unknowns, noise: Tensor, o: FitOptions) -> Tensor:
     """Robust cost (B,) of the near tracks alone."""
     rho, _ = robust(squares(problem, linearise_tracks(problem, at), noise), o.kernel, o.bend)
     return torch.where(problem.near, rho, 0.0).sum(-1)
 
 
-def _rise_and_scatter(square: Tensor, weight: Tensor, used: Tensor, size: int, o: Options) -> tuple[Tensor, Tensor]:
+def _rise_and_scatter(square: Tensor, weight: Tensor, used: Tensor, size: int, o: FitOptions) -> tuple[Tensor, Tensor]:
     """mean psi′ / mean w and mean psi² / mean w² (B,) of the used tracks, whose residuals have ``size`` coordinates.
 
     Both are corrected for the freedom that the pose takes from few residuals, the scatter once for itself and once for

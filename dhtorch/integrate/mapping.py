@@ -14,29 +14,32 @@ from torch import Tensor
 
 from dhtorch import archive, export, integrate
 from dhtorch.codes import Source
-from dhtorch.data import Recordings
 from dhtorch.data import files as data_files
+from dhtorch.data.recording import Recording
+from dhtorch.data.scene import Scene, scenes_of
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.integrate import recording as recordings
 from dhtorch.integrate.picture import draw_map
-from dhtorch.integrate.recording import Answer, Places
+from dhtorch.integrate.recording import PairEstimate, Places
+from dhtorch.method import Method
 from dhtorch.pair import merge
 from dhtorch.records import Camera, Frame
 
 Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
 Row = dict[str, Any]
+Pairs = Callable[[Scene], Iterable[tuple[int, int]]]
 
 #: Settings groups whose names are kept with the result.
 GROUPS = ("method", "data", "pairs")
 
 
 @dataclass(frozen=True)
-class Scene:
+class MappedScene:
     """The map of one recording and what it was made of."""
 
-    recording: Any
-    answers: Sequence[Answer]
+    recording: Recording
+    answers: Sequence[PairEstimate]
     places: Places
     volume: integrate.Volume
     surface: integrate.Surface
@@ -62,39 +65,39 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     if settings["threads"] is not None:
         torch.set_num_threads(settings["threads"])
         data_files.set_opencv_threads(settings["threads"])
-    sources = parts["data"] if isinstance(parts["data"], list | Recordings) else [parts["data"]]
+    sources = scenes_of(parts["data"])
     folder = Path(settings["output"])
     began = time.perf_counter()
-    scenes: list[Row] = []
+    found: list[Row] = []
     rows: list[Row] = []
     written: list[Path] = []
     try:
         for source in sources:
-            scene = make(source, parts["method"], parts["pairs"], settings, progress=progress)
-            written += write(folder / scene.recording.name, scene, settings)
-            scene.row["seconds"] = time.perf_counter() - began - sum(r["seconds"] for r in scenes)
-            scenes.append(scene.row)
-            rows += [*_pair_rows(scene), scene.row]
+            made = make(source, parts["method"], parts["pairs"], settings, progress=progress)
+            written += write(folder / source.name, made, settings)
+            made.row["seconds"] = time.perf_counter() - began - sum(r["seconds"] for r in found)
+            found.append(made.row)
+            rows += [*_pair_rows(made), made.row]
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"{len(scenes)} of {len(sources)} scenes in {folder} are whole and stay") from None
-    result = _result(settings, sources, rows, scenes)
+        raise KeyboardInterrupt(f"{len(found)} of {len(sources)} scenes in {folder} are whole and stay") from None
+    result = _result(settings, sources, rows, found)
     archive.write(folder / "result.json", result)
-    print("\n".join(_said(row, settings["voxel"]) for row in scenes))
+    print("\n".join(_said(row, settings["voxel"]) for row in found))
     print("\n".join(["wrote", *(f"  {path}" for path in [folder / "result.json", *written])]))
     return 0
 
 
-def make(recording: Any, method: Any, pairs: Any, settings: Mapping[str, Any], *, progress: Progress) -> Scene:
+def make(scene: Scene, method: Method, pairs: Pairs, settings: Mapping[str, Any], *, progress: Progress) -> MappedScene:
     """Ask the method, place the frames, fuse, and count.
 
     Raises:
         ValueError: as the readers, the method and the volume raise it; no frame that could be placed.
     """
-    chosen = list(pairs(recording))
+    recording, chosen = scene.recording, list(pairs(scene))
     anchored = settings["poses"] == "anchored"
     links = recordings.chain(chosen) if anchored else []
     options = {k: settings[k] for k in ("cutoff", "seed", "device")} | {"dtype": getattr(torch, settings["dtype"])}
-    asked = recordings.ask(recording, method, [*chosen, *links], **options)
+    asked = recordings.ask(scene, method, [*chosen, *links], **options)
     found = list(progress(asked, f"{recording.name}: pairs", len(chosen) + len(links)))
     places = recordings.place(recording, found, poses=settings["poses"])
     if not places.poses:
@@ -109,17 +112,17 @@ def make(recording: Any, method: Any, pairs: Any, settings: Mapping[str, Any], *
     alone, both = (integrate.points(v, min_weight=least) for v in (sensor, volume))
     surface = integrate.mesh(volume, min_weight=least) if _meshed(settings["mesh"]) else both
     row: Row = {"scene": recording.name, "pair": None, "method": _name(settings), "truth": settings["poses"]}
-    row |= {"role": recording.role, "n_pairs": len(chosen), "n_frames": len(places.poses)}
+    row |= {"role": scene.role, "n_pairs": len(chosen), "n_frames": len(places.poses)}
     row |= {"n_fragments": places.n_fragments, "n_unplaced": places.n_unplaced, "n_recovered": _n_recovered(answers)}
     row |= recordings.coverage(both.xyz, settings["voxel"])
     row |= {f"{k}_sensor": v for k, v in recordings.coverage(alone.xyz, settings["voxel"]).items()}
     row["voxels_vs_sensor"] = row["n_voxels"] / row["n_voxels_sensor"] if row["n_voxels_sensor"] else None
     row |= {"n_points": len(surface.xyz), "n_triangles": None if surface.face is None else len(surface.face)}
     row |= {"volume_mib": volume.bytes / 2**20}
-    return Scene(recording, answers, places, volume, surface, row)
+    return MappedScene(recording, answers, places, volume, surface, row)
 
 
-def write(folder: Path, scene: Scene, settings: Mapping[str, Any]) -> list[Path]:
+def write(folder: Path, scene: MappedScene, settings: Mapping[str, Any]) -> list[Path]:
     """The files of one scene; returns what was written."""
     surface, voxel = scene.surface, settings["voxel"]
     rgb, score = surface.features[:, :3], surface.features[:, 3]
@@ -143,7 +146,7 @@ def write(folder: Path, scene: Scene, settings: Mapping[str, Any]) -> list[Path]
     return [folder / name for name in names]
 
 
-def _cloud(scene: Scene) -> dict[str, Tensor]:
+def _cloud(scene: MappedScene) -> dict[str, Tensor]:
     """Every sample with depth, the sensor's or recovered, of every placed anchor, in the world."""
     parts: dict[str, list[Tensor]] = {k: [] for k in ("xyz", "rgb", "sigma", "score", "hole", "source")}
     for answer in scene.answers:
@@ -159,7 +162,7 @@ def _cloud(scene: Scene) -> dict[str, Tensor]:
     return {k: torch.cat(v) if v else empty.get(k, torch.zeros(0)) for k, v in parts.items()}
 
 
-def _write_colmap(folder: Path, scene: Scene) -> None:
+def _write_colmap(folder: Path, scene: MappedScene) -> None:
     """Views, tracks, and the points that were triangulated from them."""
     poses = scene.places.poses
     number = {k: n for n, k in enumerate(poses)}
@@ -174,7 +177,7 @@ def _write_colmap(folder: Path, scene: Scene) -> None:
     export.write_colmap(folder, shots, xyz, rgb=rgb, error=error, seen_by=seen_by, uv=uv)
 
 
-def _triangulated(answer: Answer, number: Mapping[int, int], poses: Mapping[int, Any]) -> list[Tensor]:
+def _triangulated(answer: PairEstimate, number: Mapping[int, int], poses: Mapping[int, Any]) -> list[Tensor]:
     """World points, colours, errors, views and pixels of what one pair answered."""
     keep = answer.estimate.keep[0]
     xyz = cameras.unproject(answer.camera, answer.estimate.uv, answer.estimate.depth.nan_to_num(1.0))
@@ -184,7 +187,7 @@ def _triangulated(answer: Answer, number: Mapping[int, int], poses: Mapping[int,
     return [x[keep] for x in (world, answer.rgb[0], answer.estimate.residual_px[0], views, uv)]
 
 
-def _pair_rows(scene: Scene) -> list[Row]:
+def _pair_rows(scene: MappedScene) -> list[Row]:
     common = {k: scene.row[k] for k in ("scene", "method", "truth")}
     return [
         {**common, "pair": list(a.pair), "pnp_ok": int(a.fit.ok[0]), "n_kept": int(a.estimate.keep.sum())}
@@ -208,11 +211,11 @@ def _said(row: Row, voxel: float) -> str:
     )
 
 
-def _n_recovered(answers: Iterable[Answer]) -> int:
+def _n_recovered(answers: Iterable[PairEstimate]) -> int:
     return sum(int(answer.recovered.sum()) for answer in answers)
 
 
-def _result(settings: Mapping[str, Any], sources: Sequence[Any], rows: list[Row], scenes: list[Row]) -> Row:
+def _result(settings: Mapping[str, Any], sources: Sequence[Scene], rows: list[Row], scenes: list[Row]) -> Row:
     choices = {group: settings["choices"][group] for group in GROUPS}
     config = {k: v for k, v in settings.items() if k != "choices"}
     named = archive.files_named({k: config[k] for k in GROUPS})

@@ -18,13 +18,15 @@ from torch import Tensor
 
 from dhtorch.codes import Source
 from dhtorch.data.pairs import between
+from dhtorch.data.recording import Recording
+from dhtorch.data.scene import Given, Scene
 from dhtorch.evaluate.holdout import range_split
 from dhtorch.geometry import camera as cameras
-from dhtorch.geometry import cells, se3
+from dhtorch.geometry import se3, sparse_grid
 from dhtorch.geometry.lookup import nearest
 from dhtorch.integrate.volume import View, Volume, fuse, splat
 from dhtorch.method import Method
-from dhtorch.records import Camera, Estimate, Frame, Pose, PoseFit, Samples, TrackHint, Tracks
+from dhtorch.records import Camera, Estimate, Frame, Pose, PoseFit, Samples, Tracks
 from dhtorch.tree import stack
 
 POSES = ("device", "anchored")
@@ -34,7 +36,7 @@ PATCH = 1.5
 
 
 @dataclass(frozen=True)
-class Answer:
+class PairEstimate:
     """What the method said about one pair, and what of the pictures a map needs."""
 
     pair: tuple[int, int]
@@ -68,7 +70,7 @@ class Places:
 
 
 def ask(
-    recording: Any,
+    scene: Given,
     method: Method,
     pairs: Iterable[tuple[int, int]],
     *,
@@ -76,11 +78,11 @@ def ask(
     seed: int = 0,
     device: str = "cpu",
     dtype: torch.dtype = torch.float32,
-) -> Iterator[Answer]:
+) -> Iterator[PairEstimate]:
     """The method's answer to each pair, one after the other.
 
     Args:
-        recording, pairs: see ``dhtorch.data``.
+        scene, pairs: see ``dhtorch.data``.
         method: of one view or several; the others lie between the two of the pair.
         cutoff: m; returns beyond it are hidden from the method. None hides nothing.
         seed, device, dtype: of the method's run; answers come back on the CPU.
@@ -88,7 +90,8 @@ def ask(
     Raises:
         ValueError: as the method, the readers and the hold-out raise it.
     """
-    views, hint = method.views, TrackHint.of(recording)
+    scene = Scene.of(scene)
+    views, hint, recording = method.views, scene.hint, scene.recording
     for i, j in pairs:
         shown = [range_split(recording[k].to(dtype).to(device), cutoff) for k in (i, *between(i, j, views))]
         trace: dict[str, Any] = {}
@@ -98,7 +101,7 @@ def ask(
             rgb = _colour(shown[0], trace["samples"].uv)
         tracks, fit = (trace[k].to("cpu") for k in ("tracks", "fit"))
         camera = shown[0].camera.to("cpu")
-        yield Answer(
+        yield PairEstimate(
             pair=(i, j),
             samples=samples,
             estimate=estimate.to("cpu"),
@@ -110,7 +113,7 @@ def ask(
         )
 
 
-def place(recording: Any, answers: Sequence[Answer], *, poses: str = "device") -> Places:
+def place(recording: Recording, answers: Sequence[PairEstimate], *, poses: str = "device") -> Places:
     """Where the frames stand that the answers speak of.
 
     Args:
@@ -164,9 +167,9 @@ def chain(pairs: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def build(
-    recording: Any,
+    recording: Recording,
     volume: Volume,
-    answers: Sequence[Answer],
+    answers: Sequence[PairEstimate],
     places: Places,
     *,
     sources: Sequence[int] = (Source.SENSOR, Source.RECOVERED),
@@ -209,10 +212,10 @@ def coverage(xyz: Tensor, cell: float) -> dict[str, Any]:
 
     ``n_voxels`` covered; ``n_islands`` of touching ones; ``largest_island``, its share; None without any.
     """
-    key = cells.occupied(xyz, cell)
+    key = sparse_grid.occupied(xyz, cell)
     if not len(key):
         return {"n_voxels": 0, "n_islands": 0, "largest_island": None}
-    sizes = cells.components(key).bincount()
+    sizes = sparse_grid.components(key).bincount()
     return {"n_voxels": len(key), "n_islands": len(sizes), "largest_island": int(sizes.max()) / len(key)}
 
 
@@ -251,7 +254,7 @@ def sensed(
     return View(depth, sigma, features.view(1, *hw, 4), camera, T_world_from_cam)
 
 
-def recovered(answer: Answer, T_world_from_cam: Pose, *, radius: float) -> View:
+def recovered(answer: PairEstimate, T_world_from_cam: Pose, *, radius: float) -> View:
     """The recovered points of a pair as patches of ``radius`` metres."""
     estimate = answer.estimate
     depth = torch.where(answer.recovered, estimate.depth, 0.0)
@@ -268,9 +271,9 @@ def recovered(answer: Answer, T_world_from_cam: Pose, *, radius: float) -> View:
     )
 
 
-def _own(recording: Any, k: int) -> Pose:
-    pose: Pose = recording.poses[k : k + 1]
-    return pose.to(torch.float64)
+def _own(recording: Recording, k: int) -> Pose:
+    assert recording.poses is not None
+    return recording.poses[k : k + 1].to(torch.float64)
 
 
 def _reached(first: int, start: Pose, links: dict[int, list[tuple[int, Pose]]]) -> dict[int, Pose]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dhtorch.geometry import cells
+from dhtorch.geometry import sparse_grid
 from dhtorch.integrate.volume import INSIDE, SIDE, SOURCES, Volume
 from dhtorch.tree import Record, collate, record
 
@@ -51,7 +51,7 @@ def points(volume: Volume, *, min_weight: float = 0.0) -> Surface:
     _check(min_weight)
     ahead = [_edges(volume, axis, min_weight) for axis in range(3)]
     a, b = (torch.cat([pair[k] for pair in ahead]) for k in (0, 1))
-    order = cells.pack(a + b).argsort()  # by place: the order does not depend on how the blocks came
+    order = sparse_grid.pack(a + b).argsort()  # by place: the order does not depend on how the blocks came
     a, b = a[order], b[order]
     front, back = _distance(volume, a), _distance(volume, b)
     t = front / (front - back)
@@ -108,7 +108,7 @@ def _welded(volume: Volume, vertices: Tensor, faces: Tensor) -> Surface:
     on = (vertices - rounded).abs() < _SNAP
     a = torch.where(on, rounded, vertices.floor()).long()
     b = torch.where(on, rounded, vertices.ceil()).long()
-    number, which = cells.pack(a + b).unique(return_inverse=True)
+    number, which = sparse_grid.pack(a + b).unique(return_inverse=True)
     first = torch.full_like(number, len(a)).scatter_reduce(0, which, torch.arange(len(a)), "amin")
     faces = which[faces]
     whole = (faces != faces.roll(1, 1)).all(-1)
@@ -157,7 +157,7 @@ def _slot(volume: Volume, ijk: Tensor) -> tuple[Tensor, Tensor]:
     """Where voxels stand in the flattened blocks, and whether anything is known of them."""
     block = ijk.div(SIDE, rounding_mode="floor")
     x, y, z = (ijk - block * SIDE).unbind(-1)
-    at, found = cells.find(volume.key, cells.pack(block))
+    at, found = sparse_grid.find(volume.key, sparse_grid.pack(block))
     index = at * INSIDE + (x * SIDE + y) * SIDE + z
     if not len(volume.key):
         return index, found
@@ -176,13 +176,13 @@ def _edges(volume: Volume, axis: int, min_weight: float) -> tuple[Tensor, Tensor
     distance = torch.where(_known(volume, min_weight), volume.distance, torch.nan).view(shape)
     dim = axis + 1
     step = torch.nn.functional.one_hot(torch.tensor(axis, device=volume.key.device), 3)
-    at, found = cells.find(volume.key, cells.pack(cells.unpack(volume.key) + step))
+    at, found = sparse_grid.find(volume.key, sparse_grid.pack(sparse_grid.unpack(volume.key) + step))
     beyond = distance.narrow(dim, 0, 1)[at] if len(at) else distance.narrow(dim, 0, 1)
     beyond = torch.where(found.view(-1, 1, 1, 1), beyond, torch.nan)
     ahead = torch.cat((distance.narrow(dim, 1, SIDE - 1), beyond), dim)
     crossing = ((distance > 0) != (ahead > 0)) & ((distance - ahead).abs() <= MAX_STEP * volume.truncation)
     place = crossing.nonzero()
-    low = cells.unpack(volume.key[place[:, 0]]) * SIDE + place[:, 1:]
+    low = sparse_grid.unpack(volume.key[place[:, 0]]) * SIDE + place[:, 1:]
     front = (distance[crossing] > 0)[:, None]
     high = low + step
     return torch.where(front, low, high), torch.where(front, high, low)
@@ -195,16 +195,16 @@ def _known(volume: Volume, min_weight: float) -> Tensor:
 
 def _bricks(volume: Volume, min_weight: float):
     """Dense pieces: origin (3,) in voxels, distance and what is known (n, n, n), with one voxel of the next brick."""
-    block = cells.unpack(volume.key)
-    brick = cells.pack(block.div(_BRICK, rounding_mode="floor"))
+    block = sparse_grid.unpack(volume.key)
+    brick = sparse_grid.pack(block.div(_BRICK, rounding_mode="floor"))
     key = volume.key.cpu()
     distance = volume.distance.cpu()
     known = _known(volume, min_weight).cpu()
     local = torch.cartesian_prod(*(torch.arange(_BRICK + 1),) * 3)
     n = SIDE * _BRICK + 1
     for number in brick.unique():
-        first = cells.unpack(number.cpu()) * _BRICK
-        at, found = cells.find(key, cells.pack(first + local))
+        first = sparse_grid.unpack(number.cpu()) * _BRICK
+        at, found = sparse_grid.find(key, sparse_grid.pack(first + local))
         dense = torch.ones(len(local), INSIDE)
         there = torch.zeros(len(local), INSIDE, dtype=torch.bool)
         dense[found], there[found] = distance[at[found]], known[at[found]]

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from dhtorch.codes import Source
 from dhtorch.geometry import camera as cameras
-from dhtorch.geometry import cells
+from dhtorch.geometry import sparse_grid
 from dhtorch.geometry.lookup import round_half_up
 from dhtorch.geometry.shapes import check
 from dhtorch.records import Camera, Pose
@@ -35,7 +35,7 @@ SOURCES = (Source.SENSOR, Source.RECOVERED)
 class Volume(Record):
     """Blocks of a signed distance field; made by :func:`empty`, grown by :func:`fuse`, never changed in place."""
 
-    key: Tensor  # (K,) int64, rising: numbers of the blocks, see geometry.cells
+    key: Tensor  # (K,) int64, rising: numbers of the blocks, see geometry.sparse_grid
     distance: Tensor  # (K, 512) m, positive in front of the surface
     weight: Tensor  # (K, 512, 2) 1/m², of the sensor and of recovered depth; 0 = nothing known
     features: Tensor  # (K, 512, 1 + C) float16: how much of the weight came with features, and that times their mean
@@ -201,7 +201,7 @@ class _Sight:
         self.R, self.t = view.T_world_from_cam.R[0].double(), view.T_world_from_cam.t[0].double()
         depth, sigma = view.depth.flatten(), view.sigma.flatten()
         self.reach = (2 * sigma).clamp_min(self.truncation)
-        usable = (depth > 0) & (depth < cells.REACH * volume.voxel) & sigma.isfinite() & (sigma > 0)
+        usable = (depth > 0) & (depth < sparse_grid.REACH * volume.voxel) & sigma.isfinite() & (sigma > 0)
         usable &= self.reach <= max_reach * self.truncation
         usable &= self.R.isfinite().all() & self.t.isfinite().all()
         self.pixel = usable.nonzero()[:, 0]
@@ -225,12 +225,12 @@ class _Sight:
         steps = max(2, int((self.truncation + longest) / (side / 2)) + 2)
         for k in range(steps):
             along = -self.truncation + (self.truncation + reach) * k / (steps - 1)
-            found.append(cells.occupied(world + along[:, None] * way, side))
+            found.append(sparse_grid.occupied(world + along[:, None] * way, side))
         return torch.cat(found).unique()
 
     def add_to(self, volume: Volume, source: int, carve: bool) -> None:
         """Update a fresh volume in place."""
-        corner = cells.unpack(volume.key).double() * SIDE * self.voxel
+        corner = sparse_grid.unpack(volume.key).double() * SIDE * self.voxel
         corner = (corner - self.t) @ self.R  # in camera axes: the rotation's transpose
         local = torch.cartesian_prod(*(torch.arange(SIDE, device=corner.device),) * 3).double() * self.voxel
         local = (local @ self.R).to(self.depth.dtype)
@@ -275,7 +275,7 @@ class _Sight:
 def _grown(volume: Volume, keys: list[Tensor]) -> Volume:
     """A copy of the volume with room for further blocks."""
     key = torch.cat((volume.key, *keys)).unique()
-    at = cells.find(key, volume.key)[0]
+    at = sparse_grid.find(key, volume.key)[0]
 
     def wider(x: Tensor) -> Tensor:
         return x.new_zeros(len(key), *x.shape[1:]).index_copy_(0, at, x)

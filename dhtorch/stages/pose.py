@@ -26,8 +26,7 @@ from dhtorch.geometry.least_squares import (
     solve_spd,
     trial_step,
 )
-from dhtorch.geometry.most_probable import Options, most_probable
-from dhtorch.geometry.most_probable import covariance as m_covariance
+from dhtorch.geometry.most_probable import FitOptions, most_probable, pose_covariance
 from dhtorch.geometry.near_far import Problem
 from dhtorch.geometry.shapes import check
 from dhtorch.geometry.small import upper
@@ -361,7 +360,7 @@ def map_pose(
     """
     check("map_pose", xyz=(samples.xyz, "B N 3"), uv_1=(tracks.uv_1, "B N 2"), cov=(tracks.cov, "B N 2 2"))
     first = start(samples, tracks, camera_0, camera_1, draws)
-    options = Options(
+    options = FitOptions(
         far_weight=far_weight,
         max_rise=max_rise,
         turn_sigma=turn_sigma,
@@ -376,7 +375,7 @@ def map_pose(
     return in_pieces(partial(_fit_all, options, threshold_px), MAP_PAIRS, first, problem, tracks)
 
 
-def _fit_all(o: Options, threshold_px: float, first: PoseFit, problem: Problem, tracks: Tracks) -> PoseFit:
+def _fit_all(o: FitOptions, threshold_px: float, first: PoseFit, problem: Problem, tracks: Tracks) -> PoseFit:
     N = tracks.uv_1.shape[1]
     eye = se3.identity(len(first.code), problem.f)
     found = most_probable(problem.detach(), choose(first.ok, first.T_1_from_0.detach(), eye), o)
@@ -388,7 +387,7 @@ def _fit_all(o: Options, threshold_px: float, first: PoseFit, problem: Problem, 
     _, H, g = near_far.normal(problem, found.at, *weights, kernel=o.kernel, bend=o.bend)
     at, solved = near_far.step(found.at, H, g)
     with torch.no_grad():
-        cov, known = m_covariance(problem, found, o)
+        cov, known = pose_covariance(problem, found, o)
         finite = at.T.R.isfinite().flatten(1).all(1) & at.T.t.isfinite().all(1)
         code = torch.where(found.far_weight < o.far_weight, PoseCode.KEPT_PNP, PoseCode.OK)
         code = torch.where(found.translates, code, PoseCode.NO_BASELINE)

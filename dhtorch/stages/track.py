@@ -95,7 +95,7 @@ def lucas_kanade(
     check("lucas_kanade", image_0=(image_0, "B C H W"), uv_0=(uv_0, "B N 2"), start=(hint.start, "B N 2"))
     check("lucas_kanade", image_1=(image_1, "B C H W"), uv_0=(uv_0, "B N 2"))
     _check_options(iterations, normalise)
-    o = lk.Options(window, iterations, epsilon_px, min_eigenvalue, normalise)
+    o = lk.SearchOptions(window, iterations, epsilon_px, min_eigenvalue, normalise)
     levels = levels if hint.levels is None else hint.levels
     with torch.no_grad():
         source = _source(hint, image_0, levels, window)
@@ -141,14 +141,14 @@ def refine(
     start = _finite(x_1)
     x, x_1 = (torch.where(usable, y, torch.zeros_like(y)) for y in (x, x_1))
     batch = torch.arange(B, device=x.device).repeat_interleave(N)
-    o = lk.Options(window, 1, 0.0, min_eigenvalue, normalise)
+    o = lk.SearchOptions(window, 1, 0.0, min_eigenvalue, normalise)
     step, textured = lk.step(source, target, o, x, x_1, batch)
     found = start - torch.where(usable & textured, step, torch.zeros_like(step))
     return found.reshape(2, B, N).permute(1, 2, 0).to(uv_0.dtype)
 
 
 def _there_and_back(
-    source: Pyramid, target: Pyramid, uv_0: Tensor, init: Tensor | None, limit_px: float, o: lk.Options
+    source: Pyramid, target: Pyramid, uv_0: Tensor, init: Tensor | None, limit_px: float, o: lk.SearchOptions
 ) -> Tracks:
     """Tracks of all points, laid out in one row (2, M), filled up to whole ``LANES`` by points outside the image."""
     B, N, _ = uv_0.shape
@@ -184,7 +184,7 @@ def _there_and_back(
         uv_1=grid(torch.where(known, x + forward, elsewhere)),
         error=grid(error),
         photometric=grid((squares / o.window**2).sqrt()),
-        cov=grid(lk.covariance(A, squares / (o.window**2 - 2))),
+        cov=grid(lk.window_covariance(A, squares / (o.window**2 - 2))),
         valid=grid(found & returned & (error < limit_px)),
     )
 

@@ -7,6 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dhtorch.data.recording import TruthRecording
+from dhtorch.data.scene import Scene
 from dhtorch.evaluate import holdout
 from dhtorch.geometry import se3
 from dhtorch.method import Trace
@@ -61,7 +63,7 @@ class HeldOut:
 
     def _truth(self, batch: Batch, trace: Trace) -> tuple[Samples, holdout.Truth]:
         whole = self.whole(batch, trace["samples"].uv)
-        found = holdout.truth_at(batch.anchor, whole.uv, sparse=batch.recording.sparse)
+        found = holdout.truth_at(batch.anchor, whole.uv)
         return whole, holdout.candidates(whole, found, 0.0)
 
 
@@ -69,7 +71,7 @@ def real_holes(batch: Batch, trace: Trace) -> holdout.Truth:
     """The sensor's own drop-outs, held against independent truth; nothing where there is none."""
     samples: Samples = trace["samples"]
     found = holdout.truth_at(batch.exact, samples.uv)
-    if not hasattr(batch.recording, "truth"):
+    if has_truth(batch.scene) is not None:
         return found.replace(code=torch.full_like(found.code, holdout.Rule.NO_RETURN))
     kinds = batch.kinds(samples.uv)
     if kinds is not None:
@@ -82,7 +84,7 @@ def trajectory(batch: Batch, *, raw: bool = False) -> Pose | None:
     """Relative pose of each pair from the device's trajectory; None where the capture has none.
 
     Args:
-        batch: pairs of one recording.
+        batch: pairs of one scene.
         raw: as the device writes it. A trajectory in OpenGL axes is then used as if its axes were OpenCV's, the
             mistake that the conversion mends; one in OpenCV axes is the same either way.
     """
@@ -90,7 +92,7 @@ def trajectory(batch: Batch, *, raw: bool = False) -> Pose | None:
     if first is None or second is None:
         return None
     T = se3.relative(first, second)
-    if not raw or getattr(batch.recording, "pose_axes", "cv") != "gl":
+    if not raw or batch.scene.recording.pose_axes != "gl":
         return T
     flip = T.R.new_tensor([1.0, -1.0, -1.0])
     return Pose(flip[:, None] * T.R * flip, flip * T.t)
@@ -105,14 +107,14 @@ def device_fit(batch: Batch, n: int, *, raw: bool = False) -> PoseFit:
     return given_pose(T.to(like.dtype), n)
 
 
-def has_trajectory(recording: Any) -> str | None:
+def has_trajectory(scene: Scene) -> str | None:
     """Why the device's trajectory cannot be used; None where it can."""
-    return "no device trajectory" if recording.poses is None else None
+    return "no device trajectory" if scene.recording.poses is None else None
 
 
-def has_truth(recording: Any) -> str | None:
+def has_truth(scene: Scene) -> str | None:
     """Why nothing but the sensor can be asked; None where an independent instrument was there."""
-    return None if hasattr(recording, "truth") else "no independent truth"
+    return None if isinstance(scene.recording, TruthRecording) else "no independent truth"
 
 
 def _only(truth: holdout.Truth, mask: Tensor) -> holdout.Truth:

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any
 
+from dhtorch.data.scene import Given
 from dhtorch.studies import protocol
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
 
 
 def run(
-    recordings: Sequence[Any],
+    scenes: Sequence[Given],
     methods: Mapping[str, Method],
     pairs: Pairs,
     settings: Settings,
@@ -27,4 +27,4 @@ def run(
     """
     variants = {name: Variant(method) for name, method in methods.items()}
     cohorts = {test: partial(protocol.held_back, test=test) for test in settings.truth}
-    return protocol.run(recordings, Protocol(variants, cohorts), pairs, settings, progress=progress)
+    return protocol.run(scenes, Protocol(variants, cohorts), pairs, settings, progress=progress)

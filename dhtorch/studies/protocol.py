@@ -1,4 +1,4 @@
-"""The one loop behind every experiment: pairs of a recording in, rows of a result out.
+"""The one loop behind every experiment: pairs of a scene in, rows of a result out.
 
 A *variant* is a method as an experiment runs it. A *cohort* is what its answers are held against; it is counted for
 every variant alike, also where the pose fails. A *protocol* joins both and says what the methods may see. An
@@ -21,14 +21,16 @@ from dhtorch import tree
 from dhtorch.codes import Gate, Hole, names
 from dhtorch.data.files import set_opencv_threads
 from dhtorch.data.pairs import between
+from dhtorch.data.recording import Recording, TruthRecording
+from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import errors, holdout
 from dhtorch.geometry.lookup import nearest, patches, round_half_up
 from dhtorch.method import Method, Trace
-from dhtorch.records import Estimate, Frame, PoseFit, Samples, TrackHint
+from dhtorch.records import Estimate, Frame, PoseFit, Samples
 from dhtorch.studies.rows import Row, overlay, scene_row, summarise
 from dhtorch.studies.shared_tracks import SharedTracks
 
-Pairs = Callable[[Any], Sequence[tuple[int, int]]]
+Pairs = Callable[[Scene], Sequence[tuple[int, int]]]
 Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
 
 #: A pair with fewer candidates says nothing: it is dropped and counted.
@@ -56,17 +58,17 @@ class Settings:
     batch: int = 1
     workers: int = 0
 
-    def cutoff_of(self, recording: Any) -> float | None:
+    def cutoff_of(self, scene: Scene) -> float | None:
         """The cutoff on one scene, m; None where nothing is known to be near."""
-        cutoff = recording.near if self.cutoff is None else self.cutoff
+        cutoff = scene.near if self.cutoff is None else self.cutoff
         return None if cutoff is None else cutoff * self.cutoff_factor
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Some pairs of one recording, loaded: all that a protocol may look at."""
+    """Some pairs of one scene, loaded: all that a protocol may look at."""
 
-    recording: Any
+    scene: Scene
     pairs: Sequence[tuple[int, int]]
     cutoff: float | None  # m
     anchor: Frame
@@ -78,7 +80,10 @@ class Batch:
     @property
     def odd(self) -> dict[int, str]:
         """Kinds of surface that are counted apart: code → name."""
-        return {k: name for k, name in self.recording.surfaces.items() if name in self.recording.odd_surfaces}
+        room = self.scene.recording
+        if not isinstance(room, TruthRecording):
+            return {}
+        return {k: name for k, name in room.surfaces.items() if name in room.odd_surfaces}
 
     def kinds(self, uv: Tensor) -> Tensor | None:
         """Kind of surface (B, N) at samples; one whose track window touches an odd surface counts with that."""
@@ -104,7 +109,7 @@ class Variant:
     fit: Callable[[Batch, int], PoseFit] | None = None  # a pose from elsewhere: (batch, number of samples) → fit
     seed: int | None = None  # None = the job's
     given: Callable[[Batch], Mapping[str, Any]] = lambda _batch: {}  # further options: an oracle may see it all
-    needs: Callable[[Any], str | None] = lambda _recording: None  # recording → why it cannot run there, None = it can
+    needs: Callable[[Scene], str | None] = lambda _scene: None  # scene → why it cannot run there, None = it can
 
 
 @dataclass(frozen=True)
@@ -149,7 +154,7 @@ def held_back(batch: Batch, trace: Trace, *, test: str = "full") -> holdout.Trut
     samples: Samples = trace["samples"]
     kinds = batch.kinds(samples.uv)
     odd = None if kinds is None else torch.isin(kinds, torch.tensor([*batch.odd], dtype=kinds.dtype).to(kinds.device))
-    found = holdout.truth_at(batch.exact, samples.uv, truth=test, sparse=batch.recording.sparse)
+    found = holdout.truth_at(batch.exact, samples.uv, truth=test)
     return holdout.candidates(samples, found, batch.cutoff if _is_cut(batch.cutoff) else None, excluded=odd)
 
 
@@ -224,18 +229,18 @@ def join(outcomes: Iterable[Outcome]) -> Outcome:
 
 
 def run(
-    recordings: Sequence[Any], protocol: Protocol, pairs: Pairs, settings: Settings, *, progress: Progress = quiet
+    scenes: Sequence[Given], protocol: Protocol, pairs: Pairs, settings: Settings, *, progress: Progress = quiet
 ) -> Outcome:
-    """Run every variant on every pair of every recording.
+    """Run every variant on every pair of every scene.
 
     Truth is the held-back return of the anchor, or, for a recording that knows it, the exact depth (``truth(i)``);
     surfaces such as mirrors are then counted apart. Points are pooled inside a scene; the summary is the median over
     scenes without a role. A scene for which ``pairs`` gives none keeps a row that says "too short".
 
     Args:
-        recordings: scenes, see ``dhtorch.data``.
+        scenes: see :class:`dhtorch.data.scene.Scene`; a recording is a scene without notes.
         protocol: variants, cohorts and what is hidden.
-        pairs: recording → list of (anchor, other).
+        pairs: scene → list of (anchor, other).
         settings: cutoff, seed, device, batch, workers.
         progress: wraps the loop over a scene's batches: (items, text, number of items) → items.
 
@@ -243,19 +248,19 @@ def run(
         ValueError: bad data or options, as the readers, ``pairs`` and the hold-out raise them.
     """
     outcome = Outcome()
-    for recording in recordings:
-        chosen = list(pairs(recording))  # first: a data set without pairs of views says so
-        scene = _Scene(recording, protocol, settings)
-        loader = _load(recording, chosen, protocol, settings)
+    for scene in scenes_of(scenes):
+        chosen = list(pairs(scene))  # first: a data set without pairs of views says so
+        collected = _Collected(scene, protocol, settings)
+        loader = _load(scene.recording, chosen, protocol, settings)
         for at, items in zip(
-            range(0, len(chosen), settings.batch), progress(loader, recording.name, len(loader)), strict=True
+            range(0, len(chosen), settings.batch), progress(loader, scene.name, len(loader)), strict=True
         ):
             moved = [_to(item, settings.device) for item in items]
-            scene.add(Batch(recording, chosen[at : at + settings.batch], scene.cutoff, *moved))
-        outcome.rows += scene.rows()
-        outcome.examples += scene.examples
+            collected.add(Batch(scene, chosen[at : at + settings.batch], collected.cutoff, *moved))
+        outcome.rows += collected.rows()
+        outcome.examples += collected.examples
         outcome.n_pairs += len(chosen)
-        outcome.points |= {(recording.name, *k): tree.collate(p) for k, p in scene.pooled.items()}
+        outcome.points |= {(scene.name, *k): tree.collate(p) for k, p in collected.pooled.items()}
     outcome.summary = summarise(outcome.rows, list(protocol.variants), list(protocol.cohorts))
     return outcome
 
@@ -267,7 +272,9 @@ Loaded = tuple[Frame, tuple[Frame, ...], Frame, Tensor, Tensor]
 class PairData(Dataset[Loaded]):
     """Pairs of one recording for a data loader."""
 
-    def __init__(self, recording: Any, pairs: Sequence[tuple[int, int]], dtype: torch.dtype, views: int = 1) -> None:
+    def __init__(
+        self, recording: Recording, pairs: Sequence[tuple[int, int]], dtype: torch.dtype, views: int = 1
+    ) -> None:
         self.recording, self.pairs, self.dtype, self.views = recording, pairs, dtype, views
 
     def __len__(self) -> int:
@@ -277,22 +284,21 @@ class PairData(Dataset[Loaded]):
         i, j = self.pairs[index]
         anchor = self.recording[i].to(self.dtype)
         others = tuple(self.recording[k].to(self.dtype) for k in between(i, j, self.views))
-        if not hasattr(self.recording, "truth"):
+        if not isinstance(self.recording, TruthRecording):
             return anchor, others, anchor, torch.zeros(1, 1, 1), torch.full((1,), torch.nan)
         exact = self.recording.truth(i)
         known = anchor.replace(depth=exact["depth"].to(self.dtype), depth_camera=None)
         return anchor, others, known, exact["surface"].float(), exact.get("disagreement", torch.full((1,), torch.nan))
 
 
-class _Scene:
-    """Collects the answers on one recording and turns them into rows."""
+class _Collected:
+    """Collects the answers on one scene and turns them into rows."""
 
-    def __init__(self, recording: Any, protocol: Protocol, settings: Settings) -> None:
-        self.recording, self.protocol, self.settings = recording, protocol, settings
-        self.cutoff = settings.cutoff_of(recording)
-        self.missing = {k: reason for k, v in protocol.variants.items() if (reason := v.needs(recording))}
+    def __init__(self, scene: Scene, protocol: Protocol, settings: Settings) -> None:
+        self.scene, self.protocol, self.settings = scene, protocol, settings
+        self.cutoff = settings.cutoff_of(scene)
+        self.missing = {k: reason for k, v in protocol.variants.items() if (reason := v.needs(scene))}
         self.variants = {k: v for k, v in protocol.variants.items() if k not in self.missing}
-        self.hint = TrackHint.of(recording)
         self.last = list(protocol.cohorts)[-1]
         blind = protocol.hide is holdout.range_split and not _is_cut(self.cutoff)
         self.least = 0 if blind else protocol.min_candidates
@@ -325,7 +331,7 @@ class _Scene:
             if not self.examples:
                 first = answer.one(0)
                 records = (near[:1], first.samples, first.estimate, first.truths[self.last])
-                self.examples.append(Example(self.recording.name, name, *records))
+                self.examples.append(Example(self.scene.name, name, *records))
 
     def rows(self) -> list[Row]:
         """One row per pair, variant and cohort, then one per variant and cohort for the scene (pair null)."""
@@ -334,8 +340,8 @@ class _Scene:
             for cohort in self.protocol.cohorts:
                 key = (name, cohort)
                 mine = [r for r in self.pair_rows if (r["method"], r["truth"]) == key]
-                row = {"scene": self.recording.name, "pair": None, "method": name, "truth": cohort}
-                row |= {"role": self.recording.role, "cutoff_m": self.cutoff}
+                row: Row = {"scene": self.scene.name, "pair": None, "method": name, "truth": cohort}
+                row |= {"role": self.scene.role, "cutoff_m": self.cutoff}
                 row |= {"n_pairs": len(mine), "n_few": self.n_few}
                 if not mine:
                     row["note"] = self.missing.get(name) or ("too few candidates" if self.n_few else "too short")
@@ -356,9 +362,11 @@ class _Scene:
     ) -> tuple[Estimate, Trace]:
         method = variant.method
         trace: Trace = {}
-        spoil = getattr(self.recording, "spoil_track", lambda track: track)  # some recordings lead trackers astray
+        spoil = getattr(
+            self.scene.recording, "spoil_track", lambda track: track
+        )  # some recordings lead trackers astray
         seed = self.settings.seed if variant.seed is None else variant.seed
-        told: dict[str, Any] = {"seed": seed, "hint": self.hint, "track": spoil(shared.seat(method.track))}
+        told: dict[str, Any] = {"seed": seed, "hint": self.scene.hint, "track": spoil(shared.seat(method.track))}
         if variant.fit is not None:
             told["fit"] = variant.fit(batch, method.n)
         told |= variant.given(batch)
@@ -379,7 +387,7 @@ class _Scene:
         estimate, fit, kinds = answer.estimate, answer.trace["fit"], answer.batch.kinds(answer.samples.uv)
         hole = ~answer.samples.usable
         share = {gate.lower(): float((estimate.gate == code).float().mean()) for code, gate in names(Gate).items()}
-        common: Row = {"scene": self.recording.name, "pair": list(answer.batch.pairs[0]), "method": answer.variant}
+        common: Row = {"scene": self.scene.name, "pair": list(answer.batch.pairs[0]), "method": answer.variant}
         found: Row = {"pnp_ok": bool(fit.ok[0]), "n_inlier": int(fit.n_inlier[0]), "n_holes": int(hole.sum())}
         found |= {"n_recovered": int((estimate.keep & hole).sum()), "gate_share": share, "ms": answer.trace["ms"]}
         more = self.protocol.columns(answer)
@@ -394,7 +402,9 @@ class _Scene:
                 self.apart.setdefault((answer.variant, cohort, kind), []).append(errors.select(estimate, there))
 
 
-def _load(recording: Any, pairs: list[tuple[int, int]], protocol: Protocol, settings: Settings) -> DataLoader[Loaded]:
+def _load(
+    recording: Recording, pairs: list[tuple[int, int]], protocol: Protocol, settings: Settings
+) -> DataLoader[Loaded]:
     wanted = max(v.method.views for v in protocol.variants.values())
     views = min([wanted, *(j - i for i, j in pairs)])  # a short gap holds fewer frames
     return DataLoader(

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from dhtorch import tree
-from dhtorch.evaluate import calibrate, curves, errors, risk
+from dhtorch.evaluate import curves, errors, reliability, risk
 from dhtorch.pair import merge
 from dhtorch.records import Estimate, Samples
 
@@ -38,7 +38,7 @@ def scene_row(
         apart: candidates on surfaces that are counted apart.
     """
     pool = tree.collate(points)
-    row: Row = errors.measure(pool) | risk.measure(pool) | calibrate.measure([pool])
+    row: Row = errors.measure(pool) | risk.measure(pool) | reliability.measure([pool])
     row["pnp_success"] = mean([float(r["pnp_ok"]) for r in pairs])
     row |= {key: mean([r[key] for r in pairs]) for key in ("n_holes", "n_recovered")}
     row["n_dropped"] = {k: sum(d[k] for d in dropped) for k in dropped[0]}

@@ -1,9 +1,9 @@
-"""The loop of an experiment whose estimator is no method: items of a recording in, rows of every variant out."""
+"""The loop of an experiment whose estimator is no method: items of a scene in, rows of every variant out."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Protocol, TypeVar
 
 import torch
 
@@ -14,45 +14,60 @@ from dhtorch.studies.rows import Row, mean, median, summarise
 Item = tuple[int, int]
 
 
+class HasRow(Protocol):
+    """What has a row of its own in a result."""
+
+    @property
+    def name(self) -> str:
+        """Of the row."""
+
+    @property
+    def role(self) -> str | None:
+        """Not None: enters no mean."""
+
+
+Asked = TypeVar("Asked", bound=HasRow)
+
+
 def screen(
-    recordings: Sequence[Any],
-    items: Callable[[Any], Sequence[Item]],
-    ask: Callable[[Any, Item], Mapping[str, Row]],
+    scenes: Sequence[Asked],
+    items: Callable[[Asked], Sequence[Item]],
+    ask: Callable[[Asked, Item], Mapping[str, Row]],
     variants: Sequence[str],
     *,
     truth: str,
-    whole: Callable[[Any, Sequence[Mapping[str, Row]]], Mapping[str, Row]] = lambda _recording, _found: {},
+    whole: Callable[[Asked, Sequence[Mapping[str, Row]]], Mapping[str, Row]] = lambda _scene, _found: {},
     progress: Progress,
 ) -> Outcome:
-    """Ask every item of every recording, one after the other.
+    """Ask every item of every scene, one after the other.
 
     Rows: one per item and variant, then one per scene and variant, in which counts are added up and everything else
     is joined: shares of a group (a dict) by mean over the items that have them, other numbers by median. The summary
     is the median over scenes without a role; intervals come from resampling scenes.
 
     Args:
-        recordings: scenes.
-        items: recording → what to ask.
-        ask: recording, item → variant → numbers; a variant that is left out has nothing to say there.
+        scenes: what there is a row for.
+        items: scene → what to ask.
+        ask: scene, item → variant → numbers; a variant that is left out has nothing to say there.
         variants: their names, in order.
         truth: what the numbers are held against, for the rows.
-        whole: recording, all that ``ask`` found there → variant → numbers of the scene, in place of the joined ones.
+        whole: scene, all that ``ask`` found there → variant → numbers of the scene, in place of the joined ones.
         progress: wraps the loop over a scene's items: (items, text, number of items) → items.
     """
     outcome = Outcome()
-    for recording in recordings:
-        chosen = list(items(recording))
+    for scene in scenes:
+        chosen = list(items(scene))
         with torch.no_grad():
-            found = [ask(recording, item) for item in progress(chosen, recording.name, len(chosen))]
-            scene = whole(recording, found)
-        name = {"scene": recording.name}
+            found = [ask(scene, item) for item in progress(chosen, scene.name, len(chosen))]
+            over = whole(scene, found)
+        name = {"scene": scene.name}
         for item, answer in zip(chosen, found, strict=True):
             outcome.rows += [{**name, "pair": list(item), "method": v, "truth": truth, **answer[v]} for v in answer]
         for variant in variants:
             mine = [answer[variant] for answer in found if variant in answer]
-            row = {**name, "pair": None, "method": variant, "truth": truth, "role": recording.role}
+            row = {**name, "pair": None, "method": variant, "truth": truth, "role": scene.role}
             note = {} if mine else {"note": "nothing to ask"}
-            outcome.rows.append(row | {"n_pairs": len(mine)} | note | _joined(mine) | scene.get(variant, {}))
+            outcome.rows.append(row | {"n_pairs": len(mine)} | note | _joined(mine) | over.get(variant, {}))
         outcome.n_pairs += len(chosen)
     outcome.summary = summarise(outcome.rows, variants, [truth])
     return outcome

@@ -1,5 +1,5 @@
 """The built-in world: rooms whose every point is known, a phone and a robot in them, and what goes wrong."""
 
-from dhtorch.synthetic.recording import SyntheticRoom
+from dhtorch.synthetic.recording import SyntheticRoom, open_room
 
-__all__ = ["SyntheticRoom"]
+__all__ = ["SyntheticRoom", "open_room"]

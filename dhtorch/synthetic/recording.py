@@ -7,9 +7,9 @@ other frames, the order of access, the process or the number of threads.
 
 from __future__ import annotations
 
+import inspect
 import itertools
 import math
-import operator
 from collections.abc import Sequence
 from random import Random
 from typing import Any
@@ -17,20 +17,22 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
+from dhtorch.data.recording import TruthRecording, numbers
+from dhtorch.data.scene import Scene
 from dhtorch.geometry import se3
 from dhtorch.geometry.camera import Camera, resize
 from dhtorch.records import Frame, Pose
 from dhtorch.synthetic.paths import PATHS, hand_held
 from dhtorch.synthetic.raycast import DARK, MIRROR, ORDINARY, WINDOW, world_rays
 from dhtorch.synthetic.room import furnished_room
-from dhtorch.synthetic.shading import Scene
+from dhtorch.synthetic.shading import ShadedRoom
 
 #: Values of ``truth(i)["surface"]``.
 SURFACES = {ORDINARY: "ordinary", MIRROR: "mirror", WINDOW: "window", DARK: "dark"}
 
 
-class SyntheticRoom(Sequence[Frame]):
-    """A lazy sequence of frames (B = 1) of the built-in room, with the attributes of a recording.
+class SyntheticRoom(TruthRecording):
+    """The built-in room: a recording whose frames are rendered when they are asked for.
 
     Args:
         seed: of the paint and small placements, the path and the sensor noise.
@@ -50,21 +52,16 @@ class SyntheticRoom(Sequence[Frame]):
             frames carry OpenCV axes in any case).
         trajectory_offset_deg: constant angle by which the device's axes are turned against the camera's; the
             trajectory that frames carry is then wrong by it, ``true_poses`` is not.
-        near: m, cutoff for a range split.
-        gap: frame step; 6 with the default step is a way of 12 cm.
+        name: of the recording.
+        true_poses: (n_frames) T_world_from_cam, float64, in the place of the path's.
+        times: (n_frames) s, float64, in the place of the frame rate's.
 
     Raises:
         ValueError: an unknown path or LiDAR, or a size, count or limit that is not positive.
     """
 
-    name = "synthetic_room"
-    format = "synthetic"
-    root = None
-    sparse = False
-    levels = None
-    surfaces = SURFACES  # values of ``truth(i)["surface"]``
-    odd_surfaces = ("mirror", "window")  # where triangulation rightly finds something else than the surface
-    report: tuple[str, ...] = ()
+    surfaces = SURFACES
+    odd_surfaces = ("mirror", "window")
 
     def __init__(
         self,
@@ -83,8 +80,9 @@ class SyntheticRoom(Sequence[Frame]):
         supersample: int = 2,
         trajectory_axes: str = "cv",
         trajectory_offset_deg: float = 0.0,
-        near: float = 2.0,
-        gap: int = 6,
+        name: str = "synthetic_room",
+        true_poses: Pose | None = None,
+        times: Tensor | None = None,
     ):
         if path not in PATHS:
             raise ValueError(f"synthetic room: path is {path!r}, expected one of {', '.join(PATHS)}")
@@ -93,25 +91,28 @@ class SyntheticRoom(Sequence[Frame]):
         if trajectory_axes not in ("cv", "gl"):
             raise ValueError(f"synthetic room: trajectory_axes is {trajectory_axes!r}, expected cv or gl")
         positive = {"n_frames": n_frames, "rate_hz": rate_hz, "range_limit": range_limit, "supersample": supersample}
-        positive |= {"near": near, "gap": gap}
-        for name, value in {**positive, "hw": min(hw), "depth_hw": min(depth_hw)}.items():
+        for option, value in {**positive, "hw": min(hw), "depth_hw": min(depth_hw)}.items():
             if not value > 0:
-                raise ValueError(f"synthetic room: {name} is {value}, expected a positive number")
-        self.seed, self.path, self.rate_hz, self.lidar = seed, path, rate_hz, lidar
+                raise ValueError(f"synthetic room: {option} is {value}, expected a positive number")
+        if true_poses is None:
+            true_poses = hand_held(path, n_frames, step_m=step_m, rate_hz=rate_hz, seed=seed)
+        super().__init__(
+            name=name,
+            format="synthetic",
+            load=self._render,
+            number=numbers(n_frames),
+            times=numbers(n_frames).double() / rate_hz if times is None else times,
+            poses=_turned(true_poses, trajectory_offset_deg),
+            pose_axes=trajectory_axes,
+            rate_hz=rate_hz,
+        )
+        self.true_poses = true_poses
+        self.seed, self.path, self.lidar = seed, path, lidar
         self.hw, self.depth_hw = (hw[0], hw[1]), (depth_hw[0], depth_hw[1])
         self.range_limit, self.depth_noise, self.image_noise = range_limit, depth_noise, image_noise
         self.supersample = supersample
-        self.near, self.gap = near, gap
-        self.role = "rotation" if path in ("rotation", "static") else None
-        self.number = torch.arange(n_frames)
-        self.times = self.number.double() / rate_hz
-        self.true_poses = hand_held(path, n_frames, step_m=step_m, rate_hz=rate_hz, seed=seed)
-        self.pose_axes, self.poses = trajectory_axes, _turned(self.true_poses, trajectory_offset_deg)
-        self.camera = _phone_camera(self.hw)
+        self.camera = phone_camera(self.hw)
         self._frames: dict[int, Frame] = {}
-
-    def __len__(self) -> int:
-        return len(self.number)
 
     def __getitem__(self, index: int) -> Frame:  # type: ignore[override]  # one frame at a time: slices would render
         i = self._position(index)
@@ -144,14 +145,9 @@ class SyntheticRoom(Sequence[Frame]):
         face, _, _ = scene.solids.locate(solid, [o[k] + d[k] * depth for k in range(3)])
         return {"depth": depth.view(1, *hw), "surface": scene.kind[face].to(torch.uint8).view(1, *hw)}
 
-    def _position(self, index: int) -> int:
-        i, n = operator.index(index), len(self)
-        if not -n <= i < n:
-            raise IndexError(f"synthetic room: frame {i} of {n}")
-        return i % n
-
     def _render(self, i: int) -> Frame:
-        pose = self.true_poses[i : i + 1]
+        pose, poses, times = self.true_poses[i : i + 1], self.poses, self.times
+        assert poses is not None and times is not None
         scene = furnished_room(self.seed)
         image = self._picture(i)
         image = image * 255 + self.image_noise * torch.randn(image.shape, generator=self._generator(i, "image"))
@@ -172,8 +168,8 @@ class SyntheticRoom(Sequence[Frame]):
             camera=self.camera,
             depth_camera=depth_camera,
             conf=conf,
-            time=self.times[i : i + 1],
-            T_world_from_cam=self.poses[i : i + 1].to(torch.float32),
+            time=times[i : i + 1],
+            T_world_from_cam=poses[i : i + 1].to(torch.float32),
         )
 
     def _picture(self, i: int) -> Tensor:
@@ -184,6 +180,36 @@ class SyntheticRoom(Sequence[Frame]):
 
     def _generator(self, i: int, stream: str) -> Generator:
         return Generator().manual_seed(Random(f"{self.seed} {i} {stream}").getrandbits(62))
+
+
+def open_room(*, near: float = 2.0, gap: int = 6, **options: Any) -> Scene:
+    """The built-in room as a scene.
+
+    Args:
+        near: m, cutoff for a range split.
+        gap: frame step; 6 with the default step is a way of 12 cm.
+        options: of :class:`SyntheticRoom`.
+
+    Raises:
+        ValueError: near or gap is not positive, or an option that there is not; else as :class:`SyntheticRoom`.
+    """
+    known = inspect.signature(SyntheticRoom).parameters
+    for option in options:
+        if option not in known:
+            raise ValueError(f"synthetic room: found option {option!r}, expected one of {', '.join(known)}")
+    return as_scene(SyntheticRoom(**options), near, gap)
+
+
+def as_scene(room: SyntheticRoom, near: float, gap: int) -> Scene:
+    """A room with the notes of a benchmark; a path without baseline has a role.
+
+    Raises:
+        ValueError: near or gap is not positive.
+    """
+    for name, value in {"near": near, "gap": gap}.items():
+        if not value > 0:
+            raise ValueError(f"synthetic room: {name} is {value}, expected a positive number")
+    return Scene(room, near=near, gap=gap, role="rotation" if room.path in ("rotation", "static") else None)
 
 
 def open_rooms(
@@ -197,23 +223,23 @@ def open_rooms(
     image_noise: float = 1.0,
     near: float = 2.0,
     gap: int = 6,
-) -> list[SyntheticRoom]:
-    """The room along several paths, or built of several seeds, one recording each; options as :class:`SyntheticRoom`.
+) -> list[Scene]:
+    """The room along several paths, or built of several seeds, one scene each; options as :func:`open_room`.
 
     A recording is named after its path and, where there are several, its seed.
     """
     options: dict[str, Any] = {"n_frames": n_frames, "hw": hw, "lidar": lidar, "near": near, "gap": gap}
     options |= {"depth_noise": depth_noise, "image_noise": image_noise}
     seeds = [seed] if isinstance(seed, int) else list(seed)
-    rooms = []
+    scenes = []
     for path, number in itertools.product(paths, seeds):
-        rooms.append(SyntheticRoom(path=path, seed=number, **options))
-        rooms[-1].name = f"synthetic_{path}" if isinstance(seed, int) else f"synthetic_{path}_{number}"
-    return rooms
+        name = f"synthetic_{path}" if isinstance(seed, int) else f"synthetic_{path}_{number}"
+        scenes.append(open_room(path=path, seed=number, name=name, **options))
+    return scenes
 
 
 def phone_lidar(
-    scene: Scene,
+    scene: ShadedRoom,
     camera: Camera,
     T_world_from_cam: Pose,
     hw: tuple[int, int],
@@ -275,7 +301,7 @@ def _turned(poses: Pose, degrees: float) -> Pose:
     return Pose(poses.R @ turn.R, poses.t)
 
 
-def _photograph(scene: Scene, camera: Camera, pose: Pose, hw: tuple[int, int], supersample: int) -> Tensor:
+def _photograph(scene: ShadedRoom, camera: Camera, pose: Pose, hw: tuple[int, int], supersample: int) -> Tensor:
     """(1, 3, H, W) display values in [0, 1]: the mean over ``supersample``² rays in each pixel."""
     s = supersample
     fine = (hw[0] * s, hw[1] * s)
@@ -323,7 +349,7 @@ def _shared_normal(hw: tuple[int, int], generator: Generator) -> Tensor:
     return (0.8 * smooth + 0.6 * torch.randn(hw, generator=generator)).flatten()
 
 
-def _phone_camera(hw: tuple[int, int]) -> Camera:
+def phone_camera(hw: tuple[int, int]) -> Camera:
     """525 px at 640 columns, principal point a little off the middle, as real ones are."""
     s = hw[1] / 640
     c = [hw[1] / 2 + 2.3 * s - 0.5, hw[0] / 2 - 1.4 * s - 0.5]

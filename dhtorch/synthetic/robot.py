@@ -98,6 +98,8 @@ def write_robot(root: Path, *, tasks: int, scenes: int, n_frames: int, hw: tuple
         for task in range(tasks):
             episode = _Episode.of(task, scene, seed)
             times = [i / RATE_HZ for i in range(n_frames)]
+            c2w = np.stack([episode.camera(t) for t in times])
+            start = _START_MS / 1000 + 1000 * (1 + task) + 100 * scene
             room = SyntheticRoom(
                 seed=seed + scene,
                 n_frames=n_frames,
@@ -105,11 +107,9 @@ def write_robot(root: Path, *, tasks: int, scenes: int, n_frames: int, hw: tuple
                 depth_hw=(hw[0] // 2, hw[1] // 2),
                 rate_hz=RATE_HZ,
                 supersample=1,
+                true_poses=Pose(torch.from_numpy(c2w[:, :3, :3]), torch.from_numpy(c2w[:, :3, 3])),
+                times=torch.tensor([start + t for t in times], dtype=torch.float64),
             )
-            c2w = np.stack([episode.camera(t) for t in times])
-            room.true_poses = room.poses = Pose(torch.from_numpy(c2w[:, :3, :3]), torch.from_numpy(c2w[:, :3, 3]))
-            start = _START_MS / 1000 + 1000 * (1 + task) + 100 * scene
-            room.times = torch.tensor([start + t for t in times], dtype=torch.float64)
             base = episode.base()
             home = _Episode.of(task, 0, seed).camera(0.0)
             arm = ARMS[_CONFIGURATION]

@@ -17,7 +17,7 @@ from functools import lru_cache
 from random import Random
 
 from dhtorch.synthetic.raycast import DARK, MIRROR, WINDOW, Solid, Surface, Triple
-from dhtorch.synthetic.shading import Light, Scene
+from dhtorch.synthetic.shading import Light, ShadedRoom
 
 LEFT, RIGHT, FRONT, BACK, HEIGHT = -2.6, 2.1, -0.5, 4.4, 2.6  #: walls and ceiling, m
 NEG_X, POS_X, TOP, BOTTOM, NEG_Z, POS_Z = range(6)  # faces by outward normal; up is -y
@@ -44,7 +44,7 @@ _CLOTHS: tuple[Triple, ...] = (
 
 
 @lru_cache(maxsize=2)
-def furnished_room(seed: int = 2) -> Scene:
+def furnished_room(seed: int = 2) -> ShadedRoom:
     """The room with its light; the same object for the same seed (two are kept)."""
     draw = Random(seed)
     solids = [_shell(draw)]
@@ -53,7 +53,7 @@ def furnished_room(seed: int = 2) -> Scene:
     window = Light((RIGHT - 0.03, -1.5, BACK - 1.2), (0, 0, 0.55), (0, 0.5, 0), (-1, 0, 0), (2.9, 3.1, 3.4), (3, 4))
     lamp = Light((LAMP[0], -LAMP[1], LAMP[2]), (0.12, 0, 0), (0, 0, 0.12), (0, 0, 0), (1.25, 1.08, 0.84), (2, 2))
     ceiling = Light((-0.6, -HEIGHT + 0.02, 1.2), (0.4, 0, 0), (0, 0, 0.4), (0, 1, 0), (1.5, 1.4, 1.25), (3, 3))
-    return Scene(solids, [window, lamp, ceiling], ambient=0.42, seed=seed)
+    return ShadedRoom(solids, [window, lamp, ceiling], ambient=0.42, seed=seed)
 
 
 def _box(

@@ -1,8 +1,8 @@
 """What surfaces look like: painted, lit once, mirrored once.
 
-Light is computed when a :class:`Scene` is made, on a grid of nodes over each face: area lights with soft shadows, and
-an ambient part that corners and crevices lose. It does not depend on the viewer, so a surface point has the same colour
-in every frame (the mirror and the gloss of the screen excepted, which is what they are for).
+Light is computed when a :class:`ShadedRoom` is made, on a grid of nodes over each face: area lights with soft shadows,
+and an ambient part that corners and crevices lose. It does not depend on the viewer, so a surface point has the same
+colour in every frame (the mirror and the gloss of the screen excepted, which is what they are for).
 
 Colours are display values, roughly square roots of light: multiplying them multiplies light and reflectance.
 Alphabet: as in :mod:`dhtorch.synthetic.raycast`; L nodes, P rays.
@@ -36,7 +36,7 @@ class Light:
     samples: tuple[int, int] = (3, 3)
 
 
-class Scene:
+class ShadedRoom:
     """Solids, pictures and light, ready to be looked at."""
 
     def __init__(self, solids: Sequence[Solid], lights: Sequence[Light], *, ambient: float, seed: int):

@@ -14,12 +14,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from dhtorch.data.scene import Scene
 from dhtorch.geometry.camera import Camera, depth_pixels
 from dhtorch.geometry.lookup import round_half_up
 from dhtorch.records import Frame, Pose, Tracks
 from dhtorch.synthetic.paths import hand_held
 from dhtorch.synthetic.raycast import world_rays
-from dhtorch.synthetic.recording import SyntheticRoom
+from dhtorch.synthetic.recording import SyntheticRoom, as_scene
 from dhtorch.synthetic.room import furnished_room
 
 #: Near returns that are left in ``few_near``.
@@ -46,21 +47,35 @@ class StressRoom(SyntheticRoom):
         stress: one of :data:`STRESSES`.
         places: for ``few_near``, where a method will look, with ``n_places``: returns are kept there. None = anywhere.
         n_places: number of places.
+        near: m; returns up to here are what a stress of the sensor is about.
+        gap: the first so many frames are anchors, which ``moved`` leaves alone.
         options: of :class:`SyntheticRoom`; those that make the stress are set by it.
 
     Raises:
         ValueError: an unknown stress; else as :class:`SyntheticRoom`.
     """
 
-    def __init__(self, stress: str, *, places: Places | None = None, n_places: int = 2048, **options: Any):
+    def __init__(
+        self,
+        stress: str,
+        *,
+        places: Places | None = None,
+        n_places: int = 2048,
+        near: float = 2.0,
+        gap: int = 6,
+        **options: Any,
+    ):
         if stress not in STRESSES:
             raise ValueError(f"stress room: stress is {stress!r}, expected one of {', '.join(STRESSES)}")
-        super().__init__(**options | STRESSES[stress].options)
-        self.stress, self.places, self.n_places = stress, places, n_places
-        self.name = f"stress_{stress}"
+        options = {"name": f"stress_{stress}", **options, **STRESSES[stress].options}
         self.bands: list[Pose] = []
         if stress == "rolling_shutter":
-            self._roll(options.get("step_m", 0.02))
+            self.bands, options["true_poses"] = _rolled(**{k: options[k] for k in _WAY if k in options})
+        super().__init__(**options)
+        self.stress, self.places, self.n_places = stress, places, n_places
+        self.near, self.gap = near, gap
+        if self.bands:
+            self.camera = self.camera.replace(readout=torch.tensor([READOUT_S]))
 
     def truth(self, index: int) -> dict[str, Tensor]:
         """As :meth:`SyntheticRoom.truth`; under a rolling shutter each row in its own camera."""
@@ -84,16 +99,6 @@ class StressRoom(SyntheticRoom):
     def _render(self, i: int) -> Frame:
         return STRESSES[self.stress].spoil(self, i, super()._render(i))
 
-    def _roll(self, step_m: float) -> None:
-        """Poses of the bands of every frame; a frame's own pose is that of its middle band."""
-        per_frame = round(BANDS / (READOUT_S * self.rate_hz))
-        options = {"step_m": step_m / per_frame, "rate_hz": self.rate_hz * per_frame, "seed": self.seed}
-        every = hand_held(self.path, len(self) * per_frame + BANDS, **options)  # type: ignore[arg-type]
-        self.bands = [every[i * per_frame : i * per_frame + BANDS] for i in range(len(self))]
-        middle = torch.arange(len(self)) * per_frame + BANDS // 2
-        self.true_poses = self.poses = Pose(every.R[middle], every.t[middle])
-        self.camera = self.camera.replace(readout=torch.tensor([READOUT_S]))
-
     def _rows(self, i: int) -> Iterator[tuple[Camera, Pose, tuple[int, int]]]:
         """Camera, pose and size of the bands of rows of frame ``i``, from the top."""
         edges = [round(k * self.hw[0] / BANDS) for k in range(BANDS + 1)]
@@ -102,6 +107,22 @@ class StressRoom(SyntheticRoom):
                 shift = torch.tensor([[0.0, float(top)]])
                 pose = self.bands[i][k : k + 1]
                 yield self.camera.replace(c=self.camera.c - shift), pose, (bottom - top, self.hw[1])
+
+
+#: Options of :class:`SyntheticRoom` that decide its way.
+_WAY = ("path", "n_frames", "step_m", "rate_hz", "seed")
+
+
+def _rolled(
+    path: str = "walk", n_frames: int = 12, step_m: float = 0.02, rate_hz: float = 30.0, seed: int = 2
+) -> tuple[list[Pose], Pose]:
+    """Poses of the bands of every frame, and of the frames: a frame's own pose is that of its middle band."""
+    per_frame = round(BANDS / (READOUT_S * rate_hz))
+    n = n_frames * per_frame + BANDS
+    every = hand_held(path, n, step_m=step_m / per_frame, rate_hz=rate_hz * per_frame, seed=seed)
+    middle = torch.arange(n_frames) * per_frame + BANDS // 2
+    bands = [every[i * per_frame : i * per_frame + BANDS] for i in range(n_frames)]
+    return bands, Pose(every.R[middle], every.t[middle])
 
 
 def open_stress(
@@ -114,11 +135,12 @@ def open_stress(
     gap: int = 6,
     places: Places | None = None,
     n_places: int = 2048,
-) -> list[StressRoom]:
-    """The room under each of :data:`STRESSES` (None = all), one recording each; options as :class:`StressRoom`."""
+) -> list[Scene]:
+    """The room under each of :data:`STRESSES` (None = all), one scene each; options as :class:`StressRoom`."""
     options: dict[str, Any] = {"seed": seed, "n_frames": n_frames, "hw": hw, "near": near, "gap": gap}
     names = STRESSES if stresses is None else stresses
-    return [StressRoom(name, places=places, n_places=n_places, **options) for name in names]
+    rooms = [StressRoom(name, places=places, n_places=n_places, **options) for name in names]
+    return [as_scene(room, near, gap) for room in rooms]
 
 
 def _nothing(room: StressRoom, i: int, frame: Frame) -> Frame:

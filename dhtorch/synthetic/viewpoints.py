@@ -7,9 +7,9 @@ from random import Random
 
 import torch
 
-from dhtorch.geometry.camera import resize
+from dhtorch.geometry.camera import Camera, resize
 from dhtorch.records import Pose
-from dhtorch.synthetic.recording import SyntheticRoom
+from dhtorch.synthetic.recording import SyntheticRoom, phone_camera
 from dhtorch.synthetic.room import BACK, FRONT, LEFT, RIGHT, furnished_room
 
 #: Views of one furnished room before the next one is painted.
@@ -45,26 +45,26 @@ def open_viewpoints(
         raise ValueError(f"viewpoints: n is {n}, expected at least 1")
     views = []
     for k in range(n):
-        room = SyntheticRoom(
-            seed=seed + k // VIEWS_A_ROOM,
+        room, camera = seed + k // VIEWS_A_ROOM, phone_camera((hw[0], hw[1]))
+        view = SyntheticRoom(
+            seed=room,
             n_frames=1,
             hw=hw,
             lidar="exact",
             image_noise=image_noise,
             supersample=supersample,
+            name=f"viewpoint_{k:02d}",
+            true_poses=_place(room, camera, (hw[0], hw[1]), Random(f"viewpoint {seed} {k}")),
         )
-        room.name = f"viewpoint_{k:02d}"
-        room.true_poses = _place(room, Random(f"viewpoint {seed} {k}"))
-        room.poses = room.true_poses
-        views.append(room)
+        views.append(view)
     return views
 
 
-def _place(room: SyntheticRoom, draw: Random) -> Pose:
+def _place(room: int, camera: Camera, hw: tuple[int, int], draw: Random) -> Pose:
     """A place with some air around it, and a direction: ``T_world_from_cam`` (1), float64."""
-    solids = furnished_room(room.seed).solids
+    solids = furnished_room(room).solids
     small = (24, 32)
-    camera = resize(room.camera, room.hw, small)
+    camera = resize(camera, hw, small)
     while True:
         x, z = draw.uniform(LEFT + 0.5, RIGHT - 0.5), draw.uniform(FRONT + 0.4, BACK - 0.8)
         yaw, pitch = math.radians(draw.uniform(-180, 180)), math.radians(draw.uniform(-22, 4))

@@ -7,7 +7,6 @@ together here. Frames have B = 1; those with poses carry them in ``T_world_from_
 
 from dhtorch.testing.arkitscenes import write_arkitscenes
 from dhtorch.testing.ca1m import write_ca1m
-from dhtorch.testing.focal_stacks import write_ddff12, write_fod500, write_image_folder, write_light_field
 from dhtorch.testing.layouts import (
     write_calib_pair,
     write_counted_frames,
@@ -26,12 +25,8 @@ __all__ = [
     "write_ca1m",
     "write_calib_pair",
     "write_counted_frames",
-    "write_ddff12",
     "write_driving",
-    "write_fod500",
-    "write_image_folder",
     "write_lerobot",
-    "write_light_field",
     "write_named_frames",
     "write_npz_pair",
     "write_r3d",

@@ -15,7 +15,7 @@ from dhtorch.transform.adapters import (
 )
 from dhtorch.transform.extend_depth import ExtendDepth
 from dhtorch.transform.leaves import SampleError
-from dhtorch.transform.problems import Problem
+from dhtorch.transform.problems import SampleProblem
 from dhtorch.transform.tokens import CHANNELS, grid, patch_tokens
 from dhtorch.transform.views import Views
 
@@ -26,9 +26,9 @@ __all__ = [
     "ExtendedDataset",
     "ExtendedStream",
     "NumpyTransform",
-    "Problem",
     "RldsBatchTransform",
     "SampleError",
+    "SampleProblem",
     "Views",
     "collate_kept",
     "grid",

@@ -17,7 +17,7 @@ from dhtorch.methods import METHODS
 from dhtorch.pair import merge
 from dhtorch.records import NO_HINT, Estimate, PoseFit, Samples, TrackHint
 from dhtorch.transform.leaves import SampleError, find, to_tensor
-from dhtorch.transform.problems import Problem, Tally
+from dhtorch.transform.problems import SampleProblem, Tally
 from dhtorch.transform.tokens import CHANNELS, FITS, grid, patch_tokens
 from dhtorch.transform.views import Read, Views
 
@@ -131,7 +131,7 @@ class ExtendDepth(torch.nn.Module):
         if self.on_error == "flag" and hw is None:
             raise SampleError(f"{error} (and no image tells the size of its tokens: give tokens_hw)") from error
         warnings.warn(f"{'skipped' if self.on_error == 'skip' else 'flagged'}: {error}", stacklevel=3)
-        self.tally.add(torch.tensor([Problem.UNREADABLE]))
+        self.tally.add(torch.tensor([SampleProblem.UNREADABLE]))
         return None if self.on_error == "skip" or hw is None else self._joined(sample, self._blank(hw))
 
     def _answer(self, read: Read, seed: int | Tensor) -> dict[str, Tensor]:
@@ -150,8 +150,8 @@ class ExtendDepth(torch.nn.Module):
         )
         valid = found.source != Source.NONE
         xyz = cam.unproject(frame.camera, found.uv, found.depth)
-        problem = (~paired).int() * Problem.NO_SECOND_VIEW
-        problem = torch.where(frame.depth.flatten(1).amax(1) > 0, problem, Problem.NO_DEPTH)
+        problem = (~paired).int() * SampleProblem.NO_SECOND_VIEW
+        problem = torch.where(frame.depth.flatten(1).amax(1) > 0, problem, SampleProblem.NO_DEPTH)
         added = {
             "uv": found.uv,
             "xyz": torch.where(valid[..., None], xyz, 0.0),
@@ -169,7 +169,7 @@ class ExtendDepth(torch.nn.Module):
         }
         if bool(bad.any()):
             added = {key: x.masked_fill(bad.view(-1, *[1] * (x.ndim - 1)), 0) for key, x in added.items()}
-            problem = torch.where(bad, Problem.UNREADABLE, problem)
+            problem = torch.where(bad, SampleProblem.UNREADABLE, problem)
         return {**added, "problem": problem}
 
     def _seeds(self, sample: Mapping[str, Any], batch: int) -> int | Tensor:
@@ -194,7 +194,7 @@ class ExtendDepth(torch.nn.Module):
             out[key] = torch.zeros(1, *size, dtype=torch.bool)
         for key, size in {"source": (n,), "flag": (n,), "hole": (n,), "gate": (n,), "pose_code": ()}.items():
             out[key] = torch.zeros(1, *size, dtype=torch.int32)
-        return {**out, "problem": torch.full((1,), Problem.UNREADABLE, dtype=torch.int32)}
+        return {**out, "problem": torch.full((1,), SampleProblem.UNREADABLE, dtype=torch.int32)}
 
     def _joined(self, sample: Mapping[str, Any], added: Mapping[str, Tensor]) -> dict[str, Any]:
         # Copies of their own: a row of a shared table would be sent to the main process with the whole table.

@@ -12,7 +12,7 @@ from torch.utils.data import get_worker_info
 from dhtorch.codes import names
 
 
-class Problem:
+class SampleProblem:
     """Codes of ``problem``, the worst one of a sample."""
 
     NONE: Final = 0
@@ -29,7 +29,7 @@ class Tally:
     """Counts by problem, in memory that forked and spawned workers share, each writing to a row of its own."""
 
     def __init__(self) -> None:
-        self.counts = _shared(torch.zeros(_ROWS, len(names(Problem)), dtype=torch.int64))
+        self.counts = _shared(torch.zeros(_ROWS, len(names(SampleProblem)), dtype=torch.int64))
 
     def add(self, problem: Tensor) -> None:
         """Count the codes of some samples."""
@@ -40,7 +40,7 @@ class Tally:
     def report(self) -> dict[str, int]:
         """Number of samples by problem, all workers together."""
         total = self.counts.sum(0).tolist()
-        return {name.lower(): total[code] for code, name in names(Problem).items()}
+        return {name.lower(): total[code] for code, name in names(SampleProblem).items()}
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Tally:
         twin = copy.copy(self)

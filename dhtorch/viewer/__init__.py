@@ -1,7 +1,7 @@
 """``dhtorch view``: a result or a recording as something to look at.
 
 Pictures, depth, what became of every sample, tracks, cameras, recovered points with their sigma, and the gates along
-time. ``scene`` computes what there is to see, ``again`` takes an archived result back to it, ``points`` a PLY file;
+time. ``exhibit`` computes what there is to see, ``again`` takes an archived result back to it, ``points`` a PLY file;
 ``rrd`` hands it to Rerun (extra ``[view]``), ``html`` makes it one page that needs nothing but a browser.
 """
 
@@ -20,11 +20,12 @@ import torch
 
 from dhtorch import archive
 from dhtorch.data import FormatError
+from dhtorch.data.scene import scenes_of
 from dhtorch.studies.protocol import Progress, Settings
 from dhtorch.viewer import again, html, points, rrd
-from dhtorch.viewer.scene import Cloud, DepthMap, Scene, Shot, View, look
+from dhtorch.viewer.exhibit import Cloud, DepthMap, Exhibit, Picture, Shot, look
 
-__all__ = ["Cloud", "DepthMap", "Scene", "Shot", "View", "look", "run"]
+__all__ = ["Cloud", "DepthMap", "Exhibit", "Picture", "Shot", "look", "run"]
 
 
 def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:
@@ -57,7 +58,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     return 0
 
 
-def _archived(target: Path, settings: Mapping[str, Any], progress: Progress) -> Scene:
+def _archived(target: Path, settings: Mapping[str, Any], progress: Progress) -> Exhibit:
     """The scene of a result: computed again, or its points alone."""
     result = archive.read(target)
     folder = target if target.is_dir() else target.parent
@@ -79,23 +80,21 @@ def _archived(target: Path, settings: Mapping[str, Any], progress: Progress) -> 
 
 def _looked(
     parts: Mapping[str, Any], settings: Mapping[str, Any], cutoff: Callable[[str], float | None], progress: Progress
-) -> Scene:
+) -> Exhibit:
     """The chosen scene of a recording or several, computed; ``cutoff`` says by its name what is held back."""
-    data = parts["data"]
-    recordings = [data] if hasattr(data, "poses") else data
-    recording = _chosen(recordings, settings["scene"], lambda r: r.name)
+    chosen = _chosen(scenes_of(parts["data"]), settings["scene"], lambda scene: scene.name)
     dtype = getattr(torch, str(settings["dtype"]), None)
     if dtype not in (torch.float32, torch.float64):
         raise ValueError(f"dtype: found {settings['dtype']!r}, expected float32 or float64")
     if not isinstance(settings["most"], int) or settings["most"] < 1:
         raise ValueError(f"most: found {settings['most']!r}, expected a whole number of at least 1")
-    common = Settings(cutoff=cutoff(recording.name), seed=settings["seed"], device=settings["device"], dtype=dtype)
-    scene = look(recording, parts["method"], parts["pairs"], common, most=settings["most"], progress=progress)
-    limit = common.cutoff_of(recording)
+    common = Settings(cutoff=cutoff(chosen.name), seed=settings["seed"], device=settings["device"], dtype=dtype)
+    shown = look(chosen, parts["method"], parts["pairs"], common, most=settings["most"], progress=progress)
+    limit = common.cutoff_of(chosen)
     hidden = limit is not None and limit != float("inf")
     facts = {"samples": f"{parts['method'].n} in each pair"}
     facts["sensor"] = f"returns beyond {limit:g} m were held back" if hidden else "all returns were used"
-    return replace(scene, facts={**facts, **scene.facts})
+    return replace(shown, facts={**facts, **shown.facts})
 
 
 def _chosen(items: Sequence[Any], wanted: str | int | None, name: Any) -> Any:
@@ -110,7 +109,7 @@ def _chosen(items: Sequence[Any], wanted: str | int | None, name: Any) -> Any:
     raise ValueError(f"scene: found {wanted!r}, expected a number below {len(known)} or one of {', '.join(known[:12])}")
 
 
-def _show(scene: Scene, page: str | None, save: str | None, folder: Path) -> list[str]:
+def _show(scene: Exhibit, page: str | None, save: str | None, folder: Path) -> list[str]:
     """Write or open what is asked for; lines that say where."""
     said = []
     if page is None and save is None:

@@ -20,7 +20,7 @@ from dhtorch import archive
 #: Group of the settings → modules whose public functions it may name.
 NAMED = {
     "data": (
-        *("dhtorch.data", "dhtorch.data.rh20t_set", "dhtorch.stages.sample"),
+        *("dhtorch.data", "dhtorch.data.rh20t_set", "dhtorch.studies.focal.formats", "dhtorch.stages.sample"),
         *(f"dhtorch.synthetic.{name}" for name in ("recording", "stress", "viewpoints", "robot")),
     ),
     "pairs": ("dhtorch.data.pairs",),

@@ -18,7 +18,7 @@ import numpy as np
 from dhtorch import archive
 from dhtorch.codes import Gate, Hole, names, words
 from dhtorch.drawing import GATE_COLOURS, HOLE_COLOURS, RECOVERED, SENSOR, SILENT
-from dhtorch.viewer.scene import Cloud, Scene, Shot, View
+from dhtorch.viewer.exhibit import Cloud, Exhibit, Picture, Shot
 
 ENDINGS = (".html", ".htm")
 
@@ -36,7 +36,7 @@ _TYPES = {
 }
 
 
-def page(scene: Scene) -> str:
+def page(scene: Exhibit) -> str:
     """The scene as one page.
 
     Raises:
@@ -60,7 +60,7 @@ def page(scene: Scene) -> str:
     return "".join(filled)
 
 
-def write(path: Path, scene: Scene) -> Path:
+def write(path: Path, scene: Exhibit) -> Path:
     """Write the page.
 
     Raises:
@@ -70,7 +70,7 @@ def write(path: Path, scene: Scene) -> Path:
     return archive.replace_file(path, page(scene).encode("utf-8"))
 
 
-def _data(scene: Scene) -> dict[str, Any]:
+def _data(scene: Exhibit) -> dict[str, Any]:
     gates = [_code(code, name, GATE_COLOURS) for code, name in names(Gate).items() if code != Gate.ANSWER]
     outcomes = [("SENSOR", "sensor", SENSOR), ("ANSWER", "recovered", RECOVERED)]
     outcomes += [(name, words(name), GATE_COLOURS[code]) for code, name in names(Gate).items() if code != Gate.ANSWER]
@@ -104,7 +104,7 @@ def _shot(shot: Shot) -> dict[str, Any]:
     return made | {k: None if T is None else [float(x) for x in T[:3].ravel()] for k, T in poses.items()}
 
 
-def _view(view: View) -> dict[str, Any]:
+def _view(view: Picture) -> dict[str, Any]:
     facts = {"number": view.number, "time": view.time, "hw": list(view.hw), "f": list(view.f), "c": list(view.c)}
     return facts | {"jpeg": base64.b64encode(view.jpeg).decode("ascii")}
 

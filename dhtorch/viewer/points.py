@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from dhtorch.codes import Gate, Hole, Source
-from dhtorch.viewer.scene import Scene, Shot
+from dhtorch.viewer.exhibit import Exhibit, Shot
 
 #: Points of a file that are shown; of more, as many drawn at random.
 MOST_POINTS = 100_000
@@ -17,7 +17,7 @@ _NUMPY |= {"char": "i1", "int8": "i1", "short": "<i2", "int16": "<i2", "ushort":
 _NUMPY |= {"int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4"}
 
 
-def read(path: Path) -> Scene:
+def read(path: Path) -> Exhibit:
     """The points of a PLY file, as :func:`dhtorch.drawing.write_ply` writes it: no pictures, no tracks.
 
     Properties that are not there are taken to be recovered points without sigma and score.
@@ -46,7 +46,7 @@ def read(path: Path) -> Scene:
     samples |= {"uv_0": zero, "uv_1": zero, "tracked": np.zeros(n, bool), "candidate": np.zeros(n, bool)}
     samples |= {"gate": np.full(n, Gate.ANSWER, np.int32), "hole": hole.astype(np.int32)}
     samples |= dict.fromkeys(("parallax_deg", "residual_px", "error"), absent)
-    return Scene(path.name, [Shot(path.name, samples, np.eye(4))])
+    return Exhibit(path.name, [Shot(path.name, samples, np.eye(4))])
 
 
 def _read_ply(path: Path) -> np.ndarray:

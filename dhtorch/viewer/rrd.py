@@ -13,7 +13,7 @@ import numpy as np
 
 from dhtorch.codes import Gate, Source, names, words
 from dhtorch.drawing import GATE_COLOURS, RECOVERED, SENSOR, SILENT
-from dhtorch.viewer.scene import Cloud, Scene, Shot, View
+from dhtorch.viewer.exhibit import Cloud, Exhibit, Picture, Shot
 
 ENDINGS = (".rrd",)
 
@@ -24,7 +24,7 @@ SMALLEST, LARGEST = 0.004, 0.15
 SENSED = 100
 
 
-def save(path: Path, scene: Scene) -> Path:
+def save(path: Path, scene: Exhibit) -> Path:
     """Write the scene as an ``.rrd`` file.
 
     Raises:
@@ -41,7 +41,7 @@ def save(path: Path, scene: Scene) -> Path:
     return path
 
 
-def spawn(scene: Scene) -> None:
+def spawn(scene: Exhibit) -> None:
     """Show the scene in a viewer of its own.
 
     Raises:
@@ -80,7 +80,7 @@ def _blueprint() -> Any:
     return b.Blueprint(b.Horizontal(left, pictures, column_shares=[2, 1]), collapse_panels=True)
 
 
-def _log(rr: Any, stream: Any, scene: Scene) -> None:
+def _log(rr: Any, stream: Any, scene: Exhibit) -> None:
     classes = [(SENSED, "sensor", _rgb(SENSOR)), (Gate.ANSWER, "recovered", _rgb(RECOVERED))]
     classes += [(code, words(names(Gate)[code]), _rgb(colour)) for code, colour in GATE_COLOURS.items()]
     stream.log("/", rr.AnnotationContext(classes), static=True)
@@ -134,7 +134,7 @@ def _log_points(rr: Any, stream: Any, shot: Shot) -> None:
         stream.log(f"world/map/{name}", rr.Points3D(_moved(T, cloud.xyz), colors=cloud.rgb, radii=SMALLEST))
 
 
-def _log_views(rr: Any, stream: Any, shot: Shot, view_0: View, view_1: View) -> None:
+def _log_views(rr: Any, stream: Any, shot: Shot, view_0: Picture, view_1: Picture) -> None:
     s = shot.samples
     _log_camera(rr, stream, "anchor", shot.T_world_from_0, view_0)
     if shot.depth_map is not None:
@@ -159,7 +159,7 @@ def _log_views(rr: Any, stream: Any, shot: Shot, view_0: View, view_1: View) -> 
     stream.log("world/other/picture/samples", rr.Points2D(at_1[found], class_ids=classes[found], radii=2.0))
 
 
-def _log_camera(rr: Any, stream: Any, name: str, T: np.ndarray, view: View) -> None:
+def _log_camera(rr: Any, stream: Any, name: str, T: np.ndarray, view: Picture) -> None:
     h, w = view.jpeg_hw
     s = (w / view.hw[1], h / view.hw[0])
     c = [(view.c[k] + 0.5) * s[k] for k in range(2)]
@@ -170,7 +170,7 @@ def _log_camera(rr: Any, stream: Any, name: str, T: np.ndarray, view: View) -> N
     stream.log(f"world/{name}/picture", rr.EncodedImage(contents=view.jpeg, media_type="image/jpeg"))
 
 
-def _shown(view: View, uv: np.ndarray) -> np.ndarray:
+def _shown(view: Picture, uv: np.ndarray) -> np.ndarray:
     """Pixels of the full picture in those of the JPEG, where (0, 0) is the corner of the first."""
     (h, w), (H, W) = view.jpeg_hw, view.hw
     return (uv + 0.5) * np.array([w / W, h / H], uv.dtype)

@@ -22,6 +22,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dhtorch.data.scene import Given
 from dhtorch.evaluate import errors, holdout
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.lookup import round_half_up
@@ -60,7 +61,7 @@ class Scale(Record):
 
 
 def run(
-    recordings: Sequence[Any],
+    scenes: Sequence[Given],
     chosen: Mapping[str, Method],
     pairs: Pairs,
     settings: Settings,
@@ -73,7 +74,7 @@ def run(
     """Run the chosen method and the networks on the same pairs, samples and candidates.
 
     Args:
-        recordings, chosen, pairs, settings, progress: as :func:`dhtorch.studies.pair.run`; of the methods, the
+        scenes, chosen, pairs, settings, progress: as :func:`dhtorch.studies.pair.run`; of the methods, the
             first one is compared with.
         models: name → builder of a network (``device=`` → pair of frames → :class:`RelativeDepth`). A partial whose
             option ``weights`` is None is left out; ``constant`` has none.
@@ -108,7 +109,7 @@ def run(
             variants[f"{name}_{scale}"] = Variant(method, ask=asked, given=given)
             labels[f"{name}_{scale}"] = {"scale": scale, "metric": SCALES[scale], **_described(network)}
     whole = Protocol(variants, columns=_columns)
-    outcome = protocol.run(recordings, whole, pairs, settings, progress=progress)
+    outcome = protocol.run(scenes, whole, pairs, settings, progress=progress)
     _complete(outcome, ours, labels, settings.device)
     outcome.summary = summarise(outcome.rows, list(variants), list(whole.cohorts))
     return outcome.decide(QUESTION, EXPECTATION, *judge(outcome, ours, f"{JUDGED}_oracle"))
@@ -141,7 +142,6 @@ def ask(
     network: Once,
     scale_pixels: int,
     known: Frame,
-    sparse: bool,
     seed: int,
     trace: Trace,
     **_told: Any,
@@ -150,7 +150,7 @@ def ask(
     like = near.camera.f
     samples = method.look(near)
     relative, ms = network(near, other)
-    scale = fit_scale(relative, known, samples.uv, n_pixels=scale_pixels, sparse=sparse, seed=seed)
+    scale = fit_scale(relative, known, samples.uv, n_pixels=scale_pixels, seed=seed)
     nowhere = Pose(
         torch.full_like(like, torch.nan)[:, :1, None].expand(-1, 3, 3), like.new_full((len(like), 3), torch.nan)
     )
@@ -158,9 +158,7 @@ def ask(
     return to_estimate(relative, samples.uv, scale.factor)
 
 
-def fit_scale(
-    relative: RelativeDepth, known: Frame, samples_uv: Tensor, *, n_pixels: int, sparse: bool, seed: int
-) -> Scale:
+def fit_scale(relative: RelativeDepth, known: Frame, samples_uv: Tensor, *, n_pixels: int, seed: int) -> Scale:
     """Metres per unit: median ratio of known to relative depth over pixels that no sample reads.
 
     Image pixels are drawn from the seed, the same for all pairs. One whose pixel of the depth map lies within the
@@ -172,14 +170,13 @@ def fit_scale(
         known: the anchors with the depth that fixes the scale.
         samples_uv: (B, N, 2) px.
         n_pixels: pixels drawn.
-        sparse: most pixels of the depth map are empty.
         seed: of the pixels.
     """
     h, w = known.hw
     draws = torch.rand(n_pixels, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     uv = (draws * torch.tensor([w, h]) - 0.5).to(samples_uv).expand(samples_uv.shape[0], -1, -1)
-    true_depth = holdout.truth_at(known, uv, truth="raw", sparse=sparse).depth
-    reach = holdout.CLOSE_SPARSE - 1 if sparse else 0
+    true_depth = holdout.truth_at(known, uv, truth="raw").depth
+    reach = uv.new_zeros(1, 1) if known.sparse is None else (holdout.CLOSE_SPARSE - 1) * known.sparse[:, None]
     taken = _near_a_sample(known, uv, samples_uv, reach)
     depth, _ = read(relative, uv)
     use = (true_depth > 0) & depth.isfinite() & ~taken
@@ -212,11 +209,11 @@ def _has_weights(build: Callable[..., Network]) -> bool:
 def _given(batch: Batch, *, scale: str, seed: int) -> dict[str, Any]:
     """What fixes the scale: the truth of the anchor, or the returns that ours sees too."""
     known = batch.exact if scale == "oracle" else holdout.range_split(batch.anchor, batch.cutoff)
-    return {"known": known, "sparse": batch.recording.sparse, "seed": seed}
+    return {"known": known, "seed": seed}
 
 
-def _near_a_sample(frame: Frame, uv: Tensor, samples_uv: Tensor, reach: int) -> Tensor:
-    """Which of the pixels (B, M) lie, in the depth map, within ``reach`` pixels of one that a sample reads."""
+def _near_a_sample(frame: Frame, uv: Tensor, samples_uv: Tensor, reach: Tensor) -> Tensor:
+    """Which of the pixels (B, M) lie, in the depth map, within ``reach`` (B, 1) pixels of one that a sample reads."""
     size = (frame.depth.shape[-2], frame.depth.shape[-1])
     place = partial(cam.depth_pixels, frame.camera, frame.hw, frame.depth_camera, size)
     here, there = (round_half_up(place(x)) for x in (uv, samples_uv))

@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
+from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import compare
 from dhtorch.studies import protocol
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
@@ -39,7 +40,7 @@ BARS: dict[str, tuple[float, float, Callable[[float, float], bool]]] = {
 
 
 def run(
-    recordings: Sequence[Any],
+    scenes: Sequence[Given],
     chosen: Mapping[str, Method],
     pairs: Pairs,
     settings: Settings,
@@ -59,7 +60,7 @@ def run(
     three, by its stand-in.
 
     Args:
-        recordings, chosen, pairs, settings, progress: as :func:`dhtorch.studies.protocol.run`.
+        scenes, chosen, pairs, settings, progress: as :func:`dhtorch.studies.protocol.run`.
         methods: name → method; None = ``chosen``.
         reference: name of the method to compare with.
         once: methods that are shown for one seed and not compared.
@@ -78,9 +79,9 @@ def run(
         for name, method in methods.items()
         for k in range(1 if name in once else seeds)
     }
-    outcome = protocol.run(recordings, Protocol(variants), pairs, settings, progress=progress)
-    rooms = {r.name: getattr(r, "room", None) or r.name for r in recordings}
-    apart = {r.name for r in recordings if r.role is not None}
+    outcome = protocol.run(scenes, Protocol(variants), pairs, settings, progress=progress)
+    rooms = {scene.name: scene.place for scene in scenes_of(scenes)}
+    apart = {scene.name for scene in scenes_of(scenes) if scene.role is not None}
     found = {name: _by_scene(outcome, name, seeds, apart) for name in (reference, *compared)}
     fallback = stand_ins or {name: compared[0] for name in compared if methods[name].views > 1}
     judged = compare.method_ratios(found, reference=reference, rooms=rooms, fallback=fallback)
@@ -112,9 +113,9 @@ def _named(method: str, k: int) -> str:
     return method if k == 0 else f"{method}, seed {k}"
 
 
-def _views(pairs: Pairs, views: int, recording: Any) -> str | None:
+def _views(pairs: Pairs, views: int, scene: Scene) -> str | None:
     """Why a method of several views is not asked on a scene; None where it is."""
-    short = views > 1 and min((j - i for i, j in pairs(recording)), default=2) < 2
+    short = views > 1 and min((j - i for i, j in pairs(scene)), default=2) < 2
     return "fewer than 3 views" if short else None
 
 

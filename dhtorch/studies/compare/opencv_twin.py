@@ -10,8 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
+from dhtorch.data.scene import Given
 from dhtorch.studies import pair
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
 from dhtorch.studies.rows import Row
@@ -21,7 +21,7 @@ EXPECTATION = "On every scene median error and coverage of ours are at most 10 %
 
 
 def run(
-    recordings: Sequence[Any],
+    scenes: Sequence[Given],
     chosen: Mapping[str, Method],
     pairs: Pairs,
     settings: Settings,
@@ -35,7 +35,7 @@ def run(
     """Run several methods side by side on the same pairs, for several truth tests.
 
     Args:
-        recordings, chosen, pairs, settings, progress: as :func:`dhtorch.studies.pair.run`.
+        scenes, chosen, pairs, settings, progress: as :func:`dhtorch.studies.pair.run`.
         methods: name → method; None = ``chosen``. The first that is not the reference is compared with it.
         reference: name of the method to compare with.
         truths: truth tests to report; the verdict looks at the last.
@@ -48,7 +48,7 @@ def run(
     if reference not in methods or len(methods) < 2:
         raise ValueError(f"experiment.methods: found {', '.join(methods)}, expected {reference} and one more")
     ours = next(name for name in methods if name != reference)
-    outcome = pair.run(recordings, methods, pairs, replace(settings, truth=tuple(truths)), progress=progress)
+    outcome = pair.run(scenes, methods, pairs, replace(settings, truth=tuple(truths)), progress=progress)
     compared, worse = compare(outcome.rows, ours, reference, truths[-1], tolerance)
     outcome.question, outcome.expectation = QUESTION, EXPECTATION
     if not compared:

@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
+from dhtorch.data.scene import Given
 from dhtorch.methods import LEVELS
 from dhtorch.studies import protocol
 from dhtorch.studies.compare import method_comparison
@@ -53,7 +54,7 @@ STAND_INS = {"+ views": "paper", "window": "map"}
 
 
 def run(
-    recordings: Sequence[Any],
+    scenes: Sequence[Given],
     chosen: Mapping[str, Method],
     pairs: Pairs,
     settings: Settings,
@@ -69,7 +70,7 @@ def run(
     ``<variant>.extra_ms``, what of it the paper's does not take.
 
     Args:
-        recordings, chosen, pairs, settings, progress: as :func:`dhtorch.studies.protocol.run`.
+        scenes, chosen, pairs, settings, progress: as :func:`dhtorch.studies.protocol.run`.
         methods: ``paper``, ``map`` and ``window``; None = ``chosen``.
         seeds: how many, from the job's own upwards.
 
@@ -81,7 +82,7 @@ def run(
         raise ValueError(f"experiment.methods: found {', '.join(methods)}, expected {', '.join(sorted(missing))} too")
     variants = taken_apart(methods["paper"], methods["map"], methods["window"])
     options: dict[str, Any] = {"once": (), "seeds": seeds, "stand_ins": STAND_INS, "progress": progress}
-    outcome = method_comparison.run(recordings, {}, pairs, settings, methods=variants, **options)
+    outcome = method_comparison.run(scenes, {}, pairs, settings, methods=variants, **options)
     cost = {name: _pair_ms(outcome, name) for name in variants}
     for name, ms in cost.items():
         more = None if ms is None or cost["paper"] is None else ms - cost["paper"]

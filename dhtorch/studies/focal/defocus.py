@@ -22,6 +22,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dhtorch.data.recording import Recording
+from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import bootstrap, holdout
 from dhtorch.evaluate.correlation import pearson, spearman
 from dhtorch.geometry.thin_lens import GAUSSIAN_OF_DISC, Lens, spot_diameter
@@ -30,6 +32,7 @@ from dhtorch.studies.focal.blur import Blur, inverse_depth, local_blur, side_by_
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
 from dhtorch.studies.rows import Row, median
 from dhtorch.studies.screening import Item, screen
+from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.synthetic.thin_lens import lens_of, photograph
 
 QUESTION = "How much depth is there in the defocus of a single picture?"
@@ -52,7 +55,7 @@ WEAK, USEFUL, KEPT = 0.5, 0.4, 0.5
 
 
 def run(
-    recordings: Sequence[Any],
+    scenes: Sequence[Given],
     methods: Mapping[str, Method],
     pairs: Pairs,
     settings: Settings,
@@ -74,7 +77,7 @@ def run(
     The two ambiguities stand apart in the summary: ``blank_wall.*`` and ``two_sides.*``, see :func:`ambiguities`.
 
     Args:
-        recordings, settings, progress: as :func:`dhtorch.studies.protocol.run`. One with exact depth
+        scenes, settings, progress: as :func:`dhtorch.studies.protocol.run`. One with exact depth
             (``lidar`` is "exact") is photographed through the lens; of any other the first frame is taken as it is.
         methods, pairs: not used.
         focal_length_m, f_number: of the lens; its pixel pitch is such that the picture keeps its field of view. What
@@ -89,25 +92,25 @@ def run(
     """
     optics = {"focal_length_m": focal_length_m, "f_number": f_number}
 
-    def ask(recording: Any, item: Item) -> dict[str, Row]:
-        frame = recording[item[0]].to(settings.dtype).to(settings.device)
+    def ask(scene: Scene, item: Item) -> dict[str, Row]:
+        frame = scene.recording[item[0]].to(settings.dtype).to(settings.device)
         uv = _grid(frame.hw, stride_px, frame.camera.f)
-        if not is_exact(recording):
+        if not is_exact(scene.recording):
             blur = local_blur(frame.image, noise=noise, window_px=window_px)
-            return {"natural": _unsigned(frame, uv, blur, recording.sparse)}
+            return {"natural": _unsigned(frame, uv, blur)}
         lens = lens_of(float(frame.camera.f[0, 0]), **optics).to(settings.dtype)
         return _through_lens(
             frame, uv, lens, colour=axial_colour_dpt, noise=noise, window_px=window_px, seed=settings.seed
         )
 
-    outcome = screen(recordings, lambda _r: [(0, 0)], ask, VARIANTS, truth="full", progress=progress)
+    outcome = screen(scenes_of(scenes), lambda _r: [(0, 0)], ask, VARIANTS, truth="full", progress=progress)
     outcome.summary |= {k: _entry(v) for k, v in ambiguities(noise=noise, window_px=window_px).items()}
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 
 
-def is_exact(recording: Any) -> bool:
+def is_exact(recording: Recording) -> bool:
     """Whether every pixel of a recording has exact depth, so that a lens can be put in front of it."""
-    return getattr(recording, "lidar", None) == "exact"
+    return isinstance(recording, SyntheticRoom) and recording.lidar == "exact"
 
 
 def verdict(outcome: Outcome) -> tuple[bool | None, str]:
@@ -209,8 +212,8 @@ def _through_lens(
 class _Sites:
     """The candidates of a picture: pixels of the grid whose depth passes the truth test."""
 
-    def __init__(self, frame: Frame, uv: Tensor, sparse: bool = False) -> None:
-        truth = holdout.truth_at(frame, uv, sparse=sparse)
+    def __init__(self, frame: Frame, uv: Tensor) -> None:
+        truth = holdout.truth_at(frame, uv)
         self.index = (uv[0, :, 1].long(), uv[0, :, 0].long())
         self.candidate, self.depth = truth.ok[0], truth.depth[0].double()
 
@@ -250,8 +253,8 @@ class _Sites:
         return float(self.at(right)[use].double().mean()) if bool(use.any()) else None
 
 
-def _unsigned(frame: Frame, uv: Tensor, blur: Blur, sparse: bool) -> Row:
-    return {"rho_abs": _Sites(frame, uv, sparse).rho(blur.valid, blur.sigma)}
+def _unsigned(frame: Frame, uv: Tensor, blur: Blur) -> Row:
+    return {"rho_abs": _Sites(frame, uv).rho(blur.valid, blur.sigma)}
 
 
 def _grid(hw: tuple[int, int], stride: int, like: Tensor) -> Tensor:

@@ -21,6 +21,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import bootstrap
 from dhtorch.evaluate.correlation import pearson
 from dhtorch.records import Frame
@@ -48,7 +49,7 @@ EDGE = 0.05
 
 
 def run(
-    recordings: Sequence[Any],
+    scenes: Sequence[Given],
     methods: Mapping[str, Method],
     pairs: Pairs,
     settings: Settings,
@@ -68,7 +69,7 @@ def run(
     relative change against ``bilinear``) and, in the scene's row, ``mean_rel_ratio`` against ``bilinear``.
 
     Args:
-        recordings, settings, progress: as :func:`dhtorch.studies.protocol.run`. Depth must be dense and of the
+        scenes, settings, progress: as :func:`dhtorch.studies.protocol.run`. Depth must be dense and of the
             picture's size; other recordings keep a row that says so.
         methods, pairs: not used.
         factor: every how many pixels a return stays; odd, so that it is the middle of its square.
@@ -84,21 +85,22 @@ def run(
     if factor < 3 or factor % 2 == 0:
         raise ValueError(f"experiment.factor: found {factor}, expected an odd number from 3")
 
-    def items(recording: Any) -> list[Item]:
-        return [(i, i) for i in range(0, len(recording), stride)] if not recording.sparse else []
+    def items(scene: Scene) -> list[Item]:
+        n = len(scene.recording)
+        return [(i, i) for i in range(0, n, stride)] if not scene.recording.sparse else []
 
-    def ask(recording: Any, item: Item) -> dict[str, Row]:
-        frame = recording[item[0]].to(settings.dtype).to(settings.device)
+    def ask(scene: Scene, item: Item) -> dict[str, Row]:
+        frame = scene.recording[item[0]].to(settings.dtype).to(settings.device)
         if frame.depth.shape[-2:] != frame.hw:
             return {}
         draw = torch.Generator().manual_seed(settings.seed)
         picture, spread = frame.image, 0.0
-        if is_exact(recording):
+        if is_exact(scene.recording):
             lens = lens_of(float(frame.camera.f[0, 0]), focal_length_m=focal_length_m, f_number=f_number)
             picture, spread = _taken(frame, lens.to(settings.dtype), noise, draw), sensor_noise
         return _frame(picture, frame.depth, factor, spread, noise, draw)
 
-    outcome = screen(recordings, items, ask, VARIANTS, truth="left_out", progress=progress)
+    outcome = screen(scenes_of(scenes), items, ask, VARIANTS, truth="left_out", progress=progress)
     _add_ratios(outcome)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 

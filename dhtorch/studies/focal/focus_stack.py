@@ -24,13 +24,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dhtorch.data.stacks import FocalStack, Stacks
+from dhtorch.data.scene import Given, Scene
 from dhtorch.evaluate import bootstrap
 from dhtorch.evaluate.correlation import pearson, spearman
 from dhtorch.geometry.lookup import luma
 from dhtorch.records import Frame
 from dhtorch.studies.focal.defocus import is_exact
 from dhtorch.studies.focal.sharpness import align, depth_at, sharpest, sharpness
+from dhtorch.studies.focal.stacks import FocalStack, Stacks
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
 from dhtorch.studies.rows import Row, mean
 from dhtorch.studies.screening import Item, screen
@@ -56,8 +57,8 @@ KEPT = 0.25
 
 
 @dataclass(frozen=True, eq=False)
-class _Scene:
-    """A scene of a data set: one stack, or all that show the same room."""
+class _StackRoom:
+    """What the stacks of a data set show: one stack, or all that show the same room."""
 
     name: str
     stacks: Stacks
@@ -66,7 +67,7 @@ class _Scene:
 
 
 def run(
-    recordings: Sequence[Any],
+    scenes: Sequence[Stacks | Given],
     methods: Mapping[str, Method],
     pairs: Pairs,
     settings: Settings,
@@ -88,7 +89,7 @@ def run(
     depth. Without depth: ``order_corr``, ``halves_corr``, ``motion_px``, see :func:`without_truth`.
 
     Args:
-        recordings, settings, progress: as :func:`dhtorch.studies.protocol.run`; recordings with exact depth
+        scenes, settings, progress: as :func:`dhtorch.studies.protocol.run`; recordings with exact depth
             (``lidar`` is "exact"; their first frame), or focal stacks.
         methods, pairs: not used.
         measures: of sharpness; the first decides.
@@ -107,23 +108,23 @@ def run(
         raise ValueError(f"experiment.slices: found {slices}, expected at least 2")
     ask_maps = partial(_numbers, measures=measures, window_px=window_px, stride=stride_px)
 
-    def ask(scene: Any, item: Item) -> dict[str, Row]:
-        if isinstance(scene, _Scene):
+    def ask(scene: _StackRoom | Scene, item: Item) -> dict[str, Row]:
+        if isinstance(scene, _StackRoom):
             stack = _sorted(scene.stacks[item[0]].to(settings.dtype).to(settings.device))
             if stack.depth is None or stack.focus_m is None:
                 return without_truth(stack, measures[0], window_px)
             taken = {"given": stack.images, "given_aligned": align(stack.images)[0]}
             return _asked(taken, stack.focus_m, stack.depth, ask_maps, measures)
-        frame = scene[0].to(settings.dtype).to(settings.device)
+        frame = scene.recording[0].to(settings.dtype).to(settings.device)
         steps = torch.linspace(1 / FOCUS[0], 1 / FOCUS[1], slices, dtype=settings.dtype)
         lens = {"focal_length_m": focal_length_m, "f_number": f_number}
         made = render(frame, 1 / steps[None], lens, settings.seed)
         return _asked(made, 1 / steps[None], frame.depth, ask_maps, measures)
 
-    scenes = [scene for recording in recordings for scene in _scenes(recording, max_stacks)]
+    rooms = [room for given in scenes for room in _rooms(given, max_stacks)]
     names = [c if m == measures[0] else f"{c}, {m}" for c in (*RENDERED, *GIVEN) for m in measures]
-    wanted = _wanted(scenes, names)
-    outcome = screen(scenes, _items, ask, wanted, truth="full", whole=_flips, progress=progress)
+    wanted = _wanted(rooms, names)
+    outcome = screen(rooms, _items, ask, wanted, truth="full", whole=_flips, progress=progress)
     for name in wanted:
         flips = [row.get("flip_share") for row in outcome.scenes(name).values()]
         entry = bootstrap.interval(flips, statistic="mean")._asdict() | {"unit": "1"}
@@ -273,12 +274,12 @@ def _numbers(
     }
 
 
-def _items(scene: Any) -> list[Item]:
+def _items(scene: _StackRoom | Scene) -> list[Item]:
     """The stacks of a scene; the first frame of a recording."""
-    return [(i, i) for i in scene.indices] if isinstance(scene, _Scene) else [(0, 0)]
+    return [(i, i) for i in scene.indices] if isinstance(scene, _StackRoom) else [(0, 0)]
 
 
-def _flips(_scene: Any, found: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
+def _flips(_scene: _StackRoom | Scene, found: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
     """Variant → share of a scene's stacks whose sign is flipped; the median of yes and no would not say it."""
     said: dict[str, list[float]] = {}
     for answer in found:
@@ -287,17 +288,18 @@ def _flips(_scene: Any, found: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
     return {variant: {"flip_share": mean(shares)} for variant, shares in said.items() if shares}
 
 
-def _scenes(recording: Any, most: int) -> list[Any]:
-    """A recording with exact depth, or every scene of a data set with those of its stacks that were chosen."""
-    if isinstance(recording, Stacks):
-        chosen = set(torch.linspace(0, len(recording) - 1, min(most, len(recording))).round().int().tolist())
-        rooms = {s: tuple(i for i in all_ if i in chosen) for s, all_ in recording.by_scene().items()}
-        single = len(recording) == 1
-        label = recording.name if recording.root is None or not single else _folder(recording)
-        return [_Scene(label if single else f"{label}/{s}", recording, stacks) for s, stacks in rooms.items() if stacks]
-    if not is_exact(recording):
-        raise ValueError(f"focus_stack: {recording.name} expected focal stacks, or a recording with exact depth")
-    return [recording]
+def _rooms(given: Stacks | Given, most: int) -> list[_StackRoom | Scene]:
+    """A scene with exact depth, or every room of a data set with those of its stacks that were chosen."""
+    if isinstance(given, Stacks):
+        chosen = set(torch.linspace(0, len(given) - 1, min(most, len(given))).round().int().tolist())
+        rooms = {s: tuple(i for i in all_ if i in chosen) for s, all_ in given.by_scene().items()}
+        single = len(given) == 1
+        label = given.name if given.root is None or not single else _folder(given)
+        return [_StackRoom(label if single else f"{label}/{s}", given, stacks) for s, stacks in rooms.items() if stacks]
+    scene = Scene.of(given)
+    if not is_exact(scene.recording):
+        raise ValueError(f"focus_stack: {scene.name} expected focal stacks, or a recording with exact depth")
+    return [scene]
 
 
 def _folder(stacks: Stacks) -> str:
@@ -306,9 +308,9 @@ def _folder(stacks: Stacks) -> str:
     return parts[-1] if not parts[-1].isdecimal() else "/".join(parts)
 
 
-def _wanted(scenes: Sequence[Any], names: Sequence[str]) -> list[str]:
+def _wanted(scenes: Sequence[_StackRoom | Scene], names: Sequence[str]) -> list[str]:
     """The variants that these scenes can have."""
-    kinds = {isinstance(s, _Scene) for s in scenes}
+    kinds = {isinstance(s, _StackRoom) for s in scenes}
     return [n for n in names if (n.split(",")[0] in GIVEN) in kinds]
 
 

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import bootstrap, holdout
 from dhtorch.evaluate.correlation import pearson, spearman
 from dhtorch.records import Frame, TrackHint
@@ -59,7 +60,7 @@ class Arm(NamedTuple):
 
 
 def run(
-    recordings: Sequence[Any],
+    scenes: Sequence[Given],
     methods: Mapping[str, Method],
     pairs: Pairs,
     settings: Settings,
@@ -84,7 +85,7 @@ def run(
     texture whose return passes the truth test. Nothing is hidden from anyone.
 
     Args:
-        recordings, pairs, settings, progress: as :func:`dhtorch.studies.protocol.run`.
+        scenes, pairs, settings, progress: as :func:`dhtorch.studies.protocol.run`.
         methods: name → method; of the first the seats 2 to 4 are asked, at as many places as it has samples.
         window: of the correlation, px along the arm.
         max_lag_share: farthest shift looked for, share of the image width.
@@ -98,14 +99,14 @@ def run(
     """
     method = next(iter(methods.values()))
 
-    def ask(recording: Any, item: Item) -> dict[str, Row]:
-        views = [recording[k].to(settings.dtype).to(settings.device) for k in item]
+    def ask(scene: Scene, item: Item) -> dict[str, Row]:
+        views = [scene.recording[k].to(settings.dtype).to(settings.device) for k in item]
         lag = max(2, round(max_lag_share * views[0].hw[1]))
         arms = partial(arms_of, turns=turns, foveation=foveation, gaze=gaze, round_arms=round_arms)
         correlated = partial(correlate, window=window, max_lag=lag, min_peak=min_peak)
-        return _pair(recording, method, views[0], views[1], correlated=correlated, blur_px=blur_px, wind=arms)
+        return _pair(scene.hint, method, views[0], views[1], correlated=correlated, blur_px=blur_px, wind=arms)
 
-    outcome = screen(recordings, pairs, ask, VARIANTS, truth="full", progress=progress)
+    outcome = screen(scenes_of(scenes), pairs, ask, VARIANTS, truth="full", progress=progress)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 
 
@@ -162,7 +163,7 @@ def _even(uv: Tensor, turn: Tensor, like: Tensor) -> Arm:
 
 
 def _pair(
-    recording: Any, method: Method, frame_0: Frame, frame_1: Frame, *, correlated: Any, blur_px: float, wind: Any
+    hint: TrackHint, method: Method, frame_0: Frame, frame_1: Frame, *, correlated: Any, blur_px: float, wind: Any
 ) -> dict[str, Row]:
     """Variant → numbers of one pair."""
     n = method.n
@@ -173,9 +174,9 @@ def _pair(
     signals = [[read_arm(f.image, a.uv, blur_px=blur_px) for a in arms] for f in (frame_0, frame_1)]
 
     samples = method.look_at(frame_0, uv)
-    truth = holdout.truth_at(frame_0, samples.uv, sparse=recording.sparse)
+    truth = holdout.truth_at(frame_0, samples.uv)
     candidate = holdout.candidates(samples, truth, 0.0).ok[0]
-    tracks = method.track(frame_0.image, frame_1.image, samples.uv, hint=TrackHint.of(recording))
+    tracks = method.track(frame_0.image, frame_1.image, samples.uv, hint=hint)
     flow = (tracks.uv_1 - tracks.uv_0)[0]
 
     own = [_against(signals, arms, sites, a=k, b=k, step=0.0, correlated=correlated) for k in (0, 1)]

@@ -13,12 +13,12 @@ What would refute it: on half of the scenes the hole rate does not rise.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from dhtorch.codes import Hole
+from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import bootstrap
 from dhtorch.records import Samples
 from dhtorch.stages.sample import vogel
@@ -36,7 +36,7 @@ TRUTH = "sensor"
 
 
 def run(
-    recordings: Sequence[Any],
+    scenes: Sequence[Given],
     methods: Mapping[str, Method],
     pairs: Pairs,
     settings: Settings,
@@ -54,7 +54,7 @@ def run(
     return.
 
     Args:
-        recordings, settings, progress: as :func:`dhtorch.studies.protocol.run`.
+        scenes, settings, progress: as :func:`dhtorch.studies.protocol.run`.
         methods: name → method; seats 1 to 3 of the first are asked. Its sampler must have a ``gaze``.
         pairs: not used.
         stride: every how many frames.
@@ -73,11 +73,11 @@ def run(
     if stride < 1:
         raise ValueError(f"hole_attention: stride is {stride}, expected at least 1")
 
-    def items(recording: Any) -> list[Item]:
-        return [(i, i) for i in range(0, len(recording), stride)]
+    def items(scene: Scene) -> list[Item]:
+        return [(i, i) for i in range(0, len(scene.recording), stride)]
 
-    def ask(recording: Any, item: Item) -> dict[str, Row]:
-        frame = recording[item[0]].to(settings.dtype).to(settings.device)
+    def ask(scene: Scene, item: Item) -> dict[str, Row]:
+        frame = scene.recording[item[0]].to(settings.dtype).to(settings.device)
         before = look(method, frame)
         hole = before.hole != Hole.NONE
         cluster = largest_cluster(before.uv, hole, neighbours=neighbours)
@@ -87,7 +87,7 @@ def run(
             looked["attention"] = look(_gazing(method, cluster.gaze[0]), frame)
         return {v: _count(looked[v], before, cluster, frame.hw) for v in VARIANTS if v in looked}
 
-    outcome = screen(recordings, items, ask, VARIANTS, truth=TRUTH, progress=progress)
+    outcome = screen(scenes_of(scenes), items, ask, VARIANTS, truth=TRUTH, progress=progress)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 
 

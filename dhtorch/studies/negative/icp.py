@@ -17,18 +17,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
 
+from dhtorch.data.recording import Recording
+from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import bootstrap
-from dhtorch.geometry import cells, se3
+from dhtorch.geometry import se3, sparse_grid
 from dhtorch.records import Frame, Pose
 from dhtorch.studies.negative.registration import Registration, normals, register
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
 from dhtorch.studies.rows import Row
 from dhtorch.studies.screening import Item, paired, screen
+from dhtorch.synthetic.recording import SyntheticRoom
 
 QUESTION = "Does ICP between independently sampled sparse sets add anything to a good device pose?"
 EXPECTATION = "No: it covers fewer voxels than the pose alone; without a pose it ends nearer to the truth than nothing."
@@ -43,7 +45,7 @@ MIN_POINTS = 16
 
 
 def run(
-    recordings: Sequence[Any],
+    scenes: Sequence[Given],
     methods: Mapping[str, Method],
     pairs: Pairs,
     settings: Settings,
@@ -70,7 +72,7 @@ def run(
     reference, its drift zero by definition, and where it is loose some of ICP's drift is the reference's own.
 
     Args:
-        recordings, settings, progress: as :func:`dhtorch.studies.protocol.run`. Scenes without a trajectory or with
+        scenes, settings, progress: as :func:`dhtorch.studies.protocol.run`. Scenes without a trajectory or with
             depth in one frame only have nothing to ask.
         methods: name → method; of the first the seats 1 and 2 are asked, its sampler with another gaze in every frame.
         pairs: not used: links follow the recording, evenly.
@@ -85,8 +87,8 @@ def run(
     method = next(iter(methods.values())).replace(n=n)
     worlds: dict[str, _Chain] = {}
 
-    def ask(recording: Any, item: Item) -> dict[str, Row]:
-        chain = worlds.setdefault(recording.name, _Chain(recording, method, settings, voxel))
+    def ask(scene: Scene, item: Item) -> dict[str, Row]:
+        chain = worlds.setdefault(scene.name, _Chain(scene.recording, method, settings, voxel))
         if not all(chain.cloud(k)[0].isfinite().all(-1).sum() >= MIN_POINTS for k in item):
             return {}
         starts = {"good": chain.relative(item), "none": se3.identity(1, chain.cloud(item[0]).double())}
@@ -103,14 +105,14 @@ def run(
                 found[source + solver] = _link(chain, item, T, fit, sure)
         return found
 
-    def whole(recording: Any, found: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
-        chain = worlds.pop(recording.name, None)
+    def whole(scene: Scene, found: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
+        chain = worlds.pop(scene.name, None)
         return {v: chain.summary(v) for v in VARIANTS} if chain and any(found) else {}
 
-    def items(recording: Any) -> list[Item]:
-        return chain_of(recording, links)
+    def items(scene: Scene) -> list[Item]:
+        return chain_of(scene.recording, links)
 
-    outcome = screen(recordings, items, ask, VARIANTS, truth=TRUTH, whole=whole, progress=progress)
+    outcome = screen(scenes_of(scenes), items, ask, VARIANTS, truth=TRUTH, whole=whole, progress=progress)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 
 
@@ -134,7 +136,7 @@ def verdict(outcome: Outcome) -> tuple[bool | None, str]:
     return fewer > len(covered) / 2 and nearer > len(lost) / 2, why
 
 
-def chain_of(recording: Any, links: int) -> list[Item]:
+def chain_of(recording: Recording, links: int) -> list[Item]:
     """Consecutive frames, evenly spread; none without a trajectory.
 
     Raises:
@@ -152,15 +154,16 @@ def chain_of(recording: Any, links: int) -> list[Item]:
 class _Chain:
     """The sparse sets of a recording, its trajectory, and where each variant has put the frames so far."""
 
-    def __init__(self, recording: Any, method: Method, settings: Settings, voxel: float) -> None:
+    def __init__(self, recording: Recording, method: Method, settings: Settings, voxel: float) -> None:
         self.recording, self.method, self.settings = recording, method, settings
         self.clouds: dict[int, Tensor] = {}
         self.placed: dict[str, dict[int, tuple[Pose, bool]]] = {v: {} for v in VARIANTS}
         depth = self.cloud(0)[0, :, 2]
         self.scale = float(depth[depth.isfinite()].median()) if bool(depth.isfinite().any()) else 1.0  # m
         self.voxel = voxel * self.scale
-        self.poses = recording.poses
-        self.true_poses = getattr(recording, "true_poses", recording.poses)
+        assert recording.poses is not None  # else it has no links
+        self.poses: Pose = recording.poses
+        self.true_poses: Pose = recording.true_poses if isinstance(recording, SyntheticRoom) else recording.poses
 
     def cloud(self, i: int) -> Tensor:
         """Points (1, n, 3) that frame ``i`` drew for itself."""
@@ -205,7 +208,7 @@ class _Chain:
     def voxels(self, placed: Mapping[int, tuple[Pose, bool]], sure_only: bool) -> Tensor:
         """Numbers (V,) of the cells that the points of the frames fall into."""
         points = [se3.apply(T, self.cloud(i).double())[0] for i, (T, sure) in placed.items() if sure or not sure_only]
-        return cells.occupied(torch.cat(points), self.voxel)
+        return sparse_grid.occupied(torch.cat(points), self.voxel)
 
     def summary(self, variant: str) -> Row:
         """What a variant's chain covers and where it ends."""
@@ -220,7 +223,7 @@ class _Chain:
             "n_voxels": len(covered),
             "voxels_vs_pose": len(covered) / max(len(alone), 1),
             "n_voxels_all": len(self.voxels(placed, sure_only=False)),
-            "right_share": float(cells.near(covered, real).double().mean()) if len(covered) else None,
+            "right_share": float(sparse_grid.near(covered, real).double().mean()) if len(covered) else None,
             "confident_share": sum(links) / len(links),
             "drift_deg": drift[0],
             "drift_rel": drift[1] / self.scale,

@@ -11,8 +11,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
+from dhtorch.data.scene import Given
 from dhtorch.stages.sample import grid, vogel
 from dhtorch.studies import protocol
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
@@ -22,7 +22,7 @@ EXPECTATION = "No change of a single part lowers the median error by more than a
 
 
 def run(
-    recordings: Sequence[Any],
+    scenes: Sequence[Given],
     methods: Mapping[str, Method],
     pairs: Pairs,
     settings: Settings,
@@ -39,7 +39,7 @@ def run(
     its error to the method's.
 
     Args:
-        recordings, pairs, settings, progress: as :func:`dhtorch.studies.protocol.run`.
+        scenes, pairs, settings, progress: as :func:`dhtorch.studies.protocol.run`.
         methods: name → method; the first is taken apart.
         n: numbers of samples.
         windows: sides of the tracking window, px.
@@ -55,9 +55,9 @@ def run(
         **{other: m for other, m in (others or {}).items() if other != name},
     }
     variants = {k: Variant(m) for k, m in changed.items()}
-    main = protocol.run(recordings, Protocol(variants), pairs, settings, progress=progress)
+    main = protocol.run(scenes, Protocol(variants), pairs, settings, progress=progress)
     near = protocol.run(
-        recordings,
+        scenes,
         Protocol({"cutoff x0.5": Variant(method)}),
         pairs,
         replace(settings, cutoff_factor=0.5),

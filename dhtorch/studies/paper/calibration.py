@@ -11,7 +11,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from dhtorch.evaluate import bootstrap, calibrate, errors, risk
+from dhtorch.data.scene import Given
+from dhtorch.evaluate import bootstrap, errors, reliability, risk
 from dhtorch.studies import protocol
 from dhtorch.studies.cohorts import HeldOut, everything
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
@@ -22,7 +23,7 @@ EXPECTATION = "It orders (AURC below the mean risk) without being calibrated (EC
 
 
 def run(
-    recordings: Sequence[Any],
+    scenes: Sequence[Given],
     methods: Mapping[str, Method],
     pairs: Pairs,
     settings: Settings,
@@ -37,17 +38,17 @@ def run(
     adds ``<method>.ece_pooled``: all scenes in one reliability table, each of equal weight.
 
     Args:
-        recordings, methods, pairs, settings, progress: as :func:`dhtorch.studies.protocol.run`.
+        scenes, methods, pairs, settings, progress: as :func:`dhtorch.studies.protocol.run`.
         thresholds: on the score.
 
     Source: paper, "Calibration" and the figure on selective risk–coverage.
     """
     split = Protocol({name: Variant(m) for name, m in methods.items()})
-    parts = [protocol.run(recordings, split, pairs, settings, progress=progress)]
+    parts = [protocol.run(scenes, split, pairs, settings, progress=progress)]
     for name, method in methods.items():
         held = HeldOut(method, settings.seed)
         asked = Protocol({name: held.variant()}, {"heldout": held.heldout}, everything)
-        parts.append(protocol.run(recordings, asked, pairs, settings, progress=progress))
+        parts.append(protocol.run(scenes, asked, pairs, settings, progress=progress))
     outcome = protocol.join(parts)
     for row in outcome.rows:
         key = (row["scene"], row["method"], row["truth"])
@@ -84,6 +85,6 @@ def _at_thresholds(points: errors.Points, thresholds: Sequence[float]) -> Row:
 def _pooled(outcome: Outcome, method: str) -> dict[str, Any]:
     apart = {r["scene"] for r in outcome.rows if r.get("role")}
     scenes = [p for (s, m, t), p in outcome.points.items() if (m, t) == (method, "full") and s not in apart]
-    value = calibrate.measure(scenes)["ece"]
+    value = reliability.measure(scenes)["ece"]
     entry = {"value": value, "low": None, "high": None, "n": len(scenes), "unit": "1"}
     return {f"{method}.ece_pooled": entry}

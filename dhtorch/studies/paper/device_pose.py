@@ -13,8 +13,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any
 
+from dhtorch.data.scene import Given
 from dhtorch.geometry import se3
 from dhtorch.studies import protocol
 from dhtorch.studies.cohorts import HeldOut, device_fit, everything, has_trajectory, trajectory
@@ -26,7 +26,7 @@ EXPECTATION = "No: depth correlates with truth better, and errs less, under the 
 
 
 def run(
-    recordings: Sequence[Any],
+    scenes: Sequence[Given],
     methods: Mapping[str, Method],
     pairs: Pairs,
     settings: Settings,
@@ -49,7 +49,7 @@ def run(
         "anchored": split.variant(),
     }
     asked = Protocol(variants, {"heldout": split.heldout}, everything, disagreement)
-    outcome = protocol.run(recordings, asked, pairs, settings, progress=progress)
+    outcome = protocol.run(scenes, asked, pairs, settings, progress=progress)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 
 

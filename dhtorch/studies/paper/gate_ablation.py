@@ -13,6 +13,7 @@ from functools import partial
 from typing import Any
 
 from dhtorch.data.pairs import by_gap, by_scaled_gap
+from dhtorch.data.scene import Given, Scene
 from dhtorch.studies import protocol
 from dhtorch.studies.cohorts import HeldOut, everything
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings
@@ -24,7 +25,7 @@ Gaps = dict[str, Callable[[Any], list[tuple[int, int]]]]
 
 
 def run(
-    recordings: Sequence[Any],
+    scenes: Sequence[Given],
     methods: Mapping[str, Method],
     pairs: Pairs,
     settings: Settings,
@@ -40,7 +41,7 @@ def run(
     gap keeps a row that says so.
 
     Args:
-        recordings, pairs, settings, progress: as :func:`dhtorch.studies.protocol.run`.
+        scenes, pairs, settings, progress: as :func:`dhtorch.studies.protocol.run`.
         methods: name → method; the first is asked.
         factors: further gaps, as factors on the scene's own.
         gaps: further gaps in frames.
@@ -58,9 +59,9 @@ def run(
         whole = split.variant()
         variants[name] = protocol.Variant(whole.method.replace(triangulate=off))
     main = protocol.run(
-        recordings, Protocol(variants, {"heldout": split.heldout}, everything), pairs, settings, progress=progress
+        scenes, Protocol(variants, {"heldout": split.heldout}, everything), pairs, settings, progress=progress
     )
-    parts = [main, *sweep(recordings, split, at_gaps(factors, gaps), settings, progress)]
+    parts = [main, *sweep(scenes, split, at_gaps(factors, gaps), settings, progress)]
     outcome = protocol.join(parts)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome.summary))
 
@@ -72,7 +73,7 @@ def at_gaps(factors: Sequence[float], gaps: Sequence[int]) -> Gaps:
 
 
 def sweep(
-    recordings: Sequence[Any],
+    scenes: Sequence[Given],
     split: HeldOut,
     gaps: Gaps,
     settings: Settings,
@@ -83,7 +84,7 @@ def sweep(
     parts = []
     for name, pairs in gaps.items():
         asked = Protocol({name: split.variant()}, {"heldout": split.heldout}, everything, columns)
-        part = protocol.run(recordings, asked, pairs, settings, progress=progress)
+        part = protocol.run(scenes, asked, pairs, settings, progress=progress)
         part.summary = {f"{name}.{k}": v for k, v in part.summary.items()}
         parts.append(part)
     return parts
@@ -100,6 +101,7 @@ def verdict(summary: Mapping[str, Any]) -> tuple[bool | None, str]:
     return both - without_parallax > both - without_residual, f"correlation: {why} (medians over scenes)"
 
 
-def _fixed(recording: Any, gap: int) -> list[tuple[int, int]]:
-    span = int(recording.number[-1] - recording.number[0])
-    return by_gap(recording, gap) if gap <= span else []
+def _fixed(scene: Scene, gap: int) -> list[tuple[int, int]]:
+    number = scene.recording.number
+    span = int(number[-1] - number[0])
+    return by_gap(scene, gap) if gap <= span else []

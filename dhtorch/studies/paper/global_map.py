@@ -21,9 +21,11 @@ from torch import Tensor
 
 from dhtorch import integrate
 from dhtorch.codes import Source
+from dhtorch.data.recording import Recording
+from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import bootstrap
-from dhtorch.geometry import cells
-from dhtorch.integrate.recording import POSES, Answer, Places, build, chain, coverage, place
+from dhtorch.geometry import sparse_grid
+from dhtorch.integrate.recording import POSES, PairEstimate, Places, build, chain, coverage, place
 from dhtorch.integrate.recording import ask as ask_pairs
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
 from dhtorch.studies.rows import Row
@@ -37,7 +39,7 @@ VARIANTS = tuple(f"{what} {poses}" for poses in POSES for what in ("sensor", "fu
 
 
 def run(
-    recordings: Sequence[Any],
+    scenes: Sequence[Given],
     methods: Mapping[str, Method],
     pairs: Pairs,
     settings: Settings,
@@ -54,7 +56,7 @@ def run(
     that sensor never sees counts as wrong.
 
     Args:
-        recordings, settings, progress: as :func:`dhtorch.studies.protocol.run`.
+        scenes, settings, progress: as :func:`dhtorch.studies.protocol.run`.
         methods: name → method; the first is asked.
         pairs: anchors and their partners; further links for ``anchored`` come from
             :func:`dhtorch.integrate.recording.chain`.
@@ -64,26 +66,26 @@ def run(
     Source: paper, "Global integration (scope note)" and the limitation "map fragmentation".
     """
     method = next(iter(methods.values())).replace(n=n)
-    answers: dict[str, dict[Item, Answer]] = {}
+    answers: dict[str, dict[Item, PairEstimate]] = {}
 
-    def items(recording: Any) -> list[Item]:
-        chosen = list(pairs(recording))
+    def items(scene: Scene) -> list[Item]:
+        chosen = list(pairs(scene))
         return [*chosen, *chain(chosen)]
 
-    def ask(recording: Any, item: Item) -> dict[str, Row]:
+    def ask(scene: Scene, item: Item) -> dict[str, Row]:
         common: dict[str, Any] = {"seed": settings.seed, "device": settings.device, "dtype": settings.dtype}
-        cutoff = settings.cutoff_of(recording)
-        (answer,) = ask_pairs(recording, method, [item], cutoff=cutoff, **common)
-        answers.setdefault(recording.name, {})[item] = answer
+        cutoff = settings.cutoff_of(scene)
+        (answer,) = ask_pairs(scene, method, [item], cutoff=cutoff, **common)
+        answers.setdefault(scene.name, {})[item] = answer
         row: Row = {"pnp_ok": int(answer.fit.ok[0]), "n_kept": int(answer.estimate.keep.sum())}
         row["n_recovered"] = int(answer.recovered.sum())
-        own = item in set(pairs(recording))  # else it only is a link between frames
+        own = item in set(pairs(scene))  # else it only is a link between frames
         found: dict[str, Row] = {"sensor anchored": {}, "fused anchored": row}
-        return found | ({"sensor device": {}, "fused device": row} if own and recording.poses is not None else {})
+        return found | ({"sensor device": {}, "fused device": row} if own and scene.recording.poses is not None else {})
 
-    def whole(recording: Any, _found: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
-        found = answers.pop(recording.name, {})
-        maps = _Maps(recording, [found[p] for p in pairs(recording)], settings.cutoff_of(recording), voxel)
+    def whole(scene: Scene, _found: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
+        recording, found = scene.recording, answers.pop(scene.name, {})
+        maps = _Maps(recording, [found[p] for p in pairs(scene)], settings.cutoff_of(scene), voxel)
         rows: dict[str, Row] = {}
         for poses in POSES:
             if poses == "anchored" or recording.poses is not None:
@@ -91,7 +93,7 @@ def run(
                 rows |= maps.rows(place(recording, every, poses=poses), poses)
         return rows
 
-    outcome = screen(recordings, items, ask, VARIANTS, truth=TRUTH, whole=whole, progress=progress)
+    outcome = screen(scenes_of(scenes), items, ask, VARIANTS, truth=TRUTH, whole=whole, progress=progress)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 
 
@@ -117,7 +119,7 @@ def verdict(outcome: Outcome) -> tuple[bool | None, str]:
 class _Maps:
     """The maps of one recording."""
 
-    def __init__(self, recording: Any, answers: list[Answer], cutoff: float | None, voxel: float) -> None:
+    def __init__(self, recording: Recording, answers: list[PairEstimate], cutoff: float | None, voxel: float) -> None:
         self.recording, self.answers, self.cutoff = recording, answers, cutoff
         depth = recording[0].depth
         there = depth[depth.isfinite() & (depth > 0)]
@@ -134,7 +136,7 @@ class _Maps:
         for what, volume in (("sensor", near), ("fused", both)):
             found = self.covered(volume)
             row = common | coverage(integrate.points(volume).xyz, self.voxel)
-            row["right_share"] = float(cells.near(found, everything).double().mean()) if len(found) else None
+            row["right_share"] = float(sparse_grid.near(found, everything).double().mean()) if len(found) else None
             row["voxel_m"] = self.voxel
             rows[f"{what} {poses}"] = row
         alone = rows[f"sensor {poses}"]["n_voxels"]
@@ -148,4 +150,4 @@ class _Maps:
 
     def covered(self, volume: integrate.Volume) -> Tensor:
         """Numbers of the voxels that the surface passes through."""
-        return cells.occupied(integrate.points(volume).xyz, self.voxel)
+        return sparse_grid.occupied(integrate.points(volume).xyz, self.voxel)

@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 
+from dhtorch.data.scene import Given
 from dhtorch.evaluate import bootstrap
 from dhtorch.studies import protocol
 from dhtorch.studies.cohorts import HeldOut, everything
@@ -29,7 +30,7 @@ MIN_CORR, MAX_MEDIAN_REL, MAX_RESIDUAL_PX, MIN_ANSWERS = 0.8, 0.1, 3.0, 10
 
 
 def run(
-    recordings: Sequence[Any],
+    scenes: Sequence[Given],
     methods: Mapping[str, Method],
     pairs: Pairs,
     settings: Settings,
@@ -50,7 +51,7 @@ def run(
         split = HeldOut(method, settings.seed)
         cohorts = {"cyclic": split.cyclic, "heldout": split.heldout}
         asked = Protocol({name: split.variant()}, cohorts, everything, partial(reach, split))
-        part = protocol.run(recordings, asked, pairs, settings, progress=progress)
+        part = protocol.run(scenes, asked, pairs, settings, progress=progress)
         part.summary |= {f"{name}.{k}": v for k, v in _judge(part.rows, name).items()}
         parts.append(part)
     outcome = protocol.join(parts)

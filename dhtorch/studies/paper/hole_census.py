@@ -14,6 +14,7 @@ from typing import Any
 import torch
 
 from dhtorch.codes import ROUTE_OF_HOLE, Hole, Route, names
+from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import errors
 from dhtorch.records import Samples
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
@@ -24,7 +25,7 @@ EXPECTATION = "At least half of the holes are TRACKABLE_NO_LIDAR, of trackabilit
 
 
 def run(
-    recordings: Sequence[Any],
+    scenes: Sequence[Given],
     methods: Mapping[str, Method],
     pairs: Pairs,
     settings: Settings,
@@ -39,7 +40,7 @@ def run(
     (``trackability_hole``) and of samples with a return (``trackability_valid``).
 
     Args:
-        recordings, settings, progress: as :func:`dhtorch.studies.protocol.run`.
+        scenes, settings, progress: as :func:`dhtorch.studies.protocol.run`.
         methods: name → method; seats 1 to 3 of the first are asked.
         pairs: not used.
         stride: every how many frames.
@@ -48,16 +49,17 @@ def run(
     """
     name, method = next(iter(methods.items()))
     outcome = Outcome()
-    for recording in recordings:
+    for scene in scenes_of(scenes):
+        recording = scene.recording
         frames = list(range(0, len(recording), stride))
         rows = []
         for i in progress(frames, recording.name, len(frames)):
             rows.append({"scene": recording.name, "pair": [i, i], "method": name, "truth": None})
             rows[-1] |= census(look(method, recording[i].to(settings.dtype).to(settings.device)))
-        outcome.rows += [*rows, _scene(rows, recording)]
+        outcome.rows += [*rows, _scene(rows, scene)]
         outcome.n_pairs += len(rows)
-    scenes = [r for r in outcome.rows if r["pair"] is None and r["role"] is None]
-    outcome.summary = errors.summarise([{k: v for k, v in r.items() if k not in ("pair", "role")} for r in scenes])
+    whole = [r for r in outcome.rows if r["pair"] is None and r["role"] is None]
+    outcome.summary = errors.summarise([{k: v for k, v in r.items() if k not in ("pair", "role")} for r in whole])
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome.summary))
 
 
@@ -95,10 +97,10 @@ def census(samples: Samples) -> Row:
     }
 
 
-def _scene(rows: Sequence[Row], recording: Any) -> Row:
+def _scene(rows: Sequence[Row], scene: Scene) -> Row:
     """Frames joined: counts added up, shares by mean over frames that have holes, trackability by median."""
-    row: Row = {"scene": recording.name, "pair": None, "method": rows[0]["method"], "truth": None}
-    row |= {"role": recording.role, "n_pairs": len(rows)}
+    row: Row = {"scene": scene.name, "pair": None, "method": rows[0]["method"], "truth": None}
+    row |= {"role": scene.role, "n_pairs": len(rows)}
     row |= {k: sum(r[k] for r in rows) for k in ("n_samples", "n_holes")}
     row["hole_rate"] = row["n_holes"] / max(row["n_samples"], 1)
     for group in ("hole_share", "route_share"):

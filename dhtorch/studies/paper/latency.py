@@ -28,10 +28,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import holdout
 from dhtorch.geometry import camera as cam
 from dhtorch.method import Trace
-from dhtorch.records import Estimate, Frame, Samples, TrackHint
+from dhtorch.records import Estimate, Frame, Samples
 from dhtorch.studies import memory
 from dhtorch.studies.baselines import dinov2 as visual
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
@@ -75,7 +76,7 @@ class Branch:
 
 
 def run(
-    recordings: Sequence[Any],
+    scenes: Sequence[Given],
     chosen: Mapping[str, Method],
     pairs: Pairs,
     settings: Settings,
@@ -91,13 +92,13 @@ def run(
     dinov2: Callable[..., torch.nn.Module] = visual.load,
     progress: Progress = quiet,
 ) -> Outcome:
-    """Time the method and DINOv2 in turn, on the first pair of the first recording, resampled to each size.
+    """Time the method and DINOv2 in turn, on the first pair of the first scene, resampled to each size.
 
     Everything is timed in rounds, so that a busy minute of the machine falls on all sides; batch size 1. Whatever is
     reported as an interval is the lowest and highest median of a round.
 
     Args:
-        recordings, chosen, pairs, settings, progress: as :func:`dhtorch.studies.pair.run`; the method named first.
+        scenes, chosen, pairs, settings, progress: as :func:`dhtorch.studies.pair.run`; the method named first.
         sizes: (height, width) of the pictures; the first is the one that ratios are taken at, the last the largest.
         n: samples.
         rounds: how often everything is timed anew.
@@ -119,9 +120,9 @@ def run(
         if count < 1:
             raise ValueError(f"experiment.{name}: found {count}, expected at least 1")
     name, method = next(iter(chosen.items()))
-    recording = recordings[0]
-    told: dict[str, Any] = {"seed": settings.seed, "hint": TrackHint.of(recording)}
-    views = _views(recording, pairs, settings)
+    scene = scenes_of(scenes)[0]
+    told: dict[str, Any] = {"seed": settings.seed, "hint": scene.hint}
+    views = _views(scene, pairs, settings)
     branches: list[Branch] = []
     for hw in sizes:
         frame_0, frame_1 = (_resampled(view, (hw[0], hw[1])) for view in views)
@@ -137,9 +138,9 @@ def run(
     for _ in progress(range(rounds), f"{len(branches)} timings", rounds):
         for branch in branches:
             _time(branch, warm_up, settings.device)
-    rows = [_row(recording.name, b, stage, settings, n) for b in branches for stage in b.rounds[0]]
+    rows = [_row(scene.name, b, stage, settings, n) for b in branches for stage in b.rounds[0]]
     if note:
-        rows.append({"scene": recording.name, "pair": None, "method": VISUAL, "stage": "forward", "note": note})
+        rows.append({"scene": scene.name, "pair": None, "method": VISUAL, "stage": "forward", "note": note})
     outcome = Outcome(rows=rows, summary=summarise(branches), n_pairs=1)
     return outcome.decide(QUESTION, EXPECTATION, *judge(name, outcome.summary, sizes, note))
 
@@ -183,13 +184,13 @@ def judge(
     return False if False in claims else None if None in claims else True, "; ".join(said)
 
 
-def _views(recording: Any, pairs: Pairs, settings: Settings) -> tuple[Frame, Frame]:
+def _views(scene: Scene, pairs: Pairs, settings: Settings) -> tuple[Frame, Frame]:
     """The first pair, as a method may see it."""
-    chosen = pairs(recording)
+    chosen = pairs(scene)
     if not chosen:
-        raise ValueError(f"latency: {recording.name} has no pair, expected at least one")
-    cutoff = settings.cutoff_of(recording)
-    anchor, other = (recording[k].to(settings.dtype).to(settings.device) for k in chosen[0])
+        raise ValueError(f"latency: {scene.name} has no pair, expected at least one")
+    cutoff = settings.cutoff_of(scene)
+    anchor, other = (scene.recording[k].to(settings.dtype).to(settings.device) for k in chosen[0])
     return holdout.range_split(anchor, cutoff), holdout.range_split(other, cutoff)
 
 

@@ -11,10 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any
 
 import torch
 
+from dhtorch.data.scene import Given
 from dhtorch.evaluate import bootstrap
 from dhtorch.evaluate.correlation import spearman
 from dhtorch.studies import protocol
@@ -29,7 +29,7 @@ EXPECTATION = "With a longer baseline more holes are recovered, and answers err 
 
 
 def run(
-    recordings: Sequence[Any],
+    scenes: Sequence[Given],
     methods: Mapping[str, Method],
     pairs: Pairs,
     settings: Settings,
@@ -43,7 +43,7 @@ def run(
     all gaps together, of the baseline with the share of holes recovered and with the median error.
 
     Args:
-        recordings, settings, progress: as :func:`dhtorch.studies.protocol.run`.
+        scenes, settings, progress: as :func:`dhtorch.studies.protocol.run`.
         methods: name → method; the first is asked.
         pairs: not used: the gaps below are.
         factors: gaps, as factors on the scene's own.
@@ -51,7 +51,7 @@ def run(
     Source: paper, "Held-out triangulation on in-house captures" and "Limitations" (motion dependence).
     """
     split = HeldOut(next(iter(methods.values())), settings.seed)
-    parts = sweep(recordings, split, at_gaps(factors, ()), settings, progress, partial(columns, split))
+    parts = sweep(scenes, split, at_gaps(factors, ()), settings, progress, partial(columns, split))
     outcome = protocol.join(parts)
     for name in dict.fromkeys(r["scene"] for r in outcome.rows):
         trend = _trend([r for r in outcome.rows if r["scene"] == name and r["pair"] is not None])

@@ -14,6 +14,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+from dhtorch.data.scene import Given
 from dhtorch.studies import protocol
 from dhtorch.studies.baselines.sensor_only import sensor_only
 from dhtorch.studies.cohorts import device_fit, has_trajectory
@@ -31,7 +32,7 @@ NO_GATES = {"min_parallax_deg": None, "max_residual_px": None}
 
 
 def run(
-    recordings: Sequence[Any],
+    scenes: Sequence[Given],
     methods: Mapping[str, Method],
     pairs: Pairs,
     settings: Settings,
@@ -48,7 +49,7 @@ def run(
     ``truth_disagreement``, the median relative difference of truth and sensor where both answer.
 
     Args:
-        recordings, pairs, settings, progress: as :func:`dhtorch.studies.protocol.run`.
+        scenes, pairs, settings, progress: as :func:`dhtorch.studies.protocol.run`.
         methods: name → method; the first is asked.
         cutoff_factors: further cutoffs, as factors on the scene's.
         cutoffs: further cutoffs in metres.
@@ -63,12 +64,12 @@ def run(
         "no_gates": Variant(method.replace(triangulate=NO_GATES)),
         "gated": Variant(method),
     }
-    main = protocol.run(recordings, Protocol(variants, columns=_truth), pairs, settings, progress=progress)
+    main = protocol.run(scenes, Protocol(variants, columns=_truth), pairs, settings, progress=progress)
     sweep = {f"gated, cutoff x{f:g}": replace(settings, cutoff_factor=f) for f in cutoff_factors}
     sweep |= {f"gated, cutoff {c:g} m": replace(settings, cutoff=c, cutoff_factor=1.0) for c in cutoffs}
     parts = [main]
     for name, at in sweep.items():
-        part = protocol.run(recordings, Protocol({name: Variant(method)}, columns=_truth), pairs, at, progress=progress)
+        part = protocol.run(scenes, Protocol({name: Variant(method)}, columns=_truth), pairs, at, progress=progress)
         part.summary = {f"{name}.{k}": v for k, v in part.summary.items()}
         parts.append(part)
     outcome = protocol.join(parts)

@@ -8,8 +8,8 @@ What would refute it: on the median scene the error on real holes is not above t
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
+from dhtorch.data.scene import Given
 from dhtorch.studies import protocol
 from dhtorch.studies.cohorts import has_truth, real_holes
 from dhtorch.studies.paper.range_split import NO_GATES
@@ -20,7 +20,7 @@ EXPECTATION = "No: on the median scene the error on real holes is larger, and so
 
 
 def run(
-    recordings: Sequence[Any],
+    scenes: Sequence[Given],
     methods: Mapping[str, Method],
     pairs: Pairs,
     settings: Settings,
@@ -43,7 +43,7 @@ def run(
     }
     cohorts = {"full": protocol.held_back, "real_holes": real_holes}
     asked = Protocol(variants, cohorts, min_candidates=1)
-    outcome = protocol.run(recordings, asked, pairs, settings, progress=progress)
+    outcome = protocol.run(scenes, asked, pairs, settings, progress=progress)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 
 

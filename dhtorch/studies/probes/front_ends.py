@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from dhtorch.data.scene import Scene
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.shapes import check
 from dhtorch.method import Method
@@ -155,9 +156,9 @@ def visual(build: Callable[..., torch.nn.Module] | None, *, cells: int, device: 
     return PatchTokens(network, cells=cells, side=options.get("side", 224)), options.get("weights") is not None
 
 
-def adapted(method: Method, recording: Any, **options: Any) -> DepthTokens:
-    """Depth tokens of a method with what a recording asks for."""
-    return DepthTokens(method, hint=TrackHint.of(recording), sparse=recording.sparse, **options)
+def adapted(method: Method, scene: Scene, **options: Any) -> DepthTokens:
+    """Depth tokens of a method with what a scene asks for."""
+    return DepthTokens(method, hint=scene.hint, sparse=scene.recording.sparse, **options)
 
 
 def _as_sample(frames: list[Frame]) -> dict[str, Tensor]:

@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import bootstrap, compare, risk
 from dhtorch.method import Trace
 from dhtorch.records import PoseFit, Tracks
@@ -40,7 +41,7 @@ class Lesson(Record):
 
 
 def run(
-    recordings: Sequence[Any],
+    scenes: Sequence[Given],
     methods: Mapping[str, Method],
     pairs: Pairs,
     settings: Settings,
@@ -59,7 +60,7 @@ def run(
     place (``room``), and those of one folder, are one room.
 
     Args:
-        recordings, pairs, settings, progress: as :func:`dhtorch.studies.protocol.run`.
+        scenes, pairs, settings, progress: as :func:`dhtorch.studies.protocol.run`.
         methods: name → method of two views; the first is asked.
         hidden, steps, learning_rate, weight_decay, most: of :func:`train`.
         save: file for the scorer trained on all scenes, JSON; null = none.
@@ -75,28 +76,26 @@ def run(
     if method.views > 1:
         raise ValueError(f"experiment.method: found {name}, which looks at several views, expected one of two views")
     answers = _Answers()
-    protocol.run(
-        recordings, Protocol({name: Variant(method)}, {"full": answers.look}), pairs, settings, progress=progress
-    )
+    protocol.run(scenes, Protocol({name: Variant(method)}, {"full": answers.look}), pairs, settings, progress=progress)
     options: dict[str, Any] = {"hidden": hidden, "steps": steps, "learning_rate": learning_rate}
     options |= {"weight_decay": weight_decay, "most": most}
-    rooms = {r.name: _room(r) for r in recordings}
+    rooms = {scene.name: _room(scene) for scene in scenes_of(scenes)}
     learned = {}
     for room in dict.fromkeys(rooms.values()):
         others = {scene: lesson for scene, lesson in answers.lessons().items() if rooms[scene] != room}
         if others:
             learned[room] = train(list(others.values()), **options)
     given: dict[str, Callable[[Batch], Mapping[str, Any]]] = {
-        "learned": lambda batch: answers.again(batch, score=learned[_room(batch.recording)])
+        "learned": lambda batch: answers.again(batch, score=learned[_room(batch.scene)])
     }
     given = {score: partial(answers.again, score=fn) for score, fn in BY_HAND.items()} | given
-    needs = {"learned": lambda recording: None if _room(recording) in learned else "no other room to learn from"}
+    needs = {"learned": lambda scene: None if _room(scene) in learned else "no other room to learn from"}
     variants = {
         score: Variant(method, fit=answers.fit, given=of, needs=needs.get(score, Variant.needs))
         for score, of in given.items()
     }
-    outcome = protocol.run(recordings, Protocol(variants), pairs, settings, progress=progress)
-    found = against(outcome, {r.name for r in recordings if r.role is not None})
+    outcome = protocol.run(scenes, Protocol(variants), pairs, settings, progress=progress)
+    found = against(outcome, {scene.name for scene in scenes_of(scenes) if scene.role is not None})
     outcome.summary |= {k: {**v._asdict(), "unit": "1"} for k, v in found.items()}
     if save is not None and answers.lessons():
         scorer = train(list(answers.lessons().values()), **options)
@@ -200,8 +199,8 @@ class _Answers:
         """The cohort of the range split; on the way, everything is remembered."""
         truth = protocol.held_back(batch, trace)
         self._known[_key(batch)] = trace["tracks"], trace["fit"]
-        if batch.recording.role is None:
-            self._lessons.setdefault(batch.recording.name, []).append(lesson(trace, truth.depth, truth.ok))
+        if batch.scene.role is None:
+            self._lessons.setdefault(batch.scene.name, []).append(lesson(trace, truth.depth, truth.ok))
         return truth
 
     def lessons(self) -> dict[str, Lesson]:
@@ -220,8 +219,8 @@ class _Answers:
 
 
 def _key(batch: Batch) -> tuple[str, tuple[tuple[int, int], ...]]:
-    return batch.recording.name, tuple(batch.pairs)
+    return batch.scene.name, tuple(batch.pairs)
 
 
-def _room(recording: Any) -> str:
-    return getattr(recording, "room", None) or recording.name.split("/")[0]
+def _room(scene: Scene) -> str:
+    return scene.room or scene.name.split("/")[0]

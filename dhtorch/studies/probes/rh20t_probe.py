@@ -27,6 +27,8 @@ from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from torch import Tensor
 
 from dhtorch.data import convert, rh20t
+from dhtorch.data.recording import Recording
+from dhtorch.data.scene import Given, scenes_of
 from dhtorch.evaluate import probe
 from dhtorch.studies.baselines import dinov2 as visual_branch
 from dhtorch.studies.probes import front_ends, probing
@@ -58,7 +60,7 @@ OURS = "dhtorch"
 
 
 def run(
-    recordings: Sequence[Any],
+    scenes: Sequence[Given],
     methods: Mapping[str, Method],
     pairs: Pairs,
     settings: Settings,
@@ -79,7 +81,7 @@ def run(
     """Compute the features of every scene once, fit the probes on tasks, judge them on others.
 
     Args:
-        recordings: RH20T scenes, one camera each.
+        scenes: of RH20T, one camera each.
         methods: name → method; the first fills the depth tokens.
         pairs: not used: the second view is the frame ``history`` ago.
         settings: of the job; nothing is hidden from the method.
@@ -108,13 +110,14 @@ def run(
     method = next(iter(methods.values()))
     outcome = Outcome()
     with Shards() as shards:
-        for recording in recordings:
+        for scene in scenes_of(scenes):
+            recording = scene.recording
             index, before, context, target = robot(recording, horizon=horizon, history=history, stride=stride)
             if not len(index):
                 outcome.rows.append(_left_out(recording))
                 continue
             options: dict[str, Any] = {"cells": depth_cells, "seed": settings.seed}
-            two, one = (front_ends.adapted(method, recording, views=v, **options) for v in (2, 1))
+            two, one = (front_ends.adapted(method, scene, views=v, **options) for v in (2, 1))
             look = partial(_look, recording, settings, two=two, one=one, network=network, rgb_side=rgb_side)
             looked = progress(list(zip(index, before, strict=True)), recording.name, len(index))
             rows = [look(i, j) for i, j in looked]
@@ -132,7 +135,7 @@ def run(
 
 
 def robot(
-    recording: Any, *, horizon: float, history: float, stride: int
+    recording: Recording, *, horizon: float, history: float, stride: int
 ) -> tuple[list[int], list[int], Tensor, Tensor]:
     """The samples of one scene.
 
@@ -149,7 +152,7 @@ def robot(
     Raises:
         ValueError: no RH20T scene. One without the hand's poses has no sample.
     """
-    if recording.format != "rh20t":
+    if recording.format != "rh20t" or recording.root is None or recording.times is None:
         expected = "an RH20T scene (data=rh20t_set data.root=PATH, or data=rh20t_synthetic)"
         raise ValueError(f"rh20t_probe: {recording.name} is {recording.format}, expected {expected}")
     streams = rh20t.streams(recording.root)
@@ -197,19 +200,19 @@ def verdict(judged: Judged, real: bool, margin: float) -> tuple[bool | None, str
     return holds, f"ratio to DINOv2, 90 % intervals, margin {margin:.0%}: {ratios}; {published}. {text}"
 
 
-def task_of(recording: Any) -> str:
+def task_of(recording: Recording) -> str:
     """The task that a scene shows, by the name of its folder."""
     named = re.search(r"task_\d+", recording.name)
     return named[0] if named else str(recording.name)
 
 
-def _left_out(recording: Any) -> Row:
+def _left_out(recording: Recording) -> Row:
     note = "no sample: no pose of the hand over so long a time"
     return {"scene": recording.name, "pair": None, "method": CONTEXT, "truth": TRUTH, "role": None, "note": note}
 
 
 def _look(
-    recording: Any,
+    recording: Recording,
     settings: Settings,
     i: int,
     j: int,

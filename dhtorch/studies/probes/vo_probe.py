@@ -23,8 +23,10 @@ import torch
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from torch import Tensor
 
+from dhtorch.data.recording import Recording
+from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.geometry import se3
-from dhtorch.records import Frame, Pose
+from dhtorch.records import Frame
 from dhtorch.studies.baselines import dinov2 as visual_branch
 from dhtorch.studies.probes import front_ends, probing
 from dhtorch.studies.probes.probing import ARMS, CONTEXT, PENALTIES, REFERENCE, TRUTH, Shard, Shards
@@ -42,7 +44,7 @@ EVERY = [*ARMS, POSE]
 
 
 def run(
-    recordings: Sequence[Any],
+    scenes: Sequence[Given],
     methods: Mapping[str, Method],
     pairs: Pairs,
     settings: Settings,
@@ -58,15 +60,15 @@ def run(
     dinov2: Callable[..., torch.nn.Module] | None = visual_branch.load,
     progress: Progress = quiet,
 ) -> Outcome:
-    """Probes of every scene alone; recordings of one room are one scene.
+    """Probes of every scene alone; scenes of one room are one.
 
     Args:
-        recordings: with poses; those without, with a role, or of rooms with few pairs are noted and left out.
+        scenes: with poses; those without, with a role, or of rooms with few pairs are noted and left out.
         methods: name → method; the first fills the depth tokens.
         pairs: not used: every frame starts a pair, so that there are enough.
         settings: of the job; nothing is hidden from the method.
-        gap_parts: a pair spans the recording's own gap, divided by this, and at least one frame.
-        blocks: consecutive parts of a scene, at least three; dealt out evenly over the recordings of a room.
+        gap_parts: a pair spans the scene's own gap, divided by this, and at least one frame.
+        blocks: consecutive parts of a scene, at least three; dealt out evenly over the scenes of a room.
         min_pairs: fewest pairs of a scene.
         moving: m; a pair moves where the camera has gone farther.
         penalties, depth_cells, dinov2_cells, rgb_side, dinov2, progress: as
@@ -85,27 +87,26 @@ def run(
         raise ValueError(f"vo_probe: blocks is {blocks}, expected at least 3")
     network, real = front_ends.visual(dinov2, cells=dinov2_cells, device=settings.device)
     outcome = Outcome()
-    rooms: dict[str, list[Any]] = {}
-    for recording in recordings:
-        rooms.setdefault(getattr(recording, "room", None) or recording.name, []).append(recording)
+    rooms: dict[str, list[Scene]] = {}
+    for scene in scenes_of(scenes):
+        rooms.setdefault(scene.place, []).append(scene)
     for room, members in rooms.items():
-        cut = {r.name: in_blocks(r, gap_parts, max(1, -(-blocks // len(members)))) for r in members}
+        cut = {s.name: in_blocks(s, gap_parts, max(1, -(-blocks // len(members)))) for s in members}
         n = sum(len(block) for own in cut.values() for block in own)
         if n < min_pairs:
             note = f"{n} pairs with known motion, fewer than {min_pairs}"
             outcome.rows += [_silent(room, arm, note) for arm in EVERY]
             continue
         with Shards() as shards:
-            for recording in members:
+            for scene in members:
                 options: dict[str, Any] = {"cells": depth_cells, "seed": settings.seed}
-                two, one = (
-                    front_ends.adapted(next(iter(methods.values())), recording, views=v, **options) for v in (2, 1)
-                )
-                look = _Look(recording, settings, two, one, network, rgb_side)
-                found = [pair for block in cut[recording.name] for pair in block]
-                rows = iter([look(*pair) for pair in progress(found, recording.name, len(found))])
-                for k, block in enumerate(cut[recording.name]):
-                    shards.add(_shard(f"{recording.name} {k}", [next(rows) for _ in block], recording, block, moving))
+                two, one = (front_ends.adapted(next(iter(methods.values())), scene, views=v, **options) for v in (2, 1))
+                look = _Look(scene.recording, settings, two, one, network, rgb_side)
+                found = [pair for block in cut[scene.name] for pair in block]
+                rows = iter([look(*pair) for pair in progress(found, scene.name, len(found))])
+                for k, block in enumerate(cut[scene.name]):
+                    own = [next(rows) for _ in block]
+                    shards.add(_shard(f"{scene.name} {k}", own, scene.recording, block, moving))
             arms = {k: names for k, names in ARMS.items() if set(names) <= set(shards.widths)}
             options = {"n_folds": len(shards.groups), "penalties": penalties, "seed": settings.seed}
             judged = probing.judge(shards, arms, told={POSE: OWN}, **options)
@@ -115,12 +116,13 @@ def run(
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, real))
 
 
-def in_blocks(recording: Any, gap_parts: int, n: int) -> list[list[tuple[int, int]]]:
+def in_blocks(scene: Scene, gap_parts: int, n: int) -> list[list[tuple[int, int]]]:
     """Pairs of frames in ``n`` consecutive blocks that share no frame; none where the motion is not known."""
-    if recording.poses is None or recording.role is not None or len(recording) < 2 * n:
+    length = len(scene.recording)
+    if scene.recording.poses is None or scene.role is not None or length < 2 * n:
         return []
-    step = max(1, round((recording.gap or 1) / gap_parts))
-    edges = [round(k * len(recording) / n) for k in range(n + 1)]
+    step = max(1, round((scene.gap or 1) / gap_parts))
+    edges = [round(k * length / n) for k in range(n + 1)]
     return [[(i, i + step) for i in range(a, b - step)] for a, b in pairwise(edges)]
 
 
@@ -145,7 +147,7 @@ class _Look:
 
     def __init__(
         self,
-        recording: Any,
+        recording: Recording,
         settings: Settings,
         two: front_ends.DepthTokens,
         one: front_ends.DepthTokens,
@@ -179,10 +181,15 @@ class _Look:
 
 
 def _shard(
-    group: str, rows: Sequence[Mapping[str, Tensor]], recording: Any, block: Sequence[tuple[int, int]], moving: float
+    group: str,
+    rows: Sequence[Mapping[str, Tensor]],
+    recording: Recording,
+    block: Sequence[tuple[int, int]],
+    moving: float,
 ) -> Shard:
     i, j = torch.tensor(list(block), dtype=torch.int64).view(-1, 2).unbind(-1)
-    poses: Pose = recording.poses
+    poses = recording.poses
+    assert poses is not None  # else there are no blocks
     target = _motion(se3.to_matrix(se3.relative(poses[i], poses[j])).double())
     blocks = {name: torch.cat([row[name] for row in rows]) for name in rows[0]}
     return Shard(

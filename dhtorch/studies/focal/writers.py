@@ -11,7 +11,7 @@ import numpy as np
 from torch import Tensor
 
 from dhtorch.data.files import need
-from dhtorch.data.stacks import FocalStack
+from dhtorch.studies.focal.stacks import FocalStack
 from dhtorch.testing.parts import depth_codes, png, write
 
 

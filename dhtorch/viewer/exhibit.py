@@ -9,12 +9,13 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import torch
 
 from dhtorch.codes import Gate, Source, names
+from dhtorch.data.recording import Recording
+from dhtorch.data.scene import Given, Scene
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.lookup import nearest
@@ -31,7 +32,7 @@ LONGEST, QUALITY = 800, 82
 
 
 @dataclass(frozen=True)
-class View:
+class Picture:
     """A picture and where it was taken."""
 
     number: int  # place of the frame in the recording
@@ -77,7 +78,7 @@ class Shot:
     samples: Mapping[str, np.ndarray]
     T_world_from_0: np.ndarray  # (4, 4)
     T_world_from_1: np.ndarray | None = None  # (4, 4), by the pose that was fitted; None = there is none
-    view_0: int | None = None  # positions in ``Scene.views``; None = no pictures
+    view_0: int | None = None  # positions in ``Exhibit.views``; None = no pictures
     view_1: int | None = None
     seen: Cloud = NO_POINTS  # returns that the method saw
     held: Cloud = NO_POINTS  # returns that it did not see, or the exact depth there
@@ -94,12 +95,12 @@ class Shot:
 
 
 @dataclass(frozen=True)
-class Scene:
+class Exhibit:
     """All that is shown of one recording."""
 
     name: str
     shots: Sequence[Shot]
-    views: Sequence[View] = ()
+    views: Sequence[Picture] = ()
     path: np.ndarray | None = None  # (n, 3) m, camera centres of the whole recording; None = no trajectory
     facts: Mapping[str, str] = field(default_factory=dict)
 
@@ -110,20 +111,20 @@ class Scene:
 
 
 def look(
-    recording: Any,
+    given: Given,
     method: Method,
     pairs: Pairs,
     settings: Settings,
     *,
     most: int = 12,
     progress: Progress = protocol.quiet,
-) -> Scene:
+) -> Exhibit:
     """Run the method on pairs of the recording, as the main job does, and keep what there is to see.
 
     Args:
-        recording: one scene, see ``dhtorch.data``.
+        given: one scene, or a recording as a scene without notes.
         method: of one other view or several.
-        pairs: recording → list of (anchor, other).
+        pairs: scene → list of (anchor, other).
         settings: cutoff, seed, device, batch, workers.
         most: pairs that are shown; of more, as many spread evenly.
         progress: wraps the loop over the pairs.
@@ -131,8 +132,10 @@ def look(
     Raises:
         ValueError: bad data or options, as :func:`dhtorch.studies.protocol.run` raises them.
     """
+    shown = Scene.of(given)
+    recording = shown.recording
     shots: list[Shot] = []
-    views: dict[int, View] = {}
+    views: dict[int, Picture] = {}
 
     def keep(answer: Answer) -> protocol.Row:
         batch = answer.batch
@@ -143,9 +146,9 @@ def look(
         return {}
 
     seen = Protocol({"view": Variant(method)}, columns=keep, min_candidates=0)
-    protocol.run([recording], seen, lambda r: _spread(pairs(r), most), settings, progress=progress)
+    protocol.run([shown], seen, lambda scene: _spread(pairs(scene), most), settings, progress=progress)
     path = None if recording.poses is None else recording.poses.t.detach().cpu().numpy()
-    return Scene(recording.name, shots, list(views.values()), path)
+    return Exhibit(recording.name, shots, list(views.values()), path)
 
 
 def _shot(answer: Answer, shown: Sequence[int]) -> Shot:
@@ -191,9 +194,9 @@ def _shot(answer: Answer, shown: Sequence[int]) -> Shot:
     )
 
 
-def _view(recording: Any, k: int, frame: Frame) -> View:
+def _view(recording: Recording, k: int, frame: Frame) -> Picture:
     time = None if recording.times is None else float(recording.times[k] - recording.times[0])
-    return View(int(recording.number[k]), time, *_jpeg(_pixels(frame)), frame.hw, *_intrinsics(frame.camera))
+    return Picture(int(recording.number[k]), time, *_jpeg(_pixels(frame)), frame.hw, *_intrinsics(frame.camera))
 
 
 def _depth_map(frame: Frame, cutoff: float) -> DepthMap:

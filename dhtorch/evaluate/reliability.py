@@ -35,7 +35,7 @@ class Reliability(Record):
         return float((self.weight * (self.claimed - self.realised).abs()).nansum())
 
 
-def reliability(
+def diagram(
     claimed: Tensor,  # (n,) in [0, 1]
     good: Tensor,  # (n,) bool
     weight: Tensor | None = None,  # (n,) ≥ 0
@@ -93,14 +93,14 @@ def measure(scenes: Sequence[Points], *, bins: int = 10) -> Numbers:
     """``ece`` (bins of equal width) and ``ece_equal_mass`` of one or several scenes; None without answers."""
     pooled = pool(scenes)
     return {
-        "ece": reliability(*pooled, bins=bins).ece,
-        "ece_equal_mass": reliability(*pooled, bins=bins, equal_mass=True).ece,
+        "ece": diagram(*pooled, bins=bins).ece,
+        "ece_equal_mass": diagram(*pooled, bins=bins, equal_mass=True).ece,
     }
 
 
 def ece_interval(scenes: Sequence[Points], *, bins: int = 10, draws: int = 2000, seed: int = 0) -> bootstrap.Interval:
     """``ece`` (bins of equal width) with its interval over scenes; scenes without answers are passed over."""
-    tables = [reliability(*pool([s]), bins=bins) for s in scenes if bool(s.keep.any())]
+    tables = [diagram(*pool([s]), bins=bins) for s in scenes if bool(s.keep.any())]
     if not tables:
         return bootstrap.Interval(None, None, None, 0)
     gaps = torch.stack([(t.weight * (t.claimed - t.realised)).nan_to_num() for t in tables])

@@ -1,15 +1,17 @@
-"""Focal stacks of any known format, beside the recordings: ``open_stacks(path)``."""
+"""Focal stacks of any known format: ``open_stacks(path)``. They show one view, so that no pairs are in them."""
 
 from __future__ import annotations
 
 import inspect
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
-from dhtorch.data import ddff12, fod500, image_folder
+from dhtorch.data import scenes_root
 from dhtorch.data.files import FormatError
-from dhtorch.data.stacks import Stacks
+from dhtorch.studies.focal import ddff12, fod500, image_folder
+from dhtorch.studies.focal.stacks import Stacks
 
 #: Name → reader, asked in this order; the first that recognises a folder reads it.
 STACK_FORMATS: Final[dict[str, ModuleType]] = {"fod500": fod500, "ddff12": ddff12, "images": image_folder}
@@ -21,7 +23,8 @@ def open_stacks(root: str | Path, format: str = "auto", **options: Any) -> Stack
     Args:
         root: a folder, or an HDF5 file.
         format: ``fod500``, ``ddff12``, ``images``, or ``auto`` to recognise it by its content.
-        options: keyword options of the reader, see ``dhtorch.data.<format>.read`` (``images``: ``image_folder``).
+        options: keyword options of the reader, see ``dhtorch.studies.focal.<format>.read`` (``images``:
+            ``image_folder``).
 
     Raises:
         FormatError: nothing there, an unknown format, or a file that is not what its format promises.
@@ -52,3 +55,20 @@ def recognise_stacks(root: str | Path) -> tuple[str, str]:
         if evidence := reader.recognise(Path(root)):
             return name, evidence
     raise FormatError(root, "format", "no focal stack", f"one of {', '.join(STACK_FORMATS)}")
+
+
+def open_collections(root: str | Path | None = None, scenes: Sequence[Mapping[str, Any]] = ()) -> list[Stacks]:
+    """Focal stacks of a list of scenes below one folder.
+
+    Args:
+        root: folder that the scenes' paths start from. None = the environment variable ``DHTORCH_DATA``.
+        scenes: for each ``path``, and the arguments of :func:`open_stacks` that it needs.
+
+    Raises:
+        FormatError: as :func:`dhtorch.data.open_scenes`.
+    """
+    root = scenes_root(root)
+    for scene in scenes:
+        if "path" not in scene:
+            raise FormatError(root, "scenes", dict(scene), "an entry with a path")
+    return [open_stacks(root / str(s["path"]), **{k: v for k, v in s.items() if k != "path"}) for s in scenes]

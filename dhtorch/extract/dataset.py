@@ -10,18 +10,19 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from dhtorch.data.scene import Scene
 from dhtorch.extract.columns import PLACE, Column, Row
 from dhtorch.extract.plan import Plan, steps_back
 from dhtorch.geometry import camera as cam
 from dhtorch.method import Method
-from dhtorch.records import Camera, Frame, TrackHint
+from dhtorch.records import Camera, Frame
 from dhtorch.transform import ExtendDepth
 
 #: Readers give metres, and the camera of these very pixels: there is no unit that could be wrong.
 _TRUSTED = {"depth_unit": "m", "layout": "chw", "max_depth": np.inf, "min_depth": 0.0, "max_offset": np.inf}
 
 
-class Answer(NamedTuple):
+class Extracted(NamedTuple):
     """What came of one row of the plan."""
 
     place: Row  # the columns that say where it belongs
@@ -29,7 +30,7 @@ class Answer(NamedTuple):
     complaint: str = ""  # why
 
 
-class Rows(Dataset[Answer]):
+class Rows(Dataset[Extracted]):
     """Position in the plan → answer. Depends on nothing but the position: not on the worker, its engine or the order.
 
     The sample is what a robot's data loader with ``delta_timestamps`` makes: the picture ``gap`` frames earlier (for a
@@ -37,17 +38,17 @@ class Rows(Dataset[Answer]):
     cannot be read, a copy of the frame pads, and the front end runs alone.
 
     Args:
-        recordings: of the data set.
+        scenes: of the data set.
         plan: from :func:`dhtorch.extract.plan.make`.
         wanted: columns of the rows.
         method: of one other view or several.
-        gap: frames back to the other view; None = the recording's own, 0 = no other view.
+        gap: frames back to the other view; None = the scene's own, 0 = no other view.
         options: of :class:`dhtorch.transform.ExtendDepth`.
     """
 
     def __init__(
         self,
-        recordings: Sequence[Any],
+        scenes: Sequence[Scene],
         plan: Plan,
         wanted: dict[str, Column],
         *,
@@ -55,17 +56,17 @@ class Rows(Dataset[Answer]):
         gap: int | None,
         **options: Any,
     ) -> None:
-        self.recordings, self.plan, self.wanted = recordings, plan, wanted
+        self.scenes, self.plan, self.wanted = scenes, plan, wanted
         self.method, self.gap, self.options = method, gap, options
         self._opened: tuple[int, _Opened] | None = None
 
     def __len__(self) -> int:
         return len(self.plan)
 
-    def __getitem__(self, position: int) -> Answer:
+    def __getitem__(self, position: int) -> Extracted:
         k, episode, i = self.plan.place(position)
         if self._opened is None or self._opened[0] != k:
-            self._opened = (k, _Opened(self.recordings[k], self.method, self.gap, self.options))
+            self._opened = (k, _Opened(self.scenes[k], self.method, self.gap, self.options))
         opened = self._opened[1]
         recording = opened.recording
         stamp = np.nan if recording.times is None else float(recording.times[i])
@@ -77,9 +78,9 @@ class Rows(Dataset[Answer]):
             if isinstance(error, MemoryError | torch.OutOfMemoryError):
                 raise
             text = f"{recording.name}, frame {place['frame_index']}: {error}"
-            return Answer(place, None, " ".join(text.split()))
+            return Extracted(place, None, " ".join(text.split()))
         keep = {k: c for k, c in self.wanted.items() if k not in PLACE}
-        return Answer(place, {k: added[k].numpy().astype(c.kind) for k, c in keep.items()})
+        return Extracted(place, {k: added[k].numpy().astype(c.kind) for k, c in keep.items()})
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_opened": None}
@@ -88,10 +89,10 @@ class Rows(Dataset[Answer]):
 class _Opened:
     """One recording, and the transforms that fit its frames."""
 
-    def __init__(self, recording: Any, method: Method, gap: int | None, options: dict[str, Any]) -> None:
-        self.recording, self.method, self.options = recording, method, options
-        self.steps = steps_back(recording, gap, method.views)
-        self.position = {int(number): i for i, number in enumerate(recording.number)} if self.steps else {}
+    def __init__(self, scene: Scene, method: Method, gap: int | None, options: dict[str, Any]) -> None:
+        self.scene, self.recording, self.method, self.options = scene, scene.recording, method, options
+        self.steps = steps_back(scene, gap, method.views)
+        self.position = {int(number): i for i, number in enumerate(self.recording.number)} if self.steps else {}
         self.transforms: dict[tuple[str, ...], ExtendDepth] = {}
 
     def answer(self, i: int) -> dict[str, Tensor]:
@@ -116,7 +117,7 @@ class _Opened:
 
     def _transform(self, optional: tuple[str, ...]) -> ExtendDepth:
         options: dict[str, Any] = {**_TRUSTED, **self.options, **{key: key for key in optional}}
-        options |= {"sparse": self.recording.sparse, "hint": TrackHint.of(self.recording)}
+        options |= {"sparse": self.recording.sparse, "hint": self.scene.hint}
         other_at = list(range(len(self.steps))) if len(self.steps) > 1 else 0
         return ExtendDepth(method=self.method, other_at=other_at, **options)
 

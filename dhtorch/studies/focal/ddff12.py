@@ -23,8 +23,8 @@ from dhtorch.data import convert, files
 from dhtorch.data.codecs.hdf5 import Hdf5Array, hdf5_arrays
 from dhtorch.data.codecs.npy import real_header
 from dhtorch.data.files import FormatError
-from dhtorch.data.light_field import refocus
-from dhtorch.data.stacks import FocalStack, Stacks, focus_distances
+from dhtorch.studies.focal.light_field import refocus
+from dhtorch.studies.focal.stacks import FocalStack, Stacks, focus_distances
 
 _DEPTH_DISPARITY = 0.1412376  # m px: 521.4052 px focal length times 0.27088 mm between two sub-apertures
 _DISPARITIES = (0.28247513, 0.02017679)  # px, of the first slice (0.5 m) and the last (7 m)

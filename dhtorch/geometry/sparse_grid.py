@@ -21,7 +21,7 @@ NOWHERE = -1
 
 def pack(ijk: Tensor) -> Tensor:
     """Numbers (…,) of cells (…, 3) int64; NOWHERE for a place out of reach. Gradient: none."""
-    check("cells.pack", ijk=(ijk, "* 3"))
+    check("sparse_grid.pack", ijk=(ijk, "* 3"))
     shifted = ijk + REACH
     inside = ((shifted >= 0) & (shifted < 2 * REACH)).all(-1)
     x, y, z = shifted.unbind(-1)
@@ -43,7 +43,7 @@ def find(
     Raises:
         ValueError: wrong shapes.
     """
-    K = check("cells.find", keys=(keys, "K"))["K"]
+    K = check("sparse_grid.find", keys=(keys, "K"))["K"]
     if not K:
         return torch.zeros_like(wanted), torch.zeros_like(wanted, dtype=torch.bool)
     at = torch.searchsorted(keys, wanted).clamp_max(K - 1)
@@ -60,9 +60,9 @@ def occupied(
     Raises:
         ValueError: wrong shapes, or a side that is not positive.
     """
-    check("cells.occupied", xyz=(xyz, "* 3"))
+    check("sparse_grid.occupied", xyz=(xyz, "* 3"))
     if not side > 0:
-        raise ValueError(f"cells.occupied: side is {side}, expected a positive length")
+        raise ValueError(f"sparse_grid.occupied: side is {side}, expected a positive length")
     scaled = xyz.reshape(-1, 3).double() / side
     there = (scaled.abs() < REACH).all(-1)  # false for NaN
     return pack(scaled[there].floor().long()).unique()
@@ -77,7 +77,7 @@ def near(
     Raises:
         ValueError: wrong shapes.
     """
-    check("cells.near", keys=(keys, "K"), others=(others, "V"))
+    check("sparse_grid.near", keys=(keys, "K"), others=(others, "V"))
     around = pack(unpack(keys)[:, None] + _steps(keys))
     return find(others, around)[1].any(-1)
 
@@ -92,7 +92,7 @@ def components(keys: Tensor) -> Tensor:
 
     Cost: the logarithm of the longest chain, times 13 look-ups of all cells.
     """
-    check("cells.components", keys=(keys, "K"))
+    check("sparse_grid.components", keys=(keys, "K"))
     at, found = find(keys, pack(unpack(keys)[:, None] + _steps(keys)[14:]))  # each pair of neighbours once
     a, b = torch.arange(len(keys), device=keys.device)[:, None].expand_as(at)[found], at[found]
     label = torch.arange(len(keys), device=keys.device)

@@ -18,7 +18,7 @@ from torch import Tensor
 from dhtorch.data import files
 from dhtorch.data.codecs import exr
 from dhtorch.data.files import FormatError
-from dhtorch.data.stacks import FocalStack, Stacks, focus_distances, read_pictures
+from dhtorch.studies.focal.stacks import FocalStack, Stacks, focus_distances, read_pictures
 
 _FOCUS = (0.1, 0.15, 0.3, 0.7, 1.5)  # m
 _SAMPLE = re.compile(r"(\d{6}).*(All\.tif|Dpt\.exr)")

@@ -12,7 +12,7 @@ import torch
 
 from dhtorch import calibration
 from dhtorch.codes import Gate
-from dhtorch.evaluate import calibrate, control, errors, monotone, recalibrate, risk
+from dhtorch.evaluate import control, errors, monotone, reliability, risk, score_calibration
 from dhtorch.records import Estimate, PoseFit, Samples, Tracks
 from dhtorch.stages import score
 
@@ -38,7 +38,7 @@ def scene_of(n, seed=0, spread=1.0, silent=0.2, boast=1.0, floor=0.0):
 
 def fitted(**provenance):
     note = {"method": "test", "scenes": ["a", "b"]} | provenance
-    return recalibrate.fit([scene_of(800, s) for s in range(3)], provenance=note)
+    return score_calibration.fit([scene_of(800, s) for s in range(3)], provenance=note)
 
 
 # ---------------------------------------------------------------------------------------------------- plain loops
@@ -81,7 +81,7 @@ def test_the_correction_of_sigma_equals_plain_loops(spread, floor, gross):
     scenes[0].sigma[:5], scenes[1].sigma[3] = 0.0, math.inf
     for scene in scenes:
         scene.depth[5 : 5 + gross] *= 3  # gross errors, more than one in ten
-    found = recalibrate.fit_sigma(scenes)
+    found = score_calibration.fit_sigma(scenes)
     scale, floor, wider = loop_sigma(scenes)
     assert (found.scale, found.floor) == pytest.approx((scale, floor), rel=1e-6) and (wider > 1) is (gross > 0)
 
@@ -89,10 +89,10 @@ def test_the_correction_of_sigma_equals_plain_loops(spread, floor, gross):
 def test_a_calibration_is_made_of_what_the_functions_say():
     scenes = [scene_of(n, s) for s, n in enumerate((90, 40, 60))]
     silent = errors.points(torch.full((4,), math.nan), torch.ones(4))
-    score, good, weight = calibrate.pool(scenes)
+    score, good, weight = reliability.pool(scenes)
     loss = torch.cat([s.answered().error.clamp(max=1) for s in scenes])
     for options, share in (({}, 0.02), ({"min_share": 0.2}, 0.2)):
-        learnt = recalibrate.fit([*scenes, silent], **options)
+        learnt = score_calibration.fit([*scenes, silent], **options)
         steps = {"min_share": share, "ends": (0.0, 1.0)}
         for found, wanted in (
             (learnt.probability, monotone.isotonic(score, good.double(), weight, **steps)),
@@ -100,23 +100,23 @@ def test_a_calibration_is_made_of_what_the_functions_say():
         ):
             assert torch.equal(found.x, wanted.x) and torch.equal(found.y, wanted.y)
     assert torch.equal(learnt.sigmoid.slope, monotone.platt(score, good, weight).slope)
-    assert learnt.sigma == recalibrate.fit_sigma(scenes)
+    assert learnt.sigma == score_calibration.fit_sigma(scenes)
     everyone = [*scenes, silent]
     assert learnt.thresholds == {k: control.plug_in(everyone, k / 100).threshold for k in (5, 10, 20)}
     assert learnt.provenance == {"n_scenes": 3, "n_answers": score.numel()}
-    other = recalibrate.fit(scenes, targets=(30,), provenance={"method": "x"})
+    other = score_calibration.fit(scenes, targets=(30,), provenance={"method": "x"})
     assert other.thresholds == {30: control.plug_in(scenes, 0.3).threshold} and other.provenance["method"] == "x"
 
 
 def test_scores_beyond_0_and_1_end_the_tables_where_they_end():
     scene = scene_of(60, 1)
     wide = scene.replace(score=torch.where(scene.keep, 3 * scene.score - 1, 0.0))
-    learnt = recalibrate.fit([wide])
+    learnt = score_calibration.fit([wide])
     answered = wide.answered().score
     for table in (learnt.probability, learnt.expected_error):
         assert (float(table.x[0]), float(table.x[-1])) == (float(answered.min()), float(answered.max()))
     edge = scene.replace(score=torch.where(scene.keep, scene.score.clamp(0.3, 0.6), 0.0))
-    assert [float(recalibrate.fit([edge]).probability.x[k]) for k in (0, -1)] == [0, 1]
+    assert [float(score_calibration.fit([edge]).probability.x[k]) for k in (0, -1)] == [0, 1]
 
 
 def test_a_calibration_is_applied_to_score_and_sigma():
@@ -133,7 +133,9 @@ def test_a_calibration_is_applied_to_score_and_sigma():
             assert found.score[k] == 0 and found.sigma[k].isnan()
     assert torch.equal(found.depth[scene.keep], scene.depth[scene.keep])
     bare = scene.replace(sigma=scene.sigma * math.nan)
-    assert recalibrate.fit([bare]).sigma is None and recalibrate.fit([bare]).apply(scene).sigma is scene.sigma
+    assert (
+        score_calibration.fit([bare]).sigma is None and score_calibration.fit([bare]).apply(scene).sigma is scene.sigma
+    )
 
 
 def test_the_least_score_is_the_threshold_after_calibration():
@@ -144,13 +146,13 @@ def test_the_least_score_is_the_threshold_after_calibration():
     assert silent.min_score(10) is None and '"10": null' in silent.to_json()
     with pytest.raises(KeyError):
         silent.min_score(5)
-    with_none = recalibrate.from_json(dataclasses.replace(silent, sigma=None).to_json())
+    with_none = score_calibration.from_json(dataclasses.replace(silent, sigma=None).to_json())
     assert with_none.sigma is None and with_none.thresholds == {10: None}
 
 
 def test_floors_are_tried_from_a_ten_thousandth_to_a_tenth():
-    assert recalibrate.FLOORS[:2] == (0.0, 1e-4) and recalibrate.FLOORS[-1] == pytest.approx(0.1)
-    assert np.diff(np.log10(recalibrate.FLOORS[1:])) == pytest.approx([0.1] * 30)
+    assert score_calibration.FLOORS[:2] == (0.0, 1e-4) and score_calibration.FLOORS[-1] == pytest.approx(0.1)
+    assert np.diff(np.log10(score_calibration.FLOORS[1:])) == pytest.approx([0.1] * 30)
 
 
 # ---------------------------------------------------------------------------------------------------- calibration
@@ -159,8 +161,8 @@ def test_floors_are_tried_from_a_ten_thousandth_to_a_tenth():
 def test_a_boastful_score_becomes_calibrated_in_scenes_not_fitted():
     fitting = [scene_of(4000, seed, boast=0.3) for seed in range(6)]
     fresh = [scene_of(4000, seed, boast=0.3) for seed in range(10, 16)]
-    learnt = recalibrate.fit(fitting)
-    before, after = calibrate.measure(fresh)["ece"], calibrate.measure([learnt.apply(s) for s in fresh])["ece"]
+    learnt = score_calibration.fit(fitting)
+    before, after = reliability.measure(fresh)["ece"], reliability.measure([learnt.apply(s) for s in fresh])["ece"]
     assert before > 0.1 and after < 0.02
     expected = torch.cat([learnt.expected_error(s.answered().score) for s in fresh])
     actual = torch.cat([risk.capped(s.answered().error) for s in fresh])
@@ -170,7 +172,7 @@ def test_a_boastful_score_becomes_calibrated_in_scenes_not_fitted():
 
 def test_every_scene_teaches_equally():
     few, many = scene_of(50, 1), scene_of(5000, 2, spread=3.0)
-    once, copied = recalibrate.fit([few, many]), recalibrate.fit([few, many[torch.arange(5000).repeat(3)]])
+    once, copied = score_calibration.fit([few, many]), score_calibration.fit([few, many[torch.arange(5000).repeat(3)]])
     at = torch.linspace(0, 1, 30, dtype=torch.float64)
     torch.testing.assert_close(once.probability(at), copied.probability(at))
     torch.testing.assert_close(once.expected_error(at), copied.expected_error(at))
@@ -179,29 +181,32 @@ def test_every_scene_teaches_equally():
 @pytest.mark.parametrize(("spread", "floor"), [(0.5, 0.0), (1.0, 0.0), (2.0, 0.0), (1.5, 0.03), (0.7, 0.1)])
 def test_the_correction_of_sigma_is_found(spread, floor):
     scenes = [scene_of(n, seed, spread=spread, floor=floor) for seed, n in enumerate((1500, 4000, 2500))]
-    found = recalibrate.fit_sigma(scenes)
+    found = score_calibration.fit_sigma(scenes)
     stated, one = torch.linspace(0.02, 0.32, 30, dtype=torch.float64), torch.ones(30, dtype=torch.float64)
     torch.testing.assert_close(
-        found(stated, one), recalibrate.SigmaModel(spread, floor)(stated, one), rtol=0.08, atol=0
+        found(stated, one), score_calibration.SigmaModel(spread, floor)(stated, one), rtol=0.08, atol=0
     )
-    learnt = [errors.measure(recalibrate.fit(scenes).apply(s)) for s in scenes]
+    learnt = [errors.measure(score_calibration.fit(scenes).apply(s)) for s in scenes]
     assert statistics.mean(m["within_sigma"] for m in learnt) == pytest.approx(0.683, abs=0.002)
     assert statistics.mean(m["within_2sigma"] for m in learnt) == pytest.approx(0.954, abs=0.01)
     assert found(torch.tensor(3.0), torch.tensor(2.0)) == pytest.approx(math.hypot(3 * found.scale, 2 * found.floor))
-    assert recalibrate.fit_sigma([errors.points(torch.ones(3), torch.ones(3))]) is None
+    assert score_calibration.fit_sigma([errors.points(torch.ones(3), torch.ones(3))]) is None
 
 
 def test_the_correction_of_sigma_weighs_scenes_and_survives_exact_ones():
     few, many = scene_of(300, 1), scene_of(3000, 2, spread=3.0)
-    once, copied = recalibrate.fit_sigma([few, many]), recalibrate.fit_sigma([few, many[torch.arange(3000).repeat(3)]])
+    once, copied = (
+        score_calibration.fit_sigma([few, many]),
+        score_calibration.fit_sigma([few, many[torch.arange(3000).repeat(3)]]),
+    )
     assert (once.scale, once.floor) == pytest.approx((copied.scale, copied.floor), rel=1e-9)
-    exact = recalibrate.fit_sigma([errors.points(torch.ones(30), torch.ones(30), sigma=torch.ones(30))])
+    exact = score_calibration.fit_sigma([errors.points(torch.ones(30), torch.ones(30), sigma=torch.ones(30))])
     assert math.isfinite(exact.scale) and math.isfinite(exact.floor)
 
 
 def test_calibration_changes_no_order_and_keeps_silence():
     scene = scene_of(1000, 3)
-    there = recalibrate.fit([scene_of(2000, s) for s in range(3)]).apply(scene)
+    there = score_calibration.fit([scene_of(2000, s) for s in range(3)]).apply(scene)
     assert torch.equal(there.keep, scene.keep) and (there.score[~scene.keep] == 0).all()
     assert risk.measure(there)["aurc"] == pytest.approx(risk.measure(scene)["aurc"], abs=1e-12)
 
@@ -210,7 +215,7 @@ def test_a_calibration_of_nothing_raises():
     silent = errors.points(torch.full((4,), math.nan), torch.ones(4))
     for scenes in ([], [silent]):
         with pytest.raises(ValueError, match="fit: found no answer"):
-            recalibrate.fit(scenes)
+            score_calibration.fit(scenes)
 
 
 def test_json_there_and_back(tmp_path):
@@ -276,7 +281,7 @@ def test_level_tables_and_narrow_ones_are_read():
     for name in ("probability", "expected_error"):
         content[name] = {"score": [0.25, 0.5, 3.0], "value": [0.5, 0.5, 0.5]}
     content["thresholds"] = {"1": 0.5, "99": None}
-    found = recalibrate.from_json(json.dumps(content))
+    found = score_calibration.from_json(json.dumps(content))
     assert found.probability(torch.tensor([0.0, 9.0])).tolist() == [0.5, 0.5] and found.thresholds == {1: 0.5, 99: None}
 
 

@@ -1,7 +1,7 @@
 """Fit the calibration that travels with the package: what a score and a sigma of ``map`` turned out to be worth.
 
-python benchmarks/calibrate.py                     on the shared scenes, five seeds; writes dhtorch/calibration/map.json
-python benchmarks/calibrate.py --method window --output FILE --seeds 2
+python benchmarks/fit_calibration.py      on the shared scenes, five seeds; writes dhtorch/calibration/map.json
+python benchmarks/fit_calibration.py --method window --output FILE --seeds 2
 
 Scenes with a role are left out; every scene has the same weight, its seeds are pooled. What the same recipe is worth in
 rooms it was not fitted on is measured by ``dhtorch experiment=method_comparison`` (rows ``ece``, ``realised_risk_…``).
@@ -22,7 +22,7 @@ from hydra.utils import instantiate
 from dhtorch import calibration, tree
 from dhtorch.commands.run import config_dir
 from dhtorch.data.pairs import by_gap
-from dhtorch.evaluate import recalibrate
+from dhtorch.evaluate import score_calibration
 from dhtorch.studies import protocol
 
 HERE = Path(__file__).resolve().parent
@@ -43,17 +43,17 @@ def main() -> int:
     parser.add_argument("--output", type=Path, default=None)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    method, recordings = settings(options.method)
+    method, chosen = settings(options.method)
     variants = {f"{k}": protocol.Variant(method, seed=k) for k in range(options.seeds)}
-    outcome = protocol.run(recordings, protocol.Protocol(variants), by_gap, protocol.Settings())
-    scenes = [r.name for r in recordings if r.role is None]
+    outcome = protocol.run(chosen, protocol.Protocol(variants), by_gap, protocol.Settings())
+    scenes = [scene.name for scene in chosen if scene.role is None]
     found = {s: [p for (name, _, _), p in outcome.points.items() if name == s] for s in scenes}
     pooled = {s: tree.collate(points) for s, points in found.items() if points}
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], cwd=HERE, capture_output=True, text=True, check=False
     ).stdout.strip()
     origin = {"method": options.method, "scenes": [*pooled], "truth": "full", "seeds": options.seeds, "git": commit}
-    fitted = recalibrate.fit(list(pooled.values()), provenance=origin)
+    fitted = score_calibration.fit(list(pooled.values()), provenance=origin)
     target = options.output or HERE.parent / "dhtorch" / "calibration" / f"{options.method}.json"
     print(calibration.save(fitted, target))
     return 0

@@ -19,9 +19,9 @@ import torch
 from torch import Tensor
 
 from dhtorch.evaluate import control
-from dhtorch.evaluate.calibrate import GOOD, pool
 from dhtorch.evaluate.errors import Points
 from dhtorch.evaluate.monotone import Sigmoid, Table, isotonic, platt
+from dhtorch.evaluate.reliability import GOOD, pool
 from dhtorch.evaluate.risk import capped
 
 SCHEMA = 1

@@ -12,7 +12,7 @@ from torch import Tensor
 from dhtorch.data import files
 from dhtorch.data.codecs import tiff as codec_tiff
 from dhtorch.data.files import FormatError
-from dhtorch.data.stacks import FocalStack, Stacks, focus_distances, read_pictures
+from dhtorch.studies.focal.stacks import FocalStack, Stacks, focus_distances, read_pictures
 
 _LOOKED_AT = 16  # pictures of a folder, to tell whether they are of one kind
 _PICTURE = re.compile(r"[^.].*\.(png|jpe?g|tiff?)", re.IGNORECASE)
