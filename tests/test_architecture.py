@@ -14,10 +14,10 @@ ROOT = Path(dhtorch.__file__).parent
 LEVELS = [
     {"tree", "codes", "closure", "archive", "console"},
     {"geometry"},
-    {"records"},
+    {"records", "drawing"},
     {"stages", "data", "evaluate", "export", "synthetic", "testing", "calibration"},
     {"method"},
-    {"pair", "window", "methods", "drawing"},
+    {"pair", "window", "methods"},
     {"transform", "integrate", "extract"},
     {"studies", "viewer"},
     {"commands", "__main__"},
@@ -32,7 +32,6 @@ SIDEWAYS = {
     ("method", "pair"),  # when it is called
     ("method", "window"),
     ("window", "pair"),
-    ("drawing", "pair"),
     ("extract", "transform"),
     ("viewer", "studies"),  # it shows what a protocol answers
     ("__main__", "commands"),

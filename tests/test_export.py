@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from dhtorch import drawing
 from dhtorch.codes import Hole, Source
+from dhtorch.drawing import colours as palette
 from dhtorch.export import Shape, Shot, write_colmap, write_glb, write_ply
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
@@ -95,7 +95,7 @@ def test_wrong_arrays_raise_and_write_nothing(tmp_path, wrong, words):
 
 
 def test_points_of_a_pair_are_coloured_by_their_source():
-    colours = drawing.source_colours(ABOUT["source"])
+    colours = palette.of_source(ABOUT["source"])
     assert (
         colours.dtype == np.uint8 and len({tuple(c) for c in colours[:2]}) == len({tuple(c) for c in colours[2:]}) == 1
     )

@@ -13,10 +13,11 @@ from typing import Any
 
 import torch
 
-from dhtorch import archive, drawing
+from dhtorch import archive
 from dhtorch.data import Recordings
 from dhtorch.data import files as data_files
 from dhtorch.studies import report
+from dhtorch.studies.pictures import draw_example
 from dhtorch.studies.protocol import MIN_CANDIDATES, Outcome, Settings
 
 _LOG = logging.getLogger(__name__)
@@ -73,7 +74,7 @@ def run(
     outcome = parts["experiment"](recordings, methods, parts["pairs"], _common(settings), progress=progress)
     _LOG.debug("%d pairs answered", outcome.n_pairs)
     examples = outcome.examples if settings["figures"] else []
-    drawn = [path for example in examples for path in drawing.draw_example(folder / example.scene, example)]
+    drawn = [path for example in examples for path in draw_example(folder / example.scene, example)]
     scenes = [r.name for r in recordings]
     data = {"name": names["data"], "scenes": scenes, "n_pairs": outcome.n_pairs, "digest": digest}
     result = _result(settings, names["experiment"], key, data, outcome)
