@@ -12,7 +12,7 @@ import dhtorch
 
 ROOT = Path(dhtorch.__file__).parent
 LEVELS = [
-    {"tree", "codes", "closure", "archive", "console"},
+    {"tree", "codes", "storage", "closure", "archive", "console"},
     {"geometry"},
     {"records", "drawing"},
     {"stages", "data", "evaluate", "export", "synthetic", "testing", "calibration"},
@@ -25,6 +25,7 @@ LEVELS = [
 LEVEL = {name: level for level, group in enumerate(LEVELS) for name in group}
 SIDEWAYS = {
     ("archive", "closure"),
+    ("archive", "storage"),
     ("synthetic", "data"),
     ("synthetic", "testing"),
     ("testing", "data"),

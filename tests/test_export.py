@@ -104,7 +104,7 @@ def test_points_of_a_pair_are_coloured_by_their_source():
 
 def test_an_interrupted_write_leaves_the_old_file(ply, monkeypatch):
     before = ply.read_bytes()
-    monkeypatch.setattr("dhtorch.archive.os.fsync", lambda _handle: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr("dhtorch.storage.os.fsync", lambda _handle: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         write_ply(ply, XYZ)
     assert ply.read_bytes() == before and [p.name for p in ply.parent.iterdir()] == ["points.ply"]

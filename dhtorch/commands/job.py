@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from dhtorch import archive
+from dhtorch import archive, storage
 from dhtorch.data import Recordings
 from dhtorch.data import files as data_files
 from dhtorch.studies import report
@@ -66,7 +66,7 @@ def run(
     for recording in recordings if _LOG.isEnabledFor(logging.DEBUG) else ():
         _LOG.debug("data: %s, %d of %s", recording.name, len(recording), recording.format)
     _LOG.debug("digest %s, key %s", digest, key)
-    archive.clear(target)
+    storage.clear(target)
     if settings["resume"] and archive.finished(target, key):
         print(f"{target}: finished and valid, left untouched")
         return Ended(str(folder), "untouched")

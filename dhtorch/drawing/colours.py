@@ -81,6 +81,8 @@ SOURCES = {Source.NONE: SILENT, Source.SENSOR: SENSOR, Source.RECOVERED: RECOVER
 
 #: Quantity → matplotlib's name of its colour map.
 DEPTH, SCORE, ERROR, SIGNED, GREY = "turbo", "viridis", "Spectral_r", "RdBu_r", "gray"
+#: Where 1/m is drawn: near is large, and blue as well.
+INVERSE_DEPTH = f"{DEPTH}_r"
 
 
 class Stroke(NamedTuple):

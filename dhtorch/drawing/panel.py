@@ -32,7 +32,8 @@ class Panel:
     ) -> None:
         self.title, self.x, self.y, self.rows = title, x, y, list(rows)
         longest = max((len(r) for r in rows), default=0)
-        self.width, self.height = size if y else (size[0], AROUND + ROW * len(rows))
+        self.width: float = size[0]
+        self.height: float = size[1] if y else AROUND + ROW * len(rows)
         self.left = min(0.4 * size[0], 12 + LETTER * SMALL * longest) if rows else 46.0
         self.right, self.top, self.bottom = 14.0, 26.0 if title else 10.0, 40.0 if x.label else 22.0
         self.marks: list[Mark] = []

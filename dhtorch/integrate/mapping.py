@@ -16,6 +16,7 @@ from dhtorch import archive, export, integrate
 from dhtorch.codes import Source
 from dhtorch.data import Recordings
 from dhtorch.data import files as data_files
+from dhtorch.evaluate import bootstrap
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.integrate import recording as recordings
@@ -220,8 +221,7 @@ def _result(settings: Mapping[str, Any], sources: Sequence[Any], rows: list[Row]
     for metric, unit in units.items():
         values = sorted(row[metric] for row in scenes if row[metric] is not None and row["role"] is None)
         middle = float(torch.tensor(values).double().quantile(0.5)) if values else None
-        entry = {"value": middle, "low": None, "high": None, "n": len(values), "unit": unit}
-        summary[f"{_name(settings)}.{metric}"] = entry
+        summary[f"{_name(settings)}.{metric}"] = bootstrap.single(middle, len(values), unit)
     threads = torch.get_num_threads()
     return archive.build(
         experiment="integrate",

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import base64
 import html
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dhtorch import archive
+from dhtorch import storage
 from dhtorch.codes import Gate, Hole, names, words
 from dhtorch.drawing import colours
 from dhtorch.drawing.colours import GATES, HOLES, RECOVERED, SENSOR
@@ -49,7 +48,7 @@ def page(scene: Scene) -> str:
     """
     if not scene.shots:
         raise ValueError(f"view: found no pair in {scene.name}, expected at least one")
-    text = json.dumps(_data(scene), ensure_ascii=True, allow_nan=False, separators=(",", ":"))
+    text = storage.dumps(_data(scene), ensure_ascii=True, separators=(",", ":"))
     parts = {
         "title": html.escape(f"{scene.name} · dhtorch"),
         "style": colours.style_sheet() + _file("page.css"),
@@ -72,7 +71,7 @@ def write(path: Path, scene: Scene) -> Path:
         ValueError: nothing to show.
         OSError: the file cannot be written.
     """
-    return archive.replace_file(path, page(scene).encode("utf-8"))
+    return storage.replace_file(path, page(scene).encode("utf-8"))
 
 
 def _data(scene: Scene) -> dict[str, Any]:

@@ -99,7 +99,7 @@ def run(
         return _through_lens(frame, uv, lens, axial_colour_dpt, noise, window_px, settings.seed)
 
     outcome = screen(recordings, lambda _r: [(0, 0)], ask, VARIANTS, truth="full", progress=progress)
-    outcome.summary |= {k: _entry(v) for k, v in ambiguities(noise=noise, window_px=window_px).items()}
+    outcome.summary |= {k: bootstrap.single(v, 1) for k, v in ambiguities(noise=noise, window_px=window_px).items()}
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 
 
@@ -255,7 +255,3 @@ def _grid(hw: tuple[int, int], stride: int, like: Tensor) -> Tensor:
     v = torch.arange(stride // 2, hw[0], stride, dtype=like.dtype, device=like.device)
     u = torch.arange(stride // 2, hw[1], stride, dtype=like.dtype, device=like.device)
     return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1).reshape(1, -1, 2)
-
-
-def _entry(value: float | None) -> dict[str, Any]:
-    return {"value": value, "low": None, "high": None, "n": 1, "unit": "1"}

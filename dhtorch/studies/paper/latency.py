@@ -29,6 +29,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from dhtorch.evaluate import holdout
+from dhtorch.evaluate.bootstrap import Interval
 from dhtorch.geometry import camera as cam
 from dhtorch.method import Trace
 from dhtorch.records import Estimate, Frame, Samples, TrackHint
@@ -287,7 +288,7 @@ def summarise(branches: Sequence[Branch]) -> dict[str, Any]:
 
 def _entry(value: float, spread: Sequence[float], n: int, unit: str) -> dict[str, Any]:
     low, high = (min(spread), max(spread)) if spread else (None, None)
-    return {"value": value, "low": low, "high": high, "n": n, "unit": unit}
+    return Interval(value, low, high, n).entry(unit)
 
 
 def _machine() -> Row:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from dhtorch import archive
+from dhtorch import storage
 from dhtorch.drawing import Key, inline
 from dhtorch.drawing.colours import style_sheet, variable
 from dhtorch.studies.report import published
@@ -56,7 +55,7 @@ def write(path: Path, results: Sequence[Result]) -> Path:
         raise ValueError(f"{path}: found {path.suffix or 'no ending'}, expected a name that ends in .html")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: found no folder {path.parent}, expected one")
-    return archive.replace_file(path, page(results).encode("utf-8"))
+    return storage.replace_file(path, page(results).encode("utf-8"))
 
 
 def _anchors(results: Sequence[Result]) -> list[str]:
@@ -148,7 +147,7 @@ def _settings(result: Result) -> Markup:
     versions = ", ".join(f"{k} {v}" for k, v in meta["versions"].items() if v)
     lines = (("key", result["key"]), ("data digest", result["data"]["digest"]), ("versions", versions))
     known = tag("dl", *(part for k, v in lines for part in (tag("dt", k), tag("dd", v))), class_="question")
-    text = json.dumps(result["config"], indent=2, ensure_ascii=False)
+    text = storage.dumps(result["config"], indent=2)
     return tag("details", tag("summary", "Configuration"), known, tag("pre", text))
 
 
