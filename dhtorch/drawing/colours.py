@@ -2,8 +2,8 @@
 
 Blue is the sensor and orange is what was recovered, and nothing else is drawn in them. A method has one colour in every
 figure. Depth has one colour map, blue near and red far, also where a viewer brings its own (Rerun's has the same name).
-Colours of codes and series stay apart for the colour-blind (Okabe and Ito, Tol) and are seen on light and on dark
-ground alike; only what belongs to a page, as its ink and its ground, has a counterpart in the dark.
+Colours stay apart for the colour-blind where they can (Okabe and Ito, Tol); those of methods and series are seen on
+light and on dark ground alike. Only what belongs to a page, as its ink and its ground, has a counterpart in the dark.
 """
 
 from __future__ import annotations
