@@ -10,7 +10,6 @@ and how far those answers are from what the anchor's pixels really show.
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -23,7 +22,7 @@ import torch
 from degenerate_pairs import KINDS, Pair, make
 from torch import Tensor
 
-from dhtorch import tree
+from dhtorch import storage, tree
 from dhtorch.codes import Gate, PoseCode, names
 from dhtorch.geometry.lookup import nearest
 from dhtorch.method import Trace
@@ -215,7 +214,7 @@ def main() -> None:
     show(rows)
     print(f"{options.n} pairs, {time.perf_counter() - start:.0f} s")
     if options.json is not None:
-        options.json.write_text(json.dumps(rows, indent=1, allow_nan=False) + "\n")
+        storage.write_json(options.json, rows)
 
 
 def explain(number: int, seed: int) -> None:

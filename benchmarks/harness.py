@@ -7,7 +7,6 @@ peer_error, bar}``; ``ratio`` is ours / peer of medians, below 1 = ours is faste
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -17,7 +16,7 @@ from typing import Any
 import cv2
 import torch
 
-from dhtorch import archive
+from dhtorch import archive, storage
 
 #: Clocks by name: what a wall shows, or (on a busy machine) the time this process was really given.
 CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
@@ -120,5 +119,5 @@ def report(rows: list[dict[str, Any]], path: Path | None) -> None:
         )
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(rows, indent=1, allow_nan=False) + "\n")
+        storage.write_json(path, rows)
         print(f"wrote {path}")

@@ -11,7 +11,6 @@ reader can tell.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import multiprocessing
 import os
@@ -25,7 +24,7 @@ from typing import Any
 
 import torch
 
-from dhtorch import archive, data
+from dhtorch import archive, data, storage
 from dhtorch import testing as writers
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
@@ -242,7 +241,7 @@ def main() -> None:
         )
     if options.json is not None:
         options.json.parent.mkdir(parents=True, exist_ok=True)
-        options.json.write_text(json.dumps(rows, indent=1, allow_nan=False) + "\n")
+        storage.write_json(options.json, rows)
         print(f"wrote {options.json}")
 
 

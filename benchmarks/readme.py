@@ -149,14 +149,12 @@ def verdicts(names: Sequence[str]) -> str:
 
 def picture(path: Path) -> None:
     """The idea at a glance: what the sensor may say within 2 m, and what two views add."""
-    import matplotlib as mpl
     import torch
-
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
+    from matplotlib.figure import Figure
 
     from dhtorch import extend, merge
     from dhtorch.codes import Source
+    from dhtorch.drawing.colours import DEPTH, GREY
     from dhtorch.evaluate import holdout
     from dhtorch.synthetic import SyntheticRoom
 
@@ -167,7 +165,8 @@ def picture(path: Path) -> None:
     trace: dict[str, Any] = {}
     estimate = extend(near, other, trace=trace)
     merged = merge(trace["samples"], estimate)
-    figure, axes = plt.subplots(1, 3, figsize=(15, 4.1))
+    figure = Figure((15, 4.1))
+    axes = figure.subplots(1, 3)
     sensor, recovered = (merged.source[0] == s for s in (Source.SENSOR, Source.RECOVERED))
     panels = (
         ("one view of a room", None),
@@ -177,10 +176,10 @@ def picture(path: Path) -> None:
     for axis, (title, mask) in zip(axes, panels, strict=True):
         grey = whole.image[0].float().mean(0)
         axis.imshow(
-            whole.image[0].permute(1, 2, 0) if mask is None else grey, cmap="gray", alpha=1 if mask is None else 0.45
+            whole.image[0].permute(1, 2, 0) if mask is None else grey, cmap=GREY, alpha=1 if mask is None else 0.45
         )
         if mask is not None:
-            dots = axis.scatter(*merged.uv[0][mask].T, c=merged.depth[0][mask], s=5, cmap="turbo", vmin=1, vmax=5)
+            dots = axis.scatter(*merged.uv[0][mask].T, c=merged.depth[0][mask], s=5, cmap=DEPTH, vmin=1, vmax=5)
         axis.set_title(title, fontsize=13)
         axis.set(xlim=(0, 639), ylim=(479, 0))
         axis.axis("off")

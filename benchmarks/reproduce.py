@@ -21,7 +21,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from dhtorch import archive
+from dhtorch import archive, storage
 from dhtorch.commands.run import config_dir, job_name
 
 HERE = Path(__file__).resolve().parent
@@ -90,7 +90,7 @@ def settings(name: str) -> dict[str, Any]:
     OmegaConf.register_new_resolver("dhtorch.job_name", job_name, replace=True)
     with hydra.initialize_config_dir(str(config_dir()), version_base="1.3", job_name="dhtorch"):
         cfg = hydra.compose("run", ["figures=false", *shlex.split(EXPERIMENTS[name])])
-    return archive.strict(archive.portable(OmegaConf.to_container(cfg, resolve=True)))  # type: ignore[arg-type]
+    return storage.strict(archive.portable(OmegaConf.to_container(cfg, resolve=True)))  # type: ignore[arg-type]
 
 
 def differences(found: Any, expected: Any, where: str = "") -> list[str]:

@@ -13,13 +13,13 @@ import math
 import os
 import platform
 import subprocess
-import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from dhtorch import closure
+from dhtorch.storage import dumps, loads, replace_file, strict
 
 SCHEMA = 1
 
@@ -92,7 +92,6 @@ IMPLIED: dict[str, dict[str, Any]] = {
 }
 
 #: Ends the name of a file that is being written.
-_UNFINISHED = ".tmp"
 
 #: Flags of x86 processors, widest vectors first, and what they are called.
 _VECTORS = {"amx_tile": "AVX-512 and AMX", "avx512f": "AVX-512", "avx2": "AVX2"}
@@ -194,29 +193,6 @@ def today(settings: Any) -> Any:
     return {**IMPLIED.get(said["_target_"], {}), **said}
 
 
-def strict(value: Any) -> Any:
-    """The same value in what strict JSON can hold: finite numbers, strings, lists, objects with string keys, null.
-
-    Non-finite numbers become null; numpy and torch values become numbers and lists, paths become strings.
-
-    Raises:
-        TypeError: a value that has no counterpart.
-    """
-    if value is None or isinstance(value, bool | int | str):
-        return value
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {str(k): strict(v) for k, v in value.items()}
-    if isinstance(value, list | tuple | set | frozenset):
-        return [strict(v) for v in (sorted(value) if isinstance(value, set | frozenset) else value)]
-    if isinstance(value, Path):
-        return str(value)
-    if hasattr(value, "tolist"):  # torch.Tensor, numpy.ndarray and numpy scalars
-        return strict(value.tolist())
-    raise TypeError(f"result: found a {type(value).__name__}, expected something that JSON can hold")
-
-
 def write(path: str | Path, result: Mapping[str, Any]) -> Path:
     """Write a result so that, whatever happens, ``path`` holds either the old file or the whole new one.
 
@@ -227,48 +203,19 @@ def write(path: str | Path, result: Mapping[str, Any]) -> Path:
     return replace_file(path, _text(result).encode("utf-8"))
 
 
-def replace_file(path: str | Path, content: bytes) -> Path:
-    """Write a file so that, whatever happens, ``path`` holds either what it held before or all of the new content."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=_UNFINISHED, dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(name).chmod(0o644)
-        Path(name).replace(path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
-    _sync_folder(path.parent)
-    return path
-
-
 def _text(result: Mapping[str, Any]) -> str:
     """JSON in which every summary entry and every row is a line: small, and two versions can be compared."""
-
-    def dump(value: Any) -> str:
-        return json.dumps(value, ensure_ascii=False, allow_nan=False)
 
     lines = []
     for name, value in result.items():
         if name == "rows":
-            body = "[\n" + ",\n".join(f"  {dump(row)}" for row in value) + "\n ]" if value else "[]"
+            body = "[\n" + ",\n".join(f"  {dumps(row)}" for row in value) + "\n ]" if value else "[]"
         elif isinstance(value, Mapping) and name != "config":
-            body = "{\n" + ",\n".join(f"  {dump(k)}: {dump(v)}" for k, v in value.items()) + "\n }" if value else "{}"
+            body = "{\n" + ",\n".join(f"  {dumps(k)}: {dumps(v)}" for k, v in value.items()) + "\n }" if value else "{}"
         else:
-            body = dump(value)
-        lines.append(f" {dump(name)}: {body}")
+            body = dumps(value)
+        lines.append(f" {dumps(name)}: {body}")
     return "{\n" + ",\n".join(lines) + "\n}\n"
-
-
-def clear(path: str | Path) -> None:
-    """Remove what a writer of ``path`` left beside it when it was killed. Nobody may be writing ``path`` meanwhile."""
-    path = Path(path)
-    for left in path.parent.glob(f".{path.name}.*{_UNFINISHED}"):
-        left.unlink(missing_ok=True)
 
 
 def read(path: str | Path) -> dict[str, Any]:
@@ -283,7 +230,7 @@ def read(path: str | Path) -> dict[str, Any]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: found no file, expected a result.json or a folder with one")
     try:
-        result = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
+        result = loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{path}: found no strict JSON ({error}), expected a result") from error
     validate(result, str(path))
@@ -453,24 +400,6 @@ def _finite(value: Any, where: str) -> None:
             _finite(v, f"{where}.{k}")
     elif isinstance(value, float):
         _expect(math.isfinite(value), where, value, "a finite number or null")
-
-
-def _refuse_constant(word: str) -> None:
-    raise ValueError(f"the constant {word}")
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make a rename durable, where the system lets a folder be opened."""
-    try:
-        handle = os.open(folder, os.O_RDONLY)
-    except OSError:
-        return
-    try:
-        os.fsync(handle)
-    except OSError:
-        pass
-    finally:
-        os.close(handle)
 
 
 def _add(total: Any, part: bytes) -> None:

@@ -13,7 +13,7 @@ import io
 import json
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,9 @@ import readme as tables  # noqa: E402
 from docstrings import markdown as as_markdown  # noqa: E402
 
 import dhtorch  # noqa: E402
+from dhtorch.codes import Gate, Hole, Source, names, words  # noqa: E402
 from dhtorch.commands import run  # noqa: E402
+from dhtorch.drawing import colours as palette  # noqa: E402
 
 #: Words of the command with a help text of their own.
 WORDS = ("", "inspect", "report", "extract", "integrate", "view")
@@ -317,6 +319,40 @@ def exit_codes() -> str:
     return "\n".join(["| code | |", "| --: | :-- |", *(f"| {k} | {v} |" for k, v in run.EXIT_CODES.items())])
 
 
+def colours() -> str:
+    """The project's colours, each with a patch of itself."""
+    tables = {
+        "Where a depth comes from": {words(names(Source)[k]): c for k, c in palette.SOURCES.items()},
+        "Methods": palette.METHODS,
+        "Series that are no method, in turn": {str(k + 1): c for k, c in enumerate(palette.OTHERS)},
+        "Gates: why an answer is withheld": {words(names(Gate)[k]): c for k, c in palette.GATES.items()},
+        "Holes: why there is no return": {words(names(Hole)[k]): c for k, c in palette.HOLES.items()},
+    }
+    parts = [_patches(title, table) for title, table in tables.items()]
+    maps = {"depth": palette.DEPTH, "1/depth": palette.INVERSE_DEPTH, "score": palette.SCORE}
+    maps |= {"error": palette.ERROR, "signed difference": palette.SIGNED, "picture": palette.GREY}
+    rows = [f"| {name} | `{kind}` | {_ramp(palette.ramp(kind, 33))} |" for name, kind in maps.items()]
+    parts.append("\n".join(["## Colour maps, from small to large", "", "| | | |", "| :-- | :-- | :-- |", *rows]))
+    pages = [f"| `{name}` | {_patch(day)} | {_patch(dark)} |" for name, (day, dark) in palette.PAGE.items()]
+    head = ["## Variables of a page", "", "| | by day | in the dark |", "| :-- | :-- | :-- |"]
+    return "\n\n".join([*parts, "\n".join([*head, *pages])])
+
+
+def _patches(title: str, table: Mapping[str, str]) -> str:
+    rows = [f"| {name} | {_patch(colour)} |" for name, colour in table.items()]
+    return "\n".join([f"## {title}", "", "| | |", "| :-- | :-- |", *rows])
+
+
+def _patch(colour: str) -> str:
+    style = f"display:inline-block;width:2.4em;height:1em;vertical-align:-.15em;border:1px solid;background:{colour}"
+    return f'<span style="{style}"></span> `{colour.lower()}`'
+
+
+def _ramp(stops: Sequence[str]) -> str:
+    style = f"display:inline-block;width:16em;height:1em;background:linear-gradient(to right,{','.join(stops)})"
+    return f'<span style="{style}"></span>'
+
+
 def licences() -> str:
     """Direct dependencies and their licences."""
     return str(terms.table())
@@ -325,5 +361,5 @@ def licences() -> str:
 MAKERS: dict[str, Callable[..., str]] = {
     "readme": section,
     **{f.__name__: f for f in (readme_head, readme_table, speed, module, reader, choices, codes)},
-    **{f.__name__: f for f in (experiments, verdicts, helps, exit_codes, licences)},
+    **{f.__name__: f for f in (experiments, verdicts, helps, exit_codes, licences, colours)},
 }

@@ -12,12 +12,12 @@ import dhtorch
 
 ROOT = Path(dhtorch.__file__).parent
 LEVELS = [
-    {"tree", "codes", "closure", "archive", "console"},
+    {"tree", "codes", "storage", "closure", "archive", "console"},
     {"geometry"},
-    {"records"},
+    {"records", "drawing"},
     {"stages", "data", "evaluate", "export", "synthetic", "testing", "calibration"},
     {"method"},
-    {"pair", "window", "methods", "drawing"},
+    {"pair", "window", "methods"},
     {"transform", "integrate", "extract"},
     {"studies", "viewer"},
     {"commands", "__main__"},
@@ -25,6 +25,7 @@ LEVELS = [
 LEVEL = {name: level for level, group in enumerate(LEVELS) for name in group}
 SIDEWAYS = {
     ("archive", "closure"),
+    ("archive", "storage"),
     ("synthetic", "data"),
     ("synthetic", "testing"),
     ("testing", "data"),
@@ -32,7 +33,6 @@ SIDEWAYS = {
     ("method", "pair"),  # when it is called
     ("method", "window"),
     ("window", "pair"),
-    ("drawing", "pair"),
     ("extract", "transform"),
     ("viewer", "studies"),  # it shows what a protocol answers
     ("__main__", "commands"),

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 
-from dhtorch import archive
+from dhtorch import archive, storage
 
 KEY = "0123456789abcdef" * 4
 
@@ -133,12 +133,12 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
     before = path.read_bytes()
     with pytest.raises(ValueError, match=r"\.key"):
         archive.write(path, {**result(), "key": "x"})
-    os_replace, archive.Path.replace = archive.Path.replace, lambda *_: (_ for _ in ()).throw(OSError("disk full"))
+    os_replace, storage.Path.replace = storage.Path.replace, lambda *_: (_ for _ in ()).throw(OSError("disk full"))
     try:
         with pytest.raises(OSError, match="disk full"):
             archive.write(path, {**result(), "key": KEY[::-1]})
     finally:
-        archive.Path.replace = os_replace
+        storage.Path.replace = os_replace
     assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["result.json"]
 
 
@@ -171,8 +171,8 @@ def test_what_a_killed_writer_left_is_cleared(tmp_path):
     path = archive.write(tmp_path / "result.json", result())
     for name in (".result.json.abc.tmp", ".result.json.1.tmp", "result.json.tmp", ".other.json.1.tmp", "x.tmp"):
         (tmp_path / name).write_text("{")
-    archive.clear(path)
-    archive.clear(tmp_path / "nowhere" / "result.json")
+    storage.clear(path)
+    storage.clear(tmp_path / "nowhere" / "result.json")
     assert {p.name for p in tmp_path.iterdir()} == {"result.json", "result.json.tmp", ".other.json.1.tmp", "x.tmp"}
     assert archive.finished(path, KEY)
 
@@ -266,7 +266,7 @@ def test_meta_says_when_and_with_what():
 
 def test_what_json_cannot_hold_is_refused():
     with pytest.raises(TypeError, match="found a object"):
-        archive.strict({"x": object()})
+        storage.strict({"x": object()})
 
 
 # ---------------------------------------------------------------------------------------------------- each field
@@ -410,7 +410,7 @@ def test_strict_makes_of_everything_what_json_holds():
         "as": [True, 0, "x", None, -2.5],
         "deep": {"a": {"b": ((math.nan,),)}},
     }
-    assert archive.strict(given) == {
+    assert storage.strict(given) == {
         "1": [0.5, [0, 1, 2], [[1.0, None]]],
         "sets": [[1, 2, 3], ["a", "b"]],
         "path": "/a/b",
@@ -418,9 +418,9 @@ def test_strict_makes_of_everything_what_json_holds():
         "as": [True, 0, "x", None, -2.5],
         "deep": {"a": {"b": [[None]]}},
     }
-    assert archive.strict(True) is True and type(archive.strict(np.int64(3))) is int
+    assert storage.strict(True) is True and type(storage.strict(np.int64(3))) is int
     with pytest.raises(TypeError, match="result: found a complex, expected something that JSON can hold"):
-        archive.strict([1j])
+        storage.strict([1j])
 
 
 # ---------------------------------------------------------------------------------------------------- files
@@ -439,10 +439,10 @@ def test_every_row_and_every_entry_is_a_line_of_its_own(tmp_path):
 
 
 def test_a_file_is_replaced_whole_and_readable_by_all(tmp_path):
-    path = archive.replace_file(str(tmp_path / "new" / "a.bin"), b"one")
+    path = storage.replace_file(str(tmp_path / "new" / "a.bin"), b"one")
     assert path == tmp_path / "new" / "a.bin" and path.read_bytes() == b"one" and path.stat().st_mode & 0o777 == 0o644
     inode = path.stat().st_ino
-    assert archive.replace_file(path, b"two").read_bytes() == b"two" and path.stat().st_ino != inode, (
+    assert storage.replace_file(path, b"two").read_bytes() == b"two" and path.stat().st_ino != inode, (
         "never written into"
     )
     assert [p.name for p in path.parent.iterdir()] == ["a.bin"]
@@ -454,7 +454,7 @@ def is_folder(handle):
 
 def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
     """Content, then name, then the folder that holds the name; unfinished it lies beside, where ``clear`` finds it."""
-    log, sync, replace = [], os.fsync, archive.Path.replace
+    log, sync, replace = [], os.fsync, storage.Path.replace
 
     def synced(handle):
         log.append("folder" if is_folder(handle) else os.fstat(handle).st_size)
@@ -464,9 +464,9 @@ def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
         log.append((self.parent == target.parent, self.name.startswith(".a.bin."), self.name.endswith(".tmp")))
         return replace(self, target)
 
-    monkeypatch.setattr(archive.os, "fsync", synced)
-    monkeypatch.setattr(archive.Path, "replace", renamed)
-    archive.replace_file(tmp_path / "a.bin", b"seven b")
+    monkeypatch.setattr(storage.os, "fsync", synced)
+    monkeypatch.setattr(storage.Path, "replace", renamed)
+    storage.replace_file(tmp_path / "a.bin", b"seven b")
     assert log == [7, (True, True, True), "folder"]
 
 
@@ -479,8 +479,8 @@ def test_a_system_that_cannot_sync_a_folder_is_no_error(tmp_path, monkeypatch):
             raise OSError("not supported")
         real_sync(handle)
 
-    monkeypatch.setattr(archive.os, "fsync", no_sync)
-    assert archive.replace_file(tmp_path / "a", b"x").read_bytes() == b"x" and len(closed) == 1
+    monkeypatch.setattr(storage.os, "fsync", no_sync)
+    assert storage.replace_file(tmp_path / "a", b"x").read_bytes() == b"x" and len(closed) == 1
     with pytest.raises(OSError, match="Bad file descriptor"):
         os.fstat(closed[0])
 
@@ -489,8 +489,8 @@ def test_a_system_that_cannot_sync_a_folder_is_no_error(tmp_path, monkeypatch):
             raise OSError("no folders")
         return real_open(path, *args, **options)
 
-    monkeypatch.setattr(archive.os, "open", no_open)
-    assert archive.replace_file(tmp_path / "a", b"y").read_bytes() == b"y"
+    monkeypatch.setattr(storage.os, "open", no_open)
+    assert storage.replace_file(tmp_path / "a", b"y").read_bytes() == b"y"
 
 
 def test_constants_that_json_does_not_know_are_refused(tmp_path):
@@ -505,6 +505,25 @@ def test_constants_that_json_does_not_know_are_refused(tmp_path):
         assert not archive.finished(tmp_path, KEY)
     path.write_text(good)
     assert archive.finished(tmp_path, KEY) and archive.finished(str(path), KEY) and not archive.finished(path, KEY[:-1])
+
+
+def test_a_key_that_stands_twice_is_refused(tmp_path):
+    path = archive.write(tmp_path / "result.json", result())
+    path.write_text(path.read_text().replace('"n": 1,', '"n": 1, "n": 2,'))
+    with pytest.raises(ValueError, match=r"result.json: found no strict JSON \(the key 'n' twice\), expected a result"):
+        archive.read(path)
+    assert storage.loads('{"a": {"b": 1}, "b": [{"b": 2}]}') == {"a": {"b": 1}, "b": [{"b": 2}]}
+
+
+def test_what_is_not_finite_is_not_written(tmp_path):
+    for value in (math.nan, math.inf):
+        with pytest.raises(ValueError, match="JSON"):
+            storage.write_json(tmp_path / "a.json", [value])
+    assert not list(tmp_path.iterdir())
+    path = storage.write_json(tmp_path / "a.json", {"é": [1, None]})
+    assert path.read_bytes() == '{\n "é": [\n  1,\n  null\n ]\n}\n'.encode() and storage.loads(path.read_text()) == {
+        "é": [1, None]
+    }
 
 
 # ---------------------------------------------------------------------------------------------------- keys

@@ -474,7 +474,7 @@ ELSEWHERE = {
     *(f"dhtorch.evaluate.compare.{name}" for name in ("method_ratios", "ratio_over_seeds", "equal_coverage")),
     "dhtorch.evaluate.curves.sampled",
     *(f"dhtorch.evaluate.correlation.{name}" for name in ("pearson", "spearman", "ranks")),
-    *(f"dhtorch.evaluate.bootstrap.{name}" for name in ("interval", "interval_of", "resample")),
+    *(f"dhtorch.evaluate.bootstrap.{name}" for name in ("interval", "interval_of", "resample", "single")),
     *(f"dhtorch.evaluate.probe.{name}" for name in ("columns", "folds", "mean_error", "ratio", "equivalent")),
 }
 

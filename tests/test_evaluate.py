@@ -273,6 +273,13 @@ def test_a_summary_passes_over_names_and_flattens_groups():
     assert errors.summarise([one])["n_kept"]["value"] is None
 
 
+def test_an_interval_is_an_entry_of_a_summary():
+    found = bootstrap.interval([1.0, 2.0, 4.0])
+    assert found.entry("m") == {"value": 2.0, "low": found.low, "high": found.high, "n": 3, "unit": "m"}
+    assert list(found.entry()) == ["value", "low", "high", "n", "unit"] and found.entry()["unit"] == "1"
+    assert bootstrap.single(0.5, 4, "ms") == {"value": 0.5, "low": None, "high": None, "n": 4, "unit": "ms"}
+
+
 def test_a_summary_hands_its_options_to_the_bootstrap():
     scenes = [{"x": float(v)} for v in (1, 2, 4, 9, 30)]
     for statistic, draws, seed in (("median", 2000, 0), ("mean", 70, 0), ("mean", 70, 5)):

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from dhtorch import drawing
 from dhtorch.codes import Hole, Source
+from dhtorch.drawing import colours as palette
 from dhtorch.export import Shape, Shot, write_colmap, write_glb, write_ply
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
@@ -95,7 +95,7 @@ def test_wrong_arrays_raise_and_write_nothing(tmp_path, wrong, words):
 
 
 def test_points_of_a_pair_are_coloured_by_their_source():
-    colours = drawing.source_colours(ABOUT["source"])
+    colours = palette.of_source(ABOUT["source"])
     assert (
         colours.dtype == np.uint8 and len({tuple(c) for c in colours[:2]}) == len({tuple(c) for c in colours[2:]}) == 1
     )
@@ -104,7 +104,7 @@ def test_points_of_a_pair_are_coloured_by_their_source():
 
 def test_an_interrupted_write_leaves_the_old_file(ply, monkeypatch):
     before = ply.read_bytes()
-    monkeypatch.setattr("dhtorch.archive.os.fsync", lambda _handle: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr("dhtorch.storage.os.fsync", lambda _handle: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         write_ply(ply, XYZ)
     assert ply.read_bytes() == before and [p.name for p in ply.parent.iterdir()] == ["points.ply"]

@@ -8,7 +8,7 @@ import torch
 from rooms import noted
 from rooms import room as rendered
 
-from dhtorch import archive, extend
+from dhtorch import extend, storage
 from dhtorch.data.pairs import by_gap
 from dhtorch.stages import score
 from dhtorch.studies import memory
@@ -49,7 +49,7 @@ def test_every_stage_has_a_row_at_every_size():
     assert outcome.verdict == "refuted" and "DINOv2-L / front end" in outcome.why, "a tiny network is no match"
     for name, value in outcome.summary.items():
         assert set(value) == {"value", "low", "high", "n", "unit"}, name
-    archive.strict(outcome.rows)
+    storage.strict(outcome.rows)
 
 
 def test_without_transformers_the_rest_is_measured(monkeypatch):

@@ -9,7 +9,7 @@ import pytest
 import torch
 from rooms import noted
 
-from dhtorch import archive, extend
+from dhtorch import extend, storage
 from dhtorch.codes import Gate
 from dhtorch.data.pairs import by_gap
 from dhtorch.evaluate import holdout
@@ -222,7 +222,7 @@ def test_networks_are_measured_on_our_candidates(room, installed):
         assert row["pnp_success"] is None and row["seconds_per_video"] > 0
         assert f"{name}.on_ours.median_rel" in outcome.summary and f"{name}.seconds_per_video" in outcome.summary
     assert outcome.verdict == "supported" and "1 of 1" in outcome.why
-    archive.strict(outcome.rows)
+    storage.strict(outcome.rows)
 
 
 def test_a_network_is_asked_once_for_all_its_scales(room, installed):

@@ -13,6 +13,7 @@ from rich.console import Console
 
 from dhtorch import archive, drawing
 from dhtorch.codes import Gate, Hole, Source, names
+from dhtorch.drawing import colours
 from dhtorch.evaluate import errors, risk
 from dhtorch.studies import report
 
@@ -148,12 +149,12 @@ def test_samples_are_drawn_in_the_colour_of_what_became_of_them(tmp_path):
     gate = torch.where(source == Source.NONE, Gate.PARALLAX, Gate.ANSWER)
     drawing.draw_samples(tmp_path / "a.png", image, uv, source, gate)
     pixels = picture(tmp_path / "a.png")
-    for colour in (drawing.SENSOR, drawing.RECOVERED, drawing.GATE_COLOURS[Gate.PARALLAX]):
+    for colour in (colours.SENSOR, colours.RECOVERED, colours.GATES[Gate.PARALLAX]):
         assert share_of(pixels, colour) > 4e-4
-    assert share_of(pixels, drawing.GATE_COLOURS[Gate.RESIDUAL]) < 1e-4
+    assert share_of(pixels, colours.GATES[Gate.RESIDUAL]) < 1e-4
     drawing.draw_samples(tmp_path / "b.png", (255 * image).to(torch.uint8), uv, 0 * source, 0 * source)
     without = picture(tmp_path / "b.png")
-    assert share_of(without, drawing.SENSOR) < 1e-4
+    assert share_of(without, colours.SENSOR) < 1e-4
     assert pixels.shape[1] > 1.1 * without.shape[1], "the legend stands beside the picture and is not cut off"
 
 
@@ -162,14 +163,14 @@ def test_holes_are_drawn_by_class(tmp_path):
     hole = torch.randint(0, 3, (300,), generator=g)
     drawing.draw_holes(tmp_path / "a.png", image[:1], uv, hole, title="one channel")
     pixels = picture(tmp_path / "a.png")
-    assert share_of(pixels, drawing.HOLE_COLOURS[Hole.TRACKABLE_NO_LIDAR]) > 1e-3
-    assert share_of(pixels, drawing.HOLE_COLOURS[Hole.AT_BORDER]) < 1e-4
+    assert share_of(pixels, colours.HOLES[Hole.TRACKABLE_NO_LIDAR]) > 1e-3
+    assert share_of(pixels, colours.HOLES[Hole.AT_BORDER]) < 1e-4
 
 
 def test_every_code_has_a_colour_of_its_own():
-    assert set(drawing.GATE_COLOURS) == set(names(Gate)) - {Gate.ANSWER}
-    assert set(drawing.HOLE_COLOURS) == set(names(Hole)) - {Hole.NONE}
-    for table in (drawing.GATE_COLOURS, drawing.HOLE_COLOURS):
+    assert set(colours.GATES) == set(names(Gate)) - {Gate.ANSWER}
+    assert set(colours.HOLES) == set(names(Hole)) - {Hole.NONE}
+    for table in (colours.GATES, colours.HOLES):
         assert len(set(table.values())) == len(table)
 
 
@@ -179,10 +180,10 @@ def test_depth_and_risk_figures_also_of_nothing(tmp_path):
     points = errors.points(depth, true, true / 10)
     drawing.draw_depth(tmp_path / "depth.png", points.true_depth, points.depth, points.score)
     drawing.draw_depth(tmp_path / "plain.png", true, depth)
-    assert share_of(picture(tmp_path / "plain.png"), drawing.SENSOR) > 5e-4
+    assert share_of(picture(tmp_path / "plain.png"), colours.SENSOR) > 5e-4
     curves = {"paper": risk.risk_coverage(points), "none": risk.risk_coverage(points[:0])}
     drawing.draw_risk_coverage(tmp_path / "risk.png", curves, oracle=risk.risk_coverage(points, oracle=True))
-    assert share_of(picture(tmp_path / "risk.png"), drawing.LINES[0]) > 1e-3
+    assert share_of(picture(tmp_path / "risk.png"), colours.METHODS["paper"]) > 1e-3
     drawing.draw_depth(tmp_path / "empty.png", true[:0], depth[:0], depth[:0])
     drawing.draw_risk_coverage(tmp_path / "void.png", {})
     picture(tmp_path / "empty.png"), picture(tmp_path / "void.png")

@@ -1,7 +1,6 @@
 """The page, the figures and the paper's tables, on results of every experiment and on what they must survive."""
 
 import copy
-import re
 import xml.etree.ElementTree as ET
 from itertools import pairwise
 from pathlib import Path
@@ -11,10 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dhtorch import archive
+from dhtorch import archive, drawing
 from dhtorch.codes import Gate, Source
+from dhtorch.drawing import Axis, Panel, Stroke, colours
 from dhtorch.studies import report
-from dhtorch.studies.report import cells, curves, layouts, page, plots, published, svg, text
+from dhtorch.studies.report import cells, curves, layouts, page, plots, published, text
 from dhtorch.studies.report.markup import Markup, escape, tag
 from dhtorch.studies.report.reading import flatten, scene_rows
 from dhtorch.studies.report.tables import COLUMNS, every_number
@@ -361,20 +361,14 @@ def test_scenes_that_a_figure_lacks_are_named():
             assert "terrace/CAMERA_01 (too short)" in figure.caption
 
 
-def points_of(element):
-    return [tuple(map(float, pair.split(","))) for pair in element.get("points").split()]
-
-
 def test_a_mean_over_few_answers_is_not_drawn():
     result = archived.pair()
     for row in result["rows"]:
         if row["pair"] is None:
             row["n_candidates"] = 100
             row["curves"]["risk_coverage"]["coverage"] = [0.02 * k for k in range(1, 21)]  # 2, 4, … 40 answers
-    figure = curves.risk(result)
-    tree = ET.fromstring(figure.panels[0])
-    (line,) = [e for e in tree.iter("polyline") if "oracle" not in e.get("class")]
-    assert len(points_of(line)) == 16, "from ten answers on"
+    (line,) = [m for m in curves.risk(result).panels[0].marks if m.kind == "line" and not m.stroke.dashes]
+    assert len(line.places) == 16, "from ten answers on"
 
 
 def test_bins_of_several_scenes_weigh_every_scene_the_same():
@@ -390,26 +384,28 @@ def test_an_overlay_draws_every_point_once_in_its_class():
     result = archived.pair()
     row = next(r for r in result["rows"] if r["pair"] is None)
     figure = plots.figures(result)[-1]
-    tree = ET.fromstring(figure.panels[0])
-    drawn = {p.get("class"): len(re.findall("M", p.get("d"))) for p in tree.iter("path")}
+    drawn = {layer.label: layer for layer in figure.panels[0].layers}
     source, gate = row["overlay"]["source"], row["overlay"]["gate"]
-    assert drawn[f"source{Source.SENSOR}"] == source.count(Source.SENSOR)
-    assert drawn[f"source{Source.RECOVERED}"] == source.count(Source.RECOVERED)
+    assert len(drawn["sensor"].uv) == source.count(Source.SENSOR) and drawn["sensor"].colour == colours.SENSOR
+    assert len(drawn["recovered"].uv) == source.count(Source.RECOVERED)
+    assert drawn["recovered"].colour == colours.RECOVERED
     silent = [g for s, g in zip(source, gate, strict=True) if s == Source.NONE]
-    assert drawn[f"gate{Gate.PARALLAX}"] == silent.count(Gate.PARALLAX)
-    assert sum(drawn.values()) == len(source)
-    assert {kind.removeprefix("box ") for kind, _ in figure.legend} >= set(drawn)
+    assert len(drawn["silent: parallax"].uv) == silent.count(Gate.PARALLAX)
+    assert sum(len(layer.uv) for layer in drawn.values()) == len(source)
+    assert {key.text for key in figure.legend} >= set(drawn)
+    svg = drawing.inline(figure.panels[0])
+    round_ends = [p.get("d").count("M") for p in ET.fromstring(svg).iter("path") if "linecap" in p.get("style")]
+    assert sum(round_ends) == sum(len(layer.uv) for layer in drawn.values() if layer.mark != "silent"), "a dot each"
 
 
 def test_a_line_breaks_where_a_value_is_missing():
-    panel = svg.Panel("t", svg.Axis(0, 1), svg.Axis(0, 1))
-    panel.line([0, 0.5, 1, None, 0.2], [0, 0.5, 1, 1, 0.2], "s0")
-    panel.line([0, 0.5, 1], [0, None, 1], "s1")
-    tree = ET.fromstring(panel.render())
-    (line,) = tree.findall("polyline")
-    assert len(points_of(line)) == 3 and len(list(tree.iter("circle"))) == 3
-    (left, low), _, (right, high) = points_of(line)
-    assert left < right and low > high, "up is up"
+    panel, stroke = Panel("t", Axis(0, 1), Axis(0, 1)), Stroke(colours.INK)
+    panel.line([0, 0.5, 1, None, 0.2], [0, 0.5, 1, 1, 0.2], stroke)
+    panel.line([0, 0.5, 1], [0, None, 1], stroke)
+    line, *dots = panel.marks
+    assert len(line.places) == 3 and [m.kind for m in dots] == ["dot"] * 3
+    (left, low), _, (right, high) = line.places
+    assert left < right and low < high, "up is up"
 
 
 ends = st.floats(1e-3, 1e3)
@@ -417,7 +413,7 @@ ends = st.floats(1e-3, 1e3)
 
 @given(ends, st.floats(1.01, 1e4), st.booleans())
 def test_ticks_are_few_round_and_inside(low, factor, log):
-    axis = svg.spanning([low, low * factor], "", log=log)
+    axis = drawing.spanning([low, low * factor], "", log=log)
     ticks = axis.ticks()
     assert 1 <= len(ticks) <= 8 and ticks == sorted(set(ticks))
     assert all(axis.low * 0.998 <= t <= axis.high * 1.002 for t in ticks)
@@ -428,7 +424,7 @@ def test_ticks_are_few_round_and_inside(low, factor, log):
 
 @given(st.lists(st.one_of(st.none(), st.floats(-1e6, 1e6)), max_size=5), st.booleans())
 def test_an_axis_takes_any_values(values, log):
-    axis = svg.spanning(values, "", log=log)
+    axis = drawing.spanning(values, "", log=log)
     assert axis.low < axis.high and (not log or axis.low > 0)
     for v in values:
         assert v is None or 0 <= axis.place(v) <= 1

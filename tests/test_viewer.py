@@ -20,7 +20,7 @@ from PIL import Image
 from rooms import Changed, noted
 from rooms import room as rendered
 
-from dhtorch import archive, closure, data, drawing, viewer
+from dhtorch import archive, closure, data, export, viewer
 from dhtorch.codes import Gate, Source, names
 from dhtorch.commands import run
 from dhtorch.data.pairs import by_gap
@@ -372,7 +372,7 @@ def test_data_that_are_gone_leave_the_points(job, command, tmp_path):
         "dhtorch.testing.write_tum",
         "dhtorch.data.os",
         "dhtorch.data.Path",
-        "dhtorch.drawing.write_ply",
+        "dhtorch.export.write_ply",
         "dhtorch.synthetic.recording._turned",
         "dhtorch.synthetic.recording.phone_lidar.__globals__",
         7,
@@ -442,7 +442,7 @@ def test_points_of_a_file(tmp_path):
     rng = np.random.default_rng(0)
     xyz, sigma, score = rng.normal(size=(50, 3)), rng.random(50), rng.random(50)
     source = rng.integers(1, 3, 50)
-    drawing.write_ply(tmp_path / "p.ply", xyz, sigma=sigma, score=score, source=source)
+    export.write_ply(tmp_path / "p.ply", xyz, sigma=sigma, score=score, source=source)
     found = points.read(tmp_path / "p.ply").shots[0].samples
     for name, value in {"xyz": xyz, "sigma": sigma, "score": score, "source": source}.items():
         assert np.allclose(found[name], value, atol=1e-6), name

@@ -24,13 +24,13 @@ from dhtorch import data
 from dhtorch.console import EPILOG, progress
 from dhtorch.data import FormatError, files
 from dhtorch.data.survey import Survey, survey_pictures, survey_recording
+from dhtorch.drawing.colours import DEPTH, GREY, INK, OTHERS, SCORE, SILENT
 from dhtorch.studies.focal import formats
 from dhtorch.studies.focal.survey import survey_stacks
 
 _LEVELS = 2  # folders below the path
 _MOST = 12  # recordings that are shown of one capture
 _SPARSE = 0.1  # share of returns below which they are drawn larger
-_COLOURS = "turbo_r"  # near is red
 _ARCHIVES = (".r3d", ".mp4", ".mov", ".tar", ".h5", ".hdf5")  # files that may be a whole capture
 _PICTURES = (".png", ".jpg", ".jpeg")
 
@@ -282,14 +282,14 @@ def _draw(axes: Any, picture: Tensor, kind: str, limits: tuple[float, float]) ->
     step = max(1, max(picture.shape[-2:]) // 400)
     if kind == "image":
         pixels = picture[:, ::step, ::step].permute(1, 2, 0).numpy()
-        axes.imshow(pixels if pixels.shape[2] == 3 else pixels[..., 0], cmap="gray")
+        axes.imshow(pixels if pixels.shape[2] == 3 else pixels[..., 0], cmap=GREY)
     elif kind == "depth":
         sparse = float((picture > 0).double().mean()) < _SPARSE
         shown = _nearest(picture, 3 * step) if sparse else picture[::step, ::step]
-        axes.imshow(np.ma.masked_equal(shown.numpy(), 0), cmap=_COLOURS, vmin=limits[0], vmax=limits[1])
+        axes.imshow(np.ma.masked_equal(shown.numpy(), 0), cmap=DEPTH, vmin=limits[0], vmax=limits[1])
         axes.add_patch(_outline(shown.shape))
     else:
-        axes.imshow(picture[::step, ::step].numpy(), cmap="viridis", vmin=0, vmax=2, interpolation="nearest")
+        axes.imshow(picture[::step, ::step].numpy(), cmap=SCORE, vmin=0, vmax=2, interpolation="nearest")
 
 
 def _nearest(depth: Tensor, size: int) -> Tensor:
@@ -303,7 +303,7 @@ def _outline(shape: Sequence[int]) -> Any:
     """Around a depth map, since its holes are white."""
     from matplotlib.patches import Rectangle  # noqa: PLC0415
 
-    return Rectangle((-0.5, -0.5), shape[1], shape[0], fill=False, edgecolor="#B4B4B4", linewidth=0.6)
+    return Rectangle((-0.5, -0.5), shape[1], shape[0], fill=False, edgecolor=SILENT, linewidth=0.6)
 
 
 def _plot_depths(axes: Any, survey: Survey) -> None:
@@ -313,7 +313,7 @@ def _plot_depths(axes: Any, survey: Survey) -> None:
     low, high = _limits(survey.depths)
     counts, edges = np.histogram(survey.depths.numpy(), bins=90, range=(0, 1.1 * high))
     middle = (edges[1:] + edges[:-1]) / 2
-    axes.bar(middle, counts, edges[1] - edges[0], color=colormaps[_COLOURS]((middle - low) / (high - low)))
+    axes.bar(middle, counts, edges[1] - edges[0], color=colormaps[DEPTH]((middle - low) / (high - low)))
     axes.set_xlabel("depth [m]", fontsize=7)
     axes.set_yticks([])
     axes.tick_params(labelsize=6)
@@ -324,8 +324,8 @@ def _plot_path(axes: Any, survey: Survey) -> None:
     assert survey.path is not None
     t = survey.path.double().numpy()
     a, b = sorted(np.argsort(np.ptp(t, axis=0))[1:])
-    axes.plot(t[:, a], t[:, b], color="#333333", linewidth=0.8)
-    for place, mark, colour, label in ((t[0], "o", "#009E73", "first"), (t[-1], "s", "#D55E00", "last")):
+    axes.plot(t[:, a], t[:, b], color=INK, linewidth=0.8)
+    for place, mark, colour, label in ((t[0], "o", OTHERS[0], "first"), (t[-1], "s", OTHERS[1], "last")):
         axes.plot(place[a], place[b], mark, color=colour, markersize=4, label=label)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel(f"path: {'xyz'[a]} [m]", fontsize=7)

@@ -13,12 +13,13 @@ from typing import Any
 
 import torch
 
-from dhtorch import archive, drawing
+from dhtorch import archive, storage
 from dhtorch.data import files as data_files
 from dhtorch.data import scenes_of
 from dhtorch.data.scene import Scene
 from dhtorch.studies import report
 from dhtorch.studies.focal.stacks import Stacks
+from dhtorch.studies.pictures import draw_example
 from dhtorch.studies.protocol import MIN_CANDIDATES, Outcome, Settings
 
 _LOG = logging.getLogger(__name__)
@@ -68,7 +69,7 @@ def run(
         what = each.recording if isinstance(each, Scene) else each
         _LOG.debug("data: %s, %d of %s", each.name, len(what), what.format)
     _LOG.debug("digest %s, key %s", digest, key)
-    archive.clear(target)
+    storage.clear(target)
     if settings["resume"] and archive.finished(target, key):
         print(f"{target}: finished and valid, left untouched")
         return Ended(str(folder), "untouched")
@@ -76,7 +77,7 @@ def run(
     outcome = parts["experiment"](asked, methods, parts["pairs"], _common(settings), progress=progress)
     _LOG.debug("%d pairs answered", outcome.n_pairs)
     examples = outcome.examples if settings["figures"] else []
-    drawn = [path for example in examples for path in drawing.draw_example(folder / example.scene, example)]
+    drawn = [path for example in examples for path in draw_example(folder / example.scene, example)]
     scenes = [each.name for each in asked]
     data = {"name": names["data"], "scenes": scenes, "n_pairs": outcome.n_pairs, "digest": digest}
     result = _result(settings, names["experiment"], key, data, outcome)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -24,6 +24,15 @@ class Interval(NamedTuple):
     low: float | None
     high: float | None
     n: int  # scenes in which the number is defined
+
+    def entry(self, unit: str = "1") -> dict[str, Any]:
+        """The interval as a result's summary holds it: ``{value, low, high, n, unit}``."""
+        return {**self._asdict(), "unit": unit}
+
+
+def single(value: float | None, n: int, unit: str = "1") -> dict[str, Any]:
+    """A summary entry of a number without an interval, over n scenes."""
+    return Interval(value, None, None, n).entry(unit)
 
 
 def interval(

@@ -88,7 +88,7 @@ def method_ratios(
             key = f"realised_risk_{percent}"
             found.silent[f"{method}.{percent}"] = [s for s, row in rows.items() if key in row and row[key] is None]
         for name, value in numbers.items():
-            found.summary[f"{method}.{name}"] = {**value._asdict(), "unit": errors.unit(name)}
+            found.summary[f"{method}.{name}"] = value.entry(errors.unit(name))
         found.rows += rows.values()
     return found
 

@@ -172,7 +172,7 @@ def summarise(
             found = bootstrap.Interval(sum(defined) if defined else None, None, None, len(defined))
         else:
             found = bootstrap.interval(values, statistic=statistic, draws=draws, seed=seed)
-        summary[name] = {**found._asdict(), "unit": unit(name)}
+        summary[name] = found.entry(unit(name))
     return summary
 
 

@@ -7,7 +7,6 @@ plug-in control, beside a note of where all that comes from.
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 from collections.abc import Mapping, Sequence
@@ -18,6 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dhtorch import storage
 from dhtorch.evaluate import control
 from dhtorch.evaluate.errors import Points
 from dhtorch.evaluate.monotone import Sigmoid, Table, isotonic, platt
@@ -93,7 +93,7 @@ class Calibration:
             "thresholds": {str(k): v for k, v in self.thresholds.items()},
             "provenance": dict(self.provenance),
         }
-        return json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+        return storage.dumps(content, indent=1) + "\n"
 
 
 def fit(
@@ -183,7 +183,7 @@ def from_json(text: str, where: str = "calibration") -> Calibration:
         ValueError: not strict JSON, or a field is missing, unknown or out of range; the message names file and field.
     """
     try:
-        content = json.loads(text, parse_constant=_refuse)
+        content = storage.loads(text)
     except ValueError as error:
         raise ValueError(f"{where}: found no strict JSON ({error}), expected a calibration") from error
     known = ("schema", "good_error", "probability", "expected_error", "sigmoid", "sigma", "thresholds")
@@ -261,9 +261,5 @@ def _number(value: Any, where: str) -> float:
 
 def _expect(condition: bool, where: str, found: Any, expected: str) -> None:
     if not condition:
-        shown = found if isinstance(found, str) else json.dumps(found)
+        shown = found if isinstance(found, str) else storage.dumps(found)
         raise ValueError(f"{where}: found {shown if len(shown) <= 60 else shown[:57] + '...'}, expected {expected}")
-
-
-def _refuse(word: str) -> None:
-    raise ValueError(f"the constant {word}")

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from dhtorch import archive
+from dhtorch import storage
 from dhtorch.export.arrays import bytes_of_colour, rows
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Pose
@@ -82,7 +82,7 @@ def write_colmap(
     }
     files["images.txt"] += pictures
     for name, text in files.items():
-        archive.replace_file(Path(folder) / name, ("\n".join(text) + "\n").encode("utf-8"))
+        storage.replace_file(Path(folder) / name, ("\n".join(text) + "\n").encode("utf-8"))
 
 
 def _camera(shot: Shot) -> str:

@@ -6,7 +6,6 @@ stands upright and looks as photographed.
 
 from __future__ import annotations
 
-import json
 import math
 import struct
 from collections.abc import Mapping, Sequence
@@ -16,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from dhtorch import archive
+from dhtorch import storage
 from dhtorch.export.arrays import array, bytes_of_colour, finite, rows
 
 _FLOAT, _UINT = 5126, 5125
@@ -52,12 +51,12 @@ def write_glb(path: str | Path, shapes: Sequence[Shape], *, up: Sequence[float] 
     for shape in shapes:
         parts.add(shape, turn)
     document = parts.document()
-    text = json.dumps(document, allow_nan=False, separators=(",", ":")).encode()
+    text = storage.dumps(document, ensure_ascii=True, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text
     if parts.data:
         chunks += struct.pack("<I4s", len(parts.data), b"BIN\0") + bytes(parts.data)
-    archive.replace_file(path, struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+    storage.replace_file(path, struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
 
 
 class _Parts:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dhtorch import archive
+from dhtorch import storage
 from dhtorch.export.arrays import array, bytes_of_colour, finite, rows
 
 _WORDS = {"f4": "float", "u1": "uchar", "i4": "int"}
@@ -70,7 +70,7 @@ def write_ply(
         triangles = np.zeros(len(corners), [("n", "u1"), ("corner", "<i4", 3)])
         triangles["n"], triangles["corner"] = 3, corners
         body += triangles.tobytes()
-    archive.replace_file(path, "\n".join([*head, "end_header\n"]).encode("ascii") + body)
+    storage.replace_file(path, "\n".join([*head, "end_header\n"]).encode("ascii") + body)
     return len(vertex)
 
 

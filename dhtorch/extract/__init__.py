@@ -17,7 +17,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from dhtorch import archive
+from dhtorch import archive, storage
 from dhtorch.data.files import need
 from dhtorch.data.scene import Scene, scenes_of
 from dhtorch.extract import columns, engines, plan, shards
@@ -153,7 +153,7 @@ def _shared(settings: Mapping[str, Any], options: ExtractOptions, whole: plan.Pl
     files = {**archive.files_below(whole.roots), **archive.files_named(config)}
     name, digest = settings["choices"]["data"], archive.data_digest(files)
     made = archive.meta(device="cpu", dtype="float32", threads=1, seed=settings["seed"])
-    found: dict[str, Any] = archive.strict(
+    found: dict[str, Any] = storage.strict(
         {
             "format": FORMAT,
             "version": made["versions"]["dhtorch"],

@@ -7,7 +7,6 @@ own: its number, and how many of its frames had which problem. No time is noted:
 
 from __future__ import annotations
 
-import json
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -15,6 +14,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from dhtorch import storage
 from dhtorch.data.files import FormatError, need
 from dhtorch.extract.columns import Column, Row, schema, table
 from dhtorch.extract.plan import Shard
@@ -45,7 +45,7 @@ def write(
         Number of rows by problem, and ``skipped``.
     """
     parquet = need("pyarrow.parquet", extra="scale")
-    layout = schema(wanted, {SHARED.decode(): json.dumps(shared, ensure_ascii=False)})
+    layout = schema(wanted, {SHARED.decode(): storage.dumps(shared)})
     problems = shared["codes"]["problem"]
     counts: Counter[str] = Counter()
     unfinished = folder / f".{shard.name}{_UNFINISHED}"
@@ -57,7 +57,7 @@ def write(
                     writer.write_table(table(group, wanted, layout))
                 counts["skipped"] = len(shard.rows) - counts.total()
                 own = {"number": shard.number, "of": shard.of, "counts": dict(sorted(counts.items()))}
-                writer.add_key_value_metadata({OWN: json.dumps(own)})
+                writer.add_key_value_metadata({OWN: storage.dumps(own)})
             file.flush()
             os.fsync(file.fileno())
         unfinished.replace(folder / shard.name)
@@ -106,7 +106,7 @@ def described(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     parquet = need("pyarrow.parquet", extra="scale")
     try:
         metadata = parquet.read_metadata(path).metadata or {}
-        return json.loads(metadata[SHARED]), json.loads(metadata[OWN])
+        return storage.loads(metadata[SHARED].decode()), storage.loads(metadata[OWN].decode())
     except (OSError, ValueError, KeyError) as error:
         raise FormatError(path, "metadata", f"{type(error).__name__}: {error}", "a shard of dhtorch extract") from None
 

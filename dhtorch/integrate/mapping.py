@@ -17,6 +17,7 @@ from dhtorch.codes import Source
 from dhtorch.data import files as data_files
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene, scenes_of
+from dhtorch.evaluate import bootstrap
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.integrate import recording as recordings
@@ -225,8 +226,7 @@ def _result(settings: Mapping[str, Any], sources: Sequence[Scene], rows: list[Ro
     for metric, unit in units.items():
         values = sorted(row[metric] for row in scenes if row[metric] is not None and row["role"] is None)
         middle = float(torch.tensor(values).double().quantile(0.5)) if values else None
-        entry = {"value": middle, "low": None, "high": None, "n": len(values), "unit": unit}
-        summary[f"{_name(settings)}.{metric}"] = entry
+        summary[f"{_name(settings)}.{metric}"] = bootstrap.single(middle, len(values), unit)
     threads = torch.get_num_threads()
     return archive.build(
         experiment="integrate",

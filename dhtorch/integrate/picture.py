@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from dhtorch.codes import Source
-from dhtorch.drawing import INK, RECOVERED, SENSOR, legend, panel, save, source_colours
+from dhtorch.drawing import Canvas, Key, Stroke, save
+from dhtorch.drawing.colours import INK, RECOVERED, SENSOR, of_source
 from dhtorch.geometry import se3
 from dhtorch.geometry.camera import project
 from dhtorch.integrate.surface import Surface
@@ -30,7 +32,7 @@ def draw_map(
     T = _viewpoint(surface, cameras, up)
     light = se3.rotate(T.R.mT, surface.normal[None].double())[0] @ torch.tensor([0.3, -0.5, -0.8]).double()
     shade = 0.35 + 0.65 * light.abs().nan_to_num(0.5).clamp(0, 1)[:, None]
-    by_source = torch.from_numpy(source_colours(surface.source)) / 255 * shade
+    by_source = torch.from_numpy(of_source(surface.source)) / 255 * shade
     xyz = se3.apply(se3.invert(T), surface.xyz[None].double())
     away = (surface.normal.double() * (T.t - surface.xyz.double())).sum(-1) < 0
     ahead = (xyz[..., 2] > voxel) & ~away
@@ -42,18 +44,34 @@ def draw_map(
     seen = splat(lens, hw, uv, depth, torch.ones_like(depth), colours, T_world_from_cam=T, radius=0.8 * voxel)
     picture = torch.where(seen.depth[0, ..., None] > 0, seen.features[0], 1.0).clamp(0, 1).numpy()
     dots = project(lens, way)[way[..., 2] > voxel].numpy()
-    figure, left = panel(4.8, 4.8 * hw[0] / hw[1], f"Map of {len(cameras)} views")
-    right = figure.add_axes((1.03, 0, 1, 1))
-    right.set_title("sensor and recovered", loc="left", fontsize=11)
-    for axes, part in ((left, picture[..., :3]), (right, picture[..., 3:])):
-        axes.imshow(part, interpolation="antialiased")
-        axes.plot(*dots.T, color=INK, linewidth=0.8, marker="o", markersize=1.5)
-        axes.set(xlim=(-0.5, hw[1] - 0.5), ylim=(hw[0] - 0.5, -0.5))
-        axes.set_axis_off()
-    for code, colour, name in ((Source.SENSOR, SENSOR, "sensor"), (Source.RECOVERED, RECOVERED, "recovered")):
-        right.plot([], [], "s", color=colour, label=f"{name}  {int((surface.source == code).sum())}")
-    legend(right, *right.get_legend_handles_labels())
-    save(figure, path)
+    counts = {code: int((surface.source == code).sum()) for code in (Source.SENSOR, Source.RECOVERED)}
+    _side_by_side(
+        path, {f"Map of {len(cameras)} views": picture[..., :3], "Sensor and recovered": picture[..., 3:]}, dots, counts
+    )
+
+
+def _side_by_side(
+    path: str | Path,
+    pictures: Mapping[str, np.ndarray],  # title → (H, W, 3) in [0, 1]
+    way: np.ndarray,  # (V, 2) px: where the cameras were
+    counts: Mapping[int, int],  # codes.Source → points
+) -> None:
+    """Draw pictures of one size with the cameras' way on each, and a legend of the sources."""
+    width, gap = 346.0, 10.0
+    H, W = next(iter(pictures.values())).shape[:2]
+    scale = width / W
+    height = H * scale
+    canvas = Canvas(len(pictures) * (width + gap) - gap, height + 20, dpi=160)
+    for k, (title, pixels) in enumerate(pictures.items()):
+        left = k * (width + gap)
+        canvas.title(title, width, height + 20, left)
+        canvas.picture(pixels, (left, 0, width, height))
+        places = [(left + (u + 0.5) * scale, height - (v + 0.5) * scale) for u, v in way.tolist()]
+        inside = [(u, v) for u, v in places if left <= u <= left + width and 0 <= v <= height]
+        canvas.lines([inside] if inside else [], Stroke(INK, 0.8))
+        canvas.dots(inside, Stroke(INK, 1.5))
+    kinds = ((Source.SENSOR, "sensor", SENSOR), (Source.RECOVERED, "recovered", RECOVERED))
+    save(canvas.finished([Key(f"{name}  {counts[code]}", colour, "box") for code, name, colour in kinds]), path)
 
 
 def _viewpoint(surface: Surface, cameras: Sequence[Pose], up: Sequence[float]) -> Pose:

@@ -6,7 +6,6 @@ Two scores made by hand and one that learns. Alphabet of the latter: ``x`` (…,
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Self
@@ -14,6 +13,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
+from dhtorch import storage
 from dhtorch.codes import Gate
 from dhtorch.geometry.exact import steady
 from dhtorch.geometry.shapes import check
@@ -226,7 +226,7 @@ class LearnedScore(nn.Module):
         weights = {k: v.tolist() for k, v in self.state_dict().items()}
         options = {"half_error": self.half_error, "min_score": self.min_score}
         content = {"evidence": [*EVIDENCE], **options, "weights": weights, "provenance": self.provenance}
-        return json.dumps(content, indent=1, allow_nan=False) + "\n"
+        return storage.dumps(content, indent=1) + "\n"
 
     @classmethod
     def from_json(cls, text: str, where: str = "learned score") -> Self:
@@ -236,7 +236,7 @@ class LearnedScore(nn.Module):
             ValueError: not strict JSON, other evidence, or weights of another shape; the message names ``where``.
         """
         try:
-            content = json.loads(text, parse_constant=_refuse)
+            content = storage.loads(text)
             if content["evidence"] != [*EVIDENCE]:
                 raise ValueError(f"evidence is {content['evidence']}")
             weights = {k: torch.tensor(v, dtype=torch.float32) for k, v in content["weights"].items()}
@@ -309,7 +309,3 @@ def _silence(estimate: Estimate, score: Tensor, min_score: float) -> Estimate:
         score=torch.where(keep, score, torch.zeros_like(score)),
         gate=gate,
     )
-
-
-def _refuse(word: str) -> None:
-    raise ValueError(f"the constant {word}")

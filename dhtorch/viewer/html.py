@@ -8,22 +8,26 @@ from __future__ import annotations
 
 import base64
 import html
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dhtorch import archive
+from dhtorch import storage
 from dhtorch.codes import Gate, Hole, names, words
-from dhtorch.drawing import GATE_COLOURS, HOLE_COLOURS, RECOVERED, SENSOR, SILENT
+from dhtorch.drawing import colours
+from dhtorch.drawing.colours import GATES, HOLES, RECOVERED, SENSOR
 from dhtorch.viewer.exhibit import Cloud, Exhibit, Picture, Shot
 
 ENDINGS = (".html", ".htm")
 
 _HERE = Path(__file__).parent
 _SCRIPTS = ("space.js", "pictures.js", "layers.js", "page.js")
+
+#: Colours that the scripts ask for by name, and their colour maps.
+_COLOURS = ("SENSOR", "RECOVERED", "SILENT", "PALE", "HELD", "WHITE", "BLACK")
+_RAMPS = {"depth": colours.DEPTH, "score": colours.SCORE, "error": colours.ERROR}
 
 #: Pixels travel in 16 bits: this many steps a pixel, from this far outside the picture.
 PER_PIXEL, MARGIN_PX = 8, 64
@@ -44,10 +48,10 @@ def page(scene: Exhibit) -> str:
     """
     if not scene.shots:
         raise ValueError(f"view: found no pair in {scene.name}, expected at least one")
-    text = json.dumps(_data(scene), ensure_ascii=True, allow_nan=False, separators=(",", ":"))
+    text = storage.dumps(_data(scene), ensure_ascii=True, separators=(",", ":"))
     parts = {
         "title": html.escape(f"{scene.name} · dhtorch"),
-        "style": _file("page.css"),
+        "style": colours.style_sheet() + _file("page.css"),
         # Neither "</script" nor "<!--" may stand in a script's text; in JSON strings an escape says the same.
         "data": text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"),
         "script": "\n".join(_file(name) for name in _SCRIPTS),
@@ -67,13 +71,13 @@ def write(path: Path, scene: Exhibit) -> Path:
         ValueError: nothing to show.
         OSError: the file cannot be written.
     """
-    return archive.replace_file(path, page(scene).encode("utf-8"))
+    return storage.replace_file(path, page(scene).encode("utf-8"))
 
 
 def _data(scene: Exhibit) -> dict[str, Any]:
-    gates = [_code(code, name, GATE_COLOURS) for code, name in names(Gate).items() if code != Gate.ANSWER]
+    gates = [_code(code, name, GATES) for code, name in names(Gate).items() if code != Gate.ANSWER]
     outcomes = [("SENSOR", "sensor", SENSOR), ("ANSWER", "recovered", RECOVERED)]
-    outcomes += [(name, words(name), GATE_COLOURS[code]) for code, name in names(Gate).items() if code != Gate.ANSWER]
+    outcomes += [(name, words(name), GATES[code]) for code, name in names(Gate).items() if code != Gate.ANSWER]
     n = sum(len(shot.samples["depth"]) for shot in scene.shots)
     return {
         "title": scene.name,
@@ -82,9 +86,11 @@ def _data(scene: Exhibit) -> dict[str, Any]:
         "placed": scene.placed,
         "per_pixel": PER_PIXEL,
         "margin_px": MARGIN_PX,
-        "colours": {"sensor": SENSOR, "recovered": RECOVERED, "silent": SILENT},
+        "colours": {name.lower(): getattr(colours, name) for name in _COLOURS},
+        "page": {name: list(colours.PAGE[name]) for name in ("stage", "rim")},
+        "ramps": {name: colours.ramp(kind) for name, kind in _RAMPS.items()},
         "gates": gates,
-        "holes": [_code(code, name, HOLE_COLOURS) for code, name in names(Hole).items() if code != Hole.NONE],
+        "holes": [_code(code, name, HOLES) for code, name in names(Hole).items() if code != Hole.NONE],
         "outcomes": [{"key": key, "name": name, "colour": colour} for key, name, colour in outcomes],
         "views": [_view(view) for view in scene.views],
         "shots": [_shot(shot) for shot in scene.shots],
@@ -128,8 +134,8 @@ def _packed(values: np.ndarray, kind: str) -> dict[str, str]:
     return {"type": kind, "base64": base64.b64encode(data).decode("ascii")}
 
 
-def _code(code: int, name: str, colours: Mapping[int, str]) -> dict[str, Any]:
-    return {"code": code, "name": words(name), "colour": colours[code]}
+def _code(code: int, name: str, of: Mapping[int, str]) -> dict[str, Any]:
+    return {"code": code, "name": words(name), "colour": of[code]}
 
 
 def _many(n: int, word: str) -> str:

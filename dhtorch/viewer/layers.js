@@ -23,16 +23,17 @@ const shots = DATA.shots.map((s) => {
 });
 const outcomes = DATA.outcomes, gateOf = Object.fromEntries(DATA.gates.map((g) => [g.code, g])), holeOf = Object.fromEntries(DATA.holes.map((h) => [h.code, h]));
 const SENSOR = hex(DATA.colours.sensor), RECOVERED = hex(DATA.colours.recovered), SILENT = hex(DATA.colours.silent);
+const PALE = hex(DATA.colours.pale), HELD = hex(DATA.colours.held), [BY_DAY, BY_NIGHT] = [0, 1].map((k) => ({ stage: hex(DATA.page.stage[k]), rim: hex(DATA.page.rim[k]) }));
 const everything = (name, wanted = () => true) => shots.flatMap((s) => Array.from(s[name]).filter((_, k) => wanted(s, k)));
 const answered = (s, k) => s.source[k] === 2;
 const hasErrors = shots.some((s) => s.error.some(Number.isFinite));
 const hasViews = DATA.views.length > 0;
 
 const scales = {
-  depth: new Scale(everything("depth", (s, k) => s.source[k] > 0), "far", { unit: "m" }),
-  sigma: new Scale(shots.flatMap((s) => Array.from(s.sigma).map((v, k) => v / s.depth[k]).filter((_, k) => answered(s, k))), "sure", { unit: "%" }),
+  depth: new Scale(everything("depth", (s, k) => s.source[k] > 0), "depth", { unit: "m" }),
+  sigma: new Scale(shots.flatMap((s) => Array.from(s.sigma).map((v, k) => v / s.depth[k]).filter((_, k) => answered(s, k))), "error", { unit: "%" }),
   score: new Scale([], "score", { log: false, range: [0, 1] }),
-  error: new Scale(everything("error"), "sure", { unit: "%", range: [0.003, 0.3] }),
+  error: new Scale(everything("error"), "error", { unit: "%", range: [0.003, 0.3] }),
 };
 const MODES = [["picture", "own colour"], ["source", "source"], ["hole", "class of hole"], ["gate", "gate"], ["depth", "depth"], ["sigma", "sigma / depth"], ["score", "score"], ["error", "error against held-back returns"]]
   .filter(([key]) => key !== "error" || hasErrors);
@@ -45,7 +46,7 @@ function sampleColour(s, k) {
   if (mode === "hole") return holeOf[s.hole[k]] ? hex(holeOf[s.hole[k]].colour) : SENSOR;
   if (mode === "gate") return source === 1 ? SENSOR : source === 2 ? RECOVERED : hex(gateOf[s.gate[k]]?.colour || DATA.colours.silent);
   if (mode === "source" || mode === "picture") return [SILENT, SENSOR, RECOVERED][source];
-  if (source === 0 || (source === 1 && mode !== "depth")) return source ? [0.45, 0.47, 0.5] : SILENT;
+  if (source === 0 || (source === 1 && mode !== "depth")) return source ? PALE : SILENT;
   const value = mode === "sigma" ? s.sigma[k] / s.depth[k] : s[mode][k];
   return Number.isFinite(value) ? scales[mode].colour(value) : SILENT;
 }
@@ -55,8 +56,8 @@ function returnColour(cloud, k, held) {
   const rgb = [0, 1, 2].map((c) => cloud.rgb[3 * k + c] / 255), grey = luma(rgb);
   if (state.mode === "picture") return rgb;
   if (state.mode === "depth") return scales.depth.colour(cloud.xyz[3 * k + 2]).map((v) => v * (0.5 + 0.6 * grey));
-  if (scales[state.mode]) return [0.3, 0.3, 0.3].map((v) => v + 0.45 * grey);
-  if (held) return [0.45, 0.62, 0.5].map((v) => v * (0.5 + grey));
+  if (scales[state.mode]) return PALE.map((v) => 0.67 * v + 0.45 * grey);
+  if (held) return HELD.map((v) => v * (0.5 + grey));
   return SENSOR.map((v, c) => 0.75 * v * (0.35 + 1.3 * grey) + 0.25 * rgb[c]);
 }
 
@@ -122,7 +123,7 @@ const layers = space.gl ? shots.map(buildShot) : [];
 const path = space.gl && DATA.path ? (() => {
   const p = unpack(DATA.path), rows = [];
   for (let k = 3; k < p.length; k += 3) rows.push(...p.subarray(k - 3, k + 3));
-  return space.layer({ position: Float32Array.from(rows), colour: colours(rows.length / 3, () => [0.55, 0.55, 0.55]) });
+  return space.layer({ position: Float32Array.from(rows), colour: colours(rows.length / 3, () => PALE) });
 })() : null;
 
 function recolour() {
@@ -147,7 +148,7 @@ const visible = (s) => (k) => {
 function drawSpace() {
   if (!space.gl) return;
   const dark = matchMedia("(prefers-color-scheme: dark)").matches;
-  space.begin(eye, dark ? [0.043, 0.051, 0.059] : [0.914, 0.922, 0.918]);
+  space.begin(eye, (dark ? BY_NIGHT : BY_DAY).stage);
   const grain = 0.006 * size.depth, threshold = state.threshold;
   layers.forEach((l, n) => {
     if (!state.all && n !== state.now) return;
@@ -158,7 +159,7 @@ function drawSpace() {
     if (show.held) space.points(l.held, { size: grain, smallest: 1.4 });
     if (show.recovered && l.recovered) {
       const large = 1 + 1.8 * Math.min(1, 3000 / l.recovered.n); // few points are drawn large, a dense cloud is not
-      space.points(l.recovered, { size: large * grain, smallest: 1.4 * large, threshold, rim: dark ? [0.05, 0.05, 0.05] : [0.25, 0.2, 0.1], rimmed: 0.75 });
+      space.points(l.recovered, { size: large * grain, smallest: 1.4 * large, threshold, rim: (dark ? BY_NIGHT : BY_DAY).rim, rimmed: 0.75 });
       if (show.sigma) space.lines(l.bars, { threshold });
     }
     if (hasViews && show.tracks && show.recovered && n === state.now) space.lines(l.rays, { alpha: 0.1, threshold });

@@ -3,11 +3,6 @@
 const hex = (text) => [1, 3, 5].map((k) => parseInt(text.slice(k, k + 2), 16) / 255);
 const css = (c) => `rgb(${c.map((v) => Math.round(255 * Math.max(0, Math.min(1, v)))).join(" ")})`;
 const luma = (c) => 0.299 * c[0] + 0.587 * c[1] + 0.114 * c[2];
-const RAMPS = {
-  far: ["#f2c14e", "#e8743b", "#b8336a", "#5b2a86", "#1c3f95"].map(hex),
-  sure: ["#3b4cc0", "#5aa5c4", "#8fd1a0", "#f0c05a", "#c8322b"].map(hex),
-  score: ["#6b2737", "#b4543c", "#e0a030", "#b7cc45", "#2f9e6e"].map(hex),
-};
 
 function along(ramp, share) {
   const x = Math.max(0, Math.min(1, share)) * (ramp.length - 1), k = Math.min(ramp.length - 2, Math.floor(x)), t = x - k;
@@ -28,7 +23,7 @@ class Scale {
     [this.low, this.high] = range || [quantile(values, 0.02), quantile(values, 0.98)];
     if (!(this.high > this.low)) [this.low, this.high] = Number.isFinite(this.low) ? [this.low * 0.9, this.low * 1.1 + 1e-6] : [0.1, 1];
     this.log = log && this.low > 0;
-    Object.assign(this, { ramp: RAMPS[ramp], unit });
+    Object.assign(this, { ramp: DATA.ramps[ramp].map(hex), unit });
   }
 
   colour(v) {
@@ -93,7 +88,7 @@ class Picture {
     pen.beginPath();
     pen.arc(x, y, r, 0, 7);
     pen.fill();
-    if (edge) { pen.strokeStyle = "#fff"; pen.lineWidth = edge; pen.stroke(); }
+    if (edge) { pen.strokeStyle = DATA.colours.white; pen.lineWidth = edge; pen.stroke(); }
   }
 
   cross(x, y, r, ratio) {
@@ -107,7 +102,7 @@ class Picture {
 
   ring(x, y, r, ratio) {
     const pen = this.context;
-    for (const [colour, width] of [["#000", 4], ["#fff", 2]]) {
+    for (const [colour, width] of [[DATA.colours.black, 4], [DATA.colours.white, 2]]) {
       pen.strokeStyle = colour; pen.lineWidth = width * ratio;
       pen.beginPath(); pen.arc(x, y, r, 0, 7); pen.stroke();
     }

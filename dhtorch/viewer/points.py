@@ -18,7 +18,7 @@ _NUMPY |= {"int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4"}
 
 
 def read(path: Path) -> Exhibit:
-    """The points of a PLY file, as :func:`dhtorch.drawing.write_ply` writes it: no pictures, no tracks.
+    """The points of a PLY file, as :func:`dhtorch.export.write_ply` writes it: no pictures, no tracks.
 
     Properties that are not there are taken to be recovered points without sigma and score.
 

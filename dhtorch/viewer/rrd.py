@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dhtorch.codes import Gate, Source, names, words
-from dhtorch.drawing import GATE_COLOURS, RECOVERED, SENSOR, SILENT
+from dhtorch.drawing.colours import DEPTH, GATES, RECOVERED, SENSOR, SILENT, rgb
 from dhtorch.viewer.exhibit import Cloud, Exhibit, Picture, Shot
 
 ENDINGS = (".rrd",)
@@ -81,14 +81,14 @@ def _blueprint() -> Any:
 
 
 def _log(rr: Any, stream: Any, scene: Exhibit) -> None:
-    classes = [(SENSED, "sensor", _rgb(SENSOR)), (Gate.ANSWER, "recovered", _rgb(RECOVERED))]
-    classes += [(code, words(names(Gate)[code]), _rgb(colour)) for code, colour in GATE_COLOURS.items()]
+    classes = [(SENSED, "sensor", rgb(SENSOR)), (Gate.ANSWER, "recovered", rgb(RECOVERED))]
+    classes += [(code, words(names(Gate)[code]), rgb(colour)) for code, colour in GATES.items()]
     stream.log("/", rr.AnnotationContext(classes), static=True)
     stream.log("world", rr.ViewCoordinates.RDF, static=True)
     about = "\n".join(f"{k}: {v}" for k, v in {"scene": scene.name, **scene.facts}.items())
     stream.log("about", rr.TextDocument(about), static=True)
     if scene.path is not None:
-        stream.log("world/path", rr.LineStrips3D([scene.path], colors=_rgb(SILENT)), static=True)
+        stream.log("world/path", rr.LineStrips3D([scene.path], colors=rgb(SILENT)), static=True)
     for name, (said, colour) in _outcomes().items():
         stream.log(f"gates/{name.lower()}", rr.SeriesLines(names=said, colors=colour), static=True)
     for k, shot in enumerate(scene.shots):
@@ -101,11 +101,11 @@ def _log(rr: Any, stream: Any, scene: Exhibit) -> None:
             _log_views(rr, stream, shot, scene.views[shot.view_0], scene.views[shot.view_1])
 
 
-def _outcomes() -> dict[str, tuple[str, list[int]]]:
+def _outcomes() -> dict[str, tuple[str, tuple[int, int, int]]]:
     """Outcome → its name and colour."""
     found = {"SENSOR": ("sensor", SENSOR), "ANSWER": ("recovered", RECOVERED)}
-    found |= {names(Gate)[code]: (words(names(Gate)[code]), colour) for code, colour in GATE_COLOURS.items()}
-    return {name: (said, _rgb(colour)) for name, (said, colour) in found.items()}
+    found |= {names(Gate)[code]: (words(names(Gate)[code]), colour) for code, colour in GATES.items()}
+    return {name: (said, rgb(colour)) for name, (said, colour) in found.items()}
 
 
 def _log_words(rr: Any, stream: Any, shot: Shot) -> None:
@@ -127,7 +127,7 @@ def _log_points(rr: Any, stream: Any, shot: Shot) -> None:
     stream.log("world/map/recovered", rr.Points3D(_moved(T, xyz), radii=radii, class_ids=classes), rr.AnyValues(**kept))
     share = (sigma / np.maximum(s["depth"][answer], 1e-9)).clip(0, 0.9)[:, None]
     bars = np.stack((_moved(T, xyz * (1 - share)), _moved(T, xyz * (1 + share))), 1)
-    stream.log("world/map/sigma", rr.LineStrips3D(bars, colors=[*_rgb(RECOVERED), 120]))
+    stream.log("world/map/sigma", rr.LineStrips3D(bars, colors=[*rgb(RECOVERED), 120]))
     sensed = s["source"] == Source.SENSOR
     seen = shot.seen if len(shot.seen.xyz) else Cloud(s["xyz"][sensed], s["rgb"][sensed])
     for name, cloud in (("sensor", seen), ("held_back", shot.held)):
@@ -141,7 +141,7 @@ def _log_views(rr: Any, stream: Any, shot: Shot, view_0: Picture, view_1: Pictur
         (h, w), m = shot.depth_map.depth.shape, shot.depth_map
         c = [m.c[0] + 0.5, m.c[1] + 0.5]
         stream.log("world/anchor/depth", rr.Pinhole(focal_length=m.f, principal_point=c, width=w, height=h))
-        stream.log("world/anchor/depth", rr.DepthImage(m.depth, meter=1.0))
+        stream.log("world/anchor/depth", rr.DepthImage(m.depth, meter=1.0, colormap=DEPTH))
     groups = {"silent": Source.NONE, "sensor": Source.SENSOR, "recovered": Source.RECOVERED}
     classes = np.where(s["source"] == Source.SENSOR, SENSED, s["gate"]).astype(np.uint16)
     at_0, at_1 = _shown(view_0, s["uv_0"]), _shown(view_1, s["uv_1"])
@@ -178,7 +178,3 @@ def _shown(view: Picture, uv: np.ndarray) -> np.ndarray:
 
 def _moved(T: np.ndarray, xyz: np.ndarray) -> np.ndarray:
     return (xyz @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
-
-
-def _rgb(colour: str) -> list[int]:
-    return [int(colour[k : k + 2], 16) for k in (1, 3, 5)]

@@ -15,6 +15,7 @@ from functools import partial
 from typing import Any
 
 from dhtorch.data.scene import Given
+from dhtorch.evaluate import bootstrap
 from dhtorch.methods import LEVELS
 from dhtorch.studies import protocol
 from dhtorch.studies.compare import method_comparison
@@ -87,8 +88,7 @@ def run(
     for name, ms in cost.items():
         more = None if ms is None or cost["paper"] is None else ms - cost["paper"]
         for number, value in (("pair_ms", ms), ("extra_ms", more)):
-            entry = {"value": value, "low": None, "high": None, "n": len(outcome.scenes(name)), "unit": "ms"}
-            outcome.summary[f"{name}.{number}"] = entry
+            outcome.summary[f"{name}.{number}"] = bootstrap.single(value, len(outcome.scenes(name)), "ms")
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome.summary))
 
 

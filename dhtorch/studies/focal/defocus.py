@@ -17,7 +17,6 @@ What would refute it: |rho| above 0.5, r with the oracle's side below 0.4, or a 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -104,7 +103,7 @@ def run(
         )
 
     outcome = screen(scenes_of(scenes), lambda _r: [(0, 0)], ask, VARIANTS, truth="full", progress=progress)
-    outcome.summary |= {k: _entry(v) for k, v in ambiguities(noise=noise, window_px=window_px).items()}
+    outcome.summary |= {k: bootstrap.single(v, 1) for k, v in ambiguities(noise=noise, window_px=window_px).items()}
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 
 
@@ -262,7 +261,3 @@ def _grid(hw: tuple[int, int], stride: int, like: Tensor) -> Tensor:
     v = torch.arange(stride // 2, hw[0], stride, dtype=like.dtype, device=like.device)
     u = torch.arange(stride // 2, hw[1], stride, dtype=like.dtype, device=like.device)
     return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1).reshape(1, -1, 2)
-
-
-def _entry(value: float | None) -> dict[str, Any]:
-    return {"value": value, "low": None, "high": None, "n": 1, "unit": "1"}

@@ -199,4 +199,4 @@ def _add_ratios(outcome: Outcome) -> None:
             if mine is not None and theirs:
                 row["mean_rel_ratio"] = mine / theirs
                 ratios.append(mine / theirs)
-        outcome.summary[f"{name}.mean_rel_ratio"] = bootstrap.interval(ratios)._asdict() | {"unit": "1"}
+        outcome.summary[f"{name}.mean_rel_ratio"] = bootstrap.interval(ratios).entry()

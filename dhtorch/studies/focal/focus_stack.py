@@ -127,7 +127,7 @@ def run(
     outcome = screen(rooms, _items, ask, wanted, truth="full", whole=_flips, progress=progress)
     for name in wanted:
         flips = [row.get("flip_share") for row in outcome.scenes(name).values()]
-        entry = bootstrap.interval(flips, statistic="mean")._asdict() | {"unit": "1"}
+        entry = bootstrap.interval(flips, statistic="mean").entry()
         outcome.summary |= {f"{name}.flip_share": entry} if entry["value"] is not None else {}
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 

@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from dhtorch.data.scene import Given
+from dhtorch.evaluate import bootstrap
 from dhtorch.stages.sample import grid, vogel
 from dhtorch.studies import protocol
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
@@ -67,8 +68,7 @@ def run(
     outcome = protocol.join([main, near])
     ratios = {k: _ratio(outcome, k, name) for k in [*changed, "cutoff x0.5"] if k != name}
     for k, (value, count) in ratios.items():
-        entry = {"value": value, "low": None, "high": None, "n": count, "unit": "1"}
-        outcome.summary[f"{k}.median_rel_ratio"] = entry
+        outcome.summary[f"{k}.median_rel_ratio"] = bootstrap.single(value, count)
     return outcome.decide(QUESTION, EXPECTATION, *verdict({k: v for k, (v, _) in ratios.items()}))
 
 

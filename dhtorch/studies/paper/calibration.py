@@ -85,6 +85,4 @@ def _at_thresholds(points: errors.Points, thresholds: Sequence[float]) -> Row:
 def _pooled(outcome: Outcome, method: str) -> dict[str, Any]:
     apart = {r["scene"] for r in outcome.rows if r.get("role")}
     scenes = [p for (s, m, t), p in outcome.points.items() if (m, t) == (method, "full") and s not in apart]
-    value = reliability.measure(scenes)["ece"]
-    entry = {"value": value, "low": None, "high": None, "n": len(scenes), "unit": "1"}
-    return {f"{method}.ece_pooled": entry}
+    return {f"{method}.ece_pooled": bootstrap.single(reliability.measure(scenes)["ece"], len(scenes))}

@@ -88,8 +88,7 @@ def _judge(rows: Sequence[Row], method: str) -> dict[str, Any]:
         row["passes"] = passes(row)
     counted = [r for r in judged if r["role"] is None]
     values = {"n_passes": sum(r["passes"] for r in counted), "n_scenes": len(counted)}
-    plain = {"low": None, "high": None, "n": len(counted), "unit": "count"}
-    return {k: {"value": v, **plain} for k, v in values.items()}
+    return {k: bootstrap.single(v, len(counted), "count") for k, v in values.items()}
 
 
 def verdict(outcome: Outcome, method: str) -> tuple[bool | None, str]:

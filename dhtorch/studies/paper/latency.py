@@ -30,6 +30,7 @@ from torch.nn.functional import interpolate
 
 from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import holdout
+from dhtorch.evaluate.bootstrap import Interval
 from dhtorch.geometry import camera as cam
 from dhtorch.method import Trace
 from dhtorch.records import Estimate, Frame, Samples
@@ -288,7 +289,7 @@ def summarise(branches: Sequence[Branch]) -> dict[str, Any]:
 
 def _entry(value: float, spread: Sequence[float], n: int, unit: str) -> dict[str, Any]:
     low, high = (min(spread), max(spread)) if spread else (None, None)
-    return {"value": value, "low": low, "high": high, "n": n, "unit": unit}
+    return Interval(value, low, high, n).entry(unit)
 
 
 def _machine() -> Row:

@@ -96,7 +96,7 @@ def run(
     }
     outcome = protocol.run(scenes, Protocol(variants), pairs, settings, progress=progress)
     found = against(outcome, {scene.name for scene in scenes_of(scenes) if scene.role is not None})
-    outcome.summary |= {k: {**v._asdict(), "unit": "1"} for k, v in found.items()}
+    outcome.summary |= {k: v.entry() for k, v in found.items()}
     if save is not None and answers.lessons():
         scorer = train(list(answers.lessons().values()), **options)
         scorer.provenance = {"method": name, "scenes": [*answers.lessons()], "seed": settings.seed, **options}

@@ -297,7 +297,7 @@ def summarise(judged: Judged) -> dict[str, Any]:
                 "vs_dinov2": judged.ratio(arm, REFERENCE, cohort),
                 "vs_dinov2_90": deciding,
             }
-            summary |= {prefix + name: {**found._asdict(), "unit": "1"} for name, found in numbers.items()}
+            summary |= {prefix + name: found.entry() for name, found in numbers.items()}
     return summary
 
 
@@ -309,7 +309,7 @@ def over_scenes(outcome: Outcome, arms: Sequence[str]) -> dict[str, Any]:
         for rows, prefix in ((whole, f"{arm}."), ([r.get(MOVING, {}) for r in whole], f"{arm}.{MOVING}.")):
             for name in ("mse", "vs_context", "vs_dinov2"):
                 found = bootstrap.interval([row.get(name) for row in rows], statistic="geometric_mean")
-                summary[prefix + name] = {**found._asdict(), "unit": "1"}
+                summary[prefix + name] = found.entry()
     return summary
 
 

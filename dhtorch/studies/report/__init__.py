@@ -4,7 +4,8 @@ So ``dhtorch report`` shows a result of any age and machine exactly as the job t
 
 ``reading`` knows the schema, ``cells`` how a number reads, ``tables`` which numbers stand together; ``layouts`` (and
 ``timings``) lay them out as the paper does, beside the figures in ``published``; ``plots`` lists the figures (made by
-``curves``, ``sweeps`` and ``overlays``, drawn with ``figure`` and ``svg``); ``text`` and ``page`` are the media.
+``curves``, ``sweeps`` and ``overlays`` in the form of ``figure``, drawn by ``dhtorch.drawing``); ``text`` and ``page``
+are the media.
 """
 
 from __future__ import annotations

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from dhtorch.drawing import FEWEST, Axis, Panel, Stroke, spanning
+from dhtorch.drawing.colours import FAINT, SOFT
 from dhtorch.studies.report.cells import show
 from dhtorch.studies.report.figure import CAP, FLOOR, Figure, deciding, legend, missing, named, series, share
 from dhtorch.studies.report.reading import Result, Row, variants
-from dhtorch.studies.report.svg import Axis, Panel, spanning
-
-#: Fewest answers whose mean error is drawn.
-FEWEST = 10
 
 OWN = "Every scene has its own range of depth."
 
@@ -31,13 +29,13 @@ def risk(result: Result) -> Figure | None:
         drawn = [v for c in found for k in ("risk", "oracle")[: 1 + ordered] for v in c[k]]
         return spanning(drawn, "mean error, %", log=True, percent=True, floor=FLOOR, cap=1.0)
 
-    def draw(panel: Panel, curve: Curve, row: Row, style: str) -> None:
+    def draw(panel: Panel, curve: Curve, row: Row, stroke: Stroke) -> None:
         n = row.get("n_candidates") or 0
         enough = [(c or 0.0) * n >= FEWEST - 0.5 for c in curve["coverage"]]
         x, y, best = ([v for v, ok in zip(curve[k], enough, strict=True) if ok] for k in ("coverage", "risk", "oracle"))
         if ordered:
-            panel.line(x, best, f"{style} oracle")
-        panel.line(x, y, style)
+            panel.line(x, best, stroke._replace(width=1.0, dashes=(2.5, 2.5), opacity=0.8))
+        panel.line(x, y, stroke)
 
     caption = "Mean relative error (at most 1) of the surest answers, by falling score; logarithmic. A mean over fewer "
     caption += f"than {FEWEST} answers is not drawn." + " Dashed: the best order there could be." * ordered
@@ -63,24 +61,24 @@ def coverage_by_distance(result: Result) -> Figure | None:
 
 def reliability(result: Result) -> Figure | None:
     """Realised against claimed probability, one panel per variant."""
-    panels = []
-    for variant in variants(result):
+    panels, strokes = [], series(result)
+    for variant in strokes:
         mine = [row["curves"]["reliability"] for row in deciding(result) if _counts(row, variant)]
         if not mine:
             continue
         panel = Panel(variant, share("score (claimed probability), %"), share("error < 10 %, share in %"))
         claimed, realised, weight = pooled(mine)
         for k, w in enumerate(weight):
-            panel.bar(k / len(weight) + 0.01, (k + 1) / len(weight) - 0.01, 0.0, w, "weight")
-        panel.line([0.0, 1.0], [0.0, 1.0], "ideal")
-        panel.line(claimed, realised, series(result, variant))
+            panel.bar(k / len(weight) + 0.01, (k + 1) / len(weight) - 0.01, 0.0, w, FAINT)
+        panel.line([0.0, 1.0], [0.0, 1.0], Stroke(SOFT, 1.0, (4, 3)))
+        panel.line(claimed, realised, strokes[variant])
         for x, y, w in zip(claimed, realised, weight, strict=True):
             if x is not None and y is not None:
                 said = [
                     f"{word} {show(v, how='percent')}" for word, v in (("claimed", x), ("realised", y), ("weight", w))
                 ]
-                panel.dot(x, y, series(result, variant), ", ".join(said))
-        panels.append(panel.render())
+                panel.dot(x, y, strokes[variant], ", ".join(said))
+        panels.append(panel)
     caption = "Realised share of answers within 10 % against the score, in ten bins; every scene without a role weighs "
     caption += "the same. Bars: share of the answers in the bin. On the diagonal the score would be a probability."
     return Figure("Reliability", caption, panels) if panels else None
@@ -109,7 +107,7 @@ def _by_scene(
     kind: str,
     across: Axes,
     up: Axes,
-    draw: Callable[[Panel, Curve, Row, str], None],
+    draw: Callable[[Panel, Curve, Row, Stroke], None],
     *,
     own: bool = False,  # every panel has its own axis across
 ) -> Figure | None:
@@ -119,13 +117,14 @@ def _by_scene(
         return None
     found = [row["curves"][kind] for row in having]
     x, y = across(found), up(found)
-    panels, scenes = [], list(dict.fromkeys(row["scene"] for row in having))
+    panels, strokes = [], series(result)
+    scenes = list(dict.fromkeys(row["scene"] for row in having))
     for scene in scenes:
         mine = [row for row in having if row["scene"] == scene]
         panel = Panel(named(mine[0]), across([row["curves"][kind] for row in mine]) if own else x, y)
         for row in mine:
-            draw(panel, row["curves"][kind], row, series(result, row["method"]))
-        panels.append(panel.render())
+            draw(panel, row["curves"][kind], row, strokes[row["method"]])
+        panels.append(panel)
     drawn = legend(result, [row["method"] for row in having])
     caption += " Of lines that coincide the last is seen." * (len(drawn) > 2)
     return Figure(title, caption + missing(result, scenes), panels, drawn)
@@ -137,8 +136,8 @@ def _by_distance(
     def across(found: Sequence[Curve]) -> Axis:
         return spanning([v for c in found for v in c["depth"]], "true depth, m")
 
-    def draw(panel: Panel, curve: Curve, _row: Row, style: str) -> None:
-        panel.line(curve["depth"], curve[metric], style)
+    def draw(panel: Panel, curve: Curve, _row: Row, stroke: Stroke) -> None:
+        panel.line(curve["depth"], curve[metric], stroke)
 
     def up(found: Sequence[Curve]) -> Axis:
         return axis([v for c in found for v in c[metric]])

@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from dhtorch.studies.report.markup import Markup
+from dhtorch import drawing
+from dhtorch.drawing import Axis, Key, Panel, Picture, Stroke, spanning
+from dhtorch.drawing.colours import SOFT, THEIRS_INSIDE
 from dhtorch.studies.report.reading import Result, Row, last_cohort, scene_rows, variants
-from dhtorch.studies.report.svg import COLOURS, Axis, spanning
 
 #: Relative errors are drawn between these.
 FLOOR, CAP = 1e-3, 10.0
-#: Legend of the paper's figures: (class, text).
-PUBLISHED = ("theirs", "published")
+#: Legend of the paper's figures.
+PUBLISHED = Key("published", THEIRS_INSIDE, "diamond")
+#: A single scene among others.
+SCENE = Stroke(SOFT, 0.9, opacity=0.55)
 
 
 @dataclass(frozen=True)
@@ -21,21 +24,20 @@ class Figure:
 
     title: str
     caption: str
-    panels: Sequence[Markup]
-    legend: Sequence[tuple[str, str]] = ()  # (class, text)
+    panels: Sequence[Panel | Picture]
+    legend: Sequence[Key] = ()
     wide: bool = False
     folded: bool = False  # of less interest: shown when asked for
 
 
-def series(result: Result, variant: str) -> str:
-    """Class of a variant's colour, the same in every figure of a result."""
-    k = variants(result).index(variant)
-    return f"s{k % COLOURS}" + (" again" if k >= COLOURS else "")
+def series(result: Result) -> dict[str, Stroke]:
+    """Variant → how it is drawn, the same in every figure of a result."""
+    return drawing.series(variants(result))
 
 
-def legend(result: Result, drawn: Sequence[str]) -> list[tuple[str, str]]:
+def legend(result: Result, drawn: Sequence[str]) -> list[Key]:
     """The drawn variants in the order of the result."""
-    return [(f"line {series(result, v)}", v) for v in variants(result) if v in drawn]
+    return [Key(v, stroke.colour, stroke=stroke) for v, stroke in series(result).items() if v in drawn]
 
 
 def named(row: Row) -> str:

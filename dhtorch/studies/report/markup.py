@@ -1,4 +1,4 @@
-"""HTML and SVG as text that cannot be broken by what is put into it."""
+"""HTML as text that cannot be broken by what is put into it."""
 
 from __future__ import annotations
 
@@ -52,4 +52,4 @@ def join(parts: Iterable[object], between: str = "") -> Markup:
 
 
 #: Elements that have no content; any other without content keeps its closing tag.
-_EMPTY = frozenset(["meta", "link", "br", "hr", "path", "line", "circle", "rect", "polyline", "polygon"])
+_EMPTY = frozenset(["meta", "link", "br", "hr"])

@@ -5,17 +5,23 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from dhtorch.codes import Gate, Source, names, words
+from dhtorch.drawing import Key, Layer, Picture
+from dhtorch.drawing.colours import GATES, SOURCES
 from dhtorch.studies.report.figure import Figure, missing, named
-from dhtorch.studies.report.markup import Markup, tag
 from dhtorch.studies.report.reading import Result, scene_rows, variants
-from dhtorch.studies.report.svg import picture
 
 #: The variant whose samples are shown first, where a result has it.
 FIRST = ("gated", "anchored", "both gates", "gap x1", "map", "paper")
 
-#: Layers from bottom to top: reasons for silence, sensor, recovered.
-LAYERS = [f"gate{code}" for code in names(Gate)] + [f"source{Source.SENSOR}", f"source{Source.RECOVERED}"]
+#: Layers from bottom to top, reasons for silence, sensor, recovered: (table, code) → what is said, colour, mark.
+LAYERS = {("gate", code): (f"silent: {words(names(Gate)[code])}", colour, "silent") for code, colour in GATES.items()}
+LAYERS |= {
+    ("source", code): (words(names(Source)[code]), SOURCES[code], mark)
+    for code, mark in ((Source.SENSOR, "sensor"), (Source.RECOVERED, "answer"))
+}
 
 
 def overlays(result: Result) -> list[Figure]:
@@ -28,33 +34,29 @@ def overlays(result: Result) -> list[Figure]:
     found: list[Figure] = []
     for variant in order:
         mine = [row for row in having if row["method"] == variant]
-        panels: list[Markup] = []
-        used: set[str] = set()
-        for row in mine:
-            layers = _layers(row["overlay"])
-            used.update(name for name, _, _ in layers)
-            title = tag("p", named(row), class_="panel-title")
-            panels.append(tag("div", title, picture(named(row), row["overlay"]["hw"], layers)))
+        panels = [Picture(named(row), row["overlay"]["hw"], layers(row["overlay"]), width=300) for row in mine]
         caption = "Some samples of each scene's first pair, where they lie in the anchor's picture. The picture itself "
         caption += "is not shown: licences of many data sets do not allow it." + missing(
             result, [r["scene"] for r in mine]
         )
-        legend = [(f"box {name}", _said(name)) for name in LAYERS if name in used]
+        used = {layer.label for panel in panels for layer in panel.layers}
+        legend = [
+            Key(said, colour, "cross" if mark == "silent" else "dot")
+            for said, colour, mark in LAYERS.values()
+            if said in used
+        ]
         found.append(Figure(f"What became of the samples: {variant}", caption, panels, legend, folded=bool(found)))
     return found
 
 
-def _layers(overlay: Mapping[str, Any]) -> list[tuple[str, list[float], list[float]]]:
-    groups: dict[str, tuple[list[float], list[float]]] = {}
+def layers(overlay: Mapping[str, Any]) -> list[Layer]:
+    """The samples of an archived overlay by what became of them; those without a place are left out."""
+    groups: dict[tuple[str, int], list[tuple[float, float]]] = {}
     for u, v, source, gate in zip(*(overlay[k] for k in ("u", "v", "source", "gate")), strict=True):
-        name = f"gate{gate}" if source == Source.NONE else f"source{source}"
-        us, vs = groups.setdefault(name, ([], []))
-        us.append(u)
-        vs.append(v)
-    return [(name, *groups[name]) for name in LAYERS if name in groups]
-
-
-def _said(name: str) -> str:
-    if name.startswith("source"):
-        return words(names(Source)[int(name.removeprefix("source"))])
-    return "silent: " + words(names(Gate)[int(name.removeprefix("gate"))])
+        if u is not None and v is not None:
+            groups.setdefault(("gate", gate) if source == Source.NONE else ("source", source), []).append((u, v))
+    return [
+        Layer(said, np.array(groups[key]), colour, mark)
+        for key, (said, colour, mark) in LAYERS.items()
+        if key in groups
+    ]

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from dhtorch import archive
-from dhtorch.codes import Source
-from dhtorch.drawing import GATE_COLOURS, HOLE_COLOURS, RECOVERED, SENSOR
+from dhtorch import storage
+from dhtorch.drawing import Key, inline
+from dhtorch.drawing.colours import style_sheet, variable
 from dhtorch.studies.report import published
 from dhtorch.studies.report.figure import Figure
 from dhtorch.studies.report.layouts import SHOWN, in_layout
@@ -32,7 +31,7 @@ def page(results: Sequence[Result]) -> str:
         results: valid ones, as from :func:`dhtorch.archive.read`.
     """
     title = "dhtorch: results"
-    style = Markup(STYLE.read_text(encoding="utf-8") + _colours())
+    style = Markup(style_sheet() + STYLE.read_text(encoding="utf-8"))
     metas = ({"charset": "utf-8"}, {"name": "viewport", "content": "width=device-width, initial-scale=1"})
     head = tag("head", *(tag("meta", **m) for m in metas), tag("title", title), tag("style", style))
     names = _anchors(results)
@@ -56,16 +55,7 @@ def write(path: Path, results: Sequence[Result]) -> Path:
         raise ValueError(f"{path}: found {path.suffix or 'no ending'}, expected a name that ends in .html")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: found no folder {path.parent}, expected one")
-    return archive.replace_file(path, page(results).encode("utf-8"))
-
-
-def _colours() -> str:
-    """Style rules of the codes, in the colours of the figures that a job draws."""
-    gates = {f"gate{code}": colour for code, colour in GATE_COLOURS.items()}
-    codes = {**gates, f"source{Source.SENSOR}": SENSOR, f"source{Source.RECOVERED}": RECOVERED}
-    codes |= {f"hole{code}": colour for code, colour in HOLE_COLOURS.items()}
-    rule = ".overlay .{0} {{ stroke: {1}; }} .swatch.{0} {{ background: {1}; }} svg rect.{0} {{ fill: {1}; }}\n"
-    return "".join(rule.format(name, colour) for name, colour in codes.items())
+    return storage.replace_file(path, page(results).encode("utf-8"))
 
 
 def _anchors(results: Sequence[Result]) -> list[str]:
@@ -157,7 +147,7 @@ def _settings(result: Result) -> Markup:
     versions = ", ".join(f"{k} {v}" for k, v in meta["versions"].items() if v)
     lines = (("key", result["key"]), ("data digest", result["data"]["digest"]), ("versions", versions))
     known = tag("dl", *(part for k, v in lines for part in (tag("dt", k), tag("dd", v))), class_="question")
-    text = json.dumps(result["config"], indent=2, ensure_ascii=False)
+    text = storage.dumps(result["config"], indent=2)
     return tag("details", tag("summary", "Configuration"), known, tag("pre", text))
 
 
@@ -223,7 +213,14 @@ def _scrolling(table: Markup, label: str) -> Markup:
 
 def figure_markup(figure: Figure) -> Markup:
     """Panels side by side where there is room, with caption and legend."""
-    legend = [tag("li", tag("span", class_=f"swatch {kind}"), text) for kind, text in figure.legend]
+    legend = [tag("li", _swatch(key), key.text) for key in figure.legend]
     below = tag("figcaption", tag("strong", f"{figure.title}. "), figure.caption)
-    panels = tag("div", *figure.panels, class_="panels wide" if figure.wide else "panels")
+    drawn = [Markup(inline(panel)) for panel in figure.panels]
+    panels = tag("div", *drawn, class_="panels wide" if figure.wide else "panels")
     return tag("figure", below, tag("ul", *legend, class_="legend") if legend else "", panels)
+
+
+def _swatch(key: Key) -> Markup:
+    """What stands for an entry of a legend."""
+    again = " again" if key.stroke and key.stroke.dashes else ""
+    return tag("span", class_=f"swatch {key.shape}{again}", style=f"color: {variable(key.colour)}")

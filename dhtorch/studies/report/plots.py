@@ -5,17 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from dhtorch.codes import Hole, names, words
+from dhtorch.drawing import Key, Panel, Stroke, spanning
+from dhtorch.drawing.colours import HOLES, OTHERS, SOFT
 from dhtorch.studies.report import curves, published, sweeps
 from dhtorch.studies.report.cells import show
 from dhtorch.studies.report.figure import PUBLISHED, Figure, axis_of, deciding, named, series, share
 from dhtorch.studies.report.layouts import counterparts
 from dhtorch.studies.report.overlays import overlays
 from dhtorch.studies.report.reading import Result, Row, entry, scene_rows, variants
-from dhtorch.studies.report.svg import Panel, spanning
 from dhtorch.studies.report.timings import branch, is_whole
 
-#: Height of a named row, and of what lies around them.
-ROW, AROUND = 19, 66
+#: What a timing is of → how it is drawn.
+_TIMED = {
+    "front end and pair": Stroke(OTHERS[0]),
+    "single stages": Stroke(OTHERS[4]),
+    "visual branch": Stroke(OTHERS[1]),
+}
 
 
 def figures(result: Result) -> list[Figure]:
@@ -41,7 +46,7 @@ def side_by_side(result: Result) -> Figure | None:
     rows = variants(result)
     if len(rows) < 2:
         return None
-    theirs, panels = counterparts(result), []
+    theirs, panels, strokes = counterparts(result), [], series(result)
     for metric, label in (("coverage", "coverage, %"), ("median_rel", "median error, %"), ("corr", "correlation")):
         entries = {v: entry(result, v, metric) for v in rows}
         ours = [e.get(k) for e in entries.values() for k in ("value", "low", "high")]
@@ -49,15 +54,15 @@ def side_by_side(result: Result) -> Figure | None:
             continue
         cited = {v: number for v in rows if (number := theirs.get(v, {}).get(metric)) is not None}
         axis = axis_of(metric, [*ours, *cited.values()])
-        panel = Panel(label, axis, None, size=(400, AROUND + ROW * len(rows)), rows=rows)
+        panel = Panel(label, axis, None, size=(400, 0), rows=rows)
         for k, (v, e) in enumerate(entries.items()):
             if e.get("low") is not None:
-                panel.line([e["low"], e["high"]], [k, k], series(result, v))
+                panel.line([e["low"], e["high"]], [k, k], strokes[v])
             if e.get("value") is not None:
-                panel.dot(e["value"], k, series(result, v), f"{v}: {show(e['value'], metric)}")
+                panel.dot(e["value"], k, strokes[v], f"{v}: {show(e['value'], metric)}")
             if v in cited:
                 panel.diamond(cited[v], k, f"published: {show(cited[v], metric)}")
-        panels.append(panel.render())
+        panels.append(panel)
     caption = "Dots: median over scenes; lines: 95 % interval of a bootstrap over scenes."
     drawn = [PUBLISHED] if any(theirs.values()) else []
     return Figure("Variants side by side", caption, panels, drawn, wide=True) if panels else None
@@ -76,16 +81,17 @@ def latency(result: Result) -> Figure | None:
     labels = [*(name for name, _ in rows), *cited]
     times = [t for _, row in rows for t in (row["p50_ms"], _slow(row))]
     x = spanning([*times, *cited.values()], "milliseconds (logarithmic)", log=True)
-    panel = Panel("", x, None, size=(720, AROUND + ROW * len(labels)), rows=labels)
+    panel = Panel("", x, None, size=(720, 0), rows=labels)
     for k, (name, row) in enumerate(rows):
-        style = "s1" if row.get("stage") == "forward" else "s0" if is_whole(row) else "s7"
-        panel.line([row["p50_ms"], _slow(row)], [k, k], style)
-        panel.dot(row["p50_ms"], k, style, f"{name}: {show(row['p50_ms'])} ms")
+        kind = "visual branch" if row.get("stage") == "forward" else "single stages"
+        stroke = _TIMED["front end and pair" if is_whole(row) and kind == "single stages" else kind]
+        panel.line([row["p50_ms"], _slow(row)], [k, k], stroke)
+        panel.dot(row["p50_ms"], k, stroke, f"{name}: {show(row['p50_ms'])} ms")
     for k, (name, number) in enumerate(cited.items()):
         panel.diamond(number, len(rows) + k, f"{name}: {number:g} ms")
     caption = "Dots: p50; lines reach to p99, or to p95 where there were too few calls."
-    drawn = [("dot s0", "front end and pair"), ("dot s7", "single stages"), ("dot s1", "visual branch"), PUBLISHED]
-    return Figure("Latency", caption, [panel.render()], drawn, wide=True)
+    drawn = [*(Key(name, stroke.colour, "dot") for name, stroke in _TIMED.items()), PUBLISHED]
+    return Figure("Latency", caption, [panel], drawn, wide=True)
 
 
 def holes(result: Result) -> Figure | None:
@@ -104,17 +110,17 @@ def holes(result: Result) -> Figure | None:
         number = published.number(cells["hole_share.trackable_no_lidar"])
         bars[f"published: {name}"] = {"trackable_no_lidar": number}
     classes = {name.lower(): code for code, name in names(Hole).items() if code}
-    panel = Panel("", share("share of the holes, %"), None, size=(720, AROUND + ROW * len(bars)), rows=list(bars))
+    panel = Panel("", share("share of the holes, %"), None, size=(720, 0), rows=list(bars))
     for k, shares in enumerate(bars.values()):
         at = 0.0
         for name, code in classes.items():
             part = shares.get(name) or 0.0
             if part > 0:
-                panel.bar(at, at + part, k + 0.32, k - 0.32, f"hole{code}")
+                panel.bar(at, at + part, k + 0.32, k - 0.32, HOLES[code], SOFT)
             at += part
-    drawn = [(f"box hole{code}", words(name)) for name, code in classes.items()]
+    drawn = [Key(words(name), HOLES[code], "box") for name, code in classes.items()]
     caption = "Holes of the sensor by class; of the published captures only the key class is known."
-    return Figure("Why returns are missing", caption, [panel.render()], drawn, wide=True)
+    return Figure("Why returns are missing", caption, [panel], drawn, wide=True)
 
 
 def _slow(row: Row) -> float | None:

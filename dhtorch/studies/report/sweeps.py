@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 
+from dhtorch.drawing import Key, Panel, Stroke, spanning
+from dhtorch.drawing.colours import INK
 from dhtorch.studies.report import published
 from dhtorch.studies.report.cells import show
-from dhtorch.studies.report.figure import PUBLISHED, Figure, axis_of, deciding, legend, series, share
+from dhtorch.studies.report.figure import PUBLISHED, SCENE, Figure, axis_of, deciding, legend, series, share
 from dhtorch.studies.report.layouts import thresholds
-from dhtorch.studies.report.markup import Markup
 from dhtorch.studies.report.reading import Result, Row, entry, value, variants
-from dhtorch.studies.report.svg import Panel, spanning
 
 METRICS = (("coverage", "coverage, %"), ("median_rel", "median error, %"))
 #: The paper's usual cutoff, m.
@@ -50,16 +50,17 @@ def threshold(result: Result) -> Figure | None:
     }
     errors = [e for path in paths.values() for _, _, e in path] + [e for _, e in cited.values()]
     panel = Panel("", share("coverage, %"), axis_of("median_rel", errors, "median error, %"), size=(560, 320))
+    strokes = series(result)
     for v, path in paths.items():
-        panel.line([c for _, c, _ in path], [e for _, _, e in path], series(result, v))
+        panel.line([c for _, c, _ in path], [e for _, _, e in path], strokes[v])
         for name, c, e in path:
-            panel.dot(c, e, series(result, v), f"{v}, {_at(name, c, e)}")
+            panel.dot(c, e, strokes[v], f"{v}, {_at(name, c, e)}")
     for name, (coverage, error) in cited.items():
         if coverage is not None and error is not None:
             panel.diamond(coverage, error, f"published, {_at(name, coverage, error)}")
     caption = "Each dot is a threshold on the score, medians over scenes; the paper gives two (0 and 0.3)."
     drawn = [*legend(result, list(paths)), PUBLISHED]
-    return Figure("Threshold on the score", caption, [panel.render()], drawn, wide=True)
+    return Figure("Threshold on the score", caption, [panel], drawn, wide=True)
 
 
 def _at(name: str, coverage: float, error: float) -> str:
@@ -82,7 +83,7 @@ def _sweep(
     at: Callable[[Row], float | None],  # row → its place on the axis
     label: str,
     cited: Mapping[float, Mapping[str, float | None]],  # place → the paper's figures
-) -> list[Markup]:
+) -> list[Panel]:
     """Coverage and error: a line per scene, the medians over scenes, the paper. Nothing with fewer than two places."""
     rows = [row for row in deciding(result) if row["method"] in swept and not row.get("role")]
     placed = [(x, row) for row in rows if (x := at(row)) is not None and not row.get("note")]
@@ -95,12 +96,12 @@ def _sweep(
         panel = Panel(words, axis, y, size=(400, 250))
         for scene in dict.fromkeys(row["scene"] for _, row in placed):
             mine = sorted(((x, value(row, metric)) for x, row in placed if row["scene"] == scene), key=lambda m: m[0])
-            panel.line([x for x, _ in mine], [v for _, v in mine], "scene")
+            panel.line([x for x, _ in mine], [v for _, v in mine], SCENE)
         _medians(panel, result, placed, metric)
         for x, number in theirs.items():
             if number is not None:
                 panel.diamond(x, number, f"published: {show(number, metric)}")
-        panels.append(panel.render())
+        panels.append(panel)
     return panels
 
 
@@ -109,10 +110,10 @@ def _medians(panel: Panel, result: Result, placed: Sequence[tuple[float, Row]], 
     names = dict.fromkeys(row["method"] for _, row in placed)
     middle = sorted((_median([x for x, row in placed if row["method"] == v]), v) for v in names)
     found = [entry(result, v, metric).get("value") for _, v in middle]
-    panel.line([x for x, _ in middle], found, "s0 thick")
+    panel.line([x for x, _ in middle], found, _MEDIAN)
     for (x, v), number in zip(middle, found, strict=True):
         if number is not None:
-            panel.dot(x, number, "s0", f"{v}: {show(number, metric)}", r=4)
+            panel.dot(x, number, _MEDIAN, f"{v}: {show(number, metric)}", width=8)
 
 
 def _median(values: Sequence[float]) -> float:
@@ -128,4 +129,5 @@ def _cutoff_part(variant: str) -> float | None:
     return float(found[1]) if found[1] else float(found[2]) / USUAL_CUTOFF if found[2] else 1.0
 
 
-_LEGEND = [("line s0 thick", "median over scenes"), ("line scene", "single scenes")]
+_MEDIAN = Stroke(INK, 2.8)
+_LEGEND = [Key("median over scenes", INK, stroke=_MEDIAN), Key("single scenes", SCENE.colour, stroke=SCENE)]

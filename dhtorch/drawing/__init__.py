@@ -1,0 +1,35 @@
+"""Everything that is drawn: figures of a job, of the report's page and of notebooks, and the project's colours.
+
+``colours`` is the one page of colours; ``axis`` says where a number stands, ``canvas`` is a bare figure, ``panel`` one
+pair of axes, ``pictures`` shows what a pair found, ``svg`` puts a panel into a page. matplotlib is imported when
+something is drawn.
+"""
+
+from __future__ import annotations
+
+from dhtorch.drawing.axis import Axis, spanning
+from dhtorch.drawing.canvas import Canvas, Key, Mark, save
+from dhtorch.drawing.colours import Stroke, series
+from dhtorch.drawing.panel import Panel
+from dhtorch.drawing.pictures import FEWEST, Layer, Picture, draw_depth, draw_holes, draw_risk_coverage, draw_samples
+from dhtorch.drawing.svg import inline
+
+__all__ = [
+    "FEWEST",
+    "Axis",
+    "Canvas",
+    "Key",
+    "Layer",
+    "Mark",
+    "Panel",
+    "Picture",
+    "Stroke",
+    "draw_depth",
+    "draw_holes",
+    "draw_risk_coverage",
+    "draw_samples",
+    "inline",
+    "save",
+    "series",
+    "spanning",
+]

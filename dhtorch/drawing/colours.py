@@ -1,0 +1,145 @@
+"""Every colour of the project, in figures, pages, viewers and notebooks: the only place where one is written down.
+
+Blue is the sensor and orange is what was recovered, and nothing else is drawn in them. A method has one colour in every
+figure. Depth has one colour map, blue near and red far, also where a viewer brings its own (Rerun's has the same name).
+Colours stay apart for the colour-blind where they can (Okabe and Ito, Tol); those of methods and series are seen on
+light and on dark ground alike. Only what belongs to a page, as its ink and its ground, has a counterpart in the dark.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dhtorch.codes import Gate, Hole, Source
+
+#: What a depth comes from; what is silent is paler than what was answered.
+SENSOR, RECOVERED, SILENT = "#0072B2", "#E69F00", "#B4B4B4"
+
+#: Variable of the pages → its colour by day and in the dark. Figures are drawn in those of the day.
+PAGE = {
+    "ground": ("#fdfdfb", "#15181b"),
+    "card": ("#ffffff", "#1b2024"),
+    "stage": ("#e9ebea", "#0b0d0f"),
+    "tint": ("#f3f3ef", "#1e2226"),
+    "faint": ("#d9dbd8", "#363c42"),
+    "soft": ("#5b6268", "#a1a8ae"),
+    "ink": ("#1c2024", "#e6e8ea"),
+    "link": ("#0b5c93", "#7cc0f2"),
+    "good": ("#1b6e3c", "#63c98a"),
+    "bad": ("#a8321f", "#f08a74"),
+    "theirs": ("#8a4f00", "#f0b860"),
+    "theirs-ground": ("#fdf4e3", "#2c2417"),
+    "picture": ("#efeeea", "#c9c8c3"),
+    "rim": ("#40331a", "#0d0d0d"),
+}
+INK, SOFT, FAINT, PICTURE = (PAGE[name][0] for name in ("ink", "soft", "faint", "picture"))
+#: Figures of the paper, beside ours: edge and inside.
+THEIRS, THEIRS_INSIDE = PAGE["theirs"][0], PAGE["theirs-ground"][0]
+#: In space: what another colouring leaves aside, and the returns that were held back.
+PALE, HELD = "#737880", "#739E80"
+#: Around a mark, so that it is seen on any picture.
+WHITE, BLACK = "#ffffff", "#000000"
+
+#: Method → its colour.
+METHODS = {
+    "paper": INK,
+    "map": "#009E73",
+    "window": "#CC79A7",
+    "auto": "#C03A5A",
+    "opencv": "#8C6D31",
+    "xfeat": "#7A5CC8",
+}
+#: Series that are no method, in turn.
+OTHERS = ("#2A9DA8", "#D55E00", "#6B8E23", "#A0529C", "#7D7D7D", "#4F6D8F")
+#: Where the colours are used up they come again in these dashes, points.
+DASHES: tuple[tuple[float, ...], ...] = ((), (5.0, 2.5), (1.5, 1.8), (7.0, 2.0, 1.5, 2.0))
+
+GATES = {
+    Gate.NO_TRACK: "#9A9A9A",
+    Gate.NO_TEXTURE: "#5E5E5E",
+    Gate.NO_POSE: BLACK,
+    Gate.NO_BASELINE: "#4B0082",
+    Gate.BEHIND: "#F0E442",
+    Gate.PARALLAX: "#CC79A7",
+    Gate.RESIDUAL: "#D55E00",
+    Gate.INCONSISTENT: "#882255",
+    Gate.UNCERTAIN: "#44AA99",
+    Gate.LOW_SCORE: "#999933",
+}
+HOLES = {
+    Hole.TRACKABLE_NO_LIDAR: "#D55E00",
+    Hole.LOW_TEXTURE: "#5E5E5E",
+    Hole.TOO_BRIGHT: "#F0E442",
+    Hole.TOO_DARK: BLACK,
+    Hole.HIGHLIGHT: "#CC79A7",
+    Hole.AT_BORDER: "#009E73",
+}
+SOURCES = {Source.NONE: SILENT, Source.SENSOR: SENSOR, Source.RECOVERED: RECOVERED}
+
+#: Quantity → matplotlib's name of its colour map.
+DEPTH, SCORE, ERROR, SIGNED, GREY = "turbo", "viridis", "Spectral_r", "RdBu_r", "gray"
+#: Where 1/m is drawn: near is large, and blue as well.
+INVERSE_DEPTH = f"{DEPTH}_r"
+
+
+class Stroke(NamedTuple):
+    """How a series is drawn."""
+
+    colour: str
+    width: float = 1.8  # points
+    dashes: tuple[float, ...] = ()  # points on, off, …; none = a whole line
+    opacity: float = 1.0
+
+
+def series(names: Iterable[str]) -> dict[str, Stroke]:
+    """Name → stroke: a method's own colour, the others in turn and then dashed."""
+    names = list(dict.fromkeys(names))
+    others = [name for name in names if name not in METHODS]
+    found = {name: Stroke(METHODS[name]) for name in names if name in METHODS}
+    for k, name in enumerate(others):
+        again, colour = divmod(k, len(OTHERS))
+        found[name] = Stroke(OTHERS[colour], dashes=DASHES[again % len(DASHES)])
+    return {name: found[name] for name in names}
+
+
+def rgb(colour: str) -> tuple[int, int, int]:
+    """``#rrggbb`` as three numbers from 0 to 255."""
+    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
+
+
+def of_source(source: Any) -> np.ndarray:
+    """Colours (P, 3) uint8 of points by codes.Source (P,): sensor blue, recovered orange."""
+    sensed = np.asarray(source.detach().cpu() if hasattr(source, "detach") else source)[:, None] == Source.SENSOR
+    return np.where(sensed, rgb(SENSOR), rgb(RECOVERED)).astype(np.uint8)
+
+
+def ramp(name: str, n: int = 17) -> list[str]:
+    """A colour map at n places from its low to its high end, for drawers that do not have it."""
+    from matplotlib import colormaps  # noqa: PLC0415
+    from matplotlib.colors import to_hex  # noqa: PLC0415
+
+    return [to_hex(colour) for colour in colormaps[name](np.linspace(0, 1, n))]
+
+
+def variable(colour: str) -> str:
+    """A colour as a page says it: by the name of its variable where it changes in the dark."""
+    return _VARIABLES.get(colour.lower(), colour.lower())
+
+
+def style_sheet() -> str:
+    """The variables of a page by day and in the dark, and those of the colours that are the same in both."""
+    fixed = {"sensor": SENSOR, "recovered": RECOVERED, "silent": SILENT, "white": WHITE, "black": BLACK}
+    day, night = ({name: pair[k] for name, pair in PAGE.items()} for k in (0, 1))
+    dark = f"@media (prefers-color-scheme: dark) {{ {_root(night)} }}"
+    return f"{_root({**day, **fixed})}\n{dark}\n"
+
+
+def _root(variables: dict[str, str]) -> str:
+    said = " ".join(f"--{name}: {colour};" for name, colour in variables.items())
+    return f":root {{ color-scheme: light dark; {said} }}"
+
+
+_VARIABLES = {day.lower(): f"var(--{name})" for name, (day, _) in PAGE.items()}

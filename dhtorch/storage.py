@@ -1,0 +1,120 @@
+"""Strict JSON, and files that hold either what they held before or all of the new content.
+
+Strict JSON is what every reader of JSON understands alike: no ``NaN``, no ``Infinity``, and no key twice in an object.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+#: How the name of a file ends while it is written.
+_UNFINISHED = ".tmp"
+
+
+def strict(value: Any) -> Any:
+    """The same value in what strict JSON can hold: finite numbers, strings, lists, objects with string keys, null.
+
+    Non-finite numbers become null; numpy and torch values become numbers and lists, paths become strings.
+
+    Raises:
+        TypeError: a value that has no counterpart.
+    """
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(k): strict(v) for k, v in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [strict(v) for v in (sorted(value) if isinstance(value, set | frozenset) else value)]
+    if isinstance(value, Path):
+        return str(value)
+    if hasattr(value, "tolist"):  # torch.Tensor, numpy.ndarray and numpy scalars
+        return strict(value.tolist())
+    raise TypeError(f"result: found a {type(value).__name__}, expected something that JSON can hold")
+
+
+def dumps(value: Any, **layout: Any) -> str:
+    """Strict JSON of what has a counterpart in it; ``layout`` as for :func:`json.dumps`.
+
+    Raises:
+        ValueError: a number that is not finite (see :func:`strict`).
+        TypeError: a value that JSON does not know.
+    """
+    return json.dumps(value, **{"ensure_ascii": False, **layout}, allow_nan=False)
+
+
+def loads(text: str) -> Any:
+    """The value of a text in strict JSON.
+
+    Raises:
+        ValueError: no JSON, a number that is not finite, or a key that stands twice in one object.
+    """
+    return json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_unique)
+
+
+def write_json(path: str | Path, value: Any) -> Path:
+    """Write a value as strict JSON, a line for every member, so that ``path`` never holds half of it.
+
+    Raises:
+        ValueError: a number that is not finite; nothing is written.
+    """
+    return replace_file(path, (dumps(value, indent=1) + "\n").encode("utf-8"))
+
+
+def replace_file(path: str | Path, content: bytes) -> Path:
+    """Write a file so that, whatever happens, ``path`` holds either what it held before or all of the new content."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=_UNFINISHED, dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        Path(name).chmod(0o644)
+        Path(name).replace(path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+    _sync_folder(path.parent)
+    return path
+
+
+def clear(path: str | Path) -> None:
+    """Remove what a writer of ``path`` left beside it when it was killed. Nobody may be writing ``path`` meanwhile."""
+    path = Path(path)
+    for left in path.parent.glob(f".{path.name}.*{_UNFINISHED}"):
+        left.unlink(missing_ok=True)
+
+
+def _refuse_constant(word: str) -> None:
+    raise ValueError(f"the constant {word}")
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"the key {next(n for n in names if names.count(n) > 1)!r} twice")
+    return found
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a rename durable, where the system lets a folder be opened."""
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError:
+        return
+    try:
+        os.fsync(handle)
+    except OSError:
+        pass
+    finally:
+        os.close(handle)

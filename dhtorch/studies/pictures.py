@@ -1,0 +1,42 @@
+"""What a pair found, as its pictures and its point cloud."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from dhtorch.codes import Source
+from dhtorch.drawing import draw_depth, draw_holes, draw_risk_coverage, draw_samples
+from dhtorch.drawing.colours import of_source
+from dhtorch.evaluate import errors
+from dhtorch.evaluate.risk import risk_coverage
+from dhtorch.export import write_ply
+from dhtorch.geometry.camera import unproject
+from dhtorch.pair import merge
+
+
+def draw_example(folder: str | Path, example: Any) -> list[Path]:
+    """Figures and the point cloud of one pair; returns the files written.
+
+    Args:
+        folder: made if need be.
+        example: a :class:`dhtorch.studies.protocol.Example`.
+    """
+    e, folder = example.cpu(), Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    whole, image, uv = merge(e.samples, e.estimate), e.frame.image[0], e.samples.uv[0]
+    draw_samples(folder / "samples.png", image, uv, whole.source[0], e.estimate.gate[0])
+    draw_holes(folder / "holes.png", image, uv, e.samples.hole[0])
+    written = ["samples.png", "holes.png", "points.ply"]
+    pooled = errors.select(e.estimate, e.truth)
+    if pooled.keep.any():
+        draw_depth(folder / "depth.png", pooled.true_depth, pooled.depth, pooled.score)
+        curves, oracle = {e.method: risk_coverage(pooled)}, risk_coverage(pooled, oracle=True)
+        draw_risk_coverage(folder / "risk_coverage.png", curves, oracle=oracle)
+        written += ["depth.png", "risk_coverage.png"]
+    filled = whole.source[0] != Source.NONE
+    xyz = unproject(e.frame.camera, whole.uv, whole.depth)[0][filled]
+    columns = {name: getattr(whole, name)[0][filled] for name in ("sigma", "score")}
+    columns |= {"hole": e.samples.hole[0][filled], "source": whole.source[0][filled]}
+    write_ply(folder / "points.ply", xyz, of_source(columns["source"]), **columns)
+    return [folder / name for name in written]
