@@ -12,7 +12,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dhtorch.geometry.lookup import luma, windows
+from dhtorch.geometry import filters
+from dhtorch.geometry.lookup import windows
 from dhtorch.geometry.shapes import check
 
 #: Padding beyond half a window: how far from a pixel of the image (or of ``MARGIN`` around it) a search may look.
@@ -149,7 +150,7 @@ def build_pyramid(
         grey = level[:, GREY : GREY + 1]
         inside = grey[..., pad:-pad, pad:-pad]
         for part in _bands(image, (h, w)):
-            inside[..., part, :] = _half(chain[-1], pad, part) if chain else luma(image[..., part, :], dim=1)
+            inside[..., part, :] = _half(chain[-1], pad, part) if chain else filters.grey(image[..., part, :])
         _mirror(grey, pad)
         if gradients:
             _add_gradients(level, pad, image)
