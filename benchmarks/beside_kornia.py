@@ -60,7 +60,7 @@ def compare(peer: Peer, repeats: int, clock: str) -> dict[str, Any]:
         more[f"{side}_gradient"] = None if arrays else gradient(fn, peer.make(torch.float32, B, FEW))
         more[f"{side}_hard"] = None if peer.hard is None else gradient(fn, peer.hard())
     versions = {name: version(name) for name in ("torch", "kornia")}
-    size = {"n": peer.size[1], "batch": peer.size[0]}
+    size = {"n": peer.size[1], "batch": peer.size[0], "clock": clock}
     return harness.row(peer.ours, ours, "kornia", theirs, **size, **more, versions=versions)
 
 

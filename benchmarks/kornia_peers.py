@@ -416,7 +416,7 @@ PEERS = (
         two_views,
         lambda a, b, c, T: epipolar.depths(a, b, c, c, T),
         lambda a, b, c, T: ke.triangulate_points(*projections(c, T), a, b, solver="cofactor")[..., 2],
-        "slower, and no digits left where rays are nearly parallel",
+        "slower; otherwise as above",
         hard=_no_baseline,
         points=(0, 1),
         note="solver cofactor",

@@ -48,7 +48,8 @@ def measured(asked: list[dict[str, Any]]) -> str:
     first = asked[0]
     versions = ", ".join(f"{name} {value}" for name, value in first["versions"].items())
     threads = "one thread" if first["threads"] == 1 else f"{first['threads']} threads"
-    return f"Measured on: {first['processor']}; {threads}; {versions}."
+    clock = {"wall": "", "cpu": "; time given to the process, on a machine that did other things too"}[first["clock"]]
+    return f"Measured on: {first['processor']}; {threads}; {versions}{clock}."
 
 
 def answers() -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from kornia.geometry.calibration import undistort_points
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.liegroup import Se3
 
@@ -101,6 +102,16 @@ def test_what_kornia_does_here_is_what_was_done_before():
     torch.testing.assert_close(cam.distort(camera, uv), before_kornia.distort(camera, uv), rtol=1e-12, atol=1e-10)
     T = motions()
     assert torch.equal(se3.to_matrix(T), before_kornia.to_matrix(T))
+
+
+def test_behind_a_wide_lens_kornias_steps_have_not_arrived():
+    camera = Camera(
+        torch.full((1, 2), 300.0), torch.tensor([[320.0, 240.0]]), torch.tensor([[-0.45, 0.2, 0.001, 0.001]])
+    )
+    uv = torch.rand(1, 500, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([640.0, 480.0])
+    ideal, theirs = cam.undistort(camera, uv), undistort_points(uv, cam.to_matrix(camera), camera.distortion)
+    assert ideal.isfinite().all() and (cam.distort(camera, ideal) - uv).abs().max() < 0.01
+    assert ((theirs - ideal).abs().amax(-1) > 0.1).float().mean() > 0.4
 
 
 def test_kornia_is_loaded_where_it_is_first_used():
