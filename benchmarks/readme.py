@@ -1,6 +1,6 @@
-"""The tables of README.md and benchmarks/README.md, made from committed result files; README's picture.
+"""The tables of README.md, benchmarks/README.md and docs/kornia.md, from committed result files; README's picture.
 
-python benchmarks/readme.py            rewrite the tables between the markers of both
+python benchmarks/readme.py            rewrite the tables between their markers
 python benchmarks/readme.py --check    exit 1 if they do not say what the result files say
 python benchmarks/readme.py --picture  also render benchmarks/results/room.png again
 """
@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import kornia_tables
 import mutants
 import speed_tables
 
@@ -226,7 +227,11 @@ TABLES |= {"verdicts": partial(verdicts, ASKED), "negative": partial(verdicts, N
 TABLES |= {"pipelines": partial(verdicts, PIPELINES), "map": partial(verdicts, ("global_map",))}
 
 #: Pages and their tables.
-PAGES = {README: TABLES, HERE / "README.md": speed_tables.TABLES | {"mutants": caught}}
+PAGES = {
+    README: TABLES,
+    HERE / "README.md": speed_tables.TABLES | {"mutants": caught},
+    HERE.parent / "docs" / "kornia.md": kornia_tables.TABLES,
+}
 
 
 def in_layout(name: str) -> str:
@@ -253,7 +258,7 @@ def fill(page: Path, tables: dict[str, Callable[[], str]]) -> str:
 
 
 def main() -> int:
-    """Rewrite or check both pages."""
+    """Rewrite or check the pages."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true")
     parser.add_argument("--picture", action="store_true")

@@ -400,6 +400,7 @@ ROWS = [
     Row(with_options(registration.normals, neighbours=4), lambda b, n, d: registered(b, n, d)[:1], "dtype batch vmap capture shuffle raises", (0,), bad=wrong_last_axis(0)),
     Row(clusters.largest_cluster, clustered, "dtype batch vmap capture shuffle raises", (0, 1), bad=wrong_last_axis(0)),
     Row(holdout.candidates, judged, "dtype batch vmap capture empty shuffle raises", (0, 1), bad=lambda a: (a[0], a[1].replace(depth=a[1].depth[:, 1:]), a[2])),
+    Row(filters.grey, lambda b, n, d: (frames(b, n, d)[0].image,), POINTLESS, grad=(0,)),
     Row(filters.separable, lambda b, n, d: (frames(b, n, d)[0].image, [0.25, 0.5, 0.25], [-0.5, 0.0, 0.5]), POINTLESS + " raises", grad=(0,), bad=lambda a: (a[0][0], *a[1:])),
     Row(filters.gaussian, lambda b, n, d: (frames(b, n, d)[0].image, 1.2), POINTLESS + " raises", grad=(0,), bad=lambda a: (a[0][0], a[1])),
     Row(filters.box, lambda b, n, d: (frames(b, n, d)[0].image, 2), POINTLESS + " raises", grad=(0,), bad=lambda a: (a[0][0], a[1])),

@@ -7,7 +7,8 @@ import pytest
 import scipy.ndimage as ndi
 import torch
 
-from dhtorch.geometry.filters import box, gaussian, gaussian_taps, separable
+from dhtorch.geometry.filters import box, gaussian, gaussian_taps, grey, separable
+from dhtorch.geometry.lookup import luma
 
 
 def pictures(seed=0):
@@ -31,6 +32,28 @@ def test_a_gaussian_reaches_four_deviations_and_is_scipys(sigma):
 
 def test_no_blur_leaves_the_picture():
     assert gaussian_taps(0.0) == [1.0] and torch.equal(gaussian(pictures(), 0.0), pictures())
+
+
+@pytest.mark.parametrize("hw", [(240, 320), (256, 256)])
+def test_a_blurred_picture_does_not_depend_on_its_company(hw):
+    """kornia filters so many pixels in another way when there are more of them."""
+    x = torch.rand(3, 1, *hw, generator=torch.Generator().manual_seed(0))
+    for k, alone in enumerate(gaussian(one, 2.0) for one in x.split(1)):
+        assert torch.equal(gaussian(x, 2.0)[k : k + 1], alone)
+
+
+def test_a_blur_may_reach_less_far():
+    want = ndi.gaussian_filter(pictures().numpy(), 1.2, mode="nearest", radius=2, axes=(2, 3))
+    np.testing.assert_allclose(gaussian(pictures(), 1.2, reach_px=2).numpy(), want, atol=1e-12)
+    assert gaussian(pictures()[:0], 1.2).shape == (0, 3, 9, 12)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_grey_is_that_of_patches_bit_for_bit(dtype):
+    x = pictures().to(dtype)
+    assert torch.equal(grey(x), luma(x, 1)) and torch.equal(grey(x[:, :1]), x[:, :1])
+    whole = (255 * x).to(torch.uint8)
+    assert torch.equal(grey(whole), luma(whole, 1)) and torch.equal(grey(whole[:, :1]), luma(whole[:, :1], 1))
 
 
 @pytest.mark.parametrize("sigma", [0.4, 1.0, 2.3])

@@ -1,13 +1,29 @@
-"""Our values as kornia's and back: cameras, motions, and what both say of the same points."""
+"""Our values as kornia's and back: cameras, motions, and what both say of the same points; kornia's functions here."""
 
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
 import torch
+from kornia.geometry.calibration import undistort_points
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.liegroup import Se3
 
 from dhtorch import Camera, Pose
+from dhtorch.data import convert
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+
+import before_kornia
+import kornia_peers
+import kornia_tables
+
+REPO = Path(__file__).resolve().parents[1]
 B, HW = 3, (120, 160)
 
 
@@ -70,3 +86,50 @@ def test_gradients_cross_the_border():
     t = motions().t.requires_grad_()
     (Pose.from_kornia(Pose(motions().R, t).to_kornia()).t * 2).sum().backward()
     assert bool((t.grad == 2).all())
+
+
+def test_what_kornia_does_here_is_what_was_done_before():
+    g = np.random.default_rng(0)
+    rotations = np.concatenate(
+        (np.zeros((1, 3)), 1e-9 * g.normal(size=(5, 3)), g.normal(size=(50, 3)), [[np.pi, 0, 0]])
+    )
+    q = convert.to_quaternions(rotations)
+    np.testing.assert_allclose(q, before_kornia.to_quaternions(rotations), atol=1e-15)
+    found = convert.to_c2w(3 * q, rotations, Path("poses"))
+    np.testing.assert_allclose(found, before_kornia.to_c2w(3 * q, rotations), atol=1e-15)
+    assert convert.to_c2w(q[:0], rotations[:0], Path("poses")).shape == (0, 4, 4)
+    camera, uv = cameras(), 160 * torch.rand(B, 30, 2, generator=torch.Generator().manual_seed(3)).double()
+    torch.testing.assert_close(cam.distort(camera, uv), before_kornia.distort(camera, uv), rtol=1e-12, atol=1e-10)
+    T = motions()
+    assert torch.equal(se3.to_matrix(T), before_kornia.to_matrix(T))
+
+
+def test_behind_a_wide_lens_kornias_steps_have_not_arrived():
+    camera = Camera(
+        torch.full((1, 2), 300.0), torch.tensor([[320.0, 240.0]]), torch.tensor([[-0.45, 0.2, 0.001, 0.001]])
+    )
+    uv = torch.rand(1, 500, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([640.0, 480.0])
+    ideal, theirs = cam.undistort(camera, uv), undistort_points(uv, cam.to_matrix(camera), camera.distortion)
+    assert ideal.isfinite().all() and (cam.distort(camera, ideal) - uv).abs().max() < 0.01
+    assert ((theirs - ideal).abs().amax(-1) > 0.1).float().mean() > 0.4
+
+
+def test_kornia_is_loaded_where_it_is_first_used():
+    code = "import sys, dhtorch; dhtorch.MAP, dhtorch.data; print('kornia' in sys.modules)"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "False"
+
+
+def test_the_page_has_a_row_for_every_pair_of_functions():
+    asked = [(p.ours, p.kornia, p.used, p.why, p.note) for p in kornia_peers.PEERS]
+    rows = [r for r in kornia_tables.rows() if r["name"] != "answers"]
+    assert asked == [(r["name"], r["kornia"], r["used"], r["why"], r["note"]) for r in rows]
+    assert len(asked) >= 15 and {p.used for p in kornia_peers.PEERS} == {"ours", "kornia"}
+    assert all(p.why for p in kornia_peers.PEERS if p.used == "ours"), "where we depart, the reason is said"
+
+
+@pytest.mark.parametrize("code", re.findall(r"```python\n(.*?)```", (REPO / "docs/kornia.md").read_text(), re.S))
+def test_the_example_of_the_page_runs(code):
+    found = {}
+    exec(compile(code, "docs/kornia.md", "exec"), found)
+    assert torch.equal(found["back"].intrinsics, found["theirs"].intrinsics)
+    assert torch.equal(found["back"].extrinsics, found["theirs"].extrinsics)

@@ -95,21 +95,12 @@ def _camera(shot: Shot) -> str:
 
 
 def _pose(shot: Shot) -> str:
-    """Quaternion w, x, y, z and translation of the camera from the world."""
+    """Quaternion w, x, y, z (kornia's) with w >= 0, and translation, of the camera from the world."""
+    from kornia.geometry.conversions import rotation_matrix_to_quaternion  # noqa: PLC0415
+
     T = se3.invert(shot.T_world_from_cam.map(lambda v: v.double()))
-    return " ".join(map(_text, [*_quaternion(T.R[0].tolist()), *T.t[0].tolist()]))
-
-
-def _quaternion(R: list[list[float]]) -> list[float]:
-    """w, x, y, z of a rotation matrix, from its largest component, so that no digit is lost; w >= 0."""
-    d = [R[k][k] for k in range(3)]
-    four = [1 + d[0] + d[1] + d[2], 1 + d[0] - d[1] - d[2], 1 - d[0] + d[1] - d[2], 1 - d[0] - d[1] + d[2]]
-    wx, wy, wz = R[2][1] - R[1][2], R[0][2] - R[2][0], R[1][0] - R[0][1]
-    xy, xz, yz = R[0][1] + R[1][0], R[0][2] + R[2][0], R[1][2] + R[2][1]
-    rows_of = [[four[0], wx, wy, wz], [wx, four[1], xy, xz], [wy, xy, four[2], yz], [wz, xz, yz, four[3]]]
-    best = rows_of[max(range(4), key=lambda k: four[k])]
-    length = math.copysign(math.sqrt(sum(v * v for v in best)), best[0] or 1.0)
-    return [v / length for v in best]
+    q = rotation_matrix_to_quaternion(T.R)[0]
+    return " ".join(map(_text, [*(-q if q[0] < 0 else q).tolist(), *T.t[0].tolist()]))
 
 
 def _text(value: float) -> str:

@@ -68,7 +68,8 @@ def min_eigenvalue(
     """Smaller eigenvalue (B, N) of the mean gradient matrix around pixels: Shi–Tomasi trackability.
 
     Equal to ``cv2.cornerMinEigenVal(grey, block, 3)`` at the nearest pixel wherever the block and the 3×3 Sobel
-    filter stay inside the image (``tests/test_holes.py``); nearer to the border the block is moved inside.
+    filter stay inside the image (``tests/test_holes.py``); nearer to the border the block is moved inside. kornia's
+    ``gftt_response`` filters the whole picture, through another window.
 
     Gradient: to the image; at equal eigenvalues the subgradient without the split is taken.
     """

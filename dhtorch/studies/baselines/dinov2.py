@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from kornia.enhance import normalize
 from torch import Tensor
 
 from dhtorch.geometry.shapes import check
@@ -87,5 +88,4 @@ def pixel_values(image: Tensor, side: int = 224) -> Tensor:
     check("pixel_values", image=(image, "B C H W"))
     x = image / 255 if image.dtype == torch.uint8 else image
     x = torch.nn.functional.interpolate(x, (side, side), mode="bicubic", antialias=True, align_corners=False)
-    mean, std = (torch.tensor(c, dtype=x.dtype, device=x.device).view(3, 1, 1) for c in (COLOUR_MEAN, COLOUR_STD))
-    return (x.clamp(0, 1).expand(-1, 3, -1, -1) - mean) / std
+    return normalize(x.clamp(0, 1).expand(-1, 3, -1, -1), x.new_tensor(COLOUR_MEAN), x.new_tensor(COLOUR_STD))

@@ -14,8 +14,7 @@ from torch import Tensor
 
 from dhtorch.codes import PoseCode
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry import covariance, epipolar, se3
-from dhtorch.geometry.lookup import luma
+from dhtorch.geometry import covariance, epipolar, filters, se3
 from dhtorch.methods import PAPER
 from dhtorch.records import NO_HINT, Camera, Pose, PoseFit, Samples, TrackHint, Tracks
 
@@ -165,7 +164,7 @@ def _grey(image: Tensor) -> list[np.ndarray]:
         return [
             cv2.cvtColor(np.ascontiguousarray(x), cv2.COLOR_RGB2GRAY) for x in image.permute(0, 2, 3, 1).cpu().numpy()
         ]
-    grey = image if image.dtype == torch.uint8 else (luma(image, 1) * 255).round().clamp(0, 255).to(torch.uint8)
+    grey = image if image.dtype == torch.uint8 else (filters.grey(image) * 255).round().clamp(0, 255).to(torch.uint8)
     return list(grey[:, 0].cpu().numpy())
 
 

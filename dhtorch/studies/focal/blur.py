@@ -13,8 +13,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dhtorch.geometry import filters
 from dhtorch.geometry.filters import gaussian, gaussian_taps, separable
-from dhtorch.geometry.lookup import luma
 from dhtorch.geometry.shapes import check
 from dhtorch.geometry.thin_lens import GAUSSIAN_OF_DISC, Lens, depth_of_spot
 from dhtorch.tree import Record, record
@@ -62,7 +62,7 @@ def local_blur(
     check("local_blur", image=(image, "B C H W"))
     if not 0 < fine_px < coarse_px:
         raise ValueError(f"local_blur: widths are {fine_px} and {coarse_px} px, expected 0 < fine_px < coarse_px")
-    grey = luma(image, 1)
+    grey = filters.grey(image)
     fine, fine_noise = _gradient_energy(grey, fine_px, window_px, noise)
     coarse, coarse_noise = _gradient_energy(grey, coarse_px, window_px, noise)
     seen = (fine > min_snr * max(fine_noise, 1e-12)) & (coarse > min_snr * max(coarse_noise, 1e-12))

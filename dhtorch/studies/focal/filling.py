@@ -15,8 +15,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from dhtorch.geometry import filters
 from dhtorch.geometry.filters import box, gaussian
-from dhtorch.geometry.lookup import luma
 from dhtorch.geometry.shapes import check
 from dhtorch.studies.focal.blur import Blur
 
@@ -106,11 +106,13 @@ def guided_filter(
     Raises:
         ValueError: wrong shapes.
 
+    kornia's ``guided_blur`` is the same where every pixel has a return; it cannot leave out those without.
+
     Gradient: to the returns and the guide.
     Source: K. He, J. Sun, "Fast guided filter", 2015.
     """
     sizes = check("guided_filter", coarse=(coarse, "B h w"), guide=(guide, "B C H W"))
-    grey = luma(guide, 1).to(coarse.dtype)
+    grey = filters.grey(guide).to(coarse.dtype)
     there = (coarse > 0).to(coarse.dtype)[:, None]
     count = box(there, radius)
     some = count > LEAST

@@ -27,7 +27,7 @@ from torch import Tensor
 from dhtorch.data.scene import Given, Scene
 from dhtorch.evaluate import bootstrap
 from dhtorch.evaluate.correlation import pearson, spearman
-from dhtorch.geometry.lookup import luma
+from dhtorch.geometry import filters
 from dhtorch.records import Frame
 from dhtorch.studies.focal.defocus import is_exact
 from dhtorch.studies.focal.sharpness import align, depth_at, sharpest, sharpness
@@ -155,7 +155,7 @@ def verdict(outcome: Outcome) -> tuple[bool | None, str]:
 
 def render(frame: Frame, focus_m: Tensor, lens: Mapping[str, float], seed: int) -> dict[str, Tensor]:
     """Condition → grey stack (1, S, 1, H, W) of a frame with exact depth."""
-    sharp = luma(frame.image, 1)
+    sharp = filters.grey(frame.image)
     draw, count = torch.Generator().manual_seed(seed), focus_m.shape[1]
     f_px = float(frame.camera.f[0, 0])
     wide = lens_of(f_px, **lens).to(focus_m.dtype)

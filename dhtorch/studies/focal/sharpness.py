@@ -11,11 +11,11 @@ in the stack, in pictures, fractions allowed.
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F
+from kornia.geometry.transform import remap
 from torch import Tensor
 
+from dhtorch.geometry import filters
 from dhtorch.geometry.filters import gaussian, separable
-from dhtorch.geometry.lookup import luma
 from dhtorch.geometry.shapes import check
 from dhtorch.tree import Record, record
 
@@ -40,7 +40,8 @@ def sharpness(
     """Sharpness (B, S, H, W) of every pixel in every picture, averaged over a Gaussian window.
 
     ``modified_laplacian``: sum of the absolute second differences along both axes. ``gradient_energy``: sum of the
-    squared first differences (Sobel). ``variance``: of the grey values in the window.
+    squared first differences (Sobel; kornia's ``spatial_gradient`` takes up to three times as long). ``variance``: of
+    the grey values in the window.
 
     Args:
         images: B stacks of at least two pictures.
@@ -57,7 +58,7 @@ def sharpness(
     _at_least_two("sharpness", sizes["S"])
     if measure not in MEASURES:
         raise ValueError(f"sharpness: measure is {measure!r}, expected one of {', '.join(MEASURES)}")
-    grey = luma(images.flatten(0, 1), 1)
+    grey = filters.grey(images.flatten(0, 1))
     if measure == "modified_laplacian":
         second = [-1.0, 2.0, -1.0]
         raw = separable(grey, [1.0], second).abs() + separable(grey, second, [1.0]).abs()
@@ -162,7 +163,7 @@ def align(
         raise ValueError(f"align: reference is {reference}, expected a position from 0 to {S - 1}")
     pictures = images / 255.0 if images.dtype == torch.uint8 else images
     with torch.no_grad():
-        soft = [gaussian(luma(pictures[:, k], 1), blur_px) for k in range(S)]
+        soft = [gaussian(filters.grey(pictures[:, k]), blur_px) for k in range(S)]
         found = [pictures.new_zeros(B, 3) for _ in range(S)]
         for k in [*range(middle - 1, -1, -1), *range(middle + 1, S)]:
             start = found[k + 1] if k < middle else found[k - 1]
@@ -195,13 +196,13 @@ def _register(fixed: Tensor, moving: Tensor, motion: Tensor, iterations: int) ->
 
 
 def _resample(picture: Tensor, motion: Tensor) -> Tensor:
-    """Pictures (B, C, H, W) read at x (1 + m) + shift, bicubic."""
+    """Pictures (B, C, H, W) read at x (1 + m) + shift, bicubic, by kornia."""
     H, W = picture.shape[-2:]
     x, y = _from_middle(picture)
     m, du, dv = (motion[:, k, None, None] for k in range(3))
-    u, v = x * (1 + m) + du, y * (1 + m) + dv
-    grid = torch.stack(((2 * u / W).expand(-1, H, W), (2 * v / H).expand(-1, H, W)), -1)
-    return F.grid_sample(picture, grid, mode="bicubic", padding_mode="border", align_corners=False)
+    u, v = x * (1 + m) + du + (W - 1) / 2, y * (1 + m) + dv + (H - 1) / 2
+    u, v = u.expand(-1, H, W), v.expand(-1, H, W)
+    return remap(picture, u, v, mode="bicubic", padding_mode="border", align_corners=True)
 
 
 def _from_middle(picture: Tensor) -> tuple[Tensor, Tensor]:

@@ -8,10 +8,9 @@ across the arm is not seen: under forward motion every point moves along its rad
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
-from dhtorch.geometry.lookup import luma
+from dhtorch.geometry import filters
 from dhtorch.geometry.shapes import check
 from dhtorch.tree import Record, record
 
@@ -49,17 +48,11 @@ def read_arm(
     Gradient: to the image and to ``arm``.
     """
     check("read_arm", image=(image, "B C H W"), arm=(arm, "L 2"))
-    grey = luma(image, 1).to(arm.dtype)
+    grey = filters.grey(image).to(arm.dtype)
     H, W = grey.shape[-2:]
     if blur_px > 0:
         reach = max(1, int(3 * blur_px + 0.5))
-        step = torch.arange(-reach, reach + 1, dtype=arm.dtype, device=arm.device)
-        weight = torch.exp(-0.5 * (step / blur_px) ** 2)
-        weight = weight / weight.sum()
-        padded = F.pad(grey, (reach, reach, reach, reach), mode="replicate")
-        taps = range(2 * reach + 1)
-        down = torch.stack([weight[k] * padded[..., k : k + H, :] for k in taps]).sum(0)
-        grey = torch.stack([weight[k] * down[..., k : k + W] for k in taps]).sum(0)
+        grey = filters.gaussian(grey, blur_px, reach_px=reach)
     limit = torch.tensor([W - 1, H - 1], dtype=arm.dtype, device=arm.device)
     x = torch.minimum(arm.clamp_min(0), limit)
     low = torch.minimum(x.detach().floor(), (limit - 1).clamp_min(0))
