@@ -147,3 +147,10 @@ def test_a_window_needs_more_texture_than_the_limit_times_its_pixels():
     for limit, found in ((0.999 * texture, True), (1.001 * texture, False)):
         o = reference.Options(WINDOW, min_eigenvalue=limit)
         assert reference.search([level], [level], x, still, o, alike=True).found is found
+
+
+def test_half_a_pixel_around_the_outermost_ones_belongs_to_a_picture():
+    for u, v in ((-0.5, 3.0), (9.5, 3.0), (4.0, -0.5), (4.0, 6.5)):
+        step = 1e-9 * torch.tensor([u - 4.5, v - 3.0]).double().sign()
+        at = torch.tensor([u, v]).double()
+        assert reference.within(at, (7, 10)) and not reference.within(at + step, (7, 10))
