@@ -6,7 +6,8 @@ alone, and a point among others as among fewer, bit for bit; whether ``torch.com
 its gradient is finite, also where a formula divides by zero. A function that now calls kornia is compared as it was
 before, see :mod:`before_kornia`.
 
-``--before FOLDER`` adds what both methods say of real pairs (``DHTORCH_DATA``), here and in an earlier checkout.
+``--before FOLDER`` asks both methods of real pairs (``DHTORCH_DATA``), here and in an earlier checkout; without it the
+file's answers stay.
 
 This file is not called ``kornia.py``, because every script beside it would then import it instead of the library.
 """
@@ -151,6 +152,8 @@ def main() -> None:
     if options.before is not None:
         rows += answers(options.before)
         print(*rows[len(rows) - 8 :], sep="\n")
+    elif options.json is not None and options.json.is_file():  # answers are not asked again for the sake of times
+        rows += [r for r in json.loads(options.json.read_text()) if r["name"] == "answers"]
     if options.json is not None:
         options.json.write_text(json.dumps(rows, indent=1, allow_nan=False) + "\n")
 

@@ -66,7 +66,10 @@ EXPERIMENTS = {
 
 #: Result of a script of this folder → its arguments.
 SCRIPTS = dict.fromkeys(("frontend", "lk", "pnp", "triangulate", "pair", "loader", "scaling", "readers"), "")
-SCRIPTS |= {"degenerate": "", "mutants": "--quiet"}
+SCRIPTS |= {"degenerate": "", "mutants": "--quiet", "kornia": "--clock cpu"}
+
+#: Scripts of another name than their result: ``kornia.py`` would be imported instead of the library.
+NAMED = {"kornia": "beside_kornia"}
 
 #: Options that change no number, and which a file may hold otherwise.
 ASIDE = {"figures", "traceback", "root"}
@@ -79,7 +82,8 @@ def command(name: str) -> str:
     """What a shell is told to make a result file."""
     if name in EXPERIMENTS:
         return f"dhtorch figures=false {EXPERIMENTS[name]}"
-    return " ".join(f"python benchmarks/{name}.py {SCRIPTS[name]} --json benchmarks/results/{name}.json".split())
+    script = NAMED.get(name, name)
+    return " ".join(f"python benchmarks/{script}.py {SCRIPTS[name]} --json benchmarks/results/{name}.json".split())
 
 
 def settings(name: str) -> dict[str, Any]:

@@ -34,7 +34,7 @@ def grey(image: Tensor) -> Tensor:
 def separable(x: Tensor, down: Sequence[float], across: Sequence[float]) -> Tensor:
     """Correlation of (B, C, H, W) with ``down`` along the rows' axis and ``across`` along the columns'.
 
-    kornia's ``filter2d_separable`` takes three to five times as long for up to 17 taps.
+    kornia's ``filter2d_separable`` takes three times as long at the least for up to 17 taps.
 
     Raises:
         ValueError: wrong shape, or an even number of taps.

@@ -171,8 +171,8 @@ def _bands(image: Tensor, hw: tuple[int, ...]) -> list[slice]:
 def _half(level: Tensor, pad: int, part: slice) -> Tensor:
     """Rows ``part`` of the half-size image of a padded one, as ``cv2.pyrDown`` (``tests/test_pyramid.py``).
 
-    kornia's ``pyrdown`` samples at other places, and takes ten times as long. Rows first, because their slices are
-    contiguous; then even and odd columns are taken apart once.
+    kornia's ``pyrdown`` samples at other places, and takes four to ten times as long. Rows first, because their slices
+    are contiguous; then even and odd columns are taken apart once.
     """
     w = (level.shape[-1] - 2 * pad + 1) // 2
     top, bottom = (pad + 2 * row for row in (part.start, part.stop))
