@@ -56,7 +56,7 @@ MAIN = ("data=synthetic",)
         (MAIN, "synthetic/room.py", True),
         (MAIN, "studies/protocol.py", True),
         (MAIN, "evaluate/risk.py", True),
-        (MAIN, "viewer/scene.py", False),
+        (MAIN, "viewer/exhibit.py", False),
         (MAIN, "viewer/html.py", False),
         (MAIN, "studies/negative/icp.py", False),
         (MAIN, "studies/negative/registration.py", False),
@@ -94,7 +94,7 @@ def test_further_roots_count(package):
     roots = {"roots": ["dhtorch.extract.dataset"], "code_dir": package}
     before = archive.result_key(config, "d", **roots)
     assert before != archive.result_key(config, "d", code_dir=package)
-    with edited(package / "extract" / "rows.py"):
+    with edited(package / "extract" / "dataset.py"):
         assert before != archive.result_key(config, "d", **roots)
 
 

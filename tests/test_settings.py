@@ -17,6 +17,7 @@ from omegaconf import OmegaConf
 from dhtorch.commands.run import config_dir
 from dhtorch.data import FORMATS
 from dhtorch.method import Method
+from dhtorch.synthetic import SyntheticRoom
 
 CONF = config_dir()
 REPO = Path(__file__).parents[1]
@@ -86,6 +87,8 @@ def test_every_setting_composes_and_names_real_options(choice):
         known = options(target(node["_target_"]))
         if node.get("format", "auto") != "auto":  # open_all hands further options to the reader of that name
             known |= options(FORMATS[node["format"]].read)
+        if node["_target_"].endswith(".open_room"):  # hands further options to the room
+            known |= options(SyntheticRoom)
         keys = {k for k in node if not k.startswith("_")}
         assert keys <= set(known), f"{choice}{path}: {keys - set(known)} are no options of {node['_target_']}"
 

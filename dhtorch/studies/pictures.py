@@ -22,7 +22,8 @@ def draw_example(folder: str | Path, example: Any) -> list[Path]:
         folder: made if need be.
         example: a :class:`dhtorch.studies.protocol.Example`.
     """
-    e, folder = example.cpu(), Path(folder)
+    e = example.cpu()
+    folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     whole, image, uv = merge(e.samples, e.estimate), e.frame.image[0], e.samples.uv[0]
     draw_samples(folder / "samples.png", image, uv, whole.source[0], e.estimate.gate[0])
@@ -31,8 +32,8 @@ def draw_example(folder: str | Path, example: Any) -> list[Path]:
     pooled = errors.select(e.estimate, e.truth)
     if pooled.keep.any():
         draw_depth(folder / "depth.png", pooled.true_depth, pooled.depth, pooled.score)
-        curves, oracle = {e.method: risk_coverage(pooled)}, risk_coverage(pooled, oracle=True)
-        draw_risk_coverage(folder / "risk_coverage.png", curves, oracle=oracle)
+        curves = {e.method: risk_coverage(pooled)}
+        draw_risk_coverage(folder / "risk_coverage.png", curves, oracle=risk_coverage(pooled, oracle=True))
         written += ["depth.png", "risk_coverage.png"]
     filled = whole.source[0] != Source.NONE
     xyz = unproject(e.frame.camera, whole.uv, whole.depth)[0][filled]

@@ -88,7 +88,7 @@ def read(
         raise FormatError(root, "stacks", f"none of split {split or 'any'}", "stack_<split> or LightField/<split>/")
     load = _Load(tuple(shots), focus, constant)
     names, scenes = (tuple(found) for found in zip(*((s.name, s.scene) for s in shots), strict=True))
-    return Stacks(root.resolve().stem, "ddff12", load, names, root, tuple(report), scenes)
+    return Stacks(root.resolve().stem, "ddff12", load, names, root=root, report=tuple(report), scenes=scenes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +158,8 @@ def _hdf5_stacks(root: Path, per_scene: int | None) -> tuple[list[_Shot], list[s
 def _light_fields(root: Path, depth_folder: str) -> tuple[list[_Shot], list[str]]:
     shots, report = [], []
     for file in sorted((root / "LightField").glob("*/*/LF_*.npy")):
-        scene, number = file.parent.relative_to(root / "LightField"), file.stem.removeprefix("LF_")
+        scene = file.parent.relative_to(root / "LightField")
+        number = file.stem.removeprefix("LF_")
         folder = root / depth_folder / scene
         truth = folder / f"DEPTH_{number}.png"
         if folder.is_dir() and not truth.is_file():
