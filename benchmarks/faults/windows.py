@@ -14,7 +14,7 @@ TESTS: dict[str, list[str]] = {
     "geometry.pyramid": ["tests/test_pyramid.py", "tests/test_contract.py"],
     "geometry.filters": ["tests/test_filters.py", "tests/test_contract.py"],
     "geometry.thin_lens": ["tests/test_thin_lens.py", "tests/test_contract.py"],
-    "geometry.cells": ["tests/test_cells.py", "tests/test_contract.py"],
+    "geometry.sparse_grid": ["tests/test_sparse_grid.py", "tests/test_contract.py"],
 }
 
 FAULTS: dict[str, list[tuple[str, ...]]] = {
@@ -168,7 +168,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("depth_of_spot", "1 / focus_m[:, None] - diameter", "1 / focus_m[:, None] - diameter.abs()"),
         ("depth_of_spot", "known = inverse > 0", "known = inverse >= 0"),
     ],
-    "geometry.cells": [
+    "geometry.sparse_grid": [
         ("pack", "(shifted >= 0)", "(shifted > 0)"),
         ("pack", "(shifted < 2 * REACH)", "(shifted <= 2 * REACH)"),
         ("pack", "(x << 2 * BITS) + (y << BITS) + z", "(z << 2 * BITS) + (y << BITS) + x"),
@@ -350,8 +350,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("lucas_kanade", "image_0.requires_grad or image_1.requires_grad", "image_0.requires_grad"),
         (
             "lucas_kanade",
-            "lk.Options(window, iterations, epsilon_px, min_eigenvalue, normalise)",
-            'lk.Options(window, iterations, epsilon_px, min_eigenvalue, "none")',
+            "lk.SearchOptions(window, iterations, epsilon_px, min_eigenvalue, normalise)",
+            'lk.SearchOptions(window, iterations, epsilon_px, min_eigenvalue, "none")',
         ),
         (
             "refine",
