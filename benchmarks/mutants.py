@@ -50,6 +50,7 @@ PLACES = (
     "transform",
     "closure",
     "archive",
+    "storage",
     "extract",
 )
 
