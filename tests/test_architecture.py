@@ -18,8 +18,8 @@ LEVELS = [
     {"stages", "data", "evaluate", "export", "synthetic", "testing", "calibration"},
     {"method"},
     {"pair", "window", "methods"},
-    {"transform", "integrate", "extract"},
-    {"studies", "viewer"},
+    {"transform", "integrate", "extract", "viewer"},
+    {"studies"},
     {"commands", "__main__"},
 ]
 LEVEL = {name: level for level, group in enumerate(LEVELS) for name in group}
@@ -34,7 +34,6 @@ SIDEWAYS = {
     ("method", "window"),
     ("window", "pair"),
     ("extract", "transform"),
-    ("viewer", "studies"),  # it shows what a protocol answers
     ("__main__", "commands"),
 }
 FILES = sorted(ROOT.rglob("*.py"))

@@ -118,11 +118,12 @@ def test_it_runs_in_a_transform_and_in_rows_for_a_data_set(room):
 
 
 def test_it_runs_in_the_viewer_and_its_result_in_the_report(room, tmp_path):
-    from dhtorch import archive, viewer  # noqa: PLC0415
+    from dhtorch import archive  # noqa: PLC0415
     from dhtorch.commands import job  # noqa: PLC0415
     from dhtorch.studies import report  # noqa: PLC0415
+    from dhtorch.studies.exhibits import look  # noqa: PLC0415
 
-    shown = viewer.look(room, PLAIN, partial(by_gap, gap=3), protocol.Settings())
+    shown = look(room, PLAIN, partial(by_gap, gap=3), protocol.Settings())
     assert len(shown.shots) == 4 and (shown.shots[0].samples["gate"] == 0).sum() > 20
     settings = {"threads": None, "resume": False, "figures": False, "seed": 0, "device": "cpu", "dtype": "float32"}
     settings |= {"batch": 1, "workers": 0, "holdout": {"cutoff": None, "truth": "full"}, "method": {}, "data": {}}

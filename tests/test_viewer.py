@@ -27,11 +27,11 @@ from dhtorch.data.pairs import by_gap
 from dhtorch.method import Method
 from dhtorch.methods import METHODS
 from dhtorch.stages.fuse import inverse_variance
+from dhtorch.studies.exhibits import DENSE, look
 from dhtorch.studies.protocol import Settings
 from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.viewer import again, points, rrd
 from dhtorch.viewer import html as pages
-from dhtorch.viewer.exhibit import DENSE, look
 
 CUTOFF, N = 2.0, 700
 HOSTILE = "</script><script>document.title='taken'</script><!-- & \u2028 ' \" ünï"
@@ -468,4 +468,4 @@ def test_broken_points_are_refused(tmp_path, content):
 
 
 def test_the_viewer_says_what_it_offers():
-    assert {"look", "run"} <= set(viewer.__all__)
+    assert {"Exhibit", "Shot", "Picture"} <= set(viewer.__all__)

@@ -30,7 +30,7 @@ COMMANDS = {"inspect": "dhtorch.commands.inspect", "report": "dhtorch.studies.re
 
 #: Sub-command with settings of its own, ``conf/<word>.yaml`` → module with ``run(settings, parts, *, progress)``, which
 #: is given all options as plain values, and as objects those that name a function. It returns the exit code.
-CONFIGURED = {"extract": "dhtorch.extract", "integrate": "dhtorch.integrate.mapping", "view": "dhtorch.viewer"}
+CONFIGURED = {"extract": "dhtorch.extract", "integrate": "dhtorch.integrate.mapping", "view": "dhtorch.commands.view"}
 
 #: Sub-command → the option that a first word without a name sets.
 FIRST_WORD = {"view": "result"}
