@@ -99,6 +99,100 @@ def inverse_variance(
     )
 
 
+def agree(
+    estimates: Estimate,  # (V, B, N), one per view
+    *,
+    max_chi2: float = 9.0,
+    max_against: float = 0.25,
+    sure_rel: float = 0.05,
+    max_sigma_rel: float | None = 0.2,
+    max_still: float = 0.5,
+) -> Estimate:
+    """Join the views that agree about a sample; one view alone answers where it is sure by itself.
+
+    Every view is asked how much the others, each weighed by its inverse variance, agree with it; the one with most
+    agreement and those that agree with it answer together, and the others speak against the answer. A view that is
+    silent speaks neither for it nor against it, so another view never costs an answer that it does not contradict.
+
+    Args:
+        max_chi2: squared difference of two views' inverse depths, over the sum of their variances, up to which they
+            agree.
+        max_against: inverse variance of the views that disagree, as a share of that of the views that agree, above
+            which the point is silenced.
+        sure_rel: sigma / depth up to which one view answers without another that agrees.
+        max_sigma_rel: sigma / depth of the joint answer above which it is withheld; None asks nothing.
+        max_still: share of the views without a baseline above which none is believed.
+
+    Returns:
+        Estimate (B, N). The joint inverse depth is the mean of those that agree, by inverse variance. Sigma is the
+        weighted mean of theirs and never less: the views share the anchor's window and the near returns, so what they
+        have in common is not averaged out; where they differ by more than they say it grows with the root of that
+        ratio. ``n_views`` counts the anchor and those that agree; ``parallax_deg`` is their largest, ``residual_px``
+        their weighted rms; ``score`` is 1 where answered.
+
+    Gates: NO_BASELINE for all points of an anchor whose views mostly have none; where no view answers, the reason of
+    the last; INCONSISTENT (contradicted), UNCERTAIN (one unsure view, or a joint sigma too large).
+
+    Raises:
+        ValueError: wrong shapes, or no view.
+
+    Gradient: depth and sigma to those of the views; which of them agree, and gates, carry none.
+    Cost: linear in views but for comparing them with each other, a few operations on (V, V, B, N).
+    """
+    V = check("agree", gate=(estimates.gate, "V B N"), depth=(estimates.depth, "V B N"))["V"]
+    if V < 1:
+        raise ValueError("agree: expected at least one view")
+    said = estimates.keep & (estimates.depth > 0) & (estimates.sigma > 0) & estimates.sigma.isfinite()
+    inverse, own, shared = _inverse_depth(estimates, said)
+    variance = own.square() + shared.square()
+    weight = torch.where(said, 1 / variance, torch.zeros_like(variance))
+    joined = _largest_agreement(inverse.detach(), variance.detach(), weight.detach(), said, max_chi2)
+    mine = torch.where(joined, weight, torch.zeros_like(weight))
+    total, n = mine.sum(0), joined.sum(0)
+    against = (weight - mine).sum(0) > max_against * total
+    share = mine / torch.where(n > 0, total, torch.ones_like(total))
+    mean = torch.where(n > 0, (share * inverse).sum(0), torch.ones_like(total))
+    chi2 = torch.where(joined, (inverse - mean).square() / variance, torch.zeros_like(variance)).sum(0)
+    widening = (chi2 / (n - 1).clamp_min(1)).clamp_min(1)
+    own_2, shared_2 = ((share * part).sum(0).square() * widening for part in (own, shared))
+    depth = 1 / mean
+    sigma = depth * depth * _root(own_2 + shared_2)
+    alone = (n < 2) & (sigma > sure_rel * depth)
+    unsure = torch.zeros_like(alone) if max_sigma_rel is None else sigma > max_sigma_rel * depth
+    gate = first_reason((against, Gate.INCONSISTENT), (alone, Gate.UNCERTAIN), (unsure, Gate.UNCERTAIN))
+    gate = torch.where(n < 1, _last_reason(estimates.gate, said), gate)
+    still = (estimates.gate == Gate.NO_BASELINE).any(-1).sum(0) > max_still * V
+    gate = torch.where(still[:, None], Gate.NO_BASELINE, gate).to(torch.int32)
+    keep = gate == Gate.ANSWER
+    residual_px = torch.where(joined, estimates.residual_px, torch.zeros_like(estimates.residual_px))
+    residual_px = _root((share * residual_px.square()).sum(0)).to(estimates.depth.dtype)
+    parallax = torch.where(joined | (n < 1), estimates.parallax_deg, torch.zeros_like(estimates.parallax_deg))
+
+    def answer(x: Tensor) -> Tensor:
+        return torch.where(keep, x, torch.full_like(x, torch.nan)).to(estimates.depth.dtype)
+
+    return Estimate(
+        uv=estimates.uv[-1],
+        depth=answer(depth),
+        sigma=answer(sigma),
+        sigma_shared=answer(depth * depth * _root(shared_2)),
+        parallax_deg=parallax.amax(0),
+        residual_px=torch.where(n > 0, residual_px, estimates.residual_px[-1]),
+        n_views=(n + 1).to(torch.int32),
+        score=keep.to(estimates.depth.dtype),
+        gate=gate,
+    )
+
+
+def _largest_agreement(inverse: Tensor, variance: Tensor, weight: Tensor, said: Tensor, max_chi2: float) -> Tensor:
+    """Which views (V, B, N) stand together: those that agree with the view that has most agreement, it included."""
+    apart = (inverse[:, None] - inverse).square() / (variance[:, None] + variance)
+    agreeing = said[:, None] & said & (apart <= max_chi2)
+    support = torch.where(agreeing, weight, torch.zeros_like(weight)).sum(1)
+    first = support.argmax(0)  # the first of equals
+    return agreeing.gather(0, first[None, None].expand(1, *agreeing.shape[1:]))[0]
+
+
 def _inverse_depth(estimates: Estimate, said: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Inverse depth and the own and shared parts of its standard deviation, float64; 1 where nothing was said."""
     one = torch.ones_like(estimates.depth)

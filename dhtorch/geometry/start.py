@@ -1,0 +1,291 @@
+"""Where to look first: the coarse motion of the whole picture, by correlation, without training.
+
+Alphabet: a, b the small pictures of image 0 and 1, (B, h, w); ``k`` how many pixels of an image make one of its small
+picture; K = R x C *cells*, windows of a on a regular grid; A a similarity (turn and zoom) about the middles of both
+pictures, one of ``G`` candidates; V (…, D, D) how well a cell fits where A puts it, moved by a whole-pixel offset.
+
+Every cell is correlated with all of the other picture that it may have moved to; what a cell cannot tell alone its
+neighbours tell it (messages along the four directions of the grid, which let the motion change by a little at a price
+and by anything at a higher one). Gain and bias cancel in the correlation. Turn and zoom are found first, on pictures of
+half the size, among a few candidates; to take one of them it must fit better than none.
+
+All that is summed is whole numbers small enough for a float to hold: the answer depends on no order of summation, so
+not on the batch, the number of threads or the device.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from dhtorch.geometry.lookup import luma
+from dhtorch.geometry.shapes import check
+from dhtorch.tree import Record, record
+
+#: Longest side of the small pictures, px, and of those on which turn and zoom are found.
+LONG, LONG_TURN = 64, 32
+
+#: Width of a cell's window, an odd number of small pixels, and about how far apart cells lie.
+WINDOW, STEP = 9, 5
+WINDOW_TURN, STEP_TURN = 7, 4
+
+#: Turns in degrees and zooms that are tried; their products are the candidates, the first of all is none.
+TURNS_DEG, ZOOMS = (0.0, -30.0, -15.0, 15.0, 30.0), (1.0, 1 / 1.4, 1.4)
+
+#: How much better than none (mean correlation) a turn must fit.
+BETTER = 0.03
+
+#: Grey levels of a small picture, and what a correlation of one is in whole numbers: their products' sum over a window
+#: stays below 2^24.
+LEVELS, UNIT = 1023, 1024
+
+#: Standard deviation of the grey values below which a window counts as flat.
+FLAT = 0.01
+
+#: What it costs neighbours to differ by one small pixel, and at most, in correlation.
+SLOPE, MOST = 0.1, 0.5
+
+#: Correlation from which on a cell has a say, and the least mean say of a picture with any start at all.
+SAY, LEAST = 0.6, 0.02
+
+
+@record
+class Flow(Record):
+    """The coarse motion from image 0 to image 1, on a grid of cells."""
+
+    uv_0: Tensor  # (B, R, C, 2) px, middles of the cells in image 0
+    uv_1: Tensor  # (B, R, C, 2) px, where they went; NaN everywhere in a pair without support
+    support: Tensor  # (B, R, C) in [0, 1], 0 = guessed from the neighbours
+    linear: Tensor  # (B, 2, 2) turn and zoom that windows undergo, d uv_1 / d uv_0
+
+    def at(self, uv: Tensor) -> Tensor:
+        """Where to look in image 1 for points ``uv`` (B, N, 2) px of image 0: (B, N, 2) px, NaN where nothing is known.
+
+        Bilinear between the middles of cells, and constant motion beyond the outermost.
+        """
+        check("Flow.at", uv_1=(self.uv_1, "B R C 2"), uv=(uv, "B N 2"))
+        R, C = self.uv_1.shape[1:3]
+        first, last = self.uv_0[:, 0, 0], self.uv_0[:, -1, -1]
+        place = (uv - first[:, None]) / (last - first)[:, None]  # 0 at the first cell, 1 at the last
+        moved = (self.uv_1 - self.uv_0).permute(0, 3, 1, 2)
+        known = moved.isfinite().all((1, 2, 3))
+        moved = torch.where(known[:, None, None, None], moved, torch.zeros_like(moved))
+        step = F.grid_sample(
+            moved, 2 * place[:, None].to(moved.dtype) - 1, mode="bilinear", padding_mode="border", align_corners=True
+        )
+        found = uv + step[:, :, 0].transpose(1, 2).to(uv.dtype)
+        return torch.where(known[:, None, None], found, torch.full_like(found, torch.nan))
+
+
+@torch.no_grad()
+def coarse_flow(
+    image_0: Tensor,  # (B, C, H, W) C 1 or 3; float in [0, 1] or uint8
+    image_1: Tensor,  # (B, C, H', W')
+    *,
+    reach: float = 0.25,
+    turns_deg: tuple[float, ...] = TURNS_DEG,
+    zooms: tuple[float, ...] = ZOOMS,
+) -> Flow:
+    """The coarse motion of the picture from image 0 to image 1, whatever their exposures.
+
+    Args:
+        reach: longest displacement beside turn and zoom, as a share of the longer side of image 1.
+        turns_deg, zooms: in-plane turns and magnifications that are tried, the first of each being none.
+
+    Returns:
+        Flow; to about a twentieth of what a cell is wide, the fine search does the rest. A cell whose own window fits
+        nowhere moves with its neighbours; a pair in which hardly a cell fits has no start at all (NaN).
+
+    Raises:
+        ValueError: wrong shapes.
+
+    Gradient: none; a start is a choice.
+    Cost: independent of the images' size but for one reading of each.
+    """
+    check("coarse_flow", image_0=(image_0, "B C H W"), image_1=(image_1, "B C H' W'"))
+    linear = _turn(image_0, image_1, reach, turns_deg, zooms)
+    small_0, small_1 = small(image_0, LONG), small(image_1, LONG)
+    a, b = _levels(small_0), _levels(small_1)
+    plain = torch.eye(2, device=a.device).expand_as(linear)
+    rivals = torch.stack([plain, linear], 1)
+    centre, offset, fit, total = _match(a, b, rivals, reach, WINDOW, STEP)
+    best = (total[:, 1] > total[:, 0] + BETTER).long()
+    pick = torch.arange(len(best), device=best.device), best
+    offset, fit, linear = offset[pick], fit[pick], rivals[pick]
+    say = ((fit - SAY) / (1 - SAY)).clamp_min(0)
+    offset = _spread(offset, say)
+    uv_0, uv_1 = small_0.to_image(centre), small_1.to_image(centre + offset)
+    silent = say.mean((-2, -1)) < LEAST
+    uv_1 = torch.where(silent[:, None, None, None], torch.full_like(uv_1, torch.nan), uv_1)
+    return Flow(uv_0=uv_0.expand_as(uv_1), uv_1=uv_1, support=say, linear=linear)
+
+
+class Small(NamedTuple):
+    """A picture of a few thousand pixels, each the mean of a square of the image's."""
+
+    grey: Tensor  # (B, 1, h, w) in [0, 1]
+    scale: int  # image pixels in a row that make one
+    first: float  # px, the image's coordinate of the middle of small pixel 0
+
+    def to_image(self, uv: Tensor) -> Tensor:
+        """Small pixels as pixels of the image."""
+        return uv * self.scale + self.first
+
+
+def small(image: Tensor, long: int) -> Small:
+    """The picture (B, C, H, W) with a longer side of at most ``long``; one that is no larger stays as it is.
+
+    Of squares wider than sixteen pixels only every so many rows and columns are read: a hundred pixels tell a mean as
+    well as a thousand do. Gradient: to the image.
+    """
+    check("small", image=(image, "B C H W"))
+    scale = max(1, math.ceil(max(image.shape[-2:]) / long))
+    thin = max(1, scale // 8)
+    side = scale // thin
+    grey = luma(image[..., ::thin, ::thin], dim=1)
+    grey = grey.to(torch.promote_types(grey.dtype, torch.float32))
+    return Small(F.avg_pool2d(grey, side), side * thin, (side - 1) * thin / 2)
+
+
+def _turn(image_0: Tensor, image_1: Tensor, reach: float, turns_deg: tuple[float, ...], zooms: tuple[float, ...]):
+    """The similarity (B, 2, 2) among the candidates under which the pictures agree best."""
+    a, b = (_levels(small(image, LONG_TURN)) for image in (image_0, image_1))
+    angle = torch.tensor([math.radians(t) for z in zooms for t in turns_deg], device=a.device)
+    zoom = torch.tensor([z for z in zooms for t in turns_deg], device=a.device)
+    c, s = zoom * angle.cos(), zoom * angle.sin()
+    candidates = torch.stack([c, -s, s, c], -1).reshape(1, -1, 2, 2).expand(len(a), -1, -1, -1)
+    total = _match(a, b, candidates, reach, WINDOW_TURN, STEP_TURN)[3]
+    best = (total + BETTER * (torch.arange(total.shape[1], device=total.device) == 0)).argmax(1)
+    return candidates[torch.arange(len(best), device=best.device), best]
+
+
+def _levels(picture: Small) -> Tensor:
+    """(B, h, w) whole numbers from 0 to ``LEVELS``."""
+    return (picture.grey[:, 0] * LEVELS).round()
+
+
+def _match(a: Tensor, b: Tensor, A: Tensor, reach: float, window: int, step: int) -> tuple[Tensor, ...]:
+    """Cells (R, C, 2) of a, how far each moved to b (B, G, R, C, 2), small px, how well it fits there (B, G, R, C), and
+    how well those fit (B, G) that A leaves in the picture."""
+    (h, w), (h_1, w_1) = a.shape[-2:], b.shape[-2:]
+    centre = _cells(h, w, step).to(a)
+    R, C = centre.shape[:2]
+    most = math.ceil(reach * max(h_1, w_1))
+    middle_0, middle_1 = (a.new_tensor([(x - 1) / 2, (y - 1) / 2]) for y, x in ((h, w), (h_1, w_1)))
+    moved = (A[:, :, None, None] * (centre - middle_0)[..., None, :]).sum(-1) + middle_1  # (B, G, R, C, 2)
+    S = _correlation(_templates(a, centre, A, window), b, window)
+    V = _around(S, moved.round().long(), most)
+    joined = _told(V)
+    D = 2 * most + 1
+    i = joined.flatten(-2).argmax(-1)
+    near = _highest(_highest(V, -1), -2)
+    fit = near.flatten(-2).gather(-1, i[..., None])[..., 0] / UNIT**2
+    shift = torch.stack([i % D, i // D], -1) - most
+    stays = ((moved > -0.5) & (moved < moved.new_tensor([w_1 - 0.5, h_1 - 0.5]))).all(-1)
+    total = torch.where(stays, fit, torch.zeros_like(fit)).sum((-2, -1)) / stays.sum((-2, -1)).clamp_min(1)
+    return centre, moved.round() + shift - centre, fit, total
+
+
+def _cells(h: int, w: int, step: int) -> Tensor:
+    """Middles (R, C, 2) of the cells of a small picture."""
+    R, C = (max(2, round(n / step)) for n in (h, w))
+    v, u = ((torch.arange(m) + 0.5) * (n / m) - 0.5 for m, n in ((R, h), (C, w)))
+    return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
+
+
+def _templates(a: Tensor, centre: Tensor, A: Tensor, window: int) -> Tensor:
+    """Windows (B, G, R·C, window²) of a as each similarity shows them in b."""
+    r = window // 2
+    o = torch.arange(-r, r + 1, device=a.device, dtype=a.dtype)
+    o = torch.stack(torch.meshgrid(o, o, indexing="xy"), -1).reshape(-1, 2)
+    scale = A[..., 0, 0] ** 2 + A[..., 1, 0] ** 2  # A⁻¹ = Aᵀ / zoom²
+    back = A.transpose(-1, -2) / scale[..., None, None]
+    read = (back[:, :, None] * o[:, None, :]).sum(-1)  # (B, G, window², 2)
+    at = centre.reshape(-1, 1, 2) + read[:, :, None]
+    h, w = a.shape[-2:]
+    grid = (2 * at + 1) / at.new_tensor([w, h]) - 1
+    out = F.grid_sample(a[:, None], grid.flatten(1, 2), mode="bilinear", padding_mode="border", align_corners=False)
+    return _unit(out[:, 0]).unflatten(1, A.shape[1:2] + (-1,))
+
+
+def _correlation(templates: Tensor, b: Tensor, window: int) -> Tensor:
+    """Normalised correlation of every template with every place of b: (B, G, K, h, w), in units of 1 / UNIT²."""
+    r = window // 2
+    there = F.unfold(F.pad(b[:, None], (r, r, r, r), mode="replicate"), window)
+    S = torch.bmm(templates.flatten(1, 2), _unit(there.transpose(1, 2)).transpose(1, 2))
+    return S.reshape(*templates.shape[:3], *b.shape[-2:])
+
+
+def _unit(windows: Tensor) -> Tensor:
+    """Windows (…, n) of mean 0 and length UNIT, in whole numbers; flat ones shorter."""
+    n = windows.shape[-1]
+    x = windows.round().double()
+    total, squares = x.sum(-1, keepdim=True), x.square().sum(-1, keepdim=True)  # whole numbers: exact
+    energy = squares - total * total / n + n * (FLAT * LEVELS) ** 2
+    return ((x - total / n) * (UNIT / energy.sqrt())).round().float()
+
+
+def _around(S: Tensor, at: Tensor, most: int) -> Tensor:
+    """The part (B, G, R, C, D, D) of S within ``most`` of ``at`` (B, G, R, C, 2); 0 outside the picture."""
+    h, w = S.shape[-2:]
+    o = torch.arange(-most, most + 1, device=S.device)
+    u, v = at[..., 0, None] + o, at[..., 1, None] + o
+    inside = ((v >= 0) & (v < h))[..., :, None] & ((u >= 0) & (u < w))[..., None, :]
+    index = v.clamp(0, h - 1)[..., :, None] * w + u.clamp(0, w - 1)[..., None, :]
+    found = S.reshape(*at.shape[:-1], h * w).gather(-1, index.flatten(-2)).reshape(index.shape)
+    return torch.where(inside, found, torch.zeros_like(found))
+
+
+def _told(V: Tensor) -> Tensor:
+    """V (B, G, R, C, D, D) and what the cells to all four sides make of it, as sums of best chains of neighbours."""
+    across = V.transpose(2, 3)
+    told = _chain(V) + _chain(V.flip(2)).flip(2)
+    return V + told + (_chain(across) + _chain(across.flip(2)).flip(2)).transpose(2, 3)
+
+
+def _chain(V: Tensor) -> Tensor:
+    """What each row of cells hears from the rows before it: (B, G, R, C, D, D) along dim 2."""
+    heard = [torch.zeros_like(V[:, :, 0])]
+    for row in V.unbind(2)[:-1]:
+        heard.append(_message(row + heard[-1]))
+    return torch.stack(heard, 2)
+
+
+def _message(x: Tensor) -> Tensor:
+    """Best of x (…, D, D) over nearby offsets, each small pixel at the price of SLOPE, at most MOST below the best."""
+    floor = x.amax((-2, -1), keepdim=True) - round(MOST * UNIT**2)
+    best = torch.maximum(x, floor)
+    for _ in range(2):
+        best = torch.maximum(best, _highest(_highest(best, -1), -2) - round(SLOPE * UNIT**2))
+    return best - floor
+
+
+def _highest(x: Tensor, dim: int) -> Tensor:
+    """The highest of each value and its two neighbours along ``dim``."""
+    n = x.shape[dim]
+    pairs = torch.maximum(x.narrow(dim, 0, n - 1), x.narrow(dim, 1, n - 1))
+    inner = torch.maximum(pairs.narrow(dim, 0, n - 2), pairs.narrow(dim, 1, n - 2))
+    return torch.cat([pairs.narrow(dim, 0, 1), inner, pairs.narrow(dim, n - 2, 1)], dim)
+
+
+def _spread(offset: Tensor, say: Tensor) -> Tensor:
+    """Offsets (B, R, C, 2), each the mean of its surroundings by their say; without any, of the whole picture."""
+    weight = say[..., None]
+    moving = offset * weight
+    near, known = _binomial(moving), _binomial(weight)
+    whole = moving.sum((1, 2), keepdim=True) / weight.sum((1, 2), keepdim=True).clamp_min(1e-6)
+    return (near + 1e-3 * whole) / (known + 1e-3)
+
+
+def _binomial(x: Tensor) -> Tensor:
+    """(B, R, C, …) smoothed by (1 2 1)/4 along R and C, with nothing beyond the border."""
+    for dim in (1, 2):
+        zero = torch.zeros_like(x.narrow(dim, 0, 1))
+        n = x.shape[dim]
+        before, after = torch.cat([zero, x.narrow(dim, 0, n - 1)], dim), torch.cat([x.narrow(dim, 1, n - 1), zero], dim)
+        x = (before + after + 2 * x) * 0.25
+    return x

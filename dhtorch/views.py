@@ -1,0 +1,123 @@
+"""Which other views of an anchor to ask: those that are expected to say most, told by small pictures.
+
+Every candidate answers a few samples as a pair, on pictures of a few thousand pixels. That costs a small part of a
+pair, and what a view is worth there (does the motion leave enough in sight, is it wide enough for a depth, is there a
+pose at all) it is worth in full.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from dhtorch.geometry import camera as cam
+from dhtorch.geometry.exact import steady
+from dhtorch.geometry.shapes import check
+from dhtorch.geometry.start import small
+from dhtorch.method import Method
+from dhtorch.pair import ask_pair, lifted
+from dhtorch.records import Estimate, Frame, PoseFit
+from dhtorch.stages.pose import map_pose
+from dhtorch.stages.track import lucas_kanade
+from dhtorch.stages.triangulate import two_view
+
+#: Longest side of the pictures on which candidates are asked, px.
+LONG = 160
+
+#: How a candidate is asked: everything that has a sigma counts, and how much is what the sigma says.
+PROBE = Method(
+    n=128,
+    track=partial(lucas_kanade, levels=4, window=15, normalise="gain_bias"),
+    pose=map_pose,
+    triangulate=partial(two_view, min_parallax_deg=None, min_t_snr=3.0, fitted_noise=True, sensor_share=1.0),
+)
+
+
+def by_probes(
+    anchor: Frame,
+    others: Frame,  # (V, B)
+    views: int,
+    *,
+    seed: int | Tensor = 0,
+    fit: PoseFit | None = None,  # (V, B)
+    probe: Method = PROBE,
+    long: int = LONG,
+    good_sigma_rel: float = 0.1,
+) -> Tensor:
+    """The views to ask of many candidates: (views, B) indices, rising.
+
+    Args:
+        anchor: B views.
+        others: V candidates of each.
+        views: how many to choose.
+        seed: of the probes' pose search.
+        fit: known poses of the candidates; their search is then skipped.
+        probe: the method by which the small pictures are asked.
+        long: longest side of the small pictures, px; smaller images stay as they are.
+        good_sigma_rel: see :func:`key_views`.
+
+    Raises:
+        ValueError: wrong shapes, or not 1 <= views <= V.
+
+    Gradient: none; a choice.
+    Cost: V pairs of ``probe`` on small pictures.
+    """
+    check("by_probes", image_0=(anchor.image, "B C H W"), images=(others.image, "V B c h w"))
+    with torch.no_grad():
+        anchor, k = shrunk(anchor, long)
+        V, B = others.image.shape[:2]
+        flat = others.map(lambda x: x.flatten(0, 1))
+        several = anchor.map(lambda x: x.expand(V, *x.shape).flatten(0, 1))
+        known = None if fit is None else fit.map(lambda x: x.flatten(0, 1))
+        seeds = seed if isinstance(seed, int) else seed.repeat(V)
+        estimate = ask_pair(probe, several, shrunk(flat, long)[0], seed=seeds, fit=known)
+        estimate = estimate.map(lambda x: x.unflatten(0, (V, B)))
+        return key_views(estimate.replace(sigma=estimate.sigma / k), views, good_sigma_rel=good_sigma_rel)
+
+
+def shrunk(frame: Frame, long: int) -> tuple[Frame, int]:
+    """The frame with a grey picture whose longer side is at most ``long``, and how many pixels make one of its.
+
+    Depth stays as it is. Gradient: to the image and the intrinsics.
+    """
+    frame = lifted(frame)
+    picture = small(frame.image, long)
+    depth_camera = frame.depth_camera
+    if depth_camera is None:
+        depth_camera = cam.resize(frame.camera, frame.hw, (frame.depth.shape[-2], frame.depth.shape[-1]))
+    camera = frame.camera.replace(f=frame.camera.f / picture.scale, c=(frame.camera.c - picture.first) / picture.scale)
+    return frame.replace(image=picture.grey, camera=camera, depth_camera=depth_camera), picture.scale
+
+
+def key_views(
+    estimates: Estimate,  # (V, B, N), one per view
+    views: int,
+    *,
+    good_sigma_rel: float = 0.1,
+) -> Tensor:
+    """Which views to keep, by the sigma to expect of the points together: (views, B) indices, rising.
+
+    A wide view is sure of what it sees, a near one sees more. What a set of views is worth is the sum over the points
+    of log(1 + sum of (good_sigma_rel · depth / sigma)² over its views); views are added one by one, each the one that
+    adds most, the wider of equals.
+
+    Raises:
+        ValueError: wrong shapes, or not 1 <= views <= V.
+    """
+    V = check("key_views", gate=(estimates.gate, "V B N"), sigma=(estimates.sigma, "V B N"))["V"]
+    if not 1 <= views <= V:
+        raise ValueError(f"key_views: views is {views}, expected 1 to {V}")
+    said = estimates.keep & (estimates.sigma > 0) & estimates.sigma.isfinite()
+    ratio = good_sigma_rel * estimates.depth / torch.where(said, estimates.sigma, 1.0)
+    worth = torch.where(said, ratio, 0.0).detach().double().square().flip(0)  # argmax takes the first of equals
+    known = torch.zeros_like(worth[0])
+    free = torch.ones_like(worth[:, :, 0], dtype=torch.bool)
+    for _ in range(views):
+        gain = steady(torch.log1p, known + worth).sum(-1).masked_fill(~free, -torch.inf)
+        best = F.one_hot(gain.argmax(0), V).T.bool()
+        known = known + (worth * best[..., None]).sum(0)
+        free = free & ~best
+    return free.flip(0).long().argsort(dim=0, stable=True)[:views]

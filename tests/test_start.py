@@ -1,0 +1,116 @@
+"""Where to look first: coarse motion of whole pictures, against motions that are known."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from dhtorch.geometry import start
+
+H, W = 240, 320
+
+
+def _texture(seed: int) -> Tensor:
+    """(1, 1, 3 H, 3 W) grey values with detail of every size."""
+    g = torch.Generator().manual_seed(seed)
+    total = torch.zeros(1, 1, 3 * H, 3 * W)
+    for size in (4, 12, 36, 108, 324):
+        noise = torch.rand(1, 1, 3 * H // size + 2, 3 * W // size + 2, generator=g)
+        total = total + size**0.5 * F.interpolate(noise, (3 * H, 3 * W), mode="bicubic", align_corners=False)
+    total = total - total.amin()
+    return total / total.amax()
+
+
+def _pair(
+    seed: int, shift: tuple[float, float], turn_deg: float = 0.0, zoom: float = 1.0
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Two pictures of one texture, and where (H, W, 2) each pixel of the first lies in the second."""
+    world = _texture(seed)
+    a = math.radians(turn_deg)
+    A = zoom * torch.tensor([[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]])
+    middle = torch.tensor([(W - 1) / 2, (H - 1) / 2])
+    v, u = torch.meshgrid(torch.arange(float(H)), torch.arange(float(W)), indexing="ij")
+    uv = torch.stack([u, v], -1)
+    there = (uv - middle) @ A.T + middle + torch.tensor(shift)
+    back = (uv - middle - torch.tensor(shift)) @ torch.linalg.inv(A).T + middle
+
+    def seen(at: Tensor) -> Tensor:
+        place = (at + torch.tensor([float(W), float(H)]) + 0.5) / torch.tensor([1.5 * W, 1.5 * H]) - 1
+        return F.grid_sample(world, place[None], mode="bilinear", align_corners=False)
+
+    return seen(uv), seen(back), there
+
+
+def _share_near(flow: start.Flow, there: Tensor, limit_px: float) -> float:
+    """Share of the pixels still in sight whose start is closer than that to where they went."""
+    v, u = torch.meshgrid(torch.arange(8, H - 8, 8), torch.arange(8, W - 8, 8), indexing="ij")
+    uv = torch.stack([u, v], -1).reshape(1, -1, 2)
+    true = there[v, u].reshape(-1, 2)
+    inside = ((true > 8) & (true < torch.tensor([W - 8.0, H - 8.0]))).all(-1)
+    miss = (flow.at(uv.float())[0] - true).norm(dim=-1)
+    return float((miss[inside] < limit_px).float().mean())
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (80.0, 0.0), (-75.0, 40.0), (10.0, -70.0)])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_shift_of_a_quarter_of_the_width_is_found(seed: int, shift: tuple[float, float]) -> None:
+    a, b, there = _pair(seed, shift)
+    flow = start.coarse_flow(a, b)
+    assert torch.equal(flow.linear[0], torch.eye(2))
+    assert _share_near(flow, there, 8.0) > 0.9
+
+
+@pytest.mark.parametrize(
+    "turn_deg, zoom", [(30.0, 1.0), (-15.0, 1.0), (0.0, 1.4), (0.0, 1 / 1.4), (20.0, 1.3), (-25.0, 0.75)]
+)
+@pytest.mark.parametrize("seed", [2, 3])
+def test_turn_and_zoom_are_found(seed: int, turn_deg: float, zoom: float) -> None:
+    a, b, there = _pair(seed, (20.0, -12.0), turn_deg, zoom)
+    assert _share_near(start.coarse_flow(a, b), there, 10.0 * max(1.0, zoom)) > 0.9
+
+
+@pytest.mark.parametrize("gain, bias", [(0.25, 0.0), (0.5, 0.3), (1.0, 0.0)])
+def test_exposure_makes_no_difference(gain: float, bias: float) -> None:
+    a, b, there = _pair(4, (40.0, 20.0))
+    assert _share_near(start.coarse_flow(a, gain * b + bias), there, 8.0) > 0.9
+    assert _share_near(start.coarse_flow(gain * a + bias, b), there, 8.0) > 0.9
+
+
+def test_pictures_of_different_things_have_no_start() -> None:
+    flow = start.coarse_flow(
+        _pair(5, (0.0, 0.0))[0], torch.rand(1, 1, H, W, generator=torch.Generator().manual_seed(1))
+    )
+    assert flow.uv_1.isnan().all()
+    flat = torch.full((1, 1, H, W), 0.5)
+    assert start.coarse_flow(flat, flat).at(torch.zeros(1, 3, 2)).isnan().all()
+
+
+def test_sizes_may_differ() -> None:
+    a, b, there = _pair(6, (30.0, 10.0))
+    flow = start.coarse_flow(a, F.interpolate(b, scale_factor=2, mode="bilinear", align_corners=False))
+    assert _share_near(flow, (there + 0.5) * 2 - 0.5, 10.0) > 0.95
+
+
+def test_one_pair_is_answered_as_in_a_batch() -> None:
+    pairs = [_pair(k, shift)[:2] for k, shift in enumerate([(30.0, 5.0), (-60.0, 0.0), (4.0, 50.0)])]
+    a, b = (torch.cat(x) for x in zip(*pairs, strict=True))
+    whole = start.coarse_flow(a, b)
+    for k in range(3):
+        one = start.coarse_flow(a[k : k + 1], b[k : k + 1])
+        for name in ("uv_0", "uv_1", "support", "linear"):
+            assert torch.equal(getattr(one, name)[0], getattr(whole, name)[k])
+
+
+@pytest.mark.parametrize("long", [16, 64, 400])
+def test_a_small_picture_says_where_its_pixels_lie(long: int) -> None:
+    v, u = torch.meshgrid(torch.arange(float(H)), torch.arange(float(W)), indexing="ij")
+    for ramp, axis in ((u, 0), (v, 1)):
+        picture = start.small((ramp / W)[None, None], long)
+        h, w = picture.grey.shape[-2:]
+        assert max(h, w) <= long or picture.scale == 1
+        at = torch.stack(torch.meshgrid(torch.arange(float(w)), torch.arange(float(h)), indexing="xy"), -1)
+        torch.testing.assert_close(picture.grey[0, 0] * W, picture.to_image(at)[..., axis], atol=1e-3, rtol=1e-5)
