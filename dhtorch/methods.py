@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from functools import partial
 
+from dhtorch.geometry.start import coarse_flow
 from dhtorch.method import Method
+from dhtorch.stages.fuse import agree
 from dhtorch.stages.pose import map_pose
-from dhtorch.stages.score import rank_by_error
-from dhtorch.stages.track import lucas_kanade_affine
+from dhtorch.stages.score import rank_by_error, rank_by_sigma
+from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 from dhtorch.stages.triangulate import two_view
+from dhtorch.views import by_probes
 
 #: The paper's method and parameters; P3P instead of EPnP as the minimal solver is the one stated difference.
 PAPER = Method()
@@ -43,4 +46,17 @@ MAP = PAPER.replace(
 #: ``MAP`` for several views of one anchor: each view a pair, their inverse depths fused where they agree.
 WINDOW = MAP.replace(views=5)
 
-METHODS = {"paper": PAPER, "map": MAP, "window": WINDOW}
+#: Several views chosen among those around the anchor; the search begins where the whole picture went, whatever the
+#: exposures; an answer needs views that agree or one that is sure by itself.
+AUTO = MAP.replace(
+    track=partial(
+        lucas_kanade_affine, levels=LEVELS, start=coarse_flow, track=partial(lucas_kanade, normalise="gain_bias")
+    ),
+    fuse=agree,
+    score=rank_by_sigma,
+    choose=by_probes,
+    views=5,
+    chain=False,
+)
+
+METHODS = {"paper": PAPER, "map": MAP, "window": WINDOW, "auto": AUTO}

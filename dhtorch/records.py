@@ -15,6 +15,7 @@ from dhtorch.codes import Gate, PoseCode
 from dhtorch.geometry.camera import Camera
 from dhtorch.geometry.pyramid import Pyramids
 from dhtorch.geometry.se3 import Pose
+from dhtorch.geometry.start import Flow
 from dhtorch.tree import KEEP_DTYPE, Record, record
 
 __all__ = ["Camera", "Estimate", "Frame", "Map", "Pose", "PoseFit", "Samples", "Shutter", "TrackHint", "Tracks"]
@@ -77,6 +78,7 @@ class TrackHint:
     start: Tensor | None = None  # (B, N, 2) px, where to look first in image 1; None or not finite = at ``uv_0``
     pyramid: Pyramids | None = None  # of image 0, shared by all who search in it
     levels: int | None = None  # pyramid levels that the motion in this scene asks for; None = the tracker's own
+    flows: tuple[Flow, Flow] | None = None  # coarse motion of the whole picture, to image 1 and back
 
     def replace(self, **changes: Any) -> TrackHint:
         """A copy with some fields replaced."""
@@ -85,7 +87,9 @@ class TrackHint:
     def __getitem__(self, part: slice) -> TrackHint:
         """The hint for some of the pairs."""
         start = None if self.start is None else self.start[part]
-        return TrackHint(start, None if self.pyramid is None else self.pyramid[part], self.levels)
+        pyramid = None if self.pyramid is None else self.pyramid[part]
+        flows = None if self.flows is None else (self.flows[0][part], self.flows[1][part])
+        return replace(self, start=start, pyramid=pyramid, flows=flows)
 
 
 #: Nothing is known beforehand.

@@ -25,7 +25,7 @@ from dhtorch.stages.track import lucas_kanade
 from dhtorch.stages.triangulate import two_view
 
 #: Longest side of the pictures on which candidates are asked, px.
-LONG = 160
+LONG = 240
 
 #: How a candidate is asked: everything that has a sigma counts, and how much is what the sigma says.
 PROBE = Method(

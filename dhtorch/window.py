@@ -17,13 +17,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dhtorch.geometry.exact import steady
 from dhtorch.geometry.pyramid import Pyramids
 from dhtorch.geometry.shapes import check
 from dhtorch.method import Method, Trace
 from dhtorch.pair import ask_pair, lifted
 from dhtorch.records import NO_HINT, Estimate, Frame, PoseFit, Samples, TrackHint, Tracks
 from dhtorch.tree import stack
+from dhtorch.views import key_views
 
 #: Samples, about, by which key views are chosen.
 PROBES = 256
@@ -43,7 +43,8 @@ def ask_window(
 
     Every view is a pair with the anchor: tracked from it, with a pose and a depth of its own. The depths are fused.
     The first three seats see the anchor once; ``score`` sees the fused estimate, with tracks and pose of the last
-    view. Of more than ``method.views`` the best are chosen (:func:`key_views`), by a few of the samples.
+    view. Of more than ``method.views`` the best are chosen, by ``method.choose`` or by a few of the samples
+    (:func:`dhtorch.views.key_views`).
     ``method.chain`` only gives a start: what is searched for is always the anchor's window.
 
     Raises:
@@ -59,10 +60,11 @@ def ask_window(
     ms["samples"] = 1e3 * (time.perf_counter() - began)
     hint = hint if hint.pyramid is not None else hint.replace(pyramid=Pyramids(anchor.image))
     common: dict[str, Any] = {"seed": seed, "hint": hint, "ms": ms}
+    index = torch.arange(len(others.image), device=samples.uv.device)[:, None].expand(-1, len(samples.uv))
     if len(others.image) > method.views:
-        thin = samples[:, :: max(1, method.n // PROBES)]
-        probes = _ask_views(method, anchor, others, thin, fit=fit, **common)
-        index = key_views(stack([t["estimate"] for t in probes]), method.views)
+        began = time.perf_counter()
+        index = _chosen(method, anchor, others, samples, fit=fit, **common)
+        ms["choose"] = 1e3 * (time.perf_counter() - began)
         pick = index, torch.arange(index.shape[1], device=index.device)
         others, fit = others[pick], None if fit is None else fit[pick]
     traces = _ask_views(method, anchor, others, samples, fit=fit, **common)
@@ -71,39 +73,27 @@ def ask_window(
     estimate = method.score(estimate, samples, last["tracks_ideal"], last["fit"])
     ms["fuse"] = 1e3 * (time.perf_counter() - began)
     if trace is not None:
-        trace.update({**last, "estimate": estimate, "ms": ms, "views": traces})
+        trace.update({**last, "estimate": estimate, "ms": ms, "views": traces, "chosen": index})
     return estimate
 
 
-def key_views(
-    estimates: Estimate,  # (V, B, N), one per view
-    views: int,
+def _chosen(
+    method: Method,
+    anchor: Frame,
+    others: Frame,
+    samples: Samples,
     *,
-    good_sigma_rel: float = 0.1,
+    seed: int | Tensor,
+    fit: PoseFit | None,
+    hint: TrackHint,
+    ms: dict[str, float],
 ) -> Tensor:
-    """Which views to keep, by the sigma to expect of the points together: (views, B) indices, rising.
-
-    A wide view is sure of what it sees, a near one sees more. What a set of views is worth is the sum over the points
-    of log(1 + sum of (good_sigma_rel · depth / sigma)² over its views); views are added one by one, each the one that
-    adds most, the wider of equals.
-
-    Raises:
-        ValueError: wrong shapes, or not 1 <= views <= V.
-    """
-    V = check("key_views", gate=(estimates.gate, "V B N"), sigma=(estimates.sigma, "V B N"))["V"]
-    if not 1 <= views <= V:
-        raise ValueError(f"key_views: views is {views}, expected 1 to {V}")
-    said = estimates.keep & (estimates.sigma > 0) & estimates.sigma.isfinite()
-    ratio = good_sigma_rel * estimates.depth / torch.where(said, estimates.sigma, 1.0)
-    worth = torch.where(said, ratio, 0.0).detach().double().square().flip(0)  # argmax takes the first of equals
-    known = torch.zeros_like(worth[0])
-    free = torch.ones_like(worth[:, :, 0], dtype=torch.bool)
-    for _ in range(views):
-        gain = steady(torch.log1p, known + worth).sum(-1).masked_fill(~free, -torch.inf)
-        best = torch.nn.functional.one_hot(gain.argmax(0), V).T.bool()
-        known = known + torch.where(best[..., None], worth, 0.0).sum(0)
-        free = free & ~best
-    return free.flip(0).long().argsort(dim=0, stable=True)[:views]
+    """Which of the views are asked: (views, B) indices, as the method chooses them or by a few of the samples."""
+    if method.choose is not None:
+        return method.choose(anchor, others, method.views, seed=seed, fit=fit)
+    thin = samples[:, :: max(1, method.n // PROBES)]
+    probes = _ask_views(method, anchor, others, thin, seed=seed, fit=fit, hint=hint, ms={})
+    return key_views(stack([t["estimate"] for t in probes]), method.views)
 
 
 def _ask_views(

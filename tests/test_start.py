@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -10,6 +11,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch.geometry import start
+from dhtorch.records import TrackHint
+from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 
 H, W = 240, 320
 
@@ -114,3 +117,58 @@ def test_a_small_picture_says_where_its_pixels_lie(long: int) -> None:
         assert max(h, w) <= long or picture.scale == 1
         at = torch.stack(torch.meshgrid(torch.arange(float(w)), torch.arange(float(h)), indexing="xy"), -1)
         torch.testing.assert_close(picture.grey[0, 0] * W, picture.to_image(at)[..., axis], atol=1e-3, rtol=1e-5)
+
+
+MOTIONS = [
+    ((80.0, 10.0), 0.0, 1.0),
+    ((20.0, -12.0), 30.0, 1.0),
+    ((20.0, -12.0), -22.0, 1.0),
+    ((10.0, 5.0), 0.0, 1.5),
+    ((10.0, 5.0), 0.0, 0.7),
+]
+
+
+@pytest.mark.parametrize("shift, turn_deg, zoom", MOTIONS)
+def test_a_tracker_with_a_start_follows_what_one_without_loses(
+    shift: tuple[float, float], turn_deg: float, zoom: float
+) -> None:
+    a, b, there = _pair(3, shift, turn_deg, zoom)
+    b = 0.5 * b + 0.1
+    v, u = torch.meshgrid(torch.arange(20, H - 20, 20), torch.arange(20, W - 20, 20), indexing="ij")
+    uv = torch.stack([u, v], -1).reshape(1, -1, 2)
+    true = there[uv[0, :, 1], uv[0, :, 0]]
+    inside = ((true > 10) & (true < torch.tensor([W - 10.0, H - 10.0]))).all(-1)
+    search = partial(lucas_kanade, levels=5, normalise="gain_bias")
+    share = {}
+    for name, begin in (("without", None), ("with", start.coarse_flow)):
+        tracks = lucas_kanade_affine(a, b, uv.float(), levels=5, track=search, start=begin)
+        miss = (tracks.uv_1[0] - true).norm(dim=-1)
+        share[name] = float((tracks.valid[0] & (miss < 0.2))[inside].float().mean())
+        assert float((tracks.valid[0] & (miss > 1.0))[inside].float().mean()) < (0.03 if begin else 0.3)
+    assert share["with"] > 0.85 and share["with"] > share["without"] + 0.2
+
+
+def test_the_way_back_starts_from_its_own_estimate() -> None:
+    """A start that is wrong on one way only is found out by the other."""
+    a, b, there = _pair(7, (60.0, 0.0))
+    uv = torch.tensor([[[100.0, 100.0], [150.0, 120.0], [90.0, 160.0]]])
+    right = start.coarse_flow(a, b), start.coarse_flow(b, a)
+    track = partial(lucas_kanade, a, b, uv, levels=2)
+    assert track(hint=TrackHint(flows=right)).valid.all()
+    wrong = right[1].replace(uv_1=right[1].uv_1 + 90.0)
+    assert not track(hint=TrackHint(flows=(right[0], wrong))).valid.any()
+    assert not track().valid.any()  # two levels do not reach so far
+    silent = right[0].replace(uv_1=torch.full_like(right[0].uv_1, torch.nan))
+    nowhere = track(hint=TrackHint(flows=(silent, silent)))
+    assert torch.equal(nowhere.uv_1, track().uv_1) or not nowhere.valid.any()
+
+
+def test_the_gradient_of_a_turned_track_is_finite_and_leaves_its_place() -> None:
+    a, b, _ = _pair(3, (20.0, -12.0), 30.0)
+    uv = torch.tensor([[[150.0, 110.0], [170.0, 130.0]]])
+    plain = lucas_kanade(a, b, uv, levels=3, start=start.coarse_flow)
+    b = b.clone().requires_grad_()
+    tracks = lucas_kanade(a, b, uv, levels=3, start=start.coarse_flow)
+    torch.testing.assert_close(tracks.uv_1.detach(), plain.uv_1)
+    tracks.uv_1.sum().backward()
+    assert b.grad is not None and bool(b.grad.isfinite().all()) and bool((b.grad != 0).any())

@@ -98,6 +98,7 @@ def register(
     uv_1: Tensor,  # (B, N, 2) px, the start
     *,
     wanted: Tensor | None = None,  # (B, N) bool
+    linear: Tensor | None = None,  # (B, 2, 2)
     window: int = 21,
     iterations: int = 7,
     epsilon_px: float = 0.01,
@@ -112,7 +113,8 @@ def register(
     Args:
         source, target: ``build_pyramid(image, levels, window)`` of both images; the second level of ``target`` is read
             where a window is magnified by more than 1.5.
-        uv_1: closer than about a quarter of the window; the search begins there, unturned.
+        uv_1: closer than about a quarter of the window; the search begins there.
+        linear: turn and zoom that the windows of a pair begin with, None = none.
         wanted: points to register, by default all; the others cost nothing and are not ok, their numbers of no meaning.
         window: width in pixels, odd.
         iterations: most Gauss–Newton steps.
@@ -139,7 +141,10 @@ def register(
         if wanted is not None:
             usable = usable & wanted.reshape(-1)
         views = _Views(source, target, _Options(window, iterations, epsilon_px, max_shift_px))
-        answer = for_some(usable, partial(_register, views), _nothing(there), (here, there, batch))
+        begin = _still(there)
+        if linear is not None:
+            begin = linear.to(there).permute(2, 1, 0).repeat_interleave(N, -1)
+        answer = for_some(usable, partial(_register, views), _nothing(there), (here, there, begin, batch))
 
     def grid(y: Tensor) -> Tensor:  # (..., M) -> (B, N, ...)
         y = y.unflatten(-1, (B, N)).movedim((-2, -1), (0, 1))
@@ -199,13 +204,14 @@ def _register(
     views: _Views,
     here: Tensor,  # (2, M) px
     there: Tensor,  # (2, M) px
+    begin: Tensor,  # (2, 2, M)
     batch: Tensor,  # (M,)
 ) -> tuple[Tensor, ...]:
     """The fields of a :class:`Registration`, points last."""
     target, o = views.target, views.o
     q = round_half_up(here)
     place = _place(here - q, o.window)
-    warp = _start(there, place, _still(there), o.window)
+    warp = _start(there, place, begin, o.window)
     state = _search(views, 0, q, place, warp, batch)
     best = state._replace(warp=warp, fit=state.first)
     if len(target.levels) > 1:

@@ -68,7 +68,6 @@ class Flow(Record):
         Bilinear between the middles of cells, and constant motion beyond the outermost.
         """
         check("Flow.at", uv_1=(self.uv_1, "B R C 2"), uv=(uv, "B N 2"))
-        R, C = self.uv_1.shape[1:3]
         first, last = self.uv_0[:, 0, 0], self.uv_0[:, -1, -1]
         place = (uv - first[:, None]) / (last - first)[:, None]  # 0 at the first cell, 1 at the last
         moved = (self.uv_1 - self.uv_0).permute(0, 3, 1, 2)
@@ -124,6 +123,41 @@ def coarse_flow(
     return Flow(uv_0=uv_0.expand_as(uv_1), uv_1=uv_1, support=say, linear=linear)
 
 
+def turned(
+    linear: Tensor,  # (B, 2, 2)
+    uv: Tensor,  # (B, N, 2) px
+    hw: tuple[int, int],
+) -> Tensor:
+    """Where pixels of the upright picture lie in the image: (B, N, 2) px, turned and zoomed about its middle."""
+    middle = uv.new_tensor([(hw[1] - 1) / 2, (hw[0] - 1) / 2])
+    return (linear.to(uv)[:, None] * (uv - middle)[..., None, :]).sum(-1) + middle
+
+
+def upright(
+    image: Tensor,  # (B, C, H, W) C 1 or 3; float in [0, 1] or uint8
+    linear: Tensor,  # (B, 2, 2) a turn and a zoom
+) -> Tensor:
+    """The grey picture (B, 1, H, W) seen through the turn and zoom: its pixel x is the image at ``turned(linear, x)``.
+
+    Beyond the image its border repeats. Where the turn is none the picture is the image's, bit for bit.
+    Gradient: to the image.
+    """
+    check("upright", image=(image, "B C H W"), linear=(linear, "B 2 2"))
+    grey = luma(image, dim=1)
+    grey = grey.to(torch.promote_types(grey.dtype, torch.float32))
+    H, W = grey.shape[-2:]
+    v, u = torch.meshgrid(*(torch.arange(n, device=grey.device, dtype=grey.dtype) for n in (H, W)), indexing="ij")
+    uv = turned(linear, torch.stack([u, v], -1).reshape(1, H * W, 2).expand(len(grey), -1, -1), (H, W))
+    place = ((2 * uv + 1) / uv.new_tensor([W, H]) - 1).reshape(-1, H, W, 2)
+    seen = F.grid_sample(grey, place, mode="bilinear", padding_mode="border", align_corners=False)
+    return torch.where(is_turned(linear)[:, None, None, None], seen, grey)
+
+
+def is_turned(linear: Tensor) -> Tensor:
+    """(B,) bool: not the identity."""
+    return (linear != torch.eye(2, device=linear.device, dtype=linear.dtype)).flatten(1).any(1)
+
+
 class Small(NamedTuple):
     """A picture of a few thousand pixels, each the mean of a square of the image's."""
 
@@ -173,7 +207,6 @@ def _match(a: Tensor, b: Tensor, A: Tensor, reach: float, window: int, step: int
     how well those fit (B, G) that A leaves in the picture."""
     (h, w), (h_1, w_1) = a.shape[-2:], b.shape[-2:]
     centre = _cells(h, w, step).to(a)
-    R, C = centre.shape[:2]
     most = math.ceil(reach * max(h_1, w_1))
     middle_0, middle_1 = (a.new_tensor([(x - 1) / 2, (y - 1) / 2]) for y, x in ((h, w), (h_1, w_1)))
     moved = (A[:, :, None, None] * (centre - middle_0)[..., None, :]).sum(-1) + middle_1  # (B, G, R, C, 2)
@@ -209,7 +242,7 @@ def _templates(a: Tensor, centre: Tensor, A: Tensor, window: int) -> Tensor:
     h, w = a.shape[-2:]
     grid = (2 * at + 1) / at.new_tensor([w, h]) - 1
     out = F.grid_sample(a[:, None], grid.flatten(1, 2), mode="bilinear", padding_mode="border", align_corners=False)
-    return _unit(out[:, 0]).unflatten(1, A.shape[1:2] + (-1,))
+    return _unit(out[:, 0]).unflatten(1, (*A.shape[1:2], -1))
 
 
 def _correlation(templates: Tensor, b: Tensor, window: int) -> Tensor:

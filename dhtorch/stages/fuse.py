@@ -124,7 +124,7 @@ def agree(
         max_still: share of the views without a baseline above which none is believed.
 
     Returns:
-        Estimate (B, N). The joint inverse depth is the mean of those that agree, by inverse variance. Sigma is the
+        Estimate (B, N); a single view's as it is. The joint inverse depth is the mean of those that agree, by inverse variance. Sigma is the
         weighted mean of theirs and never less: the views share the anchor's window and the near returns, so what they
         have in common is not averaged out; where they differ by more than they say it grows with the root of that
         ratio. ``n_views`` counts the anchor and those that agree; ``parallax_deg`` is their largest, ``residual_px``
@@ -142,6 +142,8 @@ def agree(
     V = check("agree", gate=(estimates.gate, "V B N"), depth=(estimates.depth, "V B N"))["V"]
     if V < 1:
         raise ValueError("agree: expected at least one view")
+    if V == 1:
+        return estimates[0]
     said = estimates.keep & (estimates.depth > 0) & (estimates.sigma > 0) & estimates.sigma.isfinite()
     inverse, own, shared = _inverse_depth(estimates, said)
     variance = own.square() + shared.square()

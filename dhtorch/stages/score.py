@@ -137,6 +137,46 @@ def rank_by_error(
     return _silence(estimate, score, min_score)
 
 
+def rank_by_sigma(
+    estimate: Estimate,
+    samples: Samples,
+    tracks: Tracks,
+    fit: PoseFit,
+    *,
+    half_error: float = 0.1,
+    recalibration: Callable[[Tensor], Tensor] | None = None,
+    min_score: float = 0.0,
+) -> Estimate:
+    """Score every answer of several views by its sigma and by how many of them agree: h / (h + e).
+
+    e = sigma / depth / views: views that agree share too much for sigma to shrink with their number, but an answer that
+    is wrong by far more than its sigma is seldom found twice.
+
+    Args:
+        estimate: from ``fuse``, or from seat 6 (one view).
+        samples, tracks, fit: part of the seat's signature; this score does not read them.
+        half_error, recalibration, min_score: as in :func:`rank_by_error`.
+
+    Returns:
+        Estimate with ``score`` in [0, 1], 0 where silent or where no error can be stated.
+
+    Raises:
+        ValueError: wrong shapes.
+
+    Gradient: to sigma and depth; the threshold carries none.
+    """
+    check("rank_by_sigma", gate=(estimate.gate, "B N"), uv=(samples.uv, "B N 2"), valid=(tracks.valid, "B N"))
+    stated = estimate.keep & (estimate.depth > 0) & estimate.sigma.isfinite()
+    depth = torch.where(stated, estimate.depth, torch.ones_like(estimate.depth))
+    sigma = torch.where(stated, estimate.sigma, torch.ones_like(estimate.sigma))
+    expected = (sigma / depth).clamp(max=LARGEST) / (estimate.n_views - 1).clamp_min(1)
+    zero = torch.zeros_like(expected)
+    score = torch.where(stated, half_error / (half_error + expected), zero)
+    if recalibration is not None:
+        score = torch.where(stated, recalibration(score), zero)
+    return _silence(estimate, score, min_score)
+
+
 def evidence(estimate: Estimate, samples: Samples, tracks: Tracks, fit: PoseFit) -> tuple[Tensor, Tensor]:
     """What speaks for and against every answer: logarithms (B, N, 8) in the order of :data:`EVIDENCE`.
 

@@ -16,7 +16,8 @@ from dhtorch.geometry import affine
 from dhtorch.geometry import lucas_kanade as lk
 from dhtorch.geometry.exact import filled
 from dhtorch.geometry.pyramid import Pyramid, Pyramids, build_pyramid
-from dhtorch.geometry.shapes import check
+from dhtorch.geometry.shapes import check, is_static
+from dhtorch.geometry.start import Flow, is_turned, turned, upright
 from dhtorch.records import NO_HINT, TrackHint, Tracks
 
 #: Smallest eigenvalue of A per pixel of the window below which it is not tracked: 1e-4 of cv2, which sums gradients
@@ -37,6 +38,7 @@ def lucas_kanade(
     max_round_trip_px: float = 1.0,
     normalise: str = "none",
     min_eigenvalue: float = MIN_EIGENVALUE,
+    start: Callable[[Tensor, Tensor], Flow] | None = None,
 ) -> Tracks:
     """Track points from image 0 to image 1 and back; a track that does not return to its start is not valid.
 
@@ -56,6 +58,9 @@ def lucas_kanade(
         epsilon_px: a shorter step has converged; on coarse levels, which only provide a start, four times that.
         normalise: ``none``; ``bias`` removes the means of both windows; ``gain_bias`` also their ratio of contrast.
         min_eigenvalue: of A / window² (grey values in [0, 1]); a window with less has too little texture.
+        start: ``(image_0, image_1) -> Flow``, such as :func:`dhtorch.geometry.start.coarse_flow`: asked for the coarse
+            motion of the whole picture, there and back, where the hint has none. Where a pair is turned or zoomed by it
+            the search goes through image 1 turned upright. None = the search starts at ``uv_0``.
 
     Returns:
         Tracks in the dtype of ``uv_0``: ``uv_1`` (B, N, 2) px; ``error`` (B, N) px, the round trip (the way there where
@@ -99,12 +104,23 @@ def lucas_kanade(
     levels = levels if hint.levels is None else hint.levels
     with torch.no_grad():
         source = _source(hint, image_0, levels, window)
-        target = build_pyramid(image_1, levels, window)
-        tracks = _there_and_back(source, target, uv_0.detach(), hint.start, max_round_trip_px, o)
+        flows = coarse(image_0, image_1, hint, start)
+        if flows is None:
+            target = build_pyramid(image_1, levels, window)
+            tracks = _there_and_back(source, target, uv_0.detach(), hint.start, None, max_round_trip_px, o)
+        else:
+            begin = hint.start if hint.start is not None else flows[0].at(uv_0.detach())
+            view = _Upright(image_1, flows)
+            target = build_pyramid(view.image, levels, window)
+            begin = view.from_image(begin)
+            tracks = _there_and_back(source, target, uv_0.detach(), begin, view.back, max_round_trip_px, o)
+            tracks = view.to_image(tracks)
     if torch.is_grad_enabled() and (image_0.requires_grad or image_1.requires_grad or uv_0.requires_grad):
         uv_1 = refine(
             image_0, image_1, uv_0, tracks.uv_1, window=window, normalise=normalise, min_eigenvalue=min_eigenvalue
         )
+        if flows is not None:  # a step through image 1 as it is tells nothing of a window that is turned there
+            uv_1 = torch.where(is_turned(flows[0].linear)[:, None, None], tracks.uv_1 + (uv_1 - uv_1.detach()), uv_1)
         return tracks.replace(uv_0=uv_0, uv_1=torch.where(tracks.valid[..., None], uv_1, tracks.uv_1))
     return tracks
 
@@ -147,8 +163,56 @@ def refine(
     return found.reshape(2, B, N).permute(1, 2, 0).to(uv_0.dtype)
 
 
+def coarse(
+    image_0: Tensor, image_1: Tensor, hint: TrackHint, start: Callable[[Tensor, Tensor], Flow] | None
+) -> tuple[Flow, Flow] | None:
+    """The coarse motion of the pictures there and back: the hint's, else what ``start`` says, else none."""
+    if hint.flows is not None or start is None:
+        return hint.flows
+    return start(image_0, image_1), start(image_1, image_0)
+
+
+class _Upright:
+    """Image 1 with the turn and zoom of its pair taken out, and the ways between the two."""
+
+    def __init__(self, image: Tensor, flows: tuple[Flow, Flow]) -> None:
+        self.hw = image.shape[-2], image.shape[-1]
+        self.linear, self.homewards = flows[0].linear, flows[1]
+        # Without a look at the values (under a compiler) all are turned, if by nothing.
+        self.turned = is_static(self.linear) or bool(is_turned(self.linear).any())
+        self.image = upright(image, self.linear) if self.turned else image
+
+    def from_image(self, uv: Tensor) -> Tensor:
+        """Pixels of image 1 (B, N, 2) in the upright picture."""
+        return turned(torch.linalg.inv(self.linear), uv, self.hw) if self.turned else uv
+
+    def back(self, uv: Tensor) -> Tensor:
+        """Where to look in image 0 for pixels (B, N, 2) of the upright picture."""
+        return self.homewards.at(turned(self.linear, uv, self.hw) if self.turned else uv)
+
+    def to_image(self, tracks: Tracks) -> Tracks:
+        """Tracks to the upright picture as tracks to image 1."""
+        if not self.turned:
+            return tracks
+        A = self.linear.to(tracks.cov)[:, None]
+        uv_1 = turned(self.linear, tracks.uv_1, self.hw)
+        inside = ((uv_1 >= -0.5) & (uv_1 <= uv_1.new_tensor([self.hw[1] - 0.5, self.hw[0] - 0.5]))).all(-1)
+        is_it = is_turned(self.linear)
+        uv_1 = torch.where(is_it[:, None, None], uv_1, tracks.uv_1)
+        half = (A[..., :, :, None] * tracks.cov[..., None, :, :]).sum(-2)
+        cov = (half[..., :, None, :] * A[..., None, :, :]).sum(-1)
+        cov = torch.where(is_it[:, None, None, None], cov, tracks.cov)
+        return tracks.replace(uv_1=uv_1, cov=cov, valid=tracks.valid & (inside | ~is_it[:, None]))
+
+
 def _there_and_back(
-    source: Pyramid, target: Pyramid, uv_0: Tensor, init: Tensor | None, limit_px: float, o: lk.SearchOptions
+    source: Pyramid,
+    target: Pyramid,
+    uv_0: Tensor,
+    init: Tensor | None,
+    homewards: Callable[[Tensor], Tensor] | None,
+    limit_px: float,
+    o: lk.SearchOptions,
 ) -> Tracks:
     """Tracks of all points, laid out in one row (2, M), filled up to whole ``LANES`` by points outside the image."""
     B, N, _ = uv_0.shape
@@ -175,8 +239,12 @@ def _there_and_back(
         return lk.search(target, source, o, x, d, batch, known=known, alike=alike)
 
     forward, found, A = lk.search(source, target, o, x, d, batch, known=known, alike=alike)
+    begin = -d
+    if homewards is not None:
+        begin = row(homewards(grid(x + forward))) - (x + forward)
+        begin = torch.where(begin.isfinite().all(0), begin, torch.zeros_like(begin))
     nothing = torch.zeros_like(d), torch.zeros_like(found), torch.zeros_like(A)
-    backward, returned, _ = lk.for_some(found, back, nothing, (x + forward, -d, batch, found))
+    backward, returned, _ = lk.for_some(found, back, nothing, (x + forward, begin, batch, found))
     error = (forward + backward).square().sum(0).sqrt()
     squares = lk.squares(source, target, o, x, forward, batch)
     return Tracks(
@@ -222,6 +290,7 @@ def lucas_kanade_affine(
     iterations: int = 7,
     epsilon_px: float = 0.01,
     max_shift_px: float = 2.0,
+    start: Callable[[Tensor, Tensor], Flow] | None = None,
 ) -> Tracks:
     """Track as ``track`` does, then register every window once more, free to shear and to change its brightness.
 
@@ -231,6 +300,8 @@ def lucas_kanade_affine(
         window: of the registration; the search has its own.
         levels: of the search, where it follows hints.
         iterations, epsilon_px, max_shift_px: of the registration, see :func:`dhtorch.geometry.affine.register`.
+        start: as in :func:`lucas_kanade`; ``track`` finds its answer in the hint, and the registration begins with its
+            turn and zoom.
 
     Returns:
         Tracks of ``track`` with new ``uv_1``, ``cov`` (right for white noise, see ``register``) and ``photometric``, a
@@ -250,7 +321,8 @@ def lucas_kanade_affine(
         known = Pyramids(image_0) if hint.pyramid is None else hint.pyramid
         levels = levels if hint.levels is None else hint.levels
         source = _source(hint.replace(pyramid=known), image_0, levels, window)
-        tracks = track(image_0, image_1, uv_0, hint=TrackHint(hint.start, known, levels))
+        flows = coarse(image_0, image_1, hint, start)
+        tracks = track(image_0, image_1, uv_0, hint=TrackHint(hint.start, known, levels, flows))
         target = build_pyramid(image_1, 2, window, gradients=False)
         found = affine.register(
             source,
@@ -258,6 +330,7 @@ def lucas_kanade_affine(
             uv_0,
             tracks.uv_1,
             wanted=tracks.valid,
+            linear=None if flows is None else flows[0].linear,
             window=window,
             iterations=iterations,
             epsilon_px=epsilon_px,
