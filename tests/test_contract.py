@@ -9,7 +9,7 @@ import pytest
 import torch
 from contract import PROMISES, NoMasksAsNumbers, Row, equal, leaves, reorder, take, tensor_map
 
-from dhtorch import method, pair, window
+from dhtorch import method, pair, views, window
 from dhtorch.evaluate import holdout, probe
 from dhtorch.geometry import (
     affine,
@@ -28,6 +28,7 @@ from dhtorch.geometry import (
     se3,
     small,
     sparse_grid,
+    start,
     thin_lens,
 )
 from dhtorch.methods import MAP, PAPER, WINDOW
@@ -142,6 +143,13 @@ def shifted(batch, n, dtype):
 def pyramids(batch, n, dtype):
     image_0, image_1, _ = shifted(batch, n, dtype)
     return pyramid.build_pyramid(image_0, 2), pyramid.build_pyramid(image_1, 2)
+
+
+def turns(batch, dtype):
+    angle = uniform(batch, dtype=dtype, low=-0.5, high=0.5, seed=3)
+    zoom = uniform(batch, dtype=dtype, low=0.7, high=1.4, seed=4)
+    c, s = zoom * angle.cos(), zoom * angle.sin()
+    return torch.stack([c, -s, s, c], -1).unflatten(-1, (2, 2))
 
 
 def nearby(batch, n, dtype):
@@ -350,6 +358,7 @@ ROWS = [
     Row(triangulate.two_view, tracked, ALL, (0, 1), (1, 3, 4), bad=lambda a: (a[0], a[1].replace(uv_0=a[1].uv_0[:, 1:]), *a[2:])),
     Row(score.rank, estimated, ALL, (0, 1, 2), (0,), bad=lambda a: (a[0], a[1].replace(uv=a[1].uv[:, 1:]), *a[2:])),
     Row(score.rank_by_error, estimated, ALL, (0, 1, 2), (0,), bad=lambda a: (a[0], a[1].replace(uv=a[1].uv[:, 1:]), *a[2:])),
+    Row(score.rank_by_sigma, estimated, ALL, (0, 1, 2), (0,), bad=lambda a: (a[0], a[1].replace(uv=a[1].uv[:, 1:]), *a[2:])),
     Row(score.evidence, estimated, "dtype batch vmap capture gradcheck empty shuffle nan raises", (0, 1, 2), (0,), bad=lambda a: (a[0], a[1].replace(uv=a[1].uv[:, 1:]), *a[2:])),
     Row(score.expected_error_loss, lambda b, n, d: (uniform(n, dtype=d, low=-5), uniform(n, dtype=d), uniform(n, dtype=d)), "dtype capture gradcheck raises", grad=(0,), bad=wrong_last_axis(1)),
     Row(pose.pnp_ransac, posed, "dtype batch vmap capture empty padding raises", (0, 1), bad=lambda a: (a[0], a[1].replace(uv_1=a[1].uv_1[:, 1:]), *a[2:]), atol=1e-4),
@@ -357,6 +366,9 @@ ROWS = [
     Row(track.lucas_kanade, shifted, "dtype batch capture empty shuffle padding nan raises", (2,), bad=wrong_last_axis(2), atol=1e-4, slow="capture"),
     Row(track.refine, lambda b, n, d: (*shifted(b, n, d), shifted(b, n, d)[2] + 0.3), "dtype batch capture gradcheck empty shuffle padding nan raises", (2, 3), (0, 1), bad=wrong_last_axis(2), atol=1e-4),
     Row(pyramid.build_pyramid, lambda b, n, d: (shifted(b, n, d)[0], 2, 9), "dtype batch capture"),
+    Row(start.coarse_flow, lambda b, n, d: shifted(b, n, d)[:2], "batch capture", slow="capture"),
+    Row(start.upright, lambda b, n, d: (shifted(b, n, d)[0], turns(b, d)), "dtype batch vmap capture gradcheck", grad=(0,)),
+    Row(start.turned, lambda b, n, d: (turns(b, d), pixels(b, n, d), HW), "dtype batch vmap capture gradcheck empty shuffle padding", (1,), (1,)),
     Row(track.lucas_kanade_affine, shifted, "dtype batch capture empty shuffle padding nan raises", (2,), bad=wrong_last_axis(2), atol=1e-4, slow="capture"),
     Row(affine.register, lambda b, n, d: (*pyramids(b, n, d), *nearby(b, n, d)), "dtype batch capture empty shuffle padding nan raises", (2, 3), bad=wrong_last_axis(2), atol=1e-4, slow="capture"),
     Row(affine.step, lambda b, n, d: (*pyramids(b, n, d), *nearby(b, n, d), torch.eye(2, dtype=d).expand(b, n, 2, 2)), "dtype batch capture gradcheck empty shuffle padding nan raises", (2, 3, 4), (0, 1), bad=wrong_last_axis(2), atol=1e-4),
@@ -449,10 +461,14 @@ ELSEWHERE = {
         for name in ("ask", "place", "chain", "build", "coverage", "sensed", "recovered")
     ),
     "dhtorch.geometry.filters.gaussian_taps",
-    *(f"dhtorch.window.{name}" for name in ("key_views", "ask_window")),
+    "dhtorch.window.ask_window",
     *(f"dhtorch.pair.{name}" for name in ("ask_pair", "merge", "lifted", "undistort_tracks", "uniform_draws")),
     "dhtorch.method.networks",
     "dhtorch.stages.fuse.inverse_variance",
+    "dhtorch.stages.fuse.agree",
+    *(f"dhtorch.views.{name}" for name in ("by_probes", "shrunk", "key_views")),
+    *(f"dhtorch.geometry.start.{name}" for name in ("small", "is_turned")),
+    "dhtorch.stages.track.coarse",
     "dhtorch.geometry.exact.filled",
     "dhtorch.geometry.least_squares.minimise",
     *(
@@ -658,7 +674,7 @@ ESTIMATORS = (arms, clusters, registration, blur, filling, sharpness)
 
 
 def public_functions():
-    parts = [method, pair, window, *ESTIMATORS]
+    parts = [method, pair, views, window, *ESTIMATORS]
     for package in ("geometry", "stages", "evaluate", "integrate"):
         module = importlib.import_module(f"dhtorch.{package}")
         found = pkgutil.iter_modules(module.__path__, f"dhtorch.{package}.")

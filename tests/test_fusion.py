@@ -18,7 +18,7 @@ from dhtorch.stages.fuse import inverse_variance
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 from dhtorch.studies.baselines.device_pose import given_pose
 from dhtorch.tree import stack
-from dhtorch.window import key_views
+from dhtorch.views import key_views
 
 extend_window = PAPER.replace(views=5)
 

@@ -150,7 +150,7 @@ def test_a_tracker_with_a_start_follows_what_one_without_loses(
 
 def test_the_way_back_starts_from_its_own_estimate() -> None:
     """A start that is wrong on one way only is found out by the other."""
-    a, b, there = _pair(7, (60.0, 0.0))
+    a, b, _ = _pair(7, (60.0, 0.0))
     uv = torch.tensor([[[100.0, 100.0], [150.0, 120.0], [90.0, 160.0]]])
     right = start.coarse_flow(a, b), start.coarse_flow(b, a)
     track = partial(lucas_kanade, a, b, uv, levels=2)

@@ -12,7 +12,7 @@ from dhtorch.records import Estimate
 from dhtorch.stages.fuse import inverse_variance
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 from dhtorch.studies.baselines import opencv
-from dhtorch.window import key_views
+from dhtorch.views import key_views
 
 extend_window = PAPER.replace(views=5)
 

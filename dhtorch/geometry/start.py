@@ -193,7 +193,8 @@ def _turn(image_0: Tensor, image_1: Tensor, reach: float, turns_deg: tuple[float
     c, s = zoom * angle.cos(), zoom * angle.sin()
     candidates = torch.stack([c, -s, s, c], -1).reshape(1, -1, 2, 2).expand(len(a), -1, -1, -1)
     total = _match(a, b, candidates, reach, WINDOW_TURN, STEP_TURN)[3]
-    best = (total + BETTER * (torch.arange(total.shape[1], device=total.device) == 0)).argmax(1)
+    plain = torch.arange(total.shape[1], device=total.device) == 0
+    best = torch.where(plain, total + BETTER, total).argmax(1)
     return candidates[torch.arange(len(best), device=best.device), best]
 
 

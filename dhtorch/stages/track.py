@@ -107,13 +107,17 @@ def lucas_kanade(
         flows = coarse(image_0, image_1, hint, start)
         if flows is None:
             target = build_pyramid(image_1, levels, window)
-            tracks = _there_and_back(source, target, uv_0.detach(), hint.start, None, max_round_trip_px, o)
+            tracks = _there_and_back(
+                source, target, uv_0.detach(), o, init=hint.start, homewards=None, limit_px=max_round_trip_px
+            )
         else:
             begin = hint.start if hint.start is not None else flows[0].at(uv_0.detach())
             view = _Upright(image_1, flows)
             target = build_pyramid(view.image, levels, window)
             begin = view.from_image(begin)
-            tracks = _there_and_back(source, target, uv_0.detach(), begin, view.back, max_round_trip_px, o)
+            tracks = _there_and_back(
+                source, target, uv_0.detach(), o, init=begin, homewards=view.back, limit_px=max_round_trip_px
+            )
             tracks = view.to_image(tracks)
     if torch.is_grad_enabled() and (image_0.requires_grad or image_1.requires_grad or uv_0.requires_grad):
         uv_1 = refine(
@@ -209,10 +213,11 @@ def _there_and_back(
     source: Pyramid,
     target: Pyramid,
     uv_0: Tensor,
+    o: lk.SearchOptions,
+    *,
     init: Tensor | None,
     homewards: Callable[[Tensor], Tensor] | None,
     limit_px: float,
-    o: lk.SearchOptions,
 ) -> Tracks:
     """Tracks of all points, laid out in one row (2, M), filled up to whole ``LANES`` by points outside the image."""
     B, N, _ = uv_0.shape
