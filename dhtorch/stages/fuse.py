@@ -127,8 +127,8 @@ def agree(
         Estimate (B, N); a single view's as it is. The joint inverse depth is the mean of those that agree, by inverse
         variance. Sigma is the weighted mean of theirs and never less: the views share the anchor's window and the near
         returns, so what they have in common is not averaged out; where they differ by more than they say it grows with
-        the root of that ratio. ``n_views`` counts the anchor and those that agree; ``parallax_deg`` is their largest, ``residual_px``
-        their weighted rms; ``score`` is 1 where answered.
+        the root of that ratio. ``n_views`` counts the anchor and those that agree; ``parallax_deg`` is their largest,
+        ``residual_px`` their weighted rms; ``score`` is 1 where answered.
 
     Gates: NO_BASELINE for all points of an anchor whose views mostly have none; where no view answers, the reason of
     the last; INCONSISTENT (contradicted), UNCERTAIN (one unsure view, or a joint sigma too large).
