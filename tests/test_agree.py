@@ -53,7 +53,8 @@ def test_views_are_joined_as_a_loop_over_points_joins_them(options):
         if not said:
             assert gate == views.gate[-1, b, k] and found.n_views[b, k] == 1
             continue
-        stand, against = one_point(q, variance, weight, max_chi2=o["max_chi2"], max_against=o["max_against"])
+        sure = [x * x / s for x, s in zip(q, variance, strict=True)]
+        stand, against = one_point(q, variance, sure, max_chi2=o["max_chi2"], max_against=o["max_against"])
         assert found.n_views[b, k] == len(stand) + 1
         total = sum(weight[u] for u in stand)
         mean = sum(weight[u] * q[u] for u in stand) / total

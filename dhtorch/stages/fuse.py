@@ -110,14 +110,14 @@ def agree(
 ) -> Estimate:
     """Join the views that agree about a sample; one view alone answers where it is sure by itself.
 
-    Every view is asked how much the others, each weighed by its inverse variance, agree with it; the one with most
+    Every view is asked how much the others agree with it, each as sure as its (depth / sigma)²; the one with most
     agreement and those that agree with it answer together, and the others speak against the answer. A view that is
     silent speaks neither for it nor against it, so another view never costs an answer that it does not contradict.
 
     Args:
         max_chi2: squared difference of two views' inverse depths, over the sum of their variances, up to which they
             agree.
-        max_against: inverse variance of the views that disagree, as a share of that of the views that agree, above
+        max_against: (depth / sigma)² of the views that disagree, as a share of that of the views that agree, above
             which the point is silenced.
         sure_rel: sigma / depth up to which one view answers without another that agrees.
         max_sigma_rel: sigma / depth of the joint answer above which it is withheld; None asks nothing.
@@ -148,10 +148,11 @@ def agree(
     inverse, own, shared = _inverse_depth(estimates, said)
     variance = own.square() + shared.square()
     weight = torch.where(said, 1 / variance, torch.zeros_like(variance))
-    joined = _largest_agreement(inverse.detach(), variance.detach(), weight.detach(), said, max_chi2)
+    sureness = torch.where(said, inverse.square() / variance, torch.zeros_like(variance)).detach()  # (depth / sigma)²
+    joined = _largest_agreement(inverse.detach(), variance.detach(), sureness, said, max_chi2)
     mine = torch.where(joined, weight, torch.zeros_like(weight))
     total, n = mine.sum(0), joined.sum(0)
-    against = (weight - mine).sum(0) > max_against * total
+    against = torch.where(joined, 0.0, sureness).sum(0) > max_against * torch.where(joined, sureness, 0.0).sum(0)
     share = mine / torch.where(n > 0, total, torch.ones_like(total))
     mean = torch.where(n > 0, (share * inverse).sum(0), torch.ones_like(total))
     chi2 = torch.where(joined, (inverse - mean).square() / variance, torch.zeros_like(variance)).sum(0)
@@ -186,11 +187,11 @@ def agree(
     )
 
 
-def _largest_agreement(inverse: Tensor, variance: Tensor, weight: Tensor, said: Tensor, max_chi2: float) -> Tensor:
+def _largest_agreement(inverse: Tensor, variance: Tensor, sureness: Tensor, said: Tensor, max_chi2: float) -> Tensor:
     """Which views (V, B, N) stand together: those that agree with the view that has most agreement, it included."""
     apart = (inverse[:, None] - inverse).square() / (variance[:, None] + variance)
     agreeing = said[:, None] & said & (apart <= max_chi2)
-    support = torch.where(agreeing, weight, torch.zeros_like(weight)).sum(1)
+    support = torch.where(agreeing, sureness, torch.zeros_like(sureness)).sum(1)
     first = support.argmax(0)  # the first of equals
     return agreeing.gather(0, first[None, None].expand(1, *agreeing.shape[1:]))[0]
 
