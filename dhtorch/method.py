@@ -53,12 +53,12 @@ class Method:
     triangulate: Callable[..., Estimate] = two_view  # (samples, tracks, fit, camera_0, camera_1)
     score: Callable[..., Estimate] = rank  # (estimate, samples, tracks, fit)
     fuse: Callable[..., Estimate] = inverse_variance  # (estimates (V, B, N)); asked where there are several views
-    choose: Callable[..., Tensor] | None = None  # (anchor, others, views, *, seed, fit) -> (views, B)
+    choose: Callable[..., Tensor] | None = None  # (anchor, others, views, *, seed, fit) -> (views, B) indices
 
     n: int = 2048  # samples per anchor
     hypotheses: int = 200  # minimal samples drawn by the pose search
     min_trackability: float = 1e-5  # samples below it are not used (gate NO_TEXTURE)
-    views: int = 1  # other views that are used, of more the best (``choose``, else by a few of the samples)
+    views: int = 1  # other views that are used, of more the best are chosen
     chain: bool = True  # begin the search in each view where its predecessor was found, further on at the same pace
 
     def __call__(

@@ -43,7 +43,6 @@ def by_probes(
     *,
     seed: int | Tensor = 0,
     fit: PoseFit | None = None,  # (V, B)
-    probe: Method = PROBE,
     long: int = LONG,
     good_sigma_rel: float = 0.1,
 ) -> Tensor:
@@ -55,7 +54,6 @@ def by_probes(
         views: how many to choose.
         seed: of the probes' pose search.
         fit: known poses of the candidates; their search is then skipped.
-        probe: the method by which the small pictures are asked.
         long: longest side of the small pictures, px; smaller images stay as they are.
         good_sigma_rel: see :func:`key_views`.
 
@@ -63,7 +61,7 @@ def by_probes(
         ValueError: wrong shapes, or not 1 <= views <= V.
 
     Gradient: none; a choice.
-    Cost: V pairs of ``probe`` on small pictures.
+    Cost: V pairs of :data:`PROBE` on small pictures.
     """
     check("by_probes", image_0=(anchor.image, "B C H W"), images=(others.image, "V B c h w"))
     with torch.no_grad():
@@ -73,7 +71,7 @@ def by_probes(
         several = anchor.map(lambda x: x.expand(V, *x.shape).flatten(0, 1))
         known = None if fit is None else fit.map(lambda x: x.flatten(0, 1))
         seeds = seed if isinstance(seed, int) else seed.repeat(V)
-        estimate = ask_pair(probe, several, shrunk(flat, long)[0], seed=seeds, fit=known)
+        estimate = ask_pair(PROBE, several, shrunk(flat, long)[0], seed=seeds, fit=known)
         estimate = estimate.map(lambda x: x.unflatten(0, (V, B)))
         return key_views(estimate.replace(sigma=estimate.sigma / k), views, good_sigma_rel=good_sigma_rel)
 

@@ -6,6 +6,8 @@ the capture's own frame numbers: where a frame was lost the pairs that need it a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 
 from dhtorch.data.recording import Recording
@@ -114,6 +116,31 @@ def by_scaled_gap(scene: Given, factor: float, stride: int | None = None) -> lis
         return by_gap(scene, gap, stride) if gap <= span else []
     except ValueError:  # frames were lost: no two of those left are that far apart
         return []
+
+
+#: Steps from an anchor, in frames, to those around it that are offered to a method which chooses for itself.
+LADDER = (1, 2, 3, 5, 8, 12, 20, 30)
+
+
+def around(recording: Recording, i: int, steps: Sequence[int] = LADDER) -> list[int]:
+    """Positions of frames before and after ``i`` among which a method may choose its other views, in rising order.
+
+    Steps count in the capture's own frame numbers; a frame that was lost is left out. A recording that is shorter than
+    the longest step offers what it has, and one of two frames the other one.
+
+    Raises:
+        ValueError: no such frame, or the recording has no other.
+    """
+    number = recording.number.tolist()
+    if not 0 <= i < len(number):
+        raise ValueError(f"pairs: found frame {i} of {recording.name}, expected 0 to {len(number) - 1}")
+    place = {k: p for p, k in enumerate(number)}
+    offered = sorted(place[k] for s in steps for k in (number[i] - s, number[i] + s) if k in place)
+    if not offered and len(number) > 1:
+        offered = [min((p for p in range(len(number)) if p != i), key=lambda p: abs(number[p] - number[i]))]
+    if not offered:
+        raise ValueError(f"pairs: {recording.name} has one frame, expected two at least")
+    return offered
 
 
 def between(i: int, j: int, views: int) -> list[int]:

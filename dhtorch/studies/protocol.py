@@ -76,6 +76,7 @@ class Batch:
     exact: Frame  # the anchor with the depth it is held against
     surface: Tensor  # (B, H, W) kind of surface, (B, 1, 1) where the recording knows none
     disagreement: Tensor  # (B,) median relative difference of the independent truth from the sensor; NaN = not known
+    around: tuple[Frame, ...] = ()  # offered to variants that choose for themselves, in the order of the recording
 
     @property
     def odd(self) -> dict[int, str]:
@@ -109,6 +110,7 @@ class Variant:
     fit: Callable[[Batch, int], PoseFit] | None = None  # a pose from elsewhere: (batch, number of samples) → fit
     seed: int | None = None  # None = the job's
     given: Callable[[Batch], Mapping[str, Any]] = lambda _batch: {}  # further options: an oracle may see it all
+    offers: Callable[[Recording, int], Sequence[int]] | None = None  # (recording, anchor) → positions to choose from
     needs: Callable[[Scene], str | None] = lambda _scene: None  # scene → why it cannot run there, None = it can
 
 
@@ -132,6 +134,8 @@ class Answer:
         """Pair ``b`` alone; milliseconds are the batch's share."""
         size, cut = len(self.batch.pairs), slice(b, b + 1)
         records = {k: v[cut] for k, v in self.trace.items() if isinstance(v, tree.Record)}
+        if "chosen" in self.trace:
+            records["chosen"] = self.trace["chosen"][:, cut]
         return replace(
             self,
             batch=replace(
@@ -139,6 +143,7 @@ class Answer:
                 pairs=self.batch.pairs[cut],
                 anchor=self.batch.anchor[cut],
                 others=tuple(f[cut] for f in self.batch.others),
+                around=tuple(f[cut] for f in self.batch.around),
                 exact=self.batch.exact[cut],
                 surface=self.batch.surface[cut],
                 disagreement=self.batch.disagreement[cut],
@@ -172,6 +177,22 @@ class Protocol:
     hide: Callable[[Frame, float | None], Frame] = holdout.range_split  # (view, cutoff) → what a method may see
     columns: Callable[[Answer], Row] = no_columns  # of one pair; numbers are joined over the pairs of a scene by median
     min_candidates: int = MIN_CANDIDATES
+
+    @property
+    def offers(self) -> Callable[[Recording, int], Sequence[int]] | None:
+        """Which frames are offered to the variants that choose for themselves; all are offered the same.
+
+        Raises:
+            ValueError: two variants ask for different offers.
+        """
+        asked = {v.offers for v in self.variants.values()} - {None}
+        if len(asked) > 1:
+            raise ValueError("protocol: found variants with different offers, expected one for all")
+        return next(iter(asked), None)
+
+    def batch(self, settings: Settings) -> int:
+        """Pairs per call: one where anchors are offered differently many views."""
+        return settings.batch if self.offers is None else 1
 
 
 @dataclass(frozen=True)
@@ -251,12 +272,10 @@ def run(
     for scene in scenes_of(scenes):
         chosen = list(pairs(scene))  # first: a data set without pairs of views says so
         collected = _Collected(scene, protocol, settings)
-        loader = _load(scene.recording, chosen, protocol, settings)
-        for at, items in zip(
-            range(0, len(chosen), settings.batch), progress(loader, scene.name, len(loader)), strict=True
-        ):
+        loader, size = _load(scene.recording, chosen, protocol, settings), protocol.batch(settings)
+        for at, items in zip(range(0, len(chosen), size), progress(loader, scene.name, len(loader)), strict=True):
             moved = [_to(item, settings.device) for item in items]
-            collected.add(Batch(scene, chosen[at : at + settings.batch], collected.cutoff, *moved))
+            collected.add(Batch(scene, chosen[at : at + size], collected.cutoff, *moved))
         outcome.rows += collected.rows()
         outcome.examples += collected.examples
         outcome.n_pairs += len(chosen)
@@ -265,17 +284,23 @@ def run(
     return outcome
 
 
-#: anchor, further views, anchor with its truth as depth, kinds of surface, disagreement of truth and sensor
-Loaded = tuple[Frame, tuple[Frame, ...], Frame, Tensor, Tensor]
+#: anchor, further views, anchor with its truth as depth, kinds of surface, disagreement of truth and sensor, views
+#: around it
+Loaded = tuple[Frame, tuple[Frame, ...], Frame, Tensor, Tensor, tuple[Frame, ...]]
 
 
 class PairData(Dataset[Loaded]):
     """Pairs of one recording for a data loader."""
 
     def __init__(
-        self, recording: Recording, pairs: Sequence[tuple[int, int]], dtype: torch.dtype, views: int = 1
+        self,
+        recording: Recording,
+        pairs: Sequence[tuple[int, int]],
+        dtype: torch.dtype,
+        views: int = 1,
+        offers: Callable[[Recording, int], Sequence[int]] | None = None,
     ) -> None:
-        self.recording, self.pairs, self.dtype, self.views = recording, pairs, dtype, views
+        self.recording, self.pairs, self.dtype, self.views, self.offers = recording, pairs, dtype, views, offers
 
     def __len__(self) -> int:
         return len(self.pairs)
@@ -284,11 +309,14 @@ class PairData(Dataset[Loaded]):
         i, j = self.pairs[index]
         anchor = self.recording[i].to(self.dtype)
         others = tuple(self.recording[k].to(self.dtype) for k in between(i, j, self.views))
+        offered = () if self.offers is None else self.offers(self.recording, i)
+        around = tuple(self.recording[k].to(self.dtype) for k in offered)
         if not isinstance(self.recording, TruthRecording):
-            return anchor, others, anchor, torch.zeros(1, 1, 1), torch.full((1,), torch.nan)
+            return anchor, others, anchor, torch.zeros(1, 1, 1), torch.full((1,), torch.nan), around
         exact = self.recording.truth(i)
         known = anchor.replace(depth=exact["depth"].to(self.dtype), depth_camera=None)
-        return anchor, others, known, exact["surface"].float(), exact.get("disagreement", torch.full((1,), torch.nan))
+        disagreement = exact.get("disagreement", torch.full((1,), torch.nan))
+        return anchor, others, known, exact["surface"].float(), disagreement, around
 
 
 class _Collected:
@@ -315,11 +343,12 @@ class _Collected:
         """Run all variants on one batch of pairs."""
         near = self.protocol.hide(batch.anchor, self.cutoff)
         views = tuple(self.protocol.hide(view, self.cutoff) for view in batch.others)
-        several = {variant.method.views for variant in self.variants.values()}
-        seen = {n: tree.stack(views[-n:]) if n > 1 else views[-1] for n in several}
+        offered = [self.protocol.hide(view, self.cutoff) for view in batch.around]
         shared, enough = SharedTracks(), [True] * len(batch.pairs)
         for k, (name, variant) in enumerate(self.variants.items()):
-            estimate, trace = self._ask(variant, batch, near, seen[variant.method.views], shared)
+            some = offered if variant.offers is not None else views[-variant.method.views :]
+            seen = tree.stack(some) if len(some) > 1 else some[0]
+            estimate, trace = self._ask(variant, batch, near, seen, shared)
             truths = {cohort: of(batch, trace) for cohort, of in self.protocol.cohorts.items()}
             answer = Answer(batch, name, estimate, trace, truths)
             if k == 0:
@@ -376,6 +405,16 @@ class _Collected:
         shared.charge(trace["ms"])
         return estimate, trace
 
+    def _asked(self, answer: Answer) -> Row:
+        """Which frames a variant chose that was offered some."""
+        offers = self.variants[answer.variant].offers
+        if offers is None:
+            return {}
+        offered = offers(self.scene.recording, answer.batch.pairs[0][0])
+        if "chosen" not in answer.trace:  # a single view is asked as a pair
+            return {"views": list(offered)}
+        return {"views": [offered[k] for k in answer.trace["chosen"][:, 0].tolist()]}
+
     def _count_holes(self, method: Method, anchor: Frame, uv: Tensor) -> None:
         """The sensor's own holes, before anything is held back."""
         for hole in method.look_at(anchor, uv).hole:
@@ -390,7 +429,7 @@ class _Collected:
         common: Row = {"scene": self.scene.name, "pair": list(answer.batch.pairs[0]), "method": answer.variant}
         found: Row = {"pnp_ok": bool(fit.ok[0]), "n_inlier": int(fit.n_inlier[0]), "n_holes": int(hole.sum())}
         found |= {"n_recovered": int((estimate.keep & hole).sum()), "gate_share": share, "ms": answer.trace["ms"]}
-        more = self.protocol.columns(answer)
+        more = self.protocol.columns(answer) | self._asked(answer)
         self.overlays.setdefault(answer.variant, overlay(answer.samples, estimate, answer.batch.anchor.hw))
         for cohort, truth in answer.truths.items():
             points = errors.select(estimate, truth)
@@ -405,11 +444,11 @@ class _Collected:
 def _load(
     recording: Recording, pairs: list[tuple[int, int]], protocol: Protocol, settings: Settings
 ) -> DataLoader[Loaded]:
-    wanted = max(v.method.views for v in protocol.variants.values())
+    wanted = max(v.method.views for v in protocol.variants.values() if v.offers is None or v.method.views == 1)
     views = min([wanted, *(j - i for i, j in pairs)])  # a short gap holds fewer frames
     return DataLoader(
-        PairData(recording, pairs, settings.dtype, views),
-        batch_size=settings.batch,
+        PairData(recording, pairs, settings.dtype, views, protocol.offers),
+        batch_size=protocol.batch(settings),
         num_workers=settings.workers if pairs else 0,
         collate_fn=_collate,
         worker_init_fn=_one_thread,
@@ -419,9 +458,9 @@ def _load(
 
 
 def _collate(items: list[Loaded]) -> Loaded:
-    anchor, others, exact, surface, disagreement = zip(*items, strict=True)
-    views = tuple(tree.collate(view) for view in zip(*others, strict=True))
-    return tree.collate(anchor), views, tree.collate(exact), torch.cat(surface), torch.cat(disagreement)
+    anchor, others, exact, surface, disagreement, around = zip(*items, strict=True)
+    views, offered = (tuple(tree.collate(v) for v in zip(*many, strict=True)) for many in (others, around))
+    return tree.collate(anchor), views, tree.collate(exact), torch.cat(surface), torch.cat(disagreement), offered
 
 
 def _to(item: Any, device: str) -> Any:

@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
+from dhtorch.data.pairs import around
 from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import compare
 from dhtorch.studies import protocol
@@ -75,7 +76,7 @@ def run(
     if reference not in methods or not compared:
         raise ValueError(f"experiment.methods: found {', '.join(methods)}, expected {reference} and one more")
     variants = {
-        _named(name, k): Variant(method, seed=settings.seed + k, needs=partial(_views, pairs, method.views))
+        _named(name, k): _variant(method, settings.seed + k, pairs)
         for name, method in methods.items()
         for k in range(1 if name in once else seeds)
     }
@@ -107,6 +108,13 @@ def verdict(judged: compare.Comparison, compared: Sequence[str], several: set[st
     notes = [f"{m} without ratio: {', '.join(scenes)}" for m, scenes in judged.left_out.items() if scenes]
     notes += [f"{m} % risk silences {', '.join(scenes)}" for m, scenes in judged.silent.items() if scenes]
     return not missed, "; ".join([f"{n_held} of {n_held + len(missed)} bars met", *missed, *notes])
+
+
+def _variant(method: Method, seed: int, pairs: Pairs) -> Variant:
+    """A method that chooses its views is offered those around the anchor; another takes the pair's own."""
+    if method.choose is not None:
+        return Variant(method, seed=seed, offers=around)
+    return Variant(method, seed=seed, needs=partial(_views, pairs, method.views))
 
 
 def _named(method: str, k: int) -> str:
