@@ -23,6 +23,9 @@ from dhtorch.evaluate.score_calibration import fit
 #: A scene on which either method answers fewer points says nothing about their ratio.
 MIN_ANSWERS = 20
 
+#: A scene with fewer answers above a threshold (mean over seeds) says nothing about keeping its target.
+MIN_ABOVE = 100
+
 #: Targets of the plug-in control, per cent of mean error.
 TARGETS = (10, 5)
 
@@ -70,8 +73,9 @@ def method_ratios(
         mean over scenes (on many it is zero, so that their median jumps). In rooms not learnt from, means over
         scenes: ``within_sigma`` and ``within_2sigma`` after the correction of sigma; ``realised_risk_<per cent>``,
         mean capped error at the plug-in threshold, where a silent scene counts 0; ``within_target_<per cent>``, share
-        of the scenes that meet it. And over all answers, every scene of the same weight: ``ece`` of the table,
-        ``ece_sigmoid`` of the simple control, ``ece_raw`` of the score as it came.
+        of the scenes that meet it among those with a hundred answers above the threshold; ``ece_scenes``, scene by
+        scene what :func:`dhtorch.evaluate.reliability.excess_ece` says. And over all answers, every scene of the same
+        weight: ``ece`` of the table, ``ece_sigmoid`` of the simple control, ``ece_raw`` of the score as it came.
 
     Raises:
         ValueError: no reference, or methods that differ in scenes or number of seeds.
@@ -91,6 +95,39 @@ def method_ratios(
             found.summary[f"{method}.{name}"] = value.entry(errors.unit(name))
         found.rows += rows.values()
     return found
+
+
+def against(
+    ours: Seeds, theirs: Seeds, name: str, *, draws: int = 2000, seed: int = 0
+) -> tuple[dict[str, Interval], dict[str, dict[str, float]]]:
+    """What one method of several views gains on another, with what it leaves silent counted as well.
+
+    Args:
+        ours, theirs: the same scenes and seeds.
+        name: of the other method, for the names of the numbers.
+        draws, seed: of the bootstrap over scenes.
+
+    Returns:
+        ``error_ratio_to_<name>``, geometric mean over scenes of the ratio of median errors, both cut by their own score
+        to the smaller number of answers; ``worst_scene_ratio_to_<name>``, the largest of them;
+        ``aurc_full_ratio_to_<name>``, geometric mean of the ratio of the areas over all candidates, where silence
+        counts as an error of one. And the same scene by scene, where it is defined.
+    """
+    equal, _ = ratio_over_seeds(*equal_coverage(ours, theirs), _median_rel)
+    full, _ = ratio_over_seeds(ours, theirs, lambda p: risk.measure(p)["aurc_full"], min_answers=0)
+
+    def geometric(ratios: Mapping[str, float]) -> Interval:
+        return bootstrap.interval(list(ratios.values()), statistic="geometric_mean", draws=draws, seed=seed)
+
+    numbers = {
+        f"error_ratio_to_{name}": geometric(equal),
+        f"worst_scene_ratio_to_{name}": Interval(max(equal.values(), default=None), None, None, len(equal)),
+        f"aurc_full_ratio_to_{name}": geometric(full),
+    }
+    rows = {s: {f"error_ratio_to_{name}": equal[s]} if s in equal else {} for s in ours}
+    for scene, ratio in full.items():
+        rows[scene][f"aurc_full_ratio_to_{name}"] = ratio
+    return numbers, rows
 
 
 def ratio_over_seeds(
@@ -165,8 +202,11 @@ def _promises(
             sigmoid[scene] = points.replace(score=torch.where(points.keep, learnt.sigmoid(points.score), 0.0))
             stated = errors.measure(table[scene])
             rows[scene] |= {k: stated[k] for k in ("within_sigma", "within_2sigma")}
+            rows[scene]["ece"] = reliability.excess_ece(table[scene], seed=seed)
             for percent, threshold in learnt.thresholds.items():
                 rows[scene][f"realised_risk_{percent}"] = risk.realised(points, threshold)
+                above = 0 if threshold is None else int((points.keep & (points.score >= threshold)).sum())
+                rows[scene][f"n_above_{percent}"] = above / len(ours[scene])
 
     def mean(values: list[float | None]) -> Interval:
         return bootstrap.interval(values, statistic="mean", draws=draws, seed=seed)
@@ -176,7 +216,9 @@ def _promises(
     for percent in TARGETS:
         realised = [row[f"realised_risk_{percent}"] or 0.0 for row in judged]
         numbers[f"realised_risk_{percent}"] = mean(realised)
-        numbers[f"within_target_{percent}"] = mean([float(r <= percent / 100) for r in realised])
+        enough = [r for r, row in zip(realised, judged, strict=True) if row[f"n_above_{percent}"] >= MIN_ABOVE]
+        numbers[f"within_target_{percent}"] = mean([float(r <= percent / 100) for r in enough])
+    numbers["ece_scenes"] = mean([row["ece"] for row in judged])
     for name, scenes in (("ece", table), ("ece_sigmoid", sigmoid), ("ece_raw", pooled)):
         numbers[name] = reliability.ece_interval([scenes[s] for s in table], draws=draws, seed=seed)
     return numbers

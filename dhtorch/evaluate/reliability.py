@@ -76,6 +76,28 @@ def diagram(
     )
 
 
+def excess_ece(scene: Points, *, bins: int = 10, draws: int = 200, seed: int = 0) -> float | None:
+    """How much further off the claims of one scene are than chance alone would have them; None without answers.
+
+    The calibration error over ``bins`` of equal mass less what it would be on average if every answer were good with
+    exactly the probability that it claims (``draws`` draws), and never below 0: few answers scatter.
+
+    Args:
+        scene: candidates whose score is a probability of a good answer.
+    """
+    said = scene.answered()
+    if not len(said.score):
+        return None
+    claimed = said.score.double().clamp(0, 1)
+    found = diagram(claimed, said.error < GOOD, bins=bins, equal_mass=True).ece
+    g = torch.Generator().manual_seed(seed)
+    expected = 0.0
+    for _ in range(draws):
+        good = torch.rand(len(claimed), generator=g, dtype=torch.float64) < claimed
+        expected += (diagram(claimed, good, bins=bins, equal_mass=True).ece or 0.0) / draws
+    return max(0.0, (found or 0.0) - expected)
+
+
 def pool(scenes: Sequence[Points]) -> tuple[Tensor, Tensor, Tensor]:
     """Claimed probability, goodness and weight (n,) of the answers of several scenes, each scene of total weight 1."""
     answers = [scene.answered() for scene in scenes]

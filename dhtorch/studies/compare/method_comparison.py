@@ -16,7 +16,7 @@ from typing import Any
 
 from dhtorch.data.pairs import around
 from dhtorch.data.scene import Given, Scene, scenes_of
-from dhtorch.evaluate import compare
+from dhtorch.evaluate import bootstrap, compare
 from dhtorch.studies import protocol
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
 from dhtorch.studies.rows import Row
@@ -51,6 +51,8 @@ def run(
     once: Sequence[str] = ("opencv",),
     seeds: int = 5,
     stand_ins: Mapping[str, str] | None = None,
+    baseline: str = "window",
+    indoor: Sequence[str] = (),
     progress: Progress = protocol.quiet,
 ) -> Outcome:
     """Run several methods on the same pairs, several seeds each, and compare them with the reference.
@@ -67,6 +69,8 @@ def run(
         once: methods that are shown for one seed and not compared.
         seeds: how many, from the job's own upwards.
         stand_ins: method of several views → method of one; None = the first compared method for all.
+        baseline: the method of several views that those which choose their views are held against as well.
+        indoor: rooms whose scenes make the mean ``<method>.coverage_at_5_indoor``.
 
     Raises:
         ValueError: no reference, or nothing to compare with it; else as the main job.
@@ -90,6 +94,12 @@ def run(
     outcome.rows = [r for r in outcome.rows if r["method"] not in later]
     outcome.summary = {k: v for k, v in outcome.summary.items() if not any(k.startswith(f"{m}.") for m in later)}
     outcome.summary |= judged.summary
+    outcome.summary |= _indoor(judged, rooms, indoor)
+    for name in (n for n in compared if methods[n].choose is not None and baseline in compared):
+        ours, theirs = ({**found[fallback[n]], **found[n]} if n in fallback else found[n] for n in (name, baseline))
+        numbers, by_scene = compare.against(ours, theirs, baseline)
+        outcome.summary |= {f"{name}.{k}": v.entry("1") for k, v in numbers.items()}
+        outcome.rows = [_with(r, by_scene.get(r["scene"], {})) if _is(r, name) else r for r in outcome.rows]
     _annotate(outcome.rows, judged.rows, f"against_{reference}")
     several = {name for name in compared if methods[name].views > 1}
     return outcome.decide(QUESTION, EXPECTATION, *verdict(judged, compared, several))
@@ -108,6 +118,26 @@ def verdict(judged: compare.Comparison, compared: Sequence[str], several: set[st
     notes = [f"{m} without ratio: {', '.join(scenes)}" for m, scenes in judged.left_out.items() if scenes]
     notes += [f"{m} % risk silences {', '.join(scenes)}" for m, scenes in judged.silent.items() if scenes]
     return not missed, "; ".join([f"{n_held} of {n_held + len(missed)} bars met", *missed, *notes])
+
+
+def _indoor(judged: compare.Comparison, rooms: Mapping[str, str], indoor: Sequence[str]) -> Row:
+    """Coverage at 5 % risk, its mean over the scenes of some rooms."""
+    reached: dict[str, list[float]] = {}
+    for row in judged.rows:
+        if rooms[row["scene"]] in indoor and row["coverage_at_5"] is not None:
+            reached.setdefault(row["method"], []).append(row["coverage_at_5"])
+    return {
+        f"{name}.coverage_at_5_indoor": bootstrap.interval(values, statistic="mean").entry("1")
+        for name, values in reached.items()
+    }
+
+
+def _is(row: Row, method: str) -> bool:
+    return bool(row["method"] == method and row["pair"] is None)
+
+
+def _with(row: Row, more: Mapping[str, float]) -> Row:
+    return {**row, **more}
 
 
 def _variant(method: Method, seed: int, pairs: Pairs) -> Variant:
