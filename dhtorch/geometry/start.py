@@ -23,7 +23,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch.geometry.lookup import luma
-from dhtorch.geometry.shapes import check
+from dhtorch.geometry.shapes import check, is_static
 from dhtorch.tree import Record, record
 
 #: Longest side of the small pictures, px, and of those on which turn and zoom are found.
@@ -31,7 +31,7 @@ LONG, LONG_TURN = 64, 32
 
 #: Width of a cell's window, an odd number of small pixels, and about how far apart cells lie.
 WINDOW, STEP = 9, 5
-WINDOW_TURN, STEP_TURN = 7, 4
+WINDOW_TURN, STEP_TURN = 7, 5
 
 #: Turns in degrees and zooms that are tried; their products are the candidates, the first of all is none.
 TURNS_DEG, ZOOMS = (0.0, -30.0, -15.0, 15.0, 30.0), (1.0, 1 / 1.4, 1.4)
@@ -43,11 +43,14 @@ BETTER = 0.03
 #: stays below 2^24.
 LEVELS, UNIT = 1023, 1024
 
-#: Standard deviation of the grey values below which a window counts as flat.
-FLAT = 0.01
+#: A window whose contrast is a smaller share of the whole picture's than this, or fewer grey levels, counts as flat.
+FLAT, FLAT_LEVELS = 0.05, 2.0
 
 #: What it costs neighbours to differ by one small pixel, and at most, in correlation.
 SLOPE, MOST = 0.1, 0.5
+
+#: Logarithm of a gain that counts as none, and its steps; gains that are believed.
+SAME_GAIN, STEPS_OF_GAIN, GAIN = 0.1, 32, (0.1, 10.0)
 
 #: Correlation from which on a cell has a say, and the least mean say of a picture with any start at all.
 SAY, LEAST = 0.6, 0.02
@@ -61,6 +64,7 @@ class Flow(Record):
     uv_1: Tensor  # (B, R, C, 2) px, where they went; NaN everywhere in a pair without support
     support: Tensor  # (B, R, C) in [0, 1], 0 = guessed from the neighbours
     linear: Tensor  # (B, 2, 2) turn and zoom that windows undergo, d uv_1 / d uv_0
+    gain: Tensor  # (B,) contrast of image 1 over that of image 0; 1 where they hardly differ
 
     def at(self, uv: Tensor) -> Tensor:
         """Where to look in image 1 for points ``uv`` (B, N, 2) px of image 0: (B, N, 2) px, NaN where nothing is known.
@@ -85,6 +89,7 @@ def coarse_flow(
     image_0: Tensor,  # (B, C, H, W) C 1 or 3; float in [0, 1] or uint8
     image_1: Tensor,  # (B, C, H', W')
     *,
+    linear: Tensor | None = None,  # (B, 2, 2)
     reach: float = 0.25,
     turns_deg: tuple[float, ...] = TURNS_DEG,
     zooms: tuple[float, ...] = ZOOMS,
@@ -92,6 +97,7 @@ def coarse_flow(
     """The coarse motion of the picture from image 0 to image 1, whatever their exposures.
 
     Args:
+        linear: turn and zoom, where they are known; None = they are looked for.
         reach: longest displacement beside turn and zoom, as a share of the longer side of image 1.
         turns_deg, zooms: in-plane turns and magnifications that are tried, the first of each being none.
 
@@ -103,24 +109,36 @@ def coarse_flow(
         ValueError: wrong shapes.
 
     Gradient: none; a start is a choice.
-    Cost: independent of the images' size but for one reading of each.
+    Cost: independent of the images' size but for one reading of each; a pair more where some pair is turned.
     """
-    check("coarse_flow", image_0=(image_0, "B C H W"), image_1=(image_1, "B C H' W'"))
-    linear = _turn(image_0, image_1, reach, turns_deg, zooms)
+    check("coarse_flow", image_0=(image_0, "B C H W"), image_1=(image_1, "B C H' W'"), linear=(linear, "B 2 2"))
     small_0, small_1 = small(image_0, LONG), small(image_1, LONG)
     a, b = _levels(small_0), _levels(small_1)
-    plain = torch.eye(2, device=a.device).expand_as(linear)
-    rivals = torch.stack([plain, linear], 1)
+    if linear is None:
+        found = _turn(image_0, image_1, reach, turns_deg, zooms)
+        plain = torch.eye(2, device=a.device).expand_as(found)
+        some = is_static(found) or bool(is_turned(found).any())
+        rivals = torch.stack([plain, found], 1) if some else plain[:, None]
+    else:
+        rivals = linear.to(a)[:, None]
     centre, offset, fit, total = _match(a, b, rivals, reach, WINDOW, STEP)
-    best = (total[:, 1] > total[:, 0] + BETTER).long()
-    pick = torch.arange(len(best), device=best.device), best
+    first = torch.arange(rivals.shape[1], device=a.device) == 0
+    pick = torch.arange(len(a), device=a.device), torch.where(first, total + BETTER, total).argmax(1)
     offset, fit, linear = offset[pick], fit[pick], rivals[pick]
     say = ((fit - SAY) / (1 - SAY)).clamp_min(0)
+    gain = _gain(a, b, centre, offset, linear, say)
     offset = _spread(offset, say)
     uv_0, uv_1 = small_0.to_image(centre), small_1.to_image(centre + offset)
     silent = say.mean((-2, -1)) < LEAST
     uv_1 = torch.where(silent[:, None, None, None], torch.full_like(uv_1, torch.nan), uv_1)
-    return Flow(uv_0=uv_0.expand_as(uv_1), uv_1=uv_1, support=say, linear=linear)
+    gain = torch.where(silent, torch.ones_like(gain), gain)
+    return Flow(uv_0=uv_0.expand_as(uv_1), uv_1=uv_1, support=say, linear=linear, gain=gain)
+
+
+def inverse(linear: Tensor) -> Tensor:
+    """The inverse (B, 2, 2) of turns and zooms. Gradient: to them."""
+    zoom_2 = linear[..., 0, 0] ** 2 + linear[..., 1, 0] ** 2
+    return linear.transpose(-1, -2) / zoom_2[..., None, None]
 
 
 def turned(
@@ -136,21 +154,26 @@ def turned(
 def upright(
     image: Tensor,  # (B, C, H, W) C 1 or 3; float in [0, 1] or uint8
     linear: Tensor,  # (B, 2, 2) a turn and a zoom
+    gain: Tensor,  # (B,)
 ) -> Tensor:
-    """The grey picture (B, 1, H, W) seen through the turn and zoom: its pixel x is the image at ``turned(linear, x)``.
+    """The grey picture (B, 1, H, W) with turn, zoom and gain undone: its pixel x is the image at ``turned(linear, x)``,
+    its grey values divided by ``gain``.
 
-    Beyond the image its border repeats. Where the turn is none the picture is the image's, bit for bit.
+    Beyond the image its border repeats. Where there is nothing to undo the picture is the image's, bit for bit.
     Gradient: to the image.
     """
-    check("upright", image=(image, "B C H W"), linear=(linear, "B 2 2"))
+    check("upright", image=(image, "B C H W"), linear=(linear, "B 2 2"), gain=(gain, "B"))
     grey = luma(image, dim=1)
     grey = grey.to(torch.promote_types(grey.dtype, torch.float32))
     H, W = grey.shape[-2:]
-    v, u = torch.meshgrid(*(torch.arange(n, device=grey.device, dtype=grey.dtype) for n in (H, W)), indexing="ij")
-    uv = turned(linear, torch.stack([u, v], -1).reshape(1, H * W, 2).expand(len(grey), -1, -1), (H, W))
-    place = ((2 * uv + 1) / uv.new_tensor([W, H]) - 1).reshape(-1, H, W, 2)
-    seen = F.grid_sample(grey, place, mode="bilinear", padding_mode="border", align_corners=False)
-    return torch.where(is_turned(linear)[:, None, None, None], seen, grey)
+    if is_static(linear) or bool(is_turned(linear).any()):
+        v, u = torch.meshgrid(*(torch.arange(n, device=grey.device, dtype=grey.dtype) for n in (H, W)), indexing="ij")
+        uv = turned(linear, torch.stack([u, v], -1).reshape(1, H * W, 2).expand(len(grey), -1, -1), (H, W))
+        place = ((2 * uv + 1) / uv.new_tensor([W, H]) - 1).reshape(-1, H, W, 2)
+        seen = F.grid_sample(grey, place, mode="bilinear", padding_mode="border", align_corners=False)
+        grey = torch.where(is_turned(linear)[:, None, None, None], seen, grey)
+    gain = gain.to(grey)[:, None, None, None]
+    return torch.where(gain == 1, grey, grey / gain)
 
 
 def is_turned(linear: Tensor) -> Tensor:
@@ -211,7 +234,8 @@ def _match(a: Tensor, b: Tensor, A: Tensor, reach: float, window: int, step: int
     most = math.ceil(reach * max(h_1, w_1))
     middle_0, middle_1 = (a.new_tensor([(x - 1) / 2, (y - 1) / 2]) for y, x in ((h, w), (h_1, w_1)))
     moved = (A[:, :, None, None] * (centre - middle_0)[..., None, :]).sum(-1) + middle_1  # (B, G, R, C, 2)
-    S = _correlation(_templates(a, centre, A, window), b, window)
+    templates = _unit(_read(a, centre.reshape(1, 1, -1, 2), A, window), _floor(a))
+    S = _correlation(templates, b, window)
     V = _around(S, moved.round().long(), most)
     joined = _told(V)
     D = 2 * most + 1
@@ -231,35 +255,59 @@ def _cells(h: int, w: int, step: int) -> Tensor:
     return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
 
 
-def _templates(a: Tensor, centre: Tensor, A: Tensor, window: int) -> Tensor:
-    """Windows (B, G, R·C, window²) of a as each similarity shows them in b."""
+def _read(a: Tensor, centre: Tensor, A: Tensor, window: int) -> Tensor:
+    """Windows (B, G, K, window²) of a around ``centre`` (B or 1, G or 1, K, 2), as each similarity shows them."""
     r = window // 2
     o = torch.arange(-r, r + 1, device=a.device, dtype=a.dtype)
     o = torch.stack(torch.meshgrid(o, o, indexing="xy"), -1).reshape(-1, 2)
-    scale = A[..., 0, 0] ** 2 + A[..., 1, 0] ** 2  # A⁻¹ = Aᵀ / zoom²
-    back = A.transpose(-1, -2) / scale[..., None, None]
-    read = (back[:, :, None] * o[:, None, :]).sum(-1)  # (B, G, window², 2)
-    at = centre.reshape(-1, 1, 2) + read[:, :, None]
+    read = (inverse(A)[:, :, None] * o[:, None, :]).sum(-1)  # (B, G, window², 2)
+    at = centre[..., None, :] + read[:, :, None]
     h, w = a.shape[-2:]
     grid = (2 * at + 1) / at.new_tensor([w, h]) - 1
     out = F.grid_sample(a[:, None], grid.flatten(1, 2), mode="bilinear", padding_mode="border", align_corners=False)
-    return _unit(out[:, 0]).unflatten(1, (*A.shape[1:2], -1))
+    return out[:, 0].unflatten(1, (*A.shape[1:2], -1))
+
+
+def _gain(a: Tensor, b: Tensor, centre: Tensor, offset: Tensor, linear: Tensor, say: Tensor) -> Tensor:
+    """Ratio of the contrasts (B,) of cells that found each other, as far as it differs from one, in coarse steps."""
+    here = _read(a, centre.reshape(1, 1, -1, 2), linear[:, None], WINDOW)[:, 0]
+    there = (centre + offset).flatten(1, 2)[:, None]
+    plain = torch.eye(2, device=a.device).expand_as(linear)[:, None]
+    seen = _read(b, there, plain, WINDOW)[:, 0]
+    ratio = (_variance(seen) + 1).log() - (_variance(here) + 1).log()
+    weight = say.flatten(1)
+    mean = (ratio * weight).sum(-1) / weight.sum(-1).clamp_min(1e-6) / 2
+    mean = (mean * STEPS_OF_GAIN).round() / STEPS_OF_GAIN
+    return torch.where(mean.abs() > SAME_GAIN, mean, torch.zeros_like(mean)).exp().clamp(*GAIN)
+
+
+def _variance(windows: Tensor) -> Tensor:
+    """(…, n) → (…); mean of squares about the mean."""
+    n = windows.shape[-1]
+    x = windows.round().double()  # whole numbers: exact
+    return ((x.square().sum(-1) - x.sum(-1).square() / n) / n).clamp_min(0)
 
 
 def _correlation(templates: Tensor, b: Tensor, window: int) -> Tensor:
     """Normalised correlation of every template with every place of b: (B, G, K, h, w), in units of 1 / UNIT²."""
     r = window // 2
     there = F.unfold(F.pad(b[:, None], (r, r, r, r), mode="replicate"), window)
-    S = torch.bmm(templates.flatten(1, 2), _unit(there.transpose(1, 2)).transpose(1, 2))
+    S = torch.bmm(templates.flatten(1, 2), _unit(there.transpose(1, 2), _floor(b)).transpose(1, 2))
     return S.reshape(*templates.shape[:3], *b.shape[-2:])
 
 
-def _unit(windows: Tensor) -> Tensor:
-    """Windows (…, n) of mean 0 and length UNIT, in whole numbers; flat ones shorter."""
+def _floor(picture: Tensor) -> Tensor:
+    """Variance (B,) of grey levels under which a window of a picture (B, h, w) counts as flat."""
+    return (FLAT**2 * _variance(picture.flatten(1))).clamp_min(FLAT_LEVELS**2)
+
+
+def _unit(windows: Tensor, floor: Tensor) -> Tensor:
+    """Windows (B, …, n) of mean 0 and length UNIT, in whole numbers; flat ones shorter."""
     n = windows.shape[-1]
+    floor = floor.reshape(-1, *[1] * (windows.dim() - 1))
     x = windows.round().double()
     total, squares = x.sum(-1, keepdim=True), x.square().sum(-1, keepdim=True)  # whole numbers: exact
-    energy = squares - total * total / n + n * (FLAT * LEVELS) ** 2
+    energy = squares - total * total / n + n * floor
     return ((x - total / n) * (UNIT / energy.sqrt())).round().float()
 
 

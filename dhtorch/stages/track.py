@@ -17,7 +17,7 @@ from dhtorch.geometry import lucas_kanade as lk
 from dhtorch.geometry.exact import filled
 from dhtorch.geometry.pyramid import Pyramid, Pyramids, build_pyramid
 from dhtorch.geometry.shapes import check, is_static
-from dhtorch.geometry.start import Flow, is_turned, turned, upright
+from dhtorch.geometry.start import Flow, inverse, is_turned, turned, upright
 from dhtorch.records import NO_HINT, TrackHint, Tracks
 
 #: Smallest eigenvalue of A per pixel of the window below which it is not tracked: 1e-4 of cv2, which sums gradients
@@ -38,7 +38,7 @@ def lucas_kanade(
     max_round_trip_px: float = 1.0,
     normalise: str = "none",
     min_eigenvalue: float = MIN_EIGENVALUE,
-    start: Callable[[Tensor, Tensor], Flow] | None = None,
+    start: Callable[..., Flow] | None = None,
 ) -> Tracks:
     """Track points from image 0 to image 1 and back; a track that does not return to its start is not valid.
 
@@ -58,9 +58,9 @@ def lucas_kanade(
         epsilon_px: a shorter step has converged; on coarse levels, which only provide a start, four times that.
         normalise: ``none``; ``bias`` removes the means of both windows; ``gain_bias`` also their ratio of contrast.
         min_eigenvalue: of A / window² (grey values in [0, 1]); a window with less has too little texture.
-        start: ``(image_0, image_1) -> Flow``, such as :func:`dhtorch.geometry.start.coarse_flow`: asked for the coarse
-            motion of the whole picture, there and back, where the hint has none. Where a pair is turned or zoomed by it
-            the search goes through image 1 turned upright. None = the search starts at ``uv_0``.
+        start: ``(image_0, image_1, *, linear) -> Flow``, such as :func:`dhtorch.geometry.start.coarse_flow`: asked for
+            the coarse motion of the whole picture, there and back, where the hint has none. Turn, zoom and gain of a
+            pair are undone in image 1 before it is searched. None = the search starts at ``uv_0``.
 
     Returns:
         Tracks in the dtype of ``uv_0``: ``uv_1`` (B, N, 2) px; ``error`` (B, N) px, the round trip (the way there where
@@ -123,8 +123,9 @@ def lucas_kanade(
         uv_1 = refine(
             image_0, image_1, uv_0, tracks.uv_1, window=window, normalise=normalise, min_eigenvalue=min_eigenvalue
         )
-        if flows is not None:  # a step through image 1 as it is tells nothing of a window that is turned there
-            uv_1 = torch.where(is_turned(flows[0].linear)[:, None, None], tracks.uv_1 + (uv_1 - uv_1.detach()), uv_1)
+        if flows is not None:  # a step through image 1 as it is says nothing of a window that is changed there
+            changed = is_turned(flows[0].linear) | (flows[0].gain != 1)
+            uv_1 = torch.where(changed[:, None, None], tracks.uv_1 + (uv_1 - uv_1.detach()), uv_1)
         return tracks.replace(uv_0=uv_0, uv_1=torch.where(tracks.valid[..., None], uv_1, tracks.uv_1))
     return tracks
 
@@ -168,27 +169,30 @@ def refine(
 
 
 def coarse(
-    image_0: Tensor, image_1: Tensor, hint: TrackHint, start: Callable[[Tensor, Tensor], Flow] | None
+    image_0: Tensor, image_1: Tensor, hint: TrackHint, start: Callable[..., Flow] | None
 ) -> tuple[Flow, Flow] | None:
     """The coarse motion of the pictures there and back: the hint's, else what ``start`` says, else none."""
     if hint.flows is not None or start is None:
         return hint.flows
-    return start(image_0, image_1), start(image_1, image_0)
+    there = start(image_0, image_1)
+    return there, start(image_1, image_0, linear=inverse(there.linear))
 
 
 class _Upright:
-    """Image 1 with the turn and zoom of its pair taken out, and the ways between the two."""
+    """Image 1 with the turn, zoom and gain of its pair undone, and the ways between the two."""
 
     def __init__(self, image: Tensor, flows: tuple[Flow, Flow]) -> None:
         self.hw = image.shape[-2], image.shape[-1]
         self.linear, self.homewards = flows[0].linear, flows[1]
-        # Without a look at the values (under a compiler) all are turned, if by nothing.
-        self.turned = is_static(self.linear) or bool(is_turned(self.linear).any())
-        self.image = upright(image, self.linear) if self.turned else image
+        changed = is_turned(self.linear) | (flows[0].gain != 1)
+        # Under a compiler, which sees no values, everything is undone, if it be nothing.
+        self.turned = is_static(changed) or bool(is_turned(self.linear).any())
+        undo = self.turned or bool(changed.any())
+        self.image = upright(image, self.linear, flows[0].gain) if undo else image
 
     def from_image(self, uv: Tensor) -> Tensor:
         """Pixels of image 1 (B, N, 2) in the upright picture."""
-        return turned(torch.linalg.inv(self.linear), uv, self.hw) if self.turned else uv
+        return turned(inverse(self.linear), uv, self.hw) if self.turned else uv
 
     def back(self, uv: Tensor) -> Tensor:
         """Where to look in image 0 for pixels (B, N, 2) of the upright picture."""
@@ -295,7 +299,7 @@ def lucas_kanade_affine(
     iterations: int = 7,
     epsilon_px: float = 0.01,
     max_shift_px: float = 2.0,
-    start: Callable[[Tensor, Tensor], Flow] | None = None,
+    start: Callable[..., Flow] | None = None,
 ) -> Tracks:
     """Track as ``track`` does, then register every window once more, free to shear and to change its brightness.
 
