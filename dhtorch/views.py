@@ -30,9 +30,9 @@ LONG = 240
 #: How a candidate is asked: everything that has a sigma counts, and how much is what the sigma says.
 PROBE = Method(
     n=128,
-    track=partial(lucas_kanade, levels=4, window=15, normalise="gain_bias"),
+    track=partial(lucas_kanade, levels=4, window=15, normalise="bias"),
     pose=map_pose,
-    triangulate=partial(two_view, min_parallax_deg=None, min_t_snr=3.0, fitted_noise=True, sensor_share=1.0),
+    triangulate=partial(two_view, min_parallax_deg=None, min_t_snr=1.0, fitted_noise=True, sensor_share=1.0),
 )
 
 
