@@ -109,8 +109,10 @@ def test_promises_equal_plain_loops():
     for percent, values in realised.items():
         counted = [v or 0.0 for v in values]
         assert found.summary[f"map.realised_risk_{percent}"]["value"] == pytest.approx(statistics.mean(counted))
-        met = statistics.mean(v <= percent / 100 for v in counted)
-        assert found.summary[f"map.within_target_{percent}"]["value"] == pytest.approx(met)
+        enough = [row[f"n_above_{percent}"] >= 100 for row in found.rows]
+        met = [v <= percent / 100 for v, counts in zip(counted, enough, strict=True) if counts]
+        expected = pytest.approx(statistics.mean(met)) if met else None
+        assert found.summary[f"map.within_target_{percent}"]["value"] == expected
         assert found.silent[f"map.{percent}"] == [s for s, v in zip("abcd", values, strict=True) if v is None]
     for name, scenes in (("ece", applied), ("ece_sigmoid", sigmoid), ("ece_raw", joined)):
         wanted = reliability.ece_interval(list(scenes.values()), draws=200, seed=2)
@@ -148,7 +150,7 @@ def test_a_scene_without_any_error_is_not_silent():
     assert found.silent == {"map.10": [], "map.5": []} and found.summary["map.realised_risk_5"]["value"] == 0
     back = compare.method_ratios({"map": perfect, "paper": paper}, reference="map", draws=20)
     assert back.silent == {"paper.10": list("abc"), "paper.5": list("abc")}
-    assert back.summary["paper.within_target_5"]["value"] == 1, "silence keeps any promise"
+    assert back.summary["paper.within_target_5"]["value"] is None, "silence counts neither way"
 
 
 def test_seeds_without_the_number_are_passed_over_and_a_scene_without_any_is_left_out():
@@ -265,3 +267,40 @@ def test_methods_that_do_not_match_raise():
         compare.method_ratios({"paper": paper, "map": paper | {"b": paper["b"][:2]}})
     with pytest.raises(ValueError, match=r"compare\.map\.z: found a scene"):
         compare.method_ratios({"paper": paper, "map": paper | {"z": paper["b"]}})
+
+
+def test_one_method_against_another_with_its_silence():
+    """Ratios at equal coverage as in the comparison, the worst of them, and areas in which silence counts as one."""
+    ours, theirs = small(0.5, silent=0.1, n=90), small(1.0, silent=0.6, n=90)
+    numbers, rows = compare.against(ours, theirs, "window", draws=50)
+    equal, _ = compare.ratio_over_seeds(
+        *compare.equal_coverage(ours, theirs), lambda p: errors.measure(p)["median_rel"]
+    )
+    assert numbers["error_ratio_to_window"].value == pytest.approx(math.prod(equal.values()) ** (1 / 3))
+    assert numbers["worst_scene_ratio_to_window"].value == max(equal.values())
+    full = []
+    for scene in ours:
+        areas = [median(risk.measure(p)["aurc_full"] for p in side[scene]) for side in (ours, theirs)]
+        full.append(areas[0] / areas[1])
+        assert rows[scene] == {
+            "error_ratio_to_window": equal[scene],
+            "aurc_full_ratio_to_window": pytest.approx(full[-1]),
+        }
+    value = numbers["aurc_full_ratio_to_window"].value
+    assert value == pytest.approx(math.prod(full) ** (1 / 3)) and value < 0.6
+
+
+def test_a_method_that_is_silent_has_an_area_but_no_error_to_compare():
+    mute = {name: [p.replace(keep=torch.zeros_like(p.keep)) for p in seeds] for name, seeds in small(1.0).items()}
+    numbers, rows = compare.against(mute, small(1.0), "window", draws=20)
+    assert numbers["error_ratio_to_window"].value is None and numbers["worst_scene_ratio_to_window"].value is None
+    assert numbers["aurc_full_ratio_to_window"].value > 1 and all(len(row) == 1 for row in rows.values())
+
+
+def test_a_target_is_counted_where_a_hundred_answers_are_above_its_threshold():
+    n = {name: [scene_of(400, k, spread=0.2)] for k, name in enumerate("abcd")}
+    few = n | {"d": [n["d"][0][:90]]}
+    for scenes, counted in ((n, 4), (few, 3)):
+        found = compare.method_ratios({"paper": scenes, "map": scenes}, draws=20)
+        assert found.summary["map.within_target_10"]["n"] == counted
+        assert found.summary["map.ece_scenes"]["n"] == 4

@@ -483,12 +483,15 @@ ELSEWHERE = {
     ),
     *(
         f"dhtorch.evaluate.reliability.{n}"
-        for n in ("diagram", "pool", "measure", "ece_interval", "leave_one_room_out")
+        for n in ("diagram", "excess_ece", "pool", "measure", "ece_interval", "leave_one_room_out")
     ),
     *(f"dhtorch.evaluate.score_calibration.{name}" for name in ("fit", "fit_sigma", "from_json")),
     *(f"dhtorch.evaluate.monotone.{name}" for name in ("isotonic", "pool_adjacent_violators", "platt")),
     *(f"dhtorch.evaluate.control.{name}" for name in ("plug_in", "conformal", "scenes_needed", "p_value")),
-    *(f"dhtorch.evaluate.compare.{name}" for name in ("method_ratios", "ratio_over_seeds", "equal_coverage")),
+    *(
+        f"dhtorch.evaluate.compare.{name}"
+        for name in ("method_ratios", "against", "ratio_over_seeds", "equal_coverage")
+    ),
     "dhtorch.evaluate.curves.sampled",
     *(f"dhtorch.evaluate.correlation.{name}" for name in ("pearson", "spearman", "ranks")),
     *(f"dhtorch.evaluate.bootstrap.{name}" for name in ("interval", "interval_of", "resample", "single")),

@@ -1,6 +1,7 @@
 """Methods against the paper's, several seeds: what is compared, what is named, and a verdict that goes either way."""
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 from hydra import compose as compose_settings
@@ -75,3 +76,22 @@ def test_silent_and_left_out_scenes_are_named():
 def test_nothing_to_compare_is_an_error():
     with pytest.raises(ValueError, match=r"experiment\.methods: found paper, opencv"):
         method_comparison.run([], {}, by_gap, Settings(), methods={"paper": method(), "opencv": method("opencv")})
+
+
+def test_a_method_that_chooses_is_offered_the_frames_around_and_held_against_the_window():
+    rooms = open_rooms(("walk", "lateral"), n_frames=7, hw=(192, 256), gap=3, lidar="exact")
+    rooms = [replace(room, room=name) for room, name in zip(rooms, ("hall", "attic"), strict=True)]
+    methods = {"paper": method(), "map": method("map"), "window": method("window").replace(views=2)}
+    methods["auto"] = method("auto").replace(views=3)
+    pairs = partial(by_gap, gap=3, stride=3)
+    found = method_comparison.run(rooms, {}, pairs, Settings(), methods=methods, seeds=1, indoor=["hall"])
+    rows = [r for r in found.rows if r["method"] == "auto" and r["pair"] is not None]
+    assert rows and all(len(r["views"]) == 3 and r["pair"][0] not in r["views"] for r in rows)
+    assert all("views" not in r for r in found.rows if r["method"] == "window")
+    for key in ("error_ratio_to_window", "aurc_full_ratio_to_window", "worst_scene_ratio_to_window"):
+        assert found.summary[f"auto.{key}"]["value"] > 0
+    assert found.summary["auto.coverage_at_5_indoor"]["n"] == 1
+    assert not any(k.startswith("map.error_ratio_to") for k in found.summary)
+    scenes = found.scenes("auto")
+    assert "aurc_full_ratio_to_window" in scenes["synthetic_walk"]
+    assert scenes["synthetic_walk"]["coverage"] > found.scenes("window")["synthetic_walk"]["coverage"] - 0.02

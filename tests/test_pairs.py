@@ -136,3 +136,20 @@ def test_scenes_are_opened_when_they_are_asked_for() -> None:
     first = noted[0]
     assert scenes_of(first) == [first] and scenes_of([first, line(4)])[0] is first
     assert [s.recording.name for s in scenes_of(line(4))] == ["line"]
+
+
+def test_frames_around_are_those_at_the_steps_before_and_after() -> None:
+    assert pairs.around(line(60), 30) == [0, 10, 18, 22, 25, 27, 28, 29, 31, 32, 33, 35, 38, 42, 50]
+    assert pairs.around(line(10), 0) == [1, 2, 3, 5, 8]
+    assert pairs.around(line(10), 9, steps=(1, 4)) == [5, 8]
+    lost = torch.tensor([0, 1, 4, 5, 9])
+    assert pairs.around(line(5, number=lost), 2) == [1, 3, 4], "numbers 4 - 3, 4 + 1 and 4 + 5 are there"
+
+
+def test_where_no_step_fits_the_nearest_frame_is_offered() -> None:
+    assert pairs.around(line(2, number=torch.tensor([0, 7])), 0) == [1]
+    assert pairs.around(line(3, number=torch.tensor([0, 50, 110])), 1) == [0]
+    with pytest.raises(ValueError, match="has one frame"):
+        pairs.around(line(1), 0)
+    with pytest.raises(ValueError, match="frame 9 of line"):
+        pairs.around(line(4), 9)

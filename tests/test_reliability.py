@@ -169,3 +169,37 @@ def test_the_interval_of_ece_hands_its_options_on():
         each = {row: reliability.measure([scenes[i] for i in row], bins=bins)["ece"] for row in each}
         drawn = [each[tuple(sorted(row))] for row in rows.tolist()]
         assert [found.low, found.high] == pytest.approx(np.percentile(drawn, [2.5, 97.5]).tolist())
+
+
+def honest(n, seed=0, boast=0.0):
+    """Answers that are good with the probability they claim, or with ``boast`` less."""
+    g = torch.Generator().manual_seed(seed)
+    claimed = 0.3 + 0.7 * torch.rand(n, generator=g, dtype=torch.float64)
+    good = torch.rand(n, generator=g, dtype=torch.float64) < claimed - boast
+    true = torch.full((n,), 2.0, dtype=torch.float64)
+    return errors.points(torch.where(good, 2.02, 3.0).double(), true, claimed)
+
+
+def test_excess_ece_forgives_chance_and_nothing_else():
+    few, many = (sum(reliability.excess_ece(honest(n, seed)) for seed in range(8)) / 8 for n in (40, 4000))
+    assert few < 0.03 and many < 0.005
+    raw = reliability.diagram(honest(40).score, honest(40).error < 0.1, equal_mass=True).ece
+    assert raw > 0.08, "what chance alone makes of forty answers"
+    for n in (400, 4000):
+        assert reliability.excess_ece(honest(n, boast=0.2)) == pytest.approx(0.2, abs=0.05)
+
+
+def test_excess_ece_is_the_ece_less_its_mean_under_the_claims():
+    scene = honest(60, seed=3, boast=0.3)
+    g = torch.Generator().manual_seed(5)
+    drawn = [
+        reliability.diagram(
+            scene.score, torch.rand(60, generator=g, dtype=torch.float64) < scene.score, bins=4, equal_mass=True
+        ).ece
+        for _ in range(30)
+    ]
+    found = reliability.diagram(scene.score, scene.error < 0.1, bins=4, equal_mass=True).ece
+    expected = found - sum(drawn) / 30
+    assert reliability.excess_ece(scene, bins=4, draws=30, seed=5) == pytest.approx(expected) and expected > 0.1
+    mute = scene.replace(keep=torch.zeros_like(scene.keep))
+    assert reliability.excess_ece(mute) is None

@@ -25,7 +25,8 @@ NAMED = {
     ),
     "pairs": ("dhtorch.data.pairs",),
     "method": (
-        *("dhtorch.method", "dhtorch.geometry.epipolar", "dhtorch.studies.baselines.opencv"),
+        *("dhtorch.method", "dhtorch.views", "dhtorch.geometry.epipolar", "dhtorch.geometry.start"),
+        "dhtorch.studies.baselines.opencv",
         *(
             f"dhtorch.stages.{name}"
             for name in ("sample", "backproject", "holes", "track", "pose", "triangulate", "score", "fuse")
