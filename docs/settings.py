@@ -30,7 +30,7 @@ from dhtorch.studies.baselines import opencv
 FOLDER = Path(__file__).resolve().parent.parent / "conf" / "method"
 
 #: Given by the caller at run time, never by settings.
-AT_RUN_TIME = {"hint", "device", "dtype", "seed", "fit"}
+AT_RUN_TIME = {"hint", "device", "dtype", "seed", "fit", "linear"}
 
 #: File name → method, and what its file says first.
 WRITTEN: dict[str, Method] = {**METHODS, "opencv": opencv.OPENCV, "paper_dlt": opencv.PAPER_DLT}

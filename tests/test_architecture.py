@@ -17,8 +17,8 @@ LEVELS = [
     {"records", "drawing"},
     {"stages", "data", "evaluate", "export", "synthetic", "testing", "calibration"},
     {"method"},
-    {"pair", "window", "methods"},
-    {"transform", "integrate", "extract", "viewer"},
+    {"pair", "window", "methods", "views"},
+    {"transform", "integrate", "extract", "viewer", "stream"},
     {"studies"},
     {"commands", "__main__"},
 ]
@@ -33,6 +33,9 @@ SIDEWAYS = {
     ("method", "pair"),  # when it is called
     ("method", "window"),
     ("window", "pair"),
+    ("views", "pair"),
+    ("window", "views"),
+    ("methods", "views"),
     ("extract", "transform"),
     ("__main__", "commands"),
 }

@@ -30,6 +30,7 @@ AT_RUN_TIME = {
     "device",
     "dtype",
     "hint",
+    "linear",
     "format",
     "progress",
     "example",

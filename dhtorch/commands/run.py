@@ -30,10 +30,15 @@ COMMANDS = {"inspect": "dhtorch.commands.inspect", "report": "dhtorch.studies.re
 
 #: Sub-command with settings of its own, ``conf/<word>.yaml`` → module with ``run(settings, parts, *, progress)``, which
 #: is given all options as plain values, and as objects those that name a function. It returns the exit code.
-CONFIGURED = {"extract": "dhtorch.extract", "integrate": "dhtorch.integrate.mapping", "view": "dhtorch.commands.view"}
+CONFIGURED = {
+    "extract": "dhtorch.extract",
+    "integrate": "dhtorch.integrate.mapping",
+    "stream": "dhtorch.commands.stream",
+    "view": "dhtorch.commands.view",
+}
 
 #: Sub-command → the option that a first word without a name sets.
-FIRST_WORD = {"view": "result"}
+FIRST_WORD = {"stream": "data.root", "view": "result"}
 
 DONE, SOME_FAILED, FAILED, INTERRUPTED, UNHEARD = 0, 1, 2, 130, 141
 

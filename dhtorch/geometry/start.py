@@ -128,7 +128,8 @@ def coarse_flow(
     say = ((fit - SAY) / (1 - SAY)).clamp_min(0)
     gain = _gain(a, b, centre, offset, linear, say)
     offset = _spread(offset, say)
-    uv_0, uv_1 = small_0.to_image(centre), small_1.to_image(centre + offset)
+    uv_0 = small_0.to_image(centre)
+    uv_1 = small_1.to_image(centre + offset)
     silent = say.mean((-2, -1)) < LEAST
     uv_1 = torch.where(silent[:, None, None, None], torch.full_like(uv_1, torch.nan), uv_1)
     gain = torch.where(silent, torch.ones_like(gain), gain)
@@ -306,7 +307,8 @@ def _unit(windows: Tensor, floor: Tensor) -> Tensor:
     n = windows.shape[-1]
     floor = floor.reshape(-1, *[1] * (windows.dim() - 1))
     x = windows.round().double()
-    total, squares = x.sum(-1, keepdim=True), x.square().sum(-1, keepdim=True)  # whole numbers: exact
+    total = x.sum(-1, keepdim=True)  # of whole numbers: exact
+    squares = x.square().sum(-1, keepdim=True)
     energy = squares - total * total / n + n * floor
     return ((x - total / n) * (UNIT / energy.sqrt())).round().float()
 
@@ -368,6 +370,7 @@ def _binomial(x: Tensor) -> Tensor:
     for dim in (1, 2):
         zero = torch.zeros_like(x.narrow(dim, 0, 1))
         n = x.shape[dim]
-        before, after = torch.cat([zero, x.narrow(dim, 0, n - 1)], dim), torch.cat([x.narrow(dim, 1, n - 1), zero], dim)
+        before = torch.cat([zero, x.narrow(dim, 0, n - 1)], dim)
+        after = torch.cat([x.narrow(dim, 1, n - 1), zero], dim)
         x = (before + after + 2 * x) * 0.25
     return x
