@@ -13,15 +13,17 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from dhtorch.method import Method
-    from dhtorch.methods import MAP, PAPER, WINDOW, extend
+    from dhtorch.methods import AUTO, MAP, PAPER, WINDOW, extend
     from dhtorch.pair import merge
     from dhtorch.records import Camera, Estimate, Frame, Map, Pose, PoseFit, Samples, TrackHint, Tracks
+    from dhtorch.stream import Stream
     from dhtorch.transform import ExtendDepth
     from dhtorch.tree import collate
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "AUTO",
     "MAP",
     "PAPER",
     "WINDOW",
@@ -34,6 +36,7 @@ __all__ = [
     "Pose",
     "PoseFit",
     "Samples",
+    "Stream",
     "TrackHint",
     "Tracks",
     "collate",
@@ -42,8 +45,8 @@ __all__ = [
 ]
 
 #: Where a public name lives, if not among the records.
-_HOMES = {"MAP": "methods", "PAPER": "methods", "WINDOW": "methods", "extend": "methods", "Method": "method"}
-_HOMES |= {"ExtendDepth": "transform", "collate": "tree", "merge": "pair"}
+_HOMES = dict.fromkeys(("AUTO", "MAP", "PAPER", "WINDOW", "extend"), "methods") | {"Method": "method"}
+_HOMES |= {"ExtendDepth": "transform", "Stream": "stream", "collate": "tree", "merge": "pair"}
 
 
 def __getattr__(name: str) -> Any:
