@@ -46,6 +46,8 @@ PLACES = (
     "methods",
     "pair",
     "window",
+    "views",
+    "stream",
     "evaluate",
     "transform",
     "closure",

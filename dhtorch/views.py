@@ -116,6 +116,6 @@ def key_views(
     for _ in range(views):
         gain = steady(torch.log1p, known + worth).sum(-1).masked_fill(~free, -torch.inf)
         best = F.one_hot(gain.argmax(0), V).T.bool()
-        known = known + (worth * best[..., None]).sum(0)
+        known = known + torch.where(best[..., None], worth, 0.0).sum(0)
         free = free & ~best
     return free.flip(0).long().argsort(dim=0, stable=True)[:views]

@@ -98,6 +98,17 @@ def test_sizes_may_differ() -> None:
     assert _share_near(flow, (there + 0.5) * 2 - 0.5, 10.0) > 0.95
 
 
+def test_a_picture_of_another_size_is_searched_at_the_size_of_the_first() -> None:
+    a, b, there = _pair(6, (30.0, 10.0))
+    large = F.interpolate(b, scale_factor=2, mode="bicubic", align_corners=False).clamp(0, 1)
+    assert torch.equal(start.coarse_flow(a, large).linear[0], 2 * torch.eye(2))
+    assert torch.equal(start.coarse_flow(large, a).linear[0], 0.5 * torch.eye(2))
+    uv = torch.tensor([[[100.0, 100.0], [150.0, 120.0], [90.0, 160.0], [200.0, 60.0]]])
+    true = 2 * there[uv[0, :, 1].long(), uv[0, :, 0].long()] + 0.5
+    tracks = lucas_kanade_affine(a, large, uv, start=start.coarse_flow)
+    assert tracks.valid.all() and float((tracks.uv_1[0] - true).norm(dim=-1).max()) < 0.3
+
+
 def test_one_pair_is_answered_as_in_a_batch() -> None:
     pairs = [_pair(k, shift)[:2] for k, shift in enumerate([(30.0, 5.0), (-60.0, 0.0), (4.0, 50.0)])]
     a, b = (torch.cat(x) for x in zip(*pairs, strict=True))

@@ -114,13 +114,14 @@ def coarse_flow(
     check("coarse_flow", image_0=(image_0, "B C H W"), image_1=(image_1, "B C H' W'"), linear=(linear, "B 2 2"))
     small_0, small_1 = small(image_0, LONG), small(image_1, LONG)
     a, b = _levels(small_0), _levels(small_1)
+    larger = small_1.scale / small_0.scale  # turns and zooms are those of small pictures from here on
     if linear is None:
         found = _turn(image_0, image_1, reach, turns_deg, zooms)
         plain = torch.eye(2, device=a.device).expand_as(found)
         some = is_static(found) or bool(is_turned(found).any())
         rivals = torch.stack([plain, found], 1) if some else plain[:, None]
     else:
-        rivals = linear.to(a)[:, None]
+        rivals = linear.to(a)[:, None] / larger
     centre, offset, fit, total = _match(a, b, rivals, reach, WINDOW, STEP)
     first = torch.arange(rivals.shape[1], device=a.device) == 0
     pick = torch.arange(len(a), device=a.device), torch.where(first, total + BETTER, total).argmax(1)
@@ -133,7 +134,7 @@ def coarse_flow(
     silent = say.mean((-2, -1)) < LEAST
     uv_1 = torch.where(silent[:, None, None, None], torch.full_like(uv_1, torch.nan), uv_1)
     gain = torch.where(silent, torch.ones_like(gain), gain)
-    return Flow(uv_0=uv_0.expand_as(uv_1), uv_1=uv_1, support=say, linear=linear, gain=gain)
+    return Flow(uv_0=uv_0.expand_as(uv_1), uv_1=uv_1, support=say, linear=linear * larger, gain=gain)
 
 
 def inverse(linear: Tensor) -> Tensor:
