@@ -107,6 +107,16 @@ def test_one_view_alone_must_be_sure():
     assert int(agree(still_views([4.0, 4.0], [0.9, 0.9])).gate) == Gate.UNCERTAIN
 
 
+def test_where_most_views_stand_still_none_is_believed():
+    views = views_of(V=5, B=2, N=6, silent=0.0, spread=0.1)
+    for still, silenced in ((3, False), (4, True), (5, True)):
+        gate = views.gate.clone()
+        gate[:still, 1, 2] = Gate.NO_BASELINE
+        found = agree(views.replace(gate=gate), sure_rel=1.0)
+        assert bool((found.gate[1] == Gate.NO_BASELINE).all()) == silenced and bool((found.gate[0] == 0).all())
+    assert bool((agree(views.replace(gate=gate), max_still=1.0, sure_rel=1.0).gate[0] == 0).all())
+
+
 def test_a_single_partner_is_its_own_answer_and_none_is_refused():
     views = views_of(V=1, N=9)
     assert torch.equal(agree(views).depth.nan_to_num(), views.depth[0].nan_to_num())

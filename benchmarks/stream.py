@@ -1,0 +1,109 @@
+"""Time per frame of a method that chooses its views, and of a stream.
+
+    python benchmarks/stream.py --json benchmarks/results/stream.json
+
+``auto`` is a whole anchor: the choice among the frames around it, five views and their joining; its peer is ``window``,
+handed five views. ``push`` is the newest frame answered from past ones at 640×480 with 1,024 samples; its peer is the
+same work in OpenCV's seats: the views that the stream asked, each tracked, posed and triangulated. Frames of
+7s_redkitchen_stream_200 (640×480, near limit 2 m) where DHTORCH_DATA is set, else of the built-in room. All sides take
+turns in one process.
+"""
+
+from __future__ import annotations
+
+import os
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import harness
+import torch
+
+from dhtorch import data, extend
+from dhtorch.data.pairs import around, between
+from dhtorch.data.recording import Recording
+from dhtorch.evaluate.holdout import range_split
+from dhtorch.methods import AUTO, WINDOW
+from dhtorch.records import Frame
+from dhtorch.stages import triangulate
+from dhtorch.stream import Stream
+from dhtorch.studies.baselines import opencv
+from dhtorch.synthetic.recording import SyntheticRoom
+from dhtorch.tree import stack
+
+PEER = partial(
+    extend,
+    track=opencv.lucas_kanade,
+    pose=opencv.pnp_ransac,
+    triangulate=partial(triangulate.two_view, solver=opencv.triangulate),
+)
+
+
+def load() -> tuple[Recording, float, int, int]:
+    """A recording, its near limit and gap, and the anchor that is asked."""
+    root = os.environ.get("DHTORCH_DATA")
+    if root:
+        return data.open(Path(root) / "7s_redkitchen_stream_200"), 2.0, 20, 40
+    return SyntheticRoom(n_frames=24), 2.0, 6, 12
+
+
+def measure(threads: int, options: Any) -> list[dict[str, Any]]:
+    """A row for a whole anchor and one for a frame of the stream."""
+    harness.set_threads(threads)
+    recording, near, gap, i = load()
+    seen: dict[int, Frame] = {}
+
+    def view(k: int) -> Frame:
+        if k not in seen:
+            seen[k] = range_split(recording[k], near)
+        return seen[k]
+
+    offered = stack([view(k) for k in around(recording, i)])
+    five = stack([view(k) for k in between(i, i + gap, WINDOW.views)])
+
+    def auto() -> None:
+        with torch.no_grad():
+            AUTO(view(i), offered)
+
+    def window() -> None:
+        with torch.no_grad():
+            WINDOW(view(i), five)
+
+    ours, theirs = harness.in_turn([auto, window], repeats=options.repeats, clock=options.clock)
+    rows = [harness.row("auto_anchor", ours, "window", theirs, n=AUTO.n, batch=1, bar=True)]
+
+    method = AUTO.replace(n=1024)
+    stream = Stream(method)
+    for k in range(i - max(stream.steps), i):
+        if k >= 0:
+            stream.past.append(view(k))
+    trace: dict[str, Any] = {}
+    held = list(stream.past)
+
+    def push() -> None:
+        stream.past.clear()
+        stream.past.extend(held)
+        stream.push(view(i), trace=trace)
+
+    push()
+    asked = [view(i - s) for s in trace["chosen"][:, 0].tolist()]
+
+    def peer() -> None:
+        with torch.no_grad():
+            for other in asked:
+                PEER(view(i), other, n=1024)
+
+    ours, theirs = harness.in_turn([push, peer], repeats=options.repeats, clock=options.clock)
+    return [*rows, harness.row("stream_push", ours, "opencv", theirs, n=1024, batch=1, bar=True)]
+
+
+def main() -> None:
+    """Print the table; write it with ``--json``."""
+    options = harness.arguments(__doc__ or "").parse_args()
+    rows = [row for threads in (1, 2) for row in measure(threads, options)]
+    print(f"{load()[0].name}: milliseconds, medians of {options.repeats}")
+    harness.report(rows, options.json)
+
+
+if __name__ == "__main__":
+    main()
