@@ -103,10 +103,38 @@ def test_a_picture_of_another_size_is_searched_at_the_size_of_the_first() -> Non
     large = F.interpolate(b, scale_factor=2, mode="bicubic", align_corners=False).clamp(0, 1)
     assert torch.equal(start.coarse_flow(a, large).linear[0], 2 * torch.eye(2))
     assert torch.equal(start.coarse_flow(large, a).linear[0], 0.5 * torch.eye(2))
+    known = start.coarse_flow(a, large, linear=2 * torch.eye(2)[None])
+    assert torch.equal(known.uv_1, start.coarse_flow(a, large).uv_1)
     uv = torch.tensor([[[100.0, 100.0], [150.0, 120.0], [90.0, 160.0], [200.0, 60.0]]])
     true = 2 * there[uv[0, :, 1].long(), uv[0, :, 0].long()] + 0.5
     tracks = lucas_kanade_affine(a, large, uv, start=start.coarse_flow)
     assert tracks.valid.all() and float((tracks.uv_1[0] - true).norm(dim=-1).max()) < 0.3
+
+
+def test_neighbours_tell_what_a_repeated_pattern_cannot() -> None:
+    a, b, there = _pair(8, (40.0, 0.0))
+    v, u = torch.meshgrid(torch.arange(float(H)), torch.arange(float(W)), indexing="ij")
+
+    def papered(image: Tensor, shift: float) -> Tensor:
+        stripes = 0.5 + 0.3 * torch.sin((u - shift) * (2 * math.pi / 40)) * torch.cos(v * (2 * math.pi / 48))
+        inside = ((u - shift - W / 2).abs() < 80) & ((v - H / 2).abs() < 60)
+        return torch.where(inside, stripes, image)
+
+    flow = start.coarse_flow(papered(a, 0.0), papered(b, 40.0))
+    assert _share_near(flow, there, 10.0) > 0.9
+
+
+def test_what_is_upright_was_read_where_its_pixels_lie() -> None:
+    v, u = torch.meshgrid(torch.arange(float(H)), torch.arange(float(W)), indexing="ij")
+    a = math.radians(20.0)
+    linear = 0.7 * torch.tensor([[[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]]])
+    at = start.turned(linear, torch.stack([u, v], -1).reshape(1, -1, 2), (H, W)).reshape(H, W, 2)
+    inside = ((at >= 0) & (at <= torch.tensor([W - 1.0, H - 1.0]))).all(-1)
+    for axis, ramp in enumerate((u, v)):
+        seen = start.upright((ramp / W)[None, None], linear, torch.tensor([0.5]))
+        torch.testing.assert_close(seen[0, 0][inside] * W * 0.5, at[..., axis][inside], atol=2e-3, rtol=0)
+    same = start.upright(u[None, None] / W, torch.eye(2)[None], torch.ones(1))
+    assert torch.equal(same[0, 0], u / W)
 
 
 def test_one_pair_is_answered_as_in_a_batch() -> None:
@@ -119,7 +147,7 @@ def test_one_pair_is_answered_as_in_a_batch() -> None:
             assert torch.equal(getattr(one, name)[0], getattr(whole, name)[k])
 
 
-@pytest.mark.parametrize("long", [16, 64, 400])
+@pytest.mark.parametrize("long", [16, 60, 64, 400])
 def test_a_small_picture_says_where_its_pixels_lie(long: int) -> None:
     v, u = torch.meshgrid(torch.arange(float(H)), torch.arange(float(W)), indexing="ij")
     for ramp, axis in ((u, 0), (v, 1)):
