@@ -49,7 +49,9 @@ WINDOW = MAP.replace(views=5)
 #: Several views chosen among those around the anchor; the search begins where the whole picture went, whatever the
 #: exposures; an answer needs views that agree or one that is sure by itself.
 AUTO = MAP.replace(
-    track=partial(lucas_kanade_affine, levels=4, start=coarse_flow, track=partial(lucas_kanade, normalise="bias")),
+    track=partial(
+        lucas_kanade_affine, levels=LEVELS, start=coarse_flow, track=partial(lucas_kanade, normalise="gain_bias")
+    ),
     fuse=agree,
     score=rank_by_sigma,
     choose=by_probes,

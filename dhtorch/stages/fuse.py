@@ -106,7 +106,7 @@ def agree(
     max_against: float = 0.25,
     sure_rel: float = 0.05,
     max_sigma_rel: float | None = 0.2,
-    max_still: float = 0.7,
+    max_still: float = 0.5,
 ) -> Estimate:
     """Join the views that agree about a sample; one view alone answers where it is sure by itself.
 
