@@ -33,7 +33,7 @@ DEFAULT_ROOM = "synthetic_walk_2"
 
 
 #: Methods that are compared with the paper's.
-COMPARED = ("map", "window")
+COMPARED = ("map", "window", "auto")
 
 
 def percent(value: float | None) -> str:
@@ -127,6 +127,18 @@ def comparison() -> str:
     return table(["number", *(f"`{m}`" for m in COMPARED), "bar"], rows)
 
 
+def chosen_views(*results: str) -> str:
+    """What a method that chooses its views gains on the window, in each of some comparisons, beside its bars."""
+    summaries = [json.loads((RESULTS / f"{name}.json").read_text())["summary"] for name in results]
+    rows = []
+    for name, (words, bar) in GAINS.items():
+        cells = ["" if (e := s.get(f"auto.{name}")) is None else f"{e['value']:.3f}" for s in summaries]
+        window = [s.get(f"window.{name}") for s in summaries]
+        before = " / ".join("–" if e is None or e["value"] is None else f"{e['value']:.3f}" for e in window)
+        rows.append([words, before, *cells, bar])
+    return table(["number", "`window`", *(f"`auto`, {name}" for name in results), "bar"], rows)
+
+
 def by_scene(comparison: str) -> str:
     """Coverage and median error of every method on every scene of a comparison, and the ratio at equal coverage."""
     rows = []
@@ -206,6 +218,7 @@ def caught() -> str:
 
 TABLES = {"room": room, "room seeds": room_by_seed, "shared": shared, "truths": truths, "comparison": comparison}
 TABLES |= {"comparison scenes": partial(by_scene, "method_comparison"), "stress": partial(by_scene, "stress")}
+TABLES |= {"chosen views": partial(chosen_views, "method_comparison", "streams")}
 TABLES |= {"bars": speed_tables.bars, "speed": speed_tables.stages}
 
 #: Numbers of the method comparison in words, and on which side of its bar each belongs.
@@ -220,6 +233,19 @@ NUMBER = {
     "realised_risk_10": "risk realised at the threshold for 10 %",
     "realised_risk_5": "risk realised at the threshold for 5 %",
 }
+#: What choosing and joining views is to gain, in words, and its bars.
+GAINS = {
+    "coverage": ("coverage, median over scenes", "≥ 0.50"),
+    "coverage_at_5_indoor": ("coverage at 5 % mean risk, mean over indoor scenes", "≥ 0.40"),
+    "error_ratio_to_window": ("median error at equal coverage, ratio to `window`", "≤ 1.0"),
+    "worst_scene_ratio_to_window": ("the same, worst scene", "≤ 1.15"),
+    "aurc_full_ratio_to_window": ("area under risk–coverage with silence as 1, ratio to `window`", "≤ 0.75"),
+    "within_sigma": ("errors within one stated sigma", "0.68 ± 0.05"),
+    "within_2sigma": ("errors within two", "≥ 0.92"),
+    "ece_scenes": ("calibration error beyond chance, mean over scenes", "≤ 0.05"),
+    "within_target_5": ("scenes that keep the threshold for 5 %", "≥ 0.9"),
+}
+
 BOUND = dict.fromkeys(NUMBER, "≤") | {"coverage_at_5": "≥", "within_2sigma": "≥", "within_sigma": "±0.07 of"}
 
 #: Results whose verdicts are shown, beside those with a table.
