@@ -31,7 +31,6 @@ RESULTS = HERE / "results"
 EXPERIMENTS = {
     "method_comparison": "experiment=method_comparison data=shared_scenes",
     "part_ablation": "experiment=part_ablation data=shared_scenes",
-    "streams": "experiment=method_comparison data=streams experiment.seeds=1",
     "stress": "experiment=method_comparison data=synthetic_stress experiment.seeds=2",
     "shared_scenes": "experiment=opencv_twin data=shared_scenes",
     "room_exact": "experiment=opencv_twin data=synthetic_seeds data.lidar=exact data.image_noise=0",
