@@ -161,7 +161,9 @@ def test_seeds_of_samples_are_told_apart_by_their_index():
 def test_a_method_is_a_name_or_a_record():
     assert ExtendDepth(depth_unit="m", method="paper").method is dhtorch.methods.METHODS["paper"]
     assert ExtendDepth(depth_unit="m", method="map").method is dhtorch.methods.METHODS["map"]
-    with pytest.raises(ValueError, match=r"method is 'mapp', expected one of \['map', 'paper', 'window'\] or a Method"):
+    with pytest.raises(
+        ValueError, match=r"method is 'mapp', expected one of \['auto', 'map', 'paper', 'window'\] or a Method"
+    ):
         ExtendDepth(depth_unit="m", method="mapp")
 
 

@@ -344,11 +344,14 @@ class _Collected:
         near = self.protocol.hide(batch.anchor, self.cutoff)
         views = tuple(self.protocol.hide(view, self.cutoff) for view in batch.others)
         offered = [self.protocol.hide(view, self.cutoff) for view in batch.around]
+        seen: dict[int, Frame] = {}
         shared, enough = SharedTracks(), [True] * len(batch.pairs)
         for k, (name, variant) in enumerate(self.variants.items()):
-            some = offered if variant.offers is not None else views[-variant.method.views :]
-            seen = tree.stack(some) if len(some) > 1 else some[0]
-            estimate, trace = self._ask(variant, batch, near, seen, shared)
+            some = offered if variant.offers is not None else list(views[-variant.method.views :])
+            which = 0 if variant.offers is not None else variant.method.views
+            if which not in seen:  # one record for all who see the same, so that they share tracks
+                seen[which] = tree.stack(some) if len(some) > 1 else some[0]
+            estimate, trace = self._ask(variant, batch, near, seen[which], shared)
             truths = {cohort: of(batch, trace) for cohort, of in self.protocol.cohorts.items()}
             answer = Answer(batch, name, estimate, trace, truths)
             if k == 0:
