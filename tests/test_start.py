@@ -87,7 +87,7 @@ def test_pictures_of_different_things_have_no_start() -> None:
     flow = start.coarse_flow(
         _pair(5, (0.0, 0.0))[0], torch.rand(1, 1, H, W, generator=torch.Generator().manual_seed(1))
     )
-    assert flow.uv_1.isnan().all()
+    assert flow.uv_1.isnan().all() and torch.equal(flow.linear[0], torch.eye(2))
     flat = torch.full((1, 1, H, W), 0.5)
     assert start.coarse_flow(flat, flat).at(torch.zeros(1, 3, 2)).isnan().all()
 
@@ -135,6 +135,8 @@ def test_what_is_upright_was_read_where_its_pixels_lie() -> None:
         torch.testing.assert_close(seen[0, 0][inside] * W * 0.5, at[..., axis][inside], atol=2e-3, rtol=0)
     same = start.upright(u[None, None] / W, torch.eye(2)[None], torch.ones(1))
     assert torch.equal(same[0, 0], u / W)
+    places = 300 * torch.rand(1, 500, 2, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(start.turned(torch.eye(2)[None], places, (H, W)), places)
 
 
 def test_one_pair_is_answered_as_in_a_batch() -> None:
@@ -200,6 +202,18 @@ def test_the_way_back_starts_from_its_own_estimate() -> None:
     silent = right[0].replace(uv_1=torch.full_like(right[0].uv_1, torch.nan))
     nowhere = track(hint=TrackHint(flows=(silent, silent)))
     assert torch.equal(nowhere.uv_1, track().uv_1) or not nowhere.valid.any()
+
+
+def test_a_pair_that_is_not_turned_is_tracked_beside_a_turned_one_as_alone() -> None:
+    turned, plain = _pair(3, (20.0, -12.0), 30.0)[:2], _pair(4, (33.0, 7.0))[:2]
+    a, b = (torch.cat(x) for x in zip(turned, plain, strict=True))
+    places = torch.rand(1, 300, 2, generator=torch.Generator().manual_seed(0))
+    uv = (15 + places * torch.tensor([W - 30.0, H - 30.0])).expand(2, -1, -1)
+    both = lucas_kanade(a, b, uv, levels=3, start=start.coarse_flow)
+    for k in range(2):
+        alone = lucas_kanade(a[k : k + 1], b[k : k + 1], uv[:1], levels=3, start=start.coarse_flow)
+        for name in ("uv_1", "error", "photometric", "cov", "valid"):
+            assert torch.equal(getattr(both, name)[k], getattr(alone, name)[0]), name
 
 
 def test_the_gradient_of_a_turned_track_is_finite_and_leaves_its_place() -> None:

@@ -22,7 +22,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dhtorch.geometry.lookup import luma
+from dhtorch.geometry import small as closed
+from dhtorch.geometry.filters import grey
 from dhtorch.geometry.shapes import check, is_static
 from dhtorch.tree import Record, record
 
@@ -102,8 +103,8 @@ def coarse_flow(
         turns_deg, zooms: in-plane turns and magnifications that are tried, the first of each being none.
 
     Returns:
-        Flow; to about a twentieth of what a cell is wide, the fine search does the rest. A cell whose own window fits
-        nowhere moves with its neighbours; a pair in which hardly a cell fits has no start at all (NaN).
+        Flow, in whole small pixels made smooth over neighbouring cells: the fine search does the rest. A cell whose own
+        window fits nowhere moves with its neighbours; a pair in which hardly a cell fits has no start at all (NaN).
 
     Raises:
         ValueError: wrong shapes.
@@ -134,13 +135,13 @@ def coarse_flow(
     silent = say.mean((-2, -1)) < LEAST
     uv_1 = torch.where(silent[:, None, None, None], torch.full_like(uv_1, torch.nan), uv_1)
     gain = torch.where(silent, torch.ones_like(gain), gain)
+    linear = torch.where(silent[:, None, None], torch.eye(2, device=a.device), linear)  # nothing supports a turn
     return Flow(uv_0=uv_0.expand_as(uv_1), uv_1=uv_1, support=say, linear=linear * larger, gain=gain)
 
 
 def inverse(linear: Tensor) -> Tensor:
     """The inverse (B, 2, 2) of turns and zooms. Gradient: to them."""
-    zoom_2 = linear[..., 0, 0] ** 2 + linear[..., 1, 0] ** 2
-    return linear.transpose(-1, -2) / zoom_2[..., None, None]
+    return closed.inverse(*linear.flatten(-2).unbind(-1), least=1e-30).movedim(0, -1).unflatten(-1, (2, 2))
 
 
 def turned(
@@ -148,9 +149,13 @@ def turned(
     uv: Tensor,  # (B, N, 2) px
     hw: tuple[int, int],
 ) -> Tensor:
-    """Where pixels of the upright picture lie in the image: (B, N, 2) px, turned and zoomed about its middle."""
+    """Where pixels of the upright picture lie in the image: (B, N, 2) px, turned and zoomed about its middle.
+
+    Where there is no turn they stay, bit for bit. Gradient: to both.
+    """
     middle = uv.new_tensor([(hw[1] - 1) / 2, (hw[0] - 1) / 2])
-    return (linear.to(uv)[:, None] * (uv - middle)[..., None, :]).sum(-1) + middle
+    there = (linear.to(uv)[:, None] * (uv - middle)[..., None, :]).sum(-1) + middle
+    return torch.where(is_turned(linear)[:, None, None], there, uv)
 
 
 def upright(
@@ -165,17 +170,17 @@ def upright(
     Gradient: to the image.
     """
     check("upright", image=(image, "B C H W"), linear=(linear, "B 2 2"), gain=(gain, "B"))
-    grey = luma(image, dim=1)
-    grey = grey.to(torch.promote_types(grey.dtype, torch.float32))
-    H, W = grey.shape[-2:]
+    picture = _grey(image)
+    H, W = picture.shape[-2:]
     if is_static(linear) or bool(is_turned(linear).any()):
-        v, u = torch.meshgrid(*(torch.arange(n, device=grey.device, dtype=grey.dtype) for n in (H, W)), indexing="ij")
-        uv = turned(linear, torch.stack([u, v], -1).reshape(1, H * W, 2).expand(len(grey), -1, -1), (H, W))
+        rows, columns = (torch.arange(n, device=image.device, dtype=picture.dtype) for n in (H, W))
+        v, u = torch.meshgrid(rows, columns, indexing="ij")
+        uv = turned(linear, torch.stack([u, v], -1).reshape(1, H * W, 2).expand(len(picture), -1, -1), (H, W))
         place = ((2 * uv + 1) / uv.new_tensor([W, H]) - 1).reshape(-1, H, W, 2)
-        seen = F.grid_sample(grey, place, mode="bilinear", padding_mode="border", align_corners=False)
-        grey = torch.where(is_turned(linear)[:, None, None, None], seen, grey)
-    gain = gain.to(grey)[:, None, None, None]
-    return torch.where(gain == 1, grey, grey / gain)
+        seen = F.grid_sample(picture, place, mode="bilinear", padding_mode="border", align_corners=False)
+        picture = torch.where(is_turned(linear)[:, None, None, None], seen, picture)
+    gain = gain.to(picture)[:, None, None, None]
+    return torch.where(gain == 1, picture, picture / gain)
 
 
 def is_turned(linear: Tensor) -> Tensor:
@@ -205,9 +210,14 @@ def small(image: Tensor, long: int) -> Small:
     scale = max(1, math.ceil(max(image.shape[-2:]) / long))
     thin = max(1, scale // 8)
     side = scale // thin
-    grey = luma(image[..., ::thin, ::thin], dim=1)
-    grey = grey.to(torch.promote_types(grey.dtype, torch.float32))
-    return Small(F.avg_pool2d(grey, side), side * thin, (side - 1) * thin / 2)
+    picture = _grey(image[..., ::thin, ::thin])
+    return Small(F.avg_pool2d(picture, side), side * thin, (side - 1) * thin / 2)
+
+
+def _grey(image: Tensor) -> Tensor:
+    """(B, 1, H, W) in single precision at least."""
+    picture = grey(image)
+    return picture.to(torch.promote_types(picture.dtype, torch.float32))
 
 
 def _turn(image_0: Tensor, image_1: Tensor, reach: float, turns_deg: tuple[float, ...], zooms: tuple[float, ...]):

@@ -17,6 +17,7 @@ from dhtorch.geometry import lucas_kanade as lk
 from dhtorch.geometry.exact import filled
 from dhtorch.geometry.pyramid import Pyramid, Pyramids, build_pyramid
 from dhtorch.geometry.shapes import check, is_static
+from dhtorch.geometry.small import product
 from dhtorch.geometry.start import Flow, inverse, is_turned, turned, upright
 from dhtorch.records import NO_HINT, TrackHint, Tracks
 
@@ -105,27 +106,24 @@ def lucas_kanade(
     with torch.no_grad():
         source = _source(hint, image_0, levels, window)
         flows = coarse(image_0, image_1, hint, start)
-        if flows is None:
-            target = build_pyramid(image_1, levels, window)
-            tracks = _there_and_back(
-                source, target, uv_0.detach(), o, init=hint.start, homewards=None, limit_px=max_round_trip_px
-            )
-        else:
-            begin = hint.start if hint.start is not None else flows[0].at(uv_0.detach())
-            view = _Upright(image_1, flows)
-            target = build_pyramid(view.image, levels, window)
-            begin = view.from_image(begin)
-            tracks = _there_and_back(
-                source, target, uv_0.detach(), o, init=begin, homewards=view.back, limit_px=max_round_trip_px
-            )
-            tracks = view.to_image(tracks)
+        view = None if flows is None else _Upright(image_1, flows)
+        target = build_pyramid(image_1 if view is None else view.image, levels, window)
+        tracks = _there_and_back(
+            source,
+            target,
+            uv_0.detach(),
+            o,
+            init=hint.start if view is None else view.begin(uv_0.detach(), hint.start),
+            homewards=None if view is None else view.back,
+            limit_px=max_round_trip_px,
+        )
+        tracks = tracks if view is None else view.to_image(tracks)
     if torch.is_grad_enabled() and (image_0.requires_grad or image_1.requires_grad or uv_0.requires_grad):
         uv_1 = refine(
             image_0, image_1, uv_0, tracks.uv_1, window=window, normalise=normalise, min_eigenvalue=min_eigenvalue
         )
-        if flows is not None:  # a step through image 1 as it is says nothing of a window that is changed there
-            changed = is_turned(flows[0].linear) | (flows[0].gain != 1)
-            uv_1 = torch.where(changed[:, None, None], tracks.uv_1 + (uv_1 - uv_1.detach()), uv_1)
+        if view is not None:  # a step through image 1 as it is says nothing of a window that is changed there
+            uv_1 = torch.where(view.changed[:, None, None], tracks.uv_1 + (uv_1 - uv_1.detach()), uv_1)
         return tracks.replace(uv_0=uv_0, uv_1=torch.where(tracks.valid[..., None], uv_1, tracks.uv_1))
     return tracks
 
@@ -183,34 +181,29 @@ class _Upright:
 
     def __init__(self, image: Tensor, flows: tuple[Flow, Flow]) -> None:
         self.hw = image.shape[-2], image.shape[-1]
-        self.linear, self.homewards = flows[0].linear, flows[1]
-        changed = is_turned(self.linear) | (flows[0].gain != 1)
+        self.flows, self.linear = flows, flows[0].linear
+        self.turned = is_turned(self.linear)
+        self.changed = self.turned | (flows[0].gain != 1)
         # Under a compiler, which sees no values, everything is undone, if it be nothing.
-        self.turned = is_static(changed) or bool(is_turned(self.linear).any())
-        undo = self.turned or bool(changed.any())
+        undo = is_static(self.changed) or bool(self.changed.any())
         self.image = upright(image, self.linear, flows[0].gain) if undo else image
 
-    def from_image(self, uv: Tensor) -> Tensor:
-        """Pixels of image 1 (B, N, 2) in the upright picture."""
-        return turned(inverse(self.linear), uv, self.hw) if self.turned else uv
+    def begin(self, uv_0: Tensor, known: Tensor | None) -> Tensor:
+        """Where to look in the upright picture for pixels (B, N, 2) of image 0; ``known`` in image 1 goes before."""
+        uv_1 = self.flows[0].at(uv_0) if known is None else known
+        return turned(inverse(self.linear), uv_1, self.hw)
 
     def back(self, uv: Tensor) -> Tensor:
         """Where to look in image 0 for pixels (B, N, 2) of the upright picture."""
-        return self.homewards.at(turned(self.linear, uv, self.hw) if self.turned else uv)
+        return self.flows[1].at(turned(self.linear, uv, self.hw))
 
     def to_image(self, tracks: Tracks) -> Tracks:
         """Tracks to the upright picture as tracks to image 1."""
-        if not self.turned:
-            return tracks
         A = self.linear.to(tracks.cov)[:, None]
         uv_1 = turned(self.linear, tracks.uv_1, self.hw)
         inside = ((uv_1 >= -0.5) & (uv_1 <= uv_1.new_tensor([self.hw[1] - 0.5, self.hw[0] - 0.5]))).all(-1)
-        is_it = is_turned(self.linear)
-        uv_1 = torch.where(is_it[:, None, None], uv_1, tracks.uv_1)
-        half = (A[..., :, :, None] * tracks.cov[..., None, :, :]).sum(-2)
-        cov = (half[..., :, None, :] * A[..., None, :, :]).sum(-1)
-        cov = torch.where(is_it[:, None, None, None], cov, tracks.cov)
-        return tracks.replace(uv_1=uv_1, cov=cov, valid=tracks.valid & (inside | ~is_it[:, None]))
+        cov = torch.where(self.turned[:, None, None, None], product(product(A, tracks.cov), A.mT), tracks.cov)
+        return tracks.replace(uv_1=uv_1, cov=cov, valid=tracks.valid & (inside | ~self.turned[:, None]))
 
 
 def _there_and_back(
