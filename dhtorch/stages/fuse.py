@@ -58,17 +58,10 @@ def inverse_variance(
         raise ValueError("inverse_variance: expected at least one view")
     if V == 1:
         return estimates[0]
-    said = estimates.keep & (estimates.depth > 0) & (estimates.sigma > 0) & estimates.sigma.isfinite()
+    said = _said(estimates)
     inverse, own, shared = _inverse_depth(estimates, said)
-    variance = own * own + shared * shared
-    weight = torch.where(said, 1 / variance, torch.zeros_like(variance))
-    total = weight.sum(0)
-    weight = weight / torch.where(total > 0, total, torch.ones_like(total))
     n = said.sum(0)
-    mean = (weight * inverse).sum(0)
-    mean = torch.where(n > 0, mean, torch.ones_like(mean))
-    chi2 = torch.where(said, (inverse - mean).square() / variance, torch.zeros_like(variance)).sum(0)
-    chi2 = chi2 / (n - 1).clamp_min(1)
+    weight, mean, chi2 = _mean(inverse, own * own + shared * shared, said)
     widening = chi2.clamp_min(1)
     own_2 = correlation * (weight * own).sum(0).square() + (1 - correlation) * (weight * own).square().sum(0)
     shared_2 = (weight * shared).sum(0).square() * widening
@@ -77,25 +70,15 @@ def inverse_variance(
     unsure = torch.zeros_like(n, dtype=torch.bool) if max_sigma_rel is None else sigma > max_sigma_rel * depth
     gate = first_reason((~(chi2 <= max_chi2), Gate.INCONSISTENT), (unsure, Gate.UNCERTAIN))
     gate = torch.where(n < min(max(min_views, 1), V), _last_reason(estimates.gate, said), gate)
-    still = (estimates.gate == Gate.NO_BASELINE).any(-1).sum(0) > max_still * V
-    gate = torch.where(still[:, None], Gate.NO_BASELINE, gate).to(torch.int32)
-    keep = gate == Gate.ANSWER
-    residual_px = torch.where(said, estimates.residual_px, torch.zeros_like(estimates.residual_px))
-    residual_px = _root((weight * residual_px.square()).sum(0)).to(estimates.depth.dtype)
-
-    def answer(x: Tensor) -> Tensor:
-        return torch.where(keep, x, torch.full_like(x, torch.nan)).to(estimates.depth.dtype)
-
-    return Estimate(
-        uv=estimates.uv[-1],
-        depth=answer(depth),
-        sigma=answer(sigma),
-        sigma_shared=answer(depth * depth * _root(shared_2)),
+    return _joint(
+        estimates,
+        _stilled(estimates, gate, max_still),
+        said,
+        weight,
+        depth=depth,
+        sigma=sigma,
+        sigma_shared=depth * depth * _root(shared_2),
         parallax_deg=estimates.parallax_deg.amax(0),
-        residual_px=torch.where(n > 0, residual_px, estimates.residual_px[-1]),
-        n_views=(n + 1).to(torch.int32),
-        score=keep.to(estimates.depth.dtype),
-        gate=gate,
     )
 
 
@@ -144,46 +127,31 @@ def agree(
         raise ValueError("agree: expected at least one view")
     if V == 1:
         return estimates[0]
-    said = estimates.keep & (estimates.depth > 0) & (estimates.sigma > 0) & estimates.sigma.isfinite()
+    said = _said(estimates)
     inverse, own, shared = _inverse_depth(estimates, said)
     variance = own.square() + shared.square()
-    weight = torch.where(said, 1 / variance, torch.zeros_like(variance))
     sureness = torch.where(said, inverse.square() / variance, torch.zeros_like(variance)).detach()  # (depth / sigma)²
     joined = _largest_agreement(inverse.detach(), variance.detach(), sureness, said, max_chi2)
-    mine = torch.where(joined, weight, torch.zeros_like(weight))
-    total, n = mine.sum(0), joined.sum(0)
+    n = joined.sum(0)
     against = torch.where(joined, 0.0, sureness).sum(0) > max_against * torch.where(joined, sureness, 0.0).sum(0)
-    share = mine / torch.where(n > 0, total, torch.ones_like(total))
-    mean = torch.where(n > 0, (share * inverse).sum(0), torch.ones_like(total))
-    chi2 = torch.where(joined, (inverse - mean).square() / variance, torch.zeros_like(variance)).sum(0)
-    widening = (chi2 / (n - 1).clamp_min(1)).clamp_min(1)
-    own_2, shared_2 = ((share * part).sum(0).square() * widening for part in (own, shared))
+    weight, mean, chi2 = _mean(inverse, variance, joined)
+    own_2, shared_2 = ((weight * part).sum(0).square() * chi2.clamp_min(1) for part in (own, shared))
     depth = 1 / mean
     sigma = depth * depth * _root(own_2 + shared_2)
     alone = (n < 2) & (sigma > sure_rel * depth)
     unsure = torch.zeros_like(alone) if max_sigma_rel is None else sigma > max_sigma_rel * depth
     gate = first_reason((against, Gate.INCONSISTENT), (alone, Gate.UNCERTAIN), (unsure, Gate.UNCERTAIN))
     gate = torch.where(n < 1, _last_reason(estimates.gate, said), gate)
-    still = (estimates.gate == Gate.NO_BASELINE).any(-1).sum(0) > max_still * V
-    gate = torch.where(still[:, None], Gate.NO_BASELINE, gate).to(torch.int32)
-    keep = gate == Gate.ANSWER
-    residual_px = torch.where(joined, estimates.residual_px, torch.zeros_like(estimates.residual_px))
-    residual_px = _root((share * residual_px.square()).sum(0)).to(estimates.depth.dtype)
     parallax = torch.where(joined | (n < 1), estimates.parallax_deg, torch.zeros_like(estimates.parallax_deg))
-
-    def answer(x: Tensor) -> Tensor:
-        return torch.where(keep, x, torch.full_like(x, torch.nan)).to(estimates.depth.dtype)
-
-    return Estimate(
-        uv=estimates.uv[-1],
-        depth=answer(depth),
-        sigma=answer(sigma),
-        sigma_shared=answer(depth * depth * _root(shared_2)),
+    return _joint(
+        estimates,
+        _stilled(estimates, gate, max_still),
+        joined,
+        weight,
+        depth=depth,
+        sigma=sigma,
+        sigma_shared=depth * depth * _root(shared_2),
         parallax_deg=parallax.amax(0),
-        residual_px=torch.where(n > 0, residual_px, estimates.residual_px[-1]),
-        n_views=(n + 1).to(torch.int32),
-        score=keep.to(estimates.depth.dtype),
-        gate=gate,
     )
 
 
@@ -194,6 +162,62 @@ def _largest_agreement(inverse: Tensor, variance: Tensor, sureness: Tensor, said
     support = torch.where(agreeing, sureness, torch.zeros_like(sureness)).sum(1)
     first = support.argmax(0)  # the first of equals
     return agreeing.gather(0, first[None, None].expand(1, *agreeing.shape[1:]))[0]
+
+
+def _said(estimates: Estimate) -> Tensor:
+    """(V, B, N) bool: an answer that can be weighed."""
+    return estimates.keep & (estimates.depth > 0) & (estimates.sigma > 0) & estimates.sigma.isfinite()
+
+
+def _mean(inverse: Tensor, variance: Tensor, among: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Of the views ``among`` (V, B, N) that count: their weights, their mean by inverse variance (of none: 1), and what
+    they differ by, in variances per view beyond the first."""
+    weight = torch.where(among, 1 / variance, torch.zeros_like(variance))
+    total, n = weight.sum(0), among.sum(0)
+    weight = weight / torch.where(n > 0, total, torch.ones_like(total))
+    mean = torch.where(n > 0, (weight * inverse).sum(0), torch.ones_like(total))
+    chi2 = torch.where(among, (inverse - mean).square() / variance, torch.zeros_like(variance)).sum(0)
+    return weight, mean, chi2 / (n - 1).clamp_min(1)
+
+
+def _stilled(estimates: Estimate, gate: Tensor, max_still: float) -> Tensor:
+    """The gates (B, N); NO_BASELINE for all points of an anchor whose views mostly have none."""
+    still = (estimates.gate == Gate.NO_BASELINE).any(-1).sum(0) > max_still * len(estimates.gate)
+    return torch.where(still[:, None], Gate.NO_BASELINE, gate).to(torch.int32)
+
+
+def _joint(
+    estimates: Estimate,
+    gate: Tensor,  # (B, N)
+    among: Tensor,  # (V, B, N) bool, the views that count
+    weight: Tensor,  # (V, B, N)
+    *,
+    depth: Tensor,  # (B, N) m
+    sigma: Tensor,
+    sigma_shared: Tensor,
+    parallax_deg: Tensor,
+) -> Estimate:
+    """The answer that the gates let through; its residual is the weighted rms of the views, of none the last view's."""
+    dtype = estimates.depth.dtype
+    keep = gate == Gate.ANSWER
+    n = among.sum(0)
+    residual_px = torch.where(among, estimates.residual_px, torch.zeros_like(estimates.residual_px))
+    residual_px = _root((weight * residual_px.square()).sum(0)).to(dtype)
+
+    def answer(x: Tensor) -> Tensor:
+        return torch.where(keep, x, torch.full_like(x, torch.nan)).to(dtype)
+
+    return Estimate(
+        uv=estimates.uv[-1],
+        depth=answer(depth),
+        sigma=answer(sigma),
+        sigma_shared=answer(sigma_shared),
+        parallax_deg=parallax_deg,
+        residual_px=torch.where(n > 0, residual_px, estimates.residual_px[-1]),
+        n_views=(n + 1).to(torch.int32),
+        score=keep.to(dtype),
+        gate=gate,
+    )
 
 
 def _inverse_depth(estimates: Estimate, said: Tensor) -> tuple[Tensor, Tensor, Tensor]:
