@@ -490,7 +490,7 @@ ELSEWHERE = {
     *(f"dhtorch.evaluate.control.{name}" for name in ("plug_in", "conformal", "scenes_needed", "p_value")),
     *(
         f"dhtorch.evaluate.compare.{name}"
-        for name in ("method_ratios", "against", "ratio_over_seeds", "equal_coverage")
+        for name in ("method_ratios", "against", "completed", "ratio_over_seeds", "equal_coverage")
     ),
     "dhtorch.evaluate.curves.sampled",
     *(f"dhtorch.evaluate.correlation.{name}" for name in ("pearson", "spearman", "ranks")),

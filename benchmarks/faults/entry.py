@@ -137,6 +137,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_shared", "counts.share_memory_()", "counts"),
     ],
     "transform.extend_depth": [
+        ("ExtendDepth._answer", "Estimate.silent(samples, Gate.NO_TRACK", "Estimate.silent(samples, Gate.ANSWER"),
         ("ExtendDepth.__init__", "method if n is None else method.replace(n=n)", "method"),
         ("ExtendDepth.forward", "torch.is_grad_enabled() and get_worker_info() is None", "torch.is_grad_enabled()"),
         (
@@ -167,7 +168,6 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_pose", "ok = fit.ok & paired", "ok = fit.ok"),
         ("_pose", "[[0.0, 0.0, 0.0, 1.0]]", "[[0.0, 0.0, 0.0, 0.0]]"),
         ("_pose", "torch.where(paired, fit.code, torch.zeros_like(fit.code))", "fit.code"),
-        ("_silent", "gate=torch.full_like(samples.flag, Gate.NO_TRACK)", "gate=torch.zeros_like(samples.flag)"),
     ],
     "closure": [
         ("targets", "settings = list(settings.values())", "settings = []"),

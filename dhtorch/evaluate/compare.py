@@ -80,7 +80,7 @@ def method_ratios(
     Raises:
         ValueError: no reference, or methods that differ in scenes or number of seeds.
     """
-    complete = _completed(methods, reference, fallback or {})
+    complete = completed(methods, reference, fallback or {})
     found = Comparison()
     for method, ours in complete.items():
         if method == reference:
@@ -115,14 +115,10 @@ def against(
     """
     equal, _ = ratio_over_seeds(*equal_coverage(ours, theirs), _median_rel)
     full, _ = ratio_over_seeds(ours, theirs, lambda p: risk.measure(p)["aurc_full"], min_answers=0)
-
-    def geometric(ratios: Mapping[str, float]) -> Interval:
-        return bootstrap.interval(list(ratios.values()), statistic="geometric_mean", draws=draws, seed=seed)
-
     numbers = {
-        f"error_ratio_to_{name}": geometric(equal),
-        f"worst_scene_ratio_to_{name}": Interval(max(equal.values(), default=None), None, None, len(equal)),
-        f"aurc_full_ratio_to_{name}": geometric(full),
+        f"error_ratio_to_{name}": _geometric(equal, draws, seed),
+        f"worst_scene_ratio_to_{name}": _worst(equal),
+        f"aurc_full_ratio_to_{name}": _geometric(full, draws, seed),
     }
     rows = {s: {f"error_ratio_to_{name}": equal[s]} if s in equal else {} for s in ours}
     for scene, ratio in full.items():
@@ -169,7 +165,7 @@ def _ratios(
     def geometric(ratios: Mapping[str, float], name: str) -> Interval:
         for scene, row in rows.items():
             row[name] = ratios.get(scene)
-        return bootstrap.interval(list(ratios.values()), statistic="geometric_mean", draws=draws, seed=seed)
+        return _geometric(ratios, draws, seed)
 
     own, unanswered = ratio_over_seeds(ours, theirs, _median_rel)
     left_out += unanswered
@@ -181,7 +177,7 @@ def _ratios(
     return {
         "median_rel_ratio": geometric(own, "median_rel_ratio"),
         "median_rel_ratio_at_equal_coverage": geometric(equal, "median_rel_ratio_at_equal_coverage"),
-        "worst_scene_ratio": Interval(max(equal.values(), default=None), None, None, len(equal)),
+        "worst_scene_ratio": _worst(equal),
         "aurc_ratio": geometric(ranked, "aurc_ratio"),
         "coverage_at_5": bootstrap.interval(reached, statistic="mean", draws=draws, seed=seed),
     }
@@ -224,10 +220,10 @@ def _promises(
     return numbers
 
 
-def _completed(
+def completed(
     methods: Mapping[str, Seeds], reference: str, fallback: Mapping[str, str]
 ) -> dict[str, dict[str, Sequence[Points]]]:
-    """Every method on the reference's scenes, in its order."""
+    """Every method on the reference's scenes, in its order; arguments and errors as :func:`method_ratios`."""
     if reference not in methods:
         raise ValueError(
             f"compare.reference: found {', '.join(methods) or 'no method'}, expected {reference} among them"
@@ -244,6 +240,16 @@ def _completed(
             raise ValueError(f"compare.{method}.{unknown[0]}: found a scene that {reference} does not have")
         complete[method] = {scene: scenes[scene] for scene in methods[reference]}
     return complete
+
+
+def _geometric(ratios: Mapping[str, float], draws: int, seed: int) -> Interval:
+    """Geometric mean over scenes."""
+    return bootstrap.interval(list(ratios.values()), statistic="geometric_mean", draws=draws, seed=seed)
+
+
+def _worst(ratios: Mapping[str, float]) -> Interval:
+    """The largest over scenes."""
+    return Interval(max(ratios.values(), default=None), None, None, len(ratios))
 
 
 def _median_over_seeds(seeds: Sequence[Points], measure: Callable[[Points], float | None]) -> float | None:

@@ -89,17 +89,18 @@ def run(
     apart = {scene.name for scene in scenes_of(scenes) if scene.role is not None}
     found = {name: _by_scene(outcome, name, seeds, apart) for name in (reference, *compared)}
     fallback = stand_ins or {name: compared[0] for name in compared if methods[name].views > 1}
-    judged = compare.method_ratios(found, reference=reference, rooms=rooms, fallback=fallback)
+    complete = compare.completed(found, reference, fallback)
+    judged = compare.method_ratios(complete, reference=reference, rooms=rooms)
     later = {_named(name, k) for name in methods for k in range(1, seeds)}
     outcome.rows = [r for r in outcome.rows if r["method"] not in later]
     outcome.summary = {k: v for k, v in outcome.summary.items() if not any(k.startswith(f"{m}.") for m in later)}
     outcome.summary |= judged.summary
     outcome.summary |= _indoor(judged, rooms, indoor)
     for name in (n for n in compared if methods[n].choose is not None and baseline in compared):
-        ours, theirs = ({**found[fallback[n]], **found[n]} if n in fallback else found[n] for n in (name, baseline))
-        numbers, by_scene = compare.against(ours, theirs, baseline)
+        numbers, by_scene = compare.against(complete[name], complete[baseline], baseline)
         outcome.summary |= {f"{name}.{k}": v.entry("1") for k, v in numbers.items()}
-        outcome.rows = [_with(r, by_scene.get(r["scene"], {})) if _is(r, name) else r for r in outcome.rows]
+        for scene, row in outcome.scenes(name).items():
+            row.update(by_scene[scene])
     _annotate(outcome.rows, judged.rows, f"against_{reference}")
     several = {name for name in compared if methods[name].views > 1}
     return outcome.decide(QUESTION, EXPECTATION, *verdict(judged, compared, several))
@@ -130,14 +131,6 @@ def _indoor(judged: compare.Comparison, rooms: Mapping[str, str], indoor: Sequen
         f"{name}.coverage_at_5_indoor": bootstrap.interval(values, statistic="mean").entry("1")
         for name, values in reached.items()
     }
-
-
-def _is(row: Row, method: str) -> bool:
-    return bool(row["method"] == method and row["pair"] is None)
-
-
-def _with(row: Row, more: Mapping[str, float]) -> Row:
-    return {**row, **more}
 
 
 def _variant(method: Method, seed: int, pairs: Pairs) -> Variant:
