@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -11,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry.filters import gaussian_taps
+from dhtorch.geometry.filters import gaussian_taps, separable
 from dhtorch.records import Camera, Pose
 
 _GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -31,31 +30,10 @@ def to_matrix(T: Pose) -> Tensor:
     return torch.cat((torch.cat((T.R, T.t[..., None]), -1), last), -2)
 
 
-def separable(x: Tensor, down: Sequence[float], across: Sequence[float]) -> Tensor:
-    """``geometry.filters.separable``: sums of shifted copies."""
-    i, k = len(down) // 2, len(across) // 2
-    padded = F.pad(x, (k, k, i, i), mode="replicate")
-    rows = _sum([padded[..., t : t + x.shape[-2], :] for t in range(len(down))], down)
-    return _sum([rows[..., t : t + x.shape[-1]] for t in range(len(across))], across)
-
-
 def gaussian(x: Tensor, sigma_px: float) -> Tensor:
     """``geometry.filters.gaussian``."""
     taps = gaussian_taps(sigma_px)
     return separable(x, taps, taps)
-
-
-def box(x: Tensor, radius: int) -> Tensor:
-    """``geometry.filters.box``."""
-    side = 2 * radius + 1
-    return separable(x, [1 / side] * side, [1 / side] * side)
-
-
-def _sum(parts: Sequence[Tensor], taps: Sequence[float]) -> Tensor:
-    total = parts[0] * taps[0]
-    for part, weight in zip(parts[1:], taps[1:], strict=True):
-        total = total + part * weight
-    return total
 
 
 def to_c2w(quaternion: np.ndarray, t: np.ndarray) -> np.ndarray:

@@ -31,7 +31,7 @@ from torch import Tensor
 
 from dhtorch.data import convert
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry import epipolar, p3p, pyramid, se3
+from dhtorch.geometry import epipolar, filters, p3p, pyramid, se3
 from dhtorch.geometry.lookup import luma
 from dhtorch.records import Camera, Pose
 from dhtorch.stages import holes
@@ -552,7 +552,7 @@ PEERS = (
         "geometry.filters.box",
         "filters.box_blur",
         lambda d, B, N: (picture(d, B, 1, (192, 256)),),
-        lambda x: before.box(x, 1),
+        lambda x: filters.box(x, 1),
         lambda x: kf.box_blur(x, 3, border_type="replicate", separable=True),
         "slower",
         size=(2, 1),
@@ -562,7 +562,7 @@ PEERS = (
         "geometry.filters.separable",
         "filters.filter2d_separable",
         lambda d, B, N: (picture(d, B, 1),),
-        lambda x: before.separable(x, [1.0], _SECOND),
+        lambda x: filters.separable(x, [1.0], _SECOND),
         lambda x: kf.filter2d_separable(x, x.new_tensor([_SECOND]), x.new_tensor([[1.0]]), border_type="replicate"),
         "slower for few taps",
         size=(2, 1),
@@ -572,7 +572,7 @@ PEERS = (
         "studies.focal.sharpness (gradients)",
         "filters.spatial_gradient",
         lambda d, B, N: (picture(d, B, 1),),
-        lambda x: torch.stack((before.separable(x, _SMOOTH, _SLOPE), before.separable(x, _SLOPE, _SMOOTH)), 2),
+        lambda x: torch.stack((filters.separable(x, _SMOOTH, _SLOPE), filters.separable(x, _SLOPE, _SMOOTH)), 2),
         kf.spatial_gradient,
         "as long at best, three times as long where memory is fresh",
         size=(2, 1),

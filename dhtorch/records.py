@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from dhtorch.codes import Gate, PoseCode
@@ -142,6 +143,23 @@ class Estimate(Record):
     def keep(self) -> Tensor:
         """(B, N) bool: answered."""
         return self.gate == Gate.ANSWER
+
+    @classmethod
+    def silent(cls, samples: Samples, gate: int, *, n_views: int) -> Estimate:
+        """No answer for any sample, for one reason."""
+        nan = torch.full_like(samples.depth, torch.nan)
+        zero = torch.zeros_like(samples.depth)
+        return cls(
+            uv=samples.uv,
+            depth=nan,
+            sigma=nan,
+            sigma_shared=nan,
+            parallax_deg=zero,
+            residual_px=zero,
+            n_views=torch.full_like(samples.flag, n_views),
+            score=zero,
+            gate=torch.full_like(samples.flag, gate),
+        )
 
 
 @record

@@ -1,8 +1,8 @@
 """Which other views of an anchor to ask: those that are expected to say most, told by small pictures.
 
-Every candidate answers a few samples as a pair, on pictures of a few thousand pixels. That costs a small part of a
-pair, and what a view is worth there (does the motion leave enough in sight, is it wide enough for a depth, is there a
-pose at all) it is worth in full.
+Every candidate answers a few samples as a pair, on pictures of a few ten thousand pixels. That costs a small part of
+asking it in full, and what a view is worth there (does the motion leave enough in sight, is it wide enough for a depth,
+is there a pose at all) it is worth in full.
 """
 
 from __future__ import annotations

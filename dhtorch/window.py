@@ -59,15 +59,14 @@ def ask_window(
     samples = method.look(anchor)
     ms["samples"] = 1e3 * (time.perf_counter() - began)
     hint = hint if hint.pyramid is not None else hint.replace(pyramid=Pyramids(anchor.image))
-    common: dict[str, Any] = {"seed": seed, "hint": hint, "ms": ms}
     index = torch.arange(len(others.image), device=samples.uv.device)[:, None].expand(-1, len(samples.uv))
     if len(others.image) > method.views:
         began = time.perf_counter()
-        index = _chosen(method, anchor, others, samples, fit=fit, **common)
+        index = _chosen(method, anchor, others, samples, seed=seed, fit=fit, hint=hint)
         ms["choose"] = 1e3 * (time.perf_counter() - began)
         pick = index, torch.arange(index.shape[1], device=index.device)
         others, fit = others[pick], None if fit is None else fit[pick]
-    traces = _ask_views(method, anchor, others, samples, fit=fit, **common)
+    traces = _ask_views(method, anchor, others, samples, seed=seed, fit=fit, hint=hint, ms=ms)
     last, began = traces[-1], time.perf_counter()
     estimate = method.fuse(stack([t["estimate"] for t in traces]))
     estimate = method.score(estimate, samples, last["tracks_ideal"], last["fit"])
@@ -86,7 +85,6 @@ def _chosen(
     seed: int | Tensor,
     fit: PoseFit | None,
     hint: TrackHint,
-    ms: dict[str, float],
 ) -> Tensor:
     """Which of the views are asked: (views, B) indices, as the method chooses them or by a few of the samples."""
     if method.choose is not None:

@@ -15,7 +15,7 @@ from dhtorch.geometry import camera as cam
 from dhtorch.method import Method, networks
 from dhtorch.methods import METHODS
 from dhtorch.pair import merge
-from dhtorch.records import NO_HINT, Estimate, PoseFit, Samples, TrackHint
+from dhtorch.records import NO_HINT, Estimate, PoseFit, TrackHint
 from dhtorch.transform.leaves import SampleError, find, to_tensor
 from dhtorch.transform.problems import SampleProblem, Tally
 from dhtorch.transform.tokens import CHANNELS, FITS, grid, patch_tokens
@@ -143,7 +143,7 @@ class ExtendDepth(torch.nn.Module):
             estimate = estimate.replace(gate=torch.where(paired[:, None], estimate.gate, Gate.NO_TRACK))
         else:
             samples = self.method.look(frame)
-            estimate, fit = _silent(samples), None
+            estimate, fit = Estimate.silent(samples, Gate.NO_TRACK, n_views=0), None
         found = merge(samples, estimate)
         tokens, known = patch_tokens(
             found, samples.hole, frame.hw, patch=self.patch, tokens_hw=self.tokens_hw, fit=self.fit
@@ -215,20 +215,3 @@ def _pose(fit: PoseFit | None, paired: Tensor, like: Tensor) -> dict[str, Tensor
     cov = torch.where(ok[:, None, None], fit.cov, 0.0)
     code = torch.where(paired, fit.code, torch.zeros_like(fit.code))
     return {"T_1_from_0": T, "pose_cov": cov, "pose_ok": ok, "pose_code": code}
-
-
-def _silent(samples: Samples) -> Estimate:
-    """No answer anywhere: there is no view to track into."""
-    nan = torch.full_like(samples.depth, torch.nan)
-    zero = torch.zeros_like(samples.depth)
-    return Estimate(
-        uv=samples.uv,
-        depth=nan,
-        sigma=nan,
-        sigma_shared=nan,
-        parallax_deg=zero,
-        residual_px=zero,
-        n_views=torch.zeros_like(samples.flag),
-        score=zero,
-        gate=torch.full_like(samples.flag, Gate.NO_TRACK),
-    )
