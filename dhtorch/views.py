@@ -41,7 +41,6 @@ def by_probes(
     others: Frame,  # (V, B)
     views: int,
     *,
-    seed: int | Tensor = 0,
     fit: PoseFit | None = None,  # (V, B)
     long: int = LONG,
     good_sigma_rel: float = 0.1,
@@ -52,7 +51,6 @@ def by_probes(
         anchor: B views.
         others: V candidates of each.
         views: how many to choose.
-        seed: of the probes' pose search.
         fit: known poses of the candidates; their search is then skipped.
         long: longest side of the small pictures, px; smaller images stay as they are.
         good_sigma_rel: see :func:`key_views`.
@@ -70,8 +68,7 @@ def by_probes(
         flat = others.map(lambda x: x.flatten(0, 1))
         several = anchor.map(lambda x: x.expand(V, *x.shape).flatten(0, 1))
         known = None if fit is None else fit.map(lambda x: x.flatten(0, 1))
-        seeds = seed if isinstance(seed, int) else seed.repeat(V)
-        estimate = ask_pair(PROBE, several, shrunk(flat, long)[0], seed=seeds, fit=known)
+        estimate = ask_pair(PROBE, several, shrunk(flat, long)[0], fit=known)
         estimate = estimate.map(lambda x: x.unflatten(0, (V, B)))
         return key_views(estimate.replace(sigma=estimate.sigma / k), views, good_sigma_rel=good_sigma_rel)
 

@@ -88,7 +88,7 @@ def _chosen(
 ) -> Tensor:
     """Which of the views are asked: (views, B) indices, as the method chooses them or by a few of the samples."""
     if method.choose is not None:
-        return method.choose(anchor, others, method.views, seed=seed, fit=fit)
+        return method.choose(anchor, others, method.views, fit=fit)
     thin = samples[:, :: max(1, method.n // PROBES)]
     probes = _ask_views(method, anchor, others, thin, seed=seed, fit=fit, hint=hint, ms={})
     return key_views(stack([t["estimate"] for t in probes]), method.views)

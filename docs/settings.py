@@ -23,6 +23,7 @@ from typing import Any
 
 import torch
 
+from dhtorch import first_release
 from dhtorch.method import Method
 from dhtorch.methods import METHODS
 from dhtorch.studies.baselines import opencv
@@ -33,7 +34,13 @@ FOLDER = Path(__file__).resolve().parent.parent / "conf" / "method"
 AT_RUN_TIME = {"hint", "device", "dtype", "seed", "fit", "linear"}
 
 #: File name → method, and what its file says first.
-WRITTEN: dict[str, Method] = {**METHODS, "opencv": opencv.OPENCV, "paper_dlt": opencv.PAPER_DLT}
+WRITTEN: dict[str, Method] = {
+    **METHODS,
+    "map_1": first_release.MAP_1,
+    "window_1": first_release.WINDOW_1,
+    "opencv": opencv.OPENCV,
+    "paper_dlt": opencv.PAPER_DLT,
+}
 
 WIDTH = 120
 
@@ -86,7 +93,7 @@ def _scalar(value: Any) -> str:
 
 def _said(name: str) -> list[str]:
     """The comment above a method's name in its module."""
-    for module in (sys.modules["dhtorch.methods"], opencv):
+    for module in (sys.modules["dhtorch.methods"], first_release, opencv):
         source = inspect.getsource(module)
         if found := re.search(rf"((?:^#: .*\n)+)^{name.upper()} = ", source, re.M):
             return [line.removeprefix("#: ").replace("``", "`") for line in found[1].splitlines()]
