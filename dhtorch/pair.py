@@ -37,27 +37,57 @@ def ask_pair(
     check("extend", image_0=(frame_0.image, "B C H W"), f_0=(frame_0.camera.f, "B 2"), t=(frame_1.camera.f, "B 2"))
     check("extend", image_0=(frame_0.image, "B C H W"), image_1=(frame_1.image, "B c h w"))
     frame_0, frame_1 = lifted(frame_0), lifted(frame_1)
-    clock = _Clock(trace)
+    clock = Clock(trace)
     like = frame_0.camera.f
     uv = clock("sample", method.sample(frame_0.hw, method.n, device=like.device, dtype=like.dtype))
     samples = clock("backproject", method.backproject(frame_0, uv))
     samples = clock("classify", method.classify(frame_0, samples))
-    tracks = clock("track", _tracked(method, frame_0.image, frame_1.image, samples.uv, hint))
+    tracks = clock("track", tracked(method, frame_0.image, frame_1.image, samples.uv, hint))
+    cameras = frame_0.camera, frame_1.camera
+    estimate, usable, fit = under_pose(method, samples, tracks, *cameras, seed=seed, fit=fit, clock=clock)
+    estimate = clock("score", method.score(estimate, samples, usable, fit))
+    if trace is not None:
+        trace.update(samples=samples, tracks=tracks, tracks_ideal=usable, fit=fit, estimate=estimate)
+    return estimate
+
+
+def tracked(method: Method, image_0: Tensor, image_1: Tensor, uv: Tensor, hint: TrackHint) -> Tracks:
+    """Seat 4, so many pairs at a time that memory stays bounded."""
+
+    def some(image_0: Tensor, image_1: Tensor, uv: Tensor, hint: TrackHint) -> Tracks:
+        return method.track(image_0, image_1, uv, hint=hint)
+
+    return in_pieces(some, PAIRS, image_0, image_1, uv, hint)
+
+
+def under_pose(
+    method: Method,
+    samples: Samples,
+    tracks: Tracks,
+    camera_0: Camera,
+    camera_1: Camera,
+    *,
+    seed: int | Tensor,
+    fit: PoseFit | None,
+    clock: Clock,
+) -> tuple[Estimate, Tracks, PoseFit]:
+    """Seats 5 and 6: what tracks say under the pose that they give, or under a known one.
+
+    Returns:
+        The estimate, the tracks in ideal pixels with those that have no texture no longer valid, and the pose.
+    """
     textured = samples.trackability >= method.min_trackability
     usable = tracks.replace(valid=tracks.valid & textured)
-    usable = undistort_tracks(usable, frame_0.camera, frame_1.camera)
-    camera_0, camera_1 = cam.ideal(frame_0.camera), cam.ideal(frame_1.camera)
+    usable = undistort_tracks(usable, camera_0, camera_1)
+    camera_0, camera_1 = cam.ideal(camera_0), cam.ideal(camera_1)
     if fit is None:
-        draws = uniform_draws(seed, like.shape[0], method.hypotheses).to(like)
+        draws = uniform_draws(seed, camera_0.f.shape[0], method.hypotheses).to(camera_0.f)
         fit = method.pose(samples, usable, camera_0, camera_1, draws)
     clock("pose", fit)
     estimate = clock("triangulate", method.triangulate(samples, usable, fit, camera_0, camera_1))
     untextured = (estimate.gate == Gate.NO_TRACK) & tracks.valid & ~textured
     gate = torch.where(untextured, torch.full_like(estimate.gate, Gate.NO_TEXTURE), estimate.gate)
-    estimate = clock("score", method.score(estimate.replace(gate=gate), samples, usable, fit))
-    if trace is not None:
-        trace.update(samples=samples, tracks=tracks, tracks_ideal=usable, fit=fit, estimate=estimate)
-    return estimate
+    return estimate.replace(gate=gate), usable, fit
 
 
 def merge(samples: Samples, estimate: Estimate) -> Map:
@@ -117,13 +147,6 @@ def undistort_tracks(tracks: Tracks, camera_0: Camera, camera_1: Camera) -> Trac
     return tracks.replace(uv_0=uv_0, uv_1=uv_1, cov=cov, valid=tracks.valid & fine)
 
 
-def _tracked(method: Method, image_0: Tensor, image_1: Tensor, uv: Tensor, hint: TrackHint) -> Tracks:
-    def some(image_0: Tensor, image_1: Tensor, uv: Tensor, hint: TrackHint) -> Tracks:
-        return method.track(image_0, image_1, uv, hint=hint)
-
-    return in_pieces(some, PAIRS, image_0, image_1, uv, hint)
-
-
 def uniform_draws(seed: int | Tensor, batch: int, hypotheses: int) -> Tensor:
     """Random numbers for the pose search: (batch, hypotheses, 3) uniform in [0, 1), float64, on the CPU.
 
@@ -156,7 +179,7 @@ def _(seed: Tensor, hypotheses: int) -> Tensor:
     return torch.empty(len(seed), hypotheses, 3, dtype=torch.float64)
 
 
-class _Clock:
+class Clock:
     """Writes the milliseconds of each stage into a trace; does nothing without one."""
 
     def __init__(self, trace: Trace | None) -> None:

@@ -27,11 +27,13 @@ from dhtorch.stages.triangulate import two_view
 #: Longest side of the pictures on which candidates are asked, px.
 LONG = 240
 
-#: How a candidate is asked: everything that has a sigma counts, and how much is what the sigma says.
+#: How a candidate is asked: everything that has a sigma counts, and how much is what the sigma says. Few samples, few
+#: hypotheses and few steps: what is asked is which view is better, not where its points are.
 PROBE = Method(
-    n=128,
+    n=96,
+    hypotheses=64,
     track=partial(lucas_kanade, levels=4, window=15, normalise="bias"),
-    pose=map_pose,
+    pose=partial(map_pose, turn_sigma=0.0, near_steps=2, steps=3),
     triangulate=partial(two_view, min_parallax_deg=None, min_t_snr=1.0, fitted_noise=True, sensor_share=1.0),
 )
 

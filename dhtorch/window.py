@@ -11,18 +11,17 @@ pair can see, contradicts them.
 from __future__ import annotations
 
 import time
-from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
 
+from dhtorch import tree
 from dhtorch.geometry.pyramid import Pyramids
 from dhtorch.geometry.shapes import check
 from dhtorch.method import Method, Trace
-from dhtorch.pair import ask_pair, lifted
+from dhtorch.pair import Clock, lifted, tracked, under_pose
 from dhtorch.records import NO_HINT, Estimate, Frame, PoseFit, Samples, TrackHint, Tracks
-from dhtorch.tree import stack
+from dhtorch.tree import R, stack
 from dhtorch.views import key_views
 
 #: Samples, about, by which key views are chosen.
@@ -42,6 +41,7 @@ def ask_window(
     """The method's answer for B anchors with V × B other views; what ``method(anchor, others)`` calls.
 
     Every view is a pair with the anchor: tracked from it, with a pose and a depth of its own. The depths are fused.
+    Views are tracked into one after the other, then all poses are solved together.
     The first three seats see the anchor once; ``score`` sees the fused estimate, with tracks and pose of the last
     view. Of more than ``method.views`` the best are chosen, by ``method.choose`` or by a few of the samples
     (:func:`dhtorch.views.key_views`).
@@ -106,27 +106,37 @@ def _ask_views(
     ms: dict[str, float],
 ) -> list[Trace]:
     """The anchor's samples in each of the views, as a pair."""
-    front: dict[str, Any] = {"sample": partial(_given, samples.uv), "backproject": partial(_given, samples)}
-    one = method.replace(**front, classify=partial(_given, samples), score=_no_score, n=samples.uv.shape[1])
-    traces: list[Trace] = []
-    for k in range(len(others.image)):
-        if method.chain and traces:
-            hint = hint.replace(start=_further(traces[-1]["tracks"], (k + 1) / k))
-        traces.append({"ms": ms})
-        own = None if fit is None else fit[k]
-        ask_pair(one, anchor, others[k], seed=seed, fit=own, hint=hint, trace=traces[-1])
-    return traces
+    clock = Clock({"ms": ms})
+    seen: list[Tracks] = []
+    for k, image in enumerate(others.image):
+        if method.chain and seen:
+            hint = hint.replace(start=_further(seen[-1], (k + 1) / k))
+        seen.append(clock("track", tracked(method, anchor.image, image, samples.uv, hint)))
+    V, B = others.image.shape[:2]
+    answers = under_pose(
+        method,
+        _repeated(samples, V),
+        tree.collate(seen),
+        _repeated(anchor.camera, V),
+        others.camera.map(lambda x: x.flatten(0, 1)),
+        seed=seed if isinstance(seed, int) else seed.repeat(V),
+        fit=None if fit is None else fit.map(lambda x: x.flatten(0, 1)),
+        clock=clock,
+    )
+    names = "estimate", "tracks_ideal", "fit"
+    by_view = dict(zip(names, (x.map(lambda y: y.unflatten(0, (V, B))) for x in answers), strict=True))
+    return [
+        {"ms": ms, "samples": samples, "tracks": seen[k], **{name: x[k] for name, x in by_view.items()}}
+        for k in range(V)
+    ]
+
+
+def _repeated(record: R, V: int) -> R:
+    """The anchor's (B, …), once for every view: (V B, …)."""
+    return record.map(lambda x: x.expand(V, *x.shape).flatten(0, 1))
 
 
 def _further(tracks: Tracks, pace: float) -> Tensor:
     """Where a search may start that has come ``pace`` times as far as the last one."""
     uv_0, uv_1 = tracks.uv_0.detach(), tracks.uv_1.detach()
     return torch.where(tracks.valid[..., None], uv_0 + (uv_1 - uv_0) * pace, uv_0)
-
-
-def _given(value: Any, *_args: Any, **_options: Any) -> Any:
-    return value
-
-
-def _no_score(estimate: Estimate, *_args: Any) -> Estimate:
-    return estimate

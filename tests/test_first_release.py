@@ -42,9 +42,9 @@ def test_an_option_that_follows_a_default_would_be_seen():
 
 @pytest.mark.parametrize(("first", "today", "views"), [(MAP_1, MAP, 1), (WINDOW_1, WINDOW, 3)])
 def test_today_s_method_of_that_name_answers_bit_for_bit_as_it_did(first, today, views):
-    room = SyntheticRoom(n_frames=7, hw=(96, 128))
+    room = SyntheticRoom(n_frames=7, hw=(240, 320))
     others = [room[2 * k + 2] for k in range(views)]
-    a, b = (m(room[0], others if views > 1 else others[0], n=256) for m in (first, today))
+    a, b = (m(room[0], others if views > 1 else others[0], n=512) for m in (first, today))
     assert int(a.keep.sum()) > 20
     for field in ("depth", "sigma", "score", "gate"):
         assert torch.equal(getattr(a, field).nan_to_num(-math.pi), getattr(b, field).nan_to_num(-math.pi)), field

@@ -37,7 +37,7 @@ from dhtorch.tree import in_pieces
 PAIRS = 16
 
 #: Pairs whose near and far tracks are solved together: a track has ten columns there.
-MAP_PAIRS = 8
+MAP_PAIRS = 16
 
 #: Points the search looks at; a pair with more is thinned evenly. The last steps see all points.
 SEARCH_POINTS = 256

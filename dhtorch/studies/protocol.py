@@ -447,7 +447,8 @@ class _Collected:
 def _load(
     recording: Recording, pairs: list[tuple[int, int]], protocol: Protocol, settings: Settings
 ) -> DataLoader[Loaded]:
-    wanted = max(v.method.views for v in protocol.variants.values() if v.offers is None or v.method.views == 1)
+    fixed = (v.method.views for v in protocol.variants.values() if v.offers is None)
+    wanted = max(fixed, default=1)
     views = min([wanted, *(j - i for i, j in pairs)])  # a short gap holds fewer frames
     return DataLoader(
         PairData(recording, pairs, settings.dtype, views, protocol.offers),
