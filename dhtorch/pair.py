@@ -187,6 +187,7 @@ class Clock:
         self.last = time.perf_counter() if trace is not None else 0.0
 
     def __call__(self, name: str, value: Any) -> Any:
+        """The value, with the time since the last one put down to that name."""
         if self.ms is not None:
             now = time.perf_counter()
             self.ms[name] = self.ms.get(name, 0.0) + 1e3 * (now - self.last)
