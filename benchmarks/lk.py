@@ -71,7 +71,8 @@ def forward(image_0: Tensor, image_1: Tensor, uv: Tensor, window: int, pyramid_0
         x = uv.permute(2, 0, 1).reshape(2, B * N).contiguous()
         batch = torch.arange(B).repeat_interleave(N)
         known = lk.within(x, *source.bounds())
-        d, found, _ = lk.search(source, target, o, x, torch.zeros_like(x), batch, known=known, alike=True)
+        every = {"known": known, "begun": known, "near_levels": len(source.levels), "alike": True}
+        d, found, _ = lk.search(source, target, o, x, torch.zeros_like(x), batch, **every)
     return (x + d).reshape(2, B, N).permute(1, 2, 0), found.reshape(B, N)
 
 

@@ -401,7 +401,9 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("refine", "usable & textured", "usable", "the inverse is zero without texture: no step"),
         ("refine", "start = _finite(x_1)", "start = x_1"),
         ("_there_and_back", "row(init) - x", "row(init)"),
-        ("_there_and_back", "lk.search(target, source, o,", "lk.search(source, target, o,"),
+        ("_there_and_back", "search(target, source, x=x", "search(source, target, x=x"),
+        ("_reaching", "REACH * cell_px / window", "0.1 * REACH * cell_px / window"),
+        ("lucas_kanade", "levels if flows is None else", "1 if flows is None else"),
         ("_there_and_back", "begin = -d", "begin = d"),
         ("_there_and_back", "begin = -d", "begin = -forward"),
         (

@@ -100,9 +100,12 @@ def search(
     batch: Tensor,  # (M,)
     *,
     known: Tensor,  # (M,) bool, the others are not searched for
+    begun: Tensor,  # (M,) bool
+    near_levels: int,
     alike: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Coarse to fine from ``d``. ``alike``: all ``d`` are equal, so that the points of a cell may share a search.
+    ``begun``: points whose ``d`` is as near as the finest ``near_levels`` levels reach; they skip the coarser ones.
 
     Returns the displacement (2, M), whether it was found (M,), and A (3, M) of the finest level.
     """
@@ -110,23 +113,25 @@ def search(
     top = min(len(source.levels), len(target.levels)) - 1
     rough = o._replace(epsilon_px=o.epsilon_px * COARSE_EPSILON)
 
-    def start(level: int, x: Tensor, d: Tensor, batch: Tensor) -> Tensor:
+    def start(level: int, x: Tensor, d: Tensor, batch: Tensor, begun: Tensor | None = None) -> Tensor:
         """Where the search on ``level`` starts: the displacement found on the level above."""
         if level == top:
             return d * 0.5**top
+        if begun is not None and level + 1 >= near_levels:
+            return for_some(~begun, lambda *cold: (start(level, *cold),), (d * 0.5**level,), (x, d, batch))[0]
         if alike and level + 1 >= CELL_LEVEL:
-            return _by_cell(source, level + 1, partial(coarse, level + 1), x, d, batch) * 2
-        return coarse(level + 1, x, d, batch) * 2
+            return _by_cell(source, level + 1, partial(coarse, level + 1, begun=None), x, d, batch) * 2
+        return coarse(level + 1, x, d, batch, begun) * 2
 
-    def coarse(level: int, x: Tensor, d: Tensor, batch: Tensor) -> Tensor:
+    def coarse(level: int, x: Tensor, d: Tensor, batch: Tensor, begun: Tensor | None) -> Tensor:
         pair = _Pair(source, target, rough, level, *target.bounds(level))
-        radii = TOP if level == top else BETWEEN
+        radii = TOP if level == top or level + 1 == near_levels else BETWEEN
         pixel = source.corner(level, x * 0.5**level + 0.5)  # read between pixels only where it decides the answer
         every = torch.ones_like(batch, dtype=torch.bool)
-        return _descend(pair, radii, pixel, start(level, x, d, batch), batch, every)[0]
+        return _descend(pair, radii, pixel, start(level, x, d, batch, begun), batch, every)[0]
 
     pair = _Pair(source, target, o, 0, *target.bounds(0))
-    d, held, textured, A = _descend(pair, FINEST if top else TOP, x, start(0, x, d, batch), batch, known)
+    d, held, textured, A = _descend(pair, FINEST if top else TOP, x, start(0, x, d, batch, begun), batch, known)
     return d, known & textured & held & within(x + d, pair.low, pair.high), A
 
 

@@ -6,7 +6,9 @@ row, ``x`` (2, M) in image 0 and ``d`` their displacement to image 1.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from functools import partial
 
 import torch
 import torch.nn.functional as F
@@ -20,6 +22,10 @@ from dhtorch.geometry.shapes import check, is_static
 from dhtorch.geometry.small import product
 from dhtorch.geometry.start import Flow, inverse, is_turned, turned, upright
 from dhtorch.records import NO_HINT, TrackHint, Tracks
+
+#: A search from a coarse flow begins on the first level (the second at least) whose windows are so many times as wide
+#: as the flow's cells are apart there: four small pixels, of which a cell is about five.
+REACH = 0.8
 
 #: Smallest eigenvalue of A per pixel of the window below which it is not tracked: 1e-4 of cv2, which sums gradients
 #: of 8-bit images scaled by 2^-5.
@@ -115,6 +121,7 @@ def lucas_kanade(
             o,
             init=hint.start if view is None else view.begin(uv_0.detach(), hint.start),
             homewards=None if view is None else view.back,
+            near_levels=levels if flows is None else _reaching(flows[0], source.hw(), window),
             limit_px=max_round_trip_px,
         )
         tracks = tracks if view is None else view.to_image(tracks)
@@ -214,6 +221,7 @@ def _there_and_back(
     *,
     init: Tensor | None,
     homewards: Callable[[Tensor], Tensor] | None,
+    near_levels: int,
     limit_px: float,
 ) -> Tracks:
     """Tracks of all points, laid out in one row (2, M), filled up to whole ``LANES`` by points outside the image."""
@@ -229,24 +237,26 @@ def _there_and_back(
 
     x = row(uv_0)
     d = torch.zeros_like(x) if init is None else row(init) - x
-    d = torch.where(d.isfinite().all(0), d, torch.zeros_like(d))
+    given = d.isfinite().all(0)
+    d = torch.where(given, d, torch.zeros_like(d))
     known = lk.within(x, *source.bounds(0))
     elsewhere = _finite(x) + d
     x = torch.where(known, x, torch.zeros_like(x))
     batch = F.pad(torch.arange(B, device=x.device).repeat_interleave(N), (0, fill))
 
-    alike = init is None
+    search = partial(lk.search, o=o, alike=init is None, near_levels=near_levels)
 
-    def back(x: Tensor, d: Tensor, batch: Tensor, known: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        return lk.search(target, source, o, x, d, batch, known=known, alike=alike)
+    def back(x: Tensor, d: Tensor, batch: Tensor, known: Tensor, begun: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return search(target, source, x=x, d=d, batch=batch, known=known, begun=begun)
 
-    forward, found, A = lk.search(source, target, o, x, d, batch, known=known, alike=alike)
+    forward, found, A = search(source, target, x=x, d=d, batch=batch, known=known, begun=given)
     begin = -d
     if homewards is not None:
         begin = row(homewards(grid(x + forward))) - (x + forward)
-        begin = torch.where(begin.isfinite().all(0), begin, torch.zeros_like(begin))
+        given = begin.isfinite().all(0)
+        begin = torch.where(given, begin, torch.zeros_like(begin))
     nothing = torch.zeros_like(d), torch.zeros_like(found), torch.zeros_like(A)
-    backward, returned, _ = lk.for_some(found, back, nothing, (x + forward, begin, batch, found))
+    backward, returned, _ = lk.for_some(found, back, nothing, (x + forward, begin, batch, found, given))
     error = (forward + backward).square().sum(0).sqrt()
     squares = lk.squares(source, target, o, x, forward, batch)
     return Tracks(
@@ -257,6 +267,13 @@ def _there_and_back(
         cov=grid(lk.window_covariance(A, squares / (o.window**2 - 2))),
         valid=grid(found & returned & (error < limit_px)),
     )
+
+
+def _reaching(flow: Flow, hw: tuple[int, int], window: int) -> int:
+    """How many levels a search needs that starts where a coarse flow says: until a window reaches as far as that may
+    be wrong."""
+    cell_px = max(n / cells for n, cells in zip(hw, flow.support.shape[1:], strict=True))
+    return max(2, 1 + math.ceil(math.log2(REACH * cell_px / window)))
 
 
 def _finite(x: Tensor) -> Tensor:
