@@ -29,11 +29,13 @@ VIEWER, _YAW = hand_held("static", 1, step_m=0.0, rate_hz=1.0, seed=0), 12.0
 HELD_AT: Triple = (0.02, 0.05, 0.52)
 
 #: Middle of the turntable, in the viewer's axes, and degrees a frame.
-TURNTABLE_AT: Triple = (0.0, 0.02, 0.95)
+TURNTABLE_AT: Triple = (0.0, 0.02, 1.07)
 TURN_DEG = 2.0
 
 
-def _body(at: Triple, size: Triple, picture: str, *, tile: float | None = None, yaw: float = 0, pitch: float = 0) -> Solid:
+def _body(
+    at: Triple, size: Triple, picture: str, *, tile: float | None = None, yaw: float = 0, pitch: float = 0
+) -> Solid:
     """A box whose middle is ``at`` in the viewer's axes, turned against him; ``size`` is (across, up, deep)."""
     x, y, z = se3.apply(VIEWER, torch.tensor([[at]], dtype=torch.float64))[0, 0].tolist()
     surface = Surface(picture, tile=tile, kind=MOVING)
@@ -41,13 +43,13 @@ def _body(at: Triple, size: Triple, picture: str, *, tile: float | None = None, 
 
 
 def _parcels() -> list[Solid]:
-    """A stack of parcels, 0.7 to 1.2 m before the viewer."""
+    """A stack of parcels, 0.8 to 1.2 m before the viewer."""
     return [
-        _body((0.05, 0.05, 0.98), (0.44, 0.34, 0.24), "poster:0", yaw=24),
-        _body((-0.20, 0.10, 0.84), (0.22, 0.24, 0.18), "print", tile=0.5, yaw=-18),
-        _body((0.20, 0.17, 0.82), (0.20, 0.14, 0.16), "poster:2", yaw=8),
-        _body((0.02, -0.19, 0.96), (0.26, 0.16, 0.16), "poster:1", yaw=-12),
-        _body((0.0, 0.27, 0.94), (0.62, 0.05, 0.36), "carpet", yaw=4),
+        _body((0.05, 0.05, 1.11), (0.42, 0.32, 0.22), "poster:0", yaw=24),
+        _body((-0.19, 0.10, 0.97), (0.21, 0.23, 0.18), "print", tile=0.5, yaw=-18),
+        _body((0.20, 0.16, 0.95), (0.20, 0.14, 0.16), "poster:2", yaw=8),
+        _body((0.02, -0.18, 1.09), (0.25, 0.15, 0.16), "poster:1", yaw=-12),
+        _body((0.0, 0.25, 1.07), (0.58, 0.05, 0.34), "carpet", yaw=4),
     ]
 
 

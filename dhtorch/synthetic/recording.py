@@ -179,9 +179,7 @@ class SyntheticRoom(TruthRecording):
     def _picture(self, i: int) -> Tensor:
         return self._photograph(i, self.camera, self.true_poses[i : i + 1], self.hw)
 
-    def _photograph(
-        self, i: int, camera: Camera, pose: Pose, hw: tuple[int, int], *, exposure: float = 1.0
-    ) -> Tensor:
+    def _photograph(self, i: int, camera: Camera, pose: Pose, hw: tuple[int, int], *, exposure: float = 1.0) -> Tensor:
         return _photograph(self.world(i), camera, pose, hw, supersample=self.supersample, exposure=exposure)
 
     def _generator(self, i: int, stream: str) -> Generator:

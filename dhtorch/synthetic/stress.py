@@ -154,8 +154,12 @@ class StressRoom(SyntheticRoom):
         pose, f = self.true_poses[i : i + 1], float(self.camera.f[0, 0])
         total = torch.zeros(1, 3, *self.hw)
         for k in range(n):
-            at = (k / (n - 1) - 0.5) / f  # a camera that looks farther to the left and up shifts the picture right, down
-            turn = torch.tensor([rotation(-math.degrees(right * at), math.degrees(down * at), 0.0)], dtype=torch.float64)
+            at = (
+                k / (n - 1) - 0.5
+            ) / f  # a camera that looks farther to the left and up shifts the picture right, down
+            turn = torch.tensor(
+                [rotation(-math.degrees(right * at), math.degrees(down * at), 0.0)], dtype=torch.float64
+            )
             total = total + self._photograph(i, self.camera, Pose(pose.R @ turn, pose.t), self.hw)
         return total / n
 
@@ -336,10 +340,10 @@ STRESSES: dict[str, Stress] = {
     "rolling_shutter": Stress({"path": "walk"}),
     "moved": Stress({"path": "walk"}, _elsewhere),
     "mistracks": Stress({"path": "walk"}),
-    "convoy": Stress({"path": "walk"}, moving=Moving("parcels", along, 1.25)),
-    "convoy_slow": Stress({"path": "walk"}, moving=Moving("parcels", partial(along, share=0.5), 1.25)),
+    "convoy": Stress({"path": "walk"}, moving=Moving("parcels", along, 1.3)),
+    "convoy_slow": Stress({"path": "walk"}, moving=Moving("parcels", partial(along, share=0.5), 1.3)),
     "held_object": Stress({"path": "walk"}, moving=Moving("held", in_hand, 2.0)),
-    "turntable": Stress({"path": "static"}, moving=Moving("parcels", on_turntable, 1.25)),
+    "turntable": Stress({"path": "static"}, moving=Moving("parcels", on_turntable, 1.3)),
     "fast": Stress({"path": "lateral"}),
     "exposure_jump": Stress({"path": "walk"}),
     "motion_blur": Stress({"path": "walk"}),
