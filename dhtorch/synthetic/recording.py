@@ -12,7 +12,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from random import Random
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Generator, Tensor
@@ -61,7 +61,7 @@ class SyntheticRoom(TruthRecording):
     """
 
     surfaces = SURFACES
-    odd_surfaces = ("mirror", "window")
+    odd_surfaces: ClassVar[tuple[str, ...]] = ("mirror", "window")
 
     def __init__(
         self,

@@ -208,7 +208,8 @@ class _Lightmap:
         power = ambient * _ambient(solids, p, normal)
         for light in lights:
             power = power + _direct(solids, light, p, normal)
-        self.values = power.sqrt() if known is None else torch.cat((known.values, power.sqrt()))  # (L, 3)
+        values = power.sqrt()
+        self.values: Tensor = values if known is None else torch.cat((known.values, values))  # (L, 3)
 
     def sample(self, face: Tensor, across: Tensor, down: Tensor) -> Tensor:
         """(P, 3) at places in [-1, 1] of faces."""

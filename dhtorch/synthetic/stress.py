@@ -46,7 +46,7 @@ PAN_DEG = (-6.0, 1.2)
 #: ``exposure_jump``: grey values are two to a power between these times as bright or dark, then clipped.
 STOPS = (0.5, 1.0)
 
-#: ``motion_blur``: the camera turns while it exposes, each frame in a direction of its own, by so many px at 640 columns.
+#: ``motion_blur``: the camera turns while it exposes, in each frame another way, by so many px at 640 columns.
 SMEAR_PX = (5.0, 15.0)
 
 #: Where samples will be taken: ``(hw, n) -> uv (n, 2)``.
@@ -95,7 +95,7 @@ class StressRoom(SyntheticRoom):
         super().__init__(**options)
         self.stress, self.places, self.n_places = stress, places, n_places
         moving = STRESSES[stress].moving
-        #: T_world_from_home (n_frames) of the body that moves, see :mod:`dhtorch.synthetic.guests`; None = nothing does.
+        #: T_world_from_home (n_frames) of the body that moves, if one does: see :mod:`dhtorch.synthetic.guests`.
         self.body_poses = None if moving is None else moving.motion(self.true_poses)
         self.near, self.gap = near, gap
         if self.bands:

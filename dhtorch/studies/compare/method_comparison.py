@@ -14,9 +14,9 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
+from dhtorch import tree
 from dhtorch.data.pairs import around
 from dhtorch.data.scene import Given, Scene, scenes_of
-from dhtorch import tree
 from dhtorch.evaluate import bootstrap, compare, errors
 from dhtorch.studies import protocol
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
