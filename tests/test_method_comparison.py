@@ -4,16 +4,18 @@ from dataclasses import replace
 from functools import partial
 
 import pytest
+import torch
 from hydra import compose as compose_settings
 from hydra import initialize_config_dir
 from hydra.utils import instantiate
 
 from dhtorch.commands.run import config_dir
 from dhtorch.data.pairs import by_gap
-from dhtorch.evaluate import compare
+from dhtorch.evaluate import compare, errors
 from dhtorch.studies.compare import method_comparison
 from dhtorch.studies.protocol import Settings
 from dhtorch.synthetic.recording import open_rooms
+from dhtorch.synthetic.stress import STRESSES
 
 
 def method(name="paper"):
@@ -26,7 +28,8 @@ def outcome():
     rooms = open_rooms(("walk", "lateral", "rotation"), n_frames=4, hw=(192, 256), gap=3, lidar="exact")
     methods = {"paper": method(), "strict": method().replace(triangulate={"max_residual_px": 0.5})}
     methods["opencv"] = method("opencv")
-    return method_comparison.run(rooms, {}, by_gap, Settings(), methods=methods, seeds=2)
+    moving = ["synthetic_lateral", "synthetic_rotation", "elsewhere"]
+    return method_comparison.run(rooms, {}, by_gap, Settings(), methods=methods, seeds=2, moving=moving)
 
 
 def test_rows_are_those_of_the_first_seed(outcome):
@@ -45,6 +48,38 @@ def test_summary_has_every_number_of_the_bars(outcome):
     assert outcome.verdict == "refuted" and "bars met" in outcome.why
     ratios = [outcome.scenes("strict")[s]["against_paper"]["median_rel_ratio"] for s in outcome.scenes("strict")]
     assert outcome.summary["strict.median_rel_ratio"]["value"] == pytest.approx((ratios[0] * ratios[1]) ** 0.5)
+
+
+def test_wrong_answers_where_near_things_move_count_whatever_the_role(outcome):
+    for name in ("paper", "strict"):
+        found = outcome.summary[f"{name}.convoy_wrong"]
+        assert found["n"] == 2, "the rotation is among them"
+        shares = []
+        for scene in ("synthetic_lateral", "synthetic_rotation"):
+            pools = [outcome.points[scene, variant, "full"] for variant in (name, f"{name}, seed 1")]
+            wrong = sum(int((p.keep & (p.error > 0.2)).sum()) for p in pools)
+            shares.append(wrong / sum(p.keep.numel() for p in pools))
+        assert found["value"] == pytest.approx(max(shares))
+    assert "opencv.convoy_wrong" not in outcome.summary
+
+
+def candidates(answered, wrong, silent):
+    depth = torch.tensor([1.0] * answered + [1.3] * wrong + [torch.nan] * silent)
+    return errors.points(depth, torch.ones_like(depth))
+
+
+def test_the_worst_room_is_the_one_with_most_wrong_answers_a_candidate():
+    few = [candidates(0, 1, 9), candidates(0, 3, 7)]  # all that is said is wrong, but little is said
+    many = [candidates(5, 4, 1), candidates(7, 2, 1)]
+    found = method_comparison._convoy_wrong("map", [few, many, [candidates(0, 0, 0)]])
+    assert found["map.convoy_wrong"]["value"] == pytest.approx(0.3) and found["map.convoy_wrong"]["n"] == 2
+    assert method_comparison._convoy_wrong("map", []) == {}
+
+
+def test_the_rooms_of_the_settings_are_those_in_which_a_body_moves():
+    with initialize_config_dir(str(config_dir()), version_base="1.3"):
+        named = compose_settings("run", ["experiment=method_comparison"]).experiment.moving
+    assert [*named] == [f"stress_{name}" for name, of in STRESSES.items() if of.moving]
 
 
 def judged(**changes):

@@ -28,7 +28,7 @@ class Scene:
     gap: int | None = None  # frame step that gives a usable baseline
     levels: int | None = None  # pyramid levels that the motion asks for
     room: str | None = None  # scenes of one place bear one name: what is learnt on one says little about the others
-    role: str | None = None  # "rotation" = almost no baseline: never enters a mean
+    role: str | None = None  # "rotation" = almost no baseline, "moving" = what is near moves; never enters a mean
 
     def __post_init__(self) -> None:
         if not isinstance(self.recording, Recording):

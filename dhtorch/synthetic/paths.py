@@ -22,11 +22,17 @@ _PLACE, _YAW, _PITCH = (-0.45, 1.3, 0.2), 12.0, -9.0  # where the viewer stands 
 _AIM = (-0.1, 0.9, 2.0)  # what an orbit goes around
 
 
-def hand_held(path: str, n_frames: int, *, step_m: float, rate_hz: float, seed: int) -> Pose:
-    """``T_world_from_cam`` (n_frames), float64, of one of :data:`PATHS`."""
+def hand_held(
+    path: str, n_frames: int, *, step_m: float, rate_hz: float, seed: int, pan: tuple[float, float] = (0.0, 0.0)
+) -> Pose:
+    """``T_world_from_cam`` (n_frames), float64, of one of :data:`PATHS`.
+
+    ``pan``: degrees by which the first frame looks farther to the right than the path says, and every next one more.
+    """
     stations = [PATHS[path](_Hand(seed), step_m * i, i / rate_hz) for i in range(n_frames)]
+    turns = [(yaw + pan[0] + pan[1] * i, *more) for i, (_, (yaw, *more)) in enumerate(stations)]
     return Pose(
-        torch.tensor([_rotation(*angles) for _, angles in stations], dtype=torch.float64),
+        torch.tensor([rotation(*angles) for angles in turns], dtype=torch.float64),
         torch.tensor([(x, -height, z) for (x, height, z), _ in stations], dtype=torch.float64),
     )
 
@@ -93,7 +99,7 @@ PATHS: dict[str, Callable[[_Hand, float, float], tuple[Place, Angles]]] = {
 }
 
 
-def _rotation(yaw: float, pitch: float, roll: float) -> list[list[float]]:
+def rotation(yaw: float, pitch: float, roll: float) -> list[list[float]]:
     """World from camera: roll about z, then pitch about x (positive: up), then yaw about y (positive: right)."""
     (ca, sa), (cb, sb), (cc, sc) = ((math.cos(math.radians(v)), math.sin(math.radians(v))) for v in (yaw, pitch, roll))
     return [

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -23,7 +23,7 @@ from dhtorch.geometry.se3 import Pose
 Triple = tuple[float, float, float]
 Vector = Sequence[Tensor] | Sequence[float] | Sequence[Tensor | float]  # three components that broadcast
 
-ORDINARY, MIRROR, WINDOW, DARK = 0, 1, 2, 3  #: kinds of surface
+ORDINARY, MIRROR, WINDOW, DARK, MOVING = 0, 1, 2, 3, 4  #: kinds of surface; MOVING: of a body that moves
 NOWHERE = 1e9  #: distance of what is not met
 
 _STRIP = 1 << 8  # rays cast at all solids at a time: few enough to stay in the cache
@@ -52,6 +52,14 @@ class Solid:
     ball: bool = False
     shadow: bool = True
     faces: dict[int, Surface] = field(default_factory=dict)
+
+    def moved(self, motion: Pose) -> Solid:
+        """The solid after a rigid motion (1) of the world."""
+        turn, centre = torch.tensor(self.R, dtype=torch.float64), torch.tensor(self.centre, dtype=torch.float64)
+        R, t = motion.R[0].double(), motion.t[0].double()
+        rows: list[Triple] = [(a, b, c) for a, b, c in (R @ turn).tolist()]
+        x, y, z = (R @ centre + t).tolist()
+        return replace(self, centre=(x, y, z), R=(rows[0], rows[1], rows[2]))
 
 
 class Solids:

@@ -12,7 +12,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from random import Random
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Generator, Tensor
@@ -27,7 +27,7 @@ from dhtorch.synthetic.raycast import DARK, MIRROR, ORDINARY, WINDOW, world_rays
 from dhtorch.synthetic.room import furnished_room
 from dhtorch.synthetic.shading import ShadedRoom
 
-#: Values of ``truth(i)["surface"]``.
+#: Values of ``truth(i)["surface"]`` where nothing moves.
 SURFACES = {ORDINARY: "ordinary", MIRROR: "mirror", WINDOW: "window", DARK: "dark"}
 
 
@@ -61,7 +61,7 @@ class SyntheticRoom(TruthRecording):
     """
 
     surfaces = SURFACES
-    odd_surfaces = ("mirror", "window")
+    odd_surfaces: ClassVar[tuple[str, ...]] = ("mirror", "window")
 
     def __init__(
         self,
@@ -136,10 +136,14 @@ class SyntheticRoom(TruthRecording):
             ``depth`` (1, H, W) m float32 and ``surface`` (1, H, W) uint8, a key of :data:`SURFACES`.
         """
         i = self._position(index)
-        return self._true_view(self.camera, self.true_poses[i : i + 1], self.hw)
+        return self._true_view(i, self.camera, self.true_poses[i : i + 1], self.hw)
 
-    def _true_view(self, camera: Camera, pose: Pose, hw: tuple[int, int]) -> dict[str, Tensor]:
-        scene = furnished_room(self.seed)
+    def world(self, index: int) -> ShadedRoom:
+        """What stands where at frame ``index``."""
+        return furnished_room(self.seed)
+
+    def _true_view(self, i: int, camera: Camera, pose: Pose, hw: tuple[int, int]) -> dict[str, Tensor]:
+        scene = self.world(i)
         depth, solid = scene.solids.view(camera, pose, hw)
         o, d = world_rays(camera, pose, hw)
         face, _, _ = scene.solids.locate(solid, [o[k] + d[k] * depth for k in range(3)])
@@ -148,7 +152,7 @@ class SyntheticRoom(TruthRecording):
     def _render(self, i: int) -> Frame:
         pose, poses, times = self.true_poses[i : i + 1], self.poses, self.times
         assert poses is not None and times is not None
-        scene = furnished_room(self.seed)
+        scene = self.world(i)
         image = self._picture(i)
         image = image * 255 + self.image_noise * torch.randn(image.shape, generator=self._generator(i, "image"))
         conf = torch.zeros(1, *self.depth_hw, dtype=torch.uint8)
@@ -173,10 +177,10 @@ class SyntheticRoom(TruthRecording):
         )
 
     def _picture(self, i: int) -> Tensor:
-        return self._photograph(self.camera, self.true_poses[i : i + 1], self.hw)
+        return self._photograph(i, self.camera, self.true_poses[i : i + 1], self.hw)
 
-    def _photograph(self, camera: Camera, pose: Pose, hw: tuple[int, int]) -> Tensor:
-        return _photograph(furnished_room(self.seed), camera, pose, hw, self.supersample)
+    def _photograph(self, i: int, camera: Camera, pose: Pose, hw: tuple[int, int], *, exposure: float = 1.0) -> Tensor:
+        return _photograph(self.world(i), camera, pose, hw, supersample=self.supersample, exposure=exposure)
 
     def _generator(self, i: int, stream: str) -> Generator:
         return Generator().manual_seed(Random(f"{self.seed} {i} {stream}").getrandbits(62))
@@ -301,15 +305,18 @@ def _turned(poses: Pose, degrees: float) -> Pose:
     return Pose(poses.R @ turn.R, poses.t)
 
 
-def _photograph(scene: ShadedRoom, camera: Camera, pose: Pose, hw: tuple[int, int], supersample: int) -> Tensor:
-    """(1, 3, H, W) display values in [0, 1]: the mean over ``supersample``² rays in each pixel."""
+def _photograph(
+    scene: ShadedRoom, camera: Camera, pose: Pose, hw: tuple[int, int], *, supersample: int, exposure: float = 1.0
+) -> Tensor:
+    """(1, 3, H, W) display values in [0, 1], ``exposure`` times as bright and clipped: the mean over ``supersample``²
+    rays in each pixel."""
     s = supersample
     fine = (hw[0] * s, hw[1] * s)
     dense = resize(camera, hw, fine)
     depth, solid = scene.solids.view(dense, pose, fine)
     o, d = world_rays(dense, pose, fine)
     colour, _ = scene.shade(o, d, depth, solid, 1 / float(dense.f.min()))
-    colour = colour.clamp(0, 1).view(hw[0], s, hw[1], s, 3)
+    colour = (colour * exposure).clamp(0, 1).view(hw[0], s, hw[1], s, 3)
     total = torch.zeros(*hw, 3)
     for i in range(s):
         for k in range(s):

@@ -56,7 +56,7 @@ def furnished_room(seed: int = 2) -> ShadedRoom:
     return ShadedRoom(solids, [window, lamp, ceiling], ambient=0.42, seed=seed)
 
 
-def _box(
+def box(
     x: float,
     height: float,
     z: float,
@@ -75,7 +75,7 @@ def _box(
     return Solid((x, -height - half[1], z), half, surface, R, **more)  # type: ignore[arg-type]
 
 
-def _ball(x: float, height: float, z: float, radius: float, surface: Surface, **more: object) -> Solid:
+def ball(x: float, height: float, z: float, radius: float, surface: Surface, **more: object) -> Solid:
     """A ball resting ``height`` above the floor."""
     return Solid((x, -height - radius, z), (radius, radius, radius), surface, ball=True, **more)  # type: ignore[arg-type]
 
@@ -97,7 +97,7 @@ def _shell(draw: Random) -> Solid:
         NEG_X: BLANK,
         POS_X: BLANK,
     }
-    return _box((LEFT + RIGHT) / 2, 0, (BACK + FRONT) / 2, size, BLANK, faces=faces)
+    return box((LEFT + RIGHT) / 2, 0, (BACK + FRONT) / 2, size, BLANK, faces=faces)
 
 
 def _legs(x: float, z: float, size: Triple, thick: float, surface: Surface, yaw: float = 0) -> list[Solid]:
@@ -107,7 +107,7 @@ def _legs(x: float, z: float, size: Triple, thick: float, surface: Surface, yaw:
     for i in (-1, 1):
         for k in (-1, 1):
             dx, dz = i * (size[0] / 2 - thick), k * (size[2] / 2 - thick)
-            legs.append(_box(x + c * dx + s * dz, 0, z - s * dx + c * dz, (thick, size[1], thick), surface, yaw=yaw))
+            legs.append(box(x + c * dx + s * dz, 0, z - s * dx + c * dz, (thick, size[1], thick), surface, yaw=yaw))
     return legs
 
 
@@ -115,9 +115,9 @@ def _divider(draw: Random) -> list[Solid]:
     """A low open shelf across the view, five bays of drawers, boxes and books, and the lamp behind it."""
     x0, z, pitch, top = -1.25, 1.95, 0.42, 0.86
     wide = 5 * pitch
-    parts = [_box(x0 + wide / 2, h, z, (wide + 0.03, 0.03, 0.36), WHITE) for h in (0.03, 0.43, top - 0.03)]
-    parts += [_box(x0 + k * pitch, 0.03, z, (0.03, top - 0.06, 0.36), WHITE) for k in range(6)]
-    parts.append(_box(x0 + wide / 2, 0.03, z + 0.175, (wide, top - 0.06, 0.01), WHITE))
+    parts = [box(x0 + wide / 2, h, z, (wide + 0.03, 0.03, 0.36), WHITE) for h in (0.03, 0.43, top - 0.03)]
+    parts += [box(x0 + k * pitch, 0.03, z, (0.03, top - 0.06, 0.36), WHITE) for k in range(6)]
+    parts.append(box(x0 + wide / 2, 0.03, z + 0.175, (wide, top - 0.06, 0.01), WHITE))
     fronts = ["print", "poster:0", "books", "wallpaper", "poster:2"]
     draw.shuffle(fronts)
     for row in (0.06, 0.46):
@@ -128,23 +128,23 @@ def _divider(draw: Random) -> list[Solid]:
             else:
                 tile = 0.6 if front in ("print", "wallpaper") else None
                 parts.append(
-                    _box(left + pitch / 2 - 0.015, row, z, (pitch - 0.04, 0.36, 0.34), Surface(front, tile=tile))
+                    box(left + pitch / 2 - 0.015, row, z, (pitch - 0.04, 0.36, 0.34), Surface(front, tile=tile))
                 )
     shade = Surface("print", (0.8, 0.75, 0.65), 0.5, glow=0.4)
-    parts.append(_box(LAMP[0], LAMP[1] + 0.17, LAMP[2], (0.012, 1.0, 0.012), BLACK, shadow=False))
-    return [*parts, _ball(LAMP[0], LAMP[1] - 0.17, LAMP[2], 0.17, shade, shadow=False)]
+    parts.append(box(LAMP[0], LAMP[1] + 0.17, LAMP[2], (0.012, 1.0, 0.012), BLACK, shadow=False))
+    return [*parts, ball(LAMP[0], LAMP[1] - 0.17, LAMP[2], 0.17, shade, shadow=False)]
 
 
 def _on_the_divider(draw: Random) -> list[Solid]:
     top, x, z = 0.86, -0.2, 1.95
     return [
         *_plant(x - 0.92, top, z + 0.05, 1.1),
-        _box(x - 0.56, top, z + 0.02, (0.09, 0.03, 0.09), OAK, yaw=10),
-        _ball(x - 0.56, top + 0.03, z + 0.02, 0.14, Surface("globe", tile=0.36)),
-        _box(x - 0.10, top, z + 0.07, (0.30, 0.36, 0.07), Surface("poster:1"), yaw=draw.uniform(4, 14)),
+        box(x - 0.56, top, z + 0.02, (0.09, 0.03, 0.09), OAK, yaw=10),
+        ball(x - 0.56, top + 0.03, z + 0.02, 0.14, Surface("globe", tile=0.36)),
+        box(x - 0.10, top, z + 0.07, (0.30, 0.36, 0.07), Surface("poster:1"), yaw=draw.uniform(4, 14)),
         *_laptop(x + 0.42, top, z - 0.03),
-        _ball(x - 0.40, top, z - 0.06, 0.04, Surface("speckle", (1.0, 0.55, 0.15), 0.25)),
-        _ball(x - 0.46, top, z - 0.12, 0.042, Surface("speckle", (0.9, 0.2, 0.15), 0.25)),
+        ball(x - 0.40, top, z - 0.06, 0.04, Surface("speckle", (1.0, 0.55, 0.15), 0.25)),
+        ball(x - 0.46, top, z - 0.12, 0.042, Surface("speckle", (0.9, 0.2, 0.15), 0.25)),
     ]
 
 
@@ -153,8 +153,8 @@ def _laptop(x: float, height: float, z: float) -> list[Solid]:
     picture = Surface("poster:0", (0.9, 0.9, 0.9), glow=0.12)
     lid, keys, screen = (x + 0.045, height + 0.015, z + 0.125), {TOP: Surface("keyboard")}, {NEG_Z: picture}
     return [
-        _box(x, height, z, (0.35, 0.018, 0.23), case, yaw=-18, faces=keys),
-        _box(*lid, (0.35, 0.24, 0.012), SCREEN, yaw=-18, pitch=-14, faces=screen),
+        box(x, height, z, (0.35, 0.018, 0.23), case, yaw=-18, faces=keys),
+        box(*lid, (0.35, 0.24, 0.012), SCREEN, yaw=-18, pitch=-14, faces=screen),
     ]
 
 
@@ -164,10 +164,10 @@ def _plant(x: float, height: float, z: float, size: float) -> list[Solid]:
     pot = Surface("speckle")
     bush = ((0, 0, 0.10), (-0.06, -0.03, 0.07), (0.05, 0.04, 0.075), (0.02, -0.06, 0.06))
     balls = [
-        _ball(x + size * dx, height + size * (0.15 + 0.045 * k), z + size * dz, size * r, leaf)
+        ball(x + size * dx, height + size * (0.15 + 0.045 * k), z + size * dz, size * r, leaf)
         for k, (dx, dz, r) in enumerate(bush)
     ]
-    return [_box(x, height, z, (0.10 * size, 0.16 * size, 0.10 * size), pot, yaw=30), *balls]
+    return [box(x, height, z, (0.10 * size, 0.16 * size, 0.10 * size), pot, yaw=30), *balls]
 
 
 def _chair(x: float, z: float, yaw: float, surface: Surface) -> list[Solid]:
@@ -178,37 +178,37 @@ def _chair(x: float, z: float, yaw: float, surface: Surface) -> list[Solid]:
         return x + c * dx + s * dz, z - s * dx + c * dz
 
     cover = Surface("print", (1.0, 0.95, 0.9), 0.55)
-    parts = [_box(x, 0.43, z, (0.44, 0.05, 0.44), cover, yaw=yaw), *_legs(x, z, (0.44, 0.43, 0.44), 0.04, surface, yaw)]
+    parts = [box(x, 0.43, z, (0.44, 0.05, 0.44), cover, yaw=yaw), *_legs(x, z, (0.44, 0.43, 0.44), 0.04, surface, yaw)]
     for dx in (-0.21, 0.21):
         px, pz = at(dx, 0.2)
-        parts.append(_box(px, 0.47, pz, (0.04, 0.54, 0.03), surface, yaw=yaw))
+        parts.append(box(px, 0.47, pz, (0.04, 0.54, 0.03), surface, yaw=yaw))
     px, pz = at(0, 0.2)
-    return [*parts, _box(px, 0.56, pz, (0.385, 0.43, 0.045), cover, yaw=yaw)]
+    return [*parts, box(px, 0.56, pz, (0.385, 0.43, 0.045), cover, yaw=yaw)]
 
 
 def _seats(draw: Random) -> list[Solid]:
     cushion, sofa = Surface("fabric", (0.50, 0.62, 0.72), 0.6), Surface("fabric", (0.62, 0.66, 0.58), 0.8)
     x, z = RIGHT - 0.47, BACK - 1.2
     parts = [
-        _box(x, 0.10, z, (0.85, 0.32, 1.7), sofa),
-        _box(RIGHT - 0.16, 0.30, z, (0.22, 0.50, 1.7), sofa),
-        _box(x, 0.10, z - 0.9, (0.88, 0.50, 0.18), sofa),
-        _box(x, 0.10, z + 0.9, (0.88, 0.50, 0.18), sofa),
-        _box(x + 0.12, 0.44, z + 0.55, (0.14, 0.38, 0.40), Surface("carpet"), yaw=20, pitch=8),
-        _box(x + 0.10, 0.44, z - 0.45, (0.14, 0.36, 0.38), Surface("print", (1.0, 0.75, 0.65), 0.5), yaw=-25),
-        _box(0.0, 0.001, 3.0, (2.0, 0.012, 1.5), Surface("carpet"), yaw=3),
-        _box(0.35, 0.36, 3.1, (0.85, 0.04, 0.5), PALE, yaw=8),
+        box(x, 0.10, z, (0.85, 0.32, 1.7), sofa),
+        box(RIGHT - 0.16, 0.30, z, (0.22, 0.50, 1.7), sofa),
+        box(x, 0.10, z - 0.9, (0.88, 0.50, 0.18), sofa),
+        box(x, 0.10, z + 0.9, (0.88, 0.50, 0.18), sofa),
+        box(x + 0.12, 0.44, z + 0.55, (0.14, 0.38, 0.40), Surface("carpet"), yaw=20, pitch=8),
+        box(x + 0.10, 0.44, z - 0.45, (0.14, 0.36, 0.38), Surface("print", (1.0, 0.75, 0.65), 0.5), yaw=-25),
+        box(0.0, 0.001, 3.0, (2.0, 0.012, 1.5), Surface("carpet"), yaw=3),
+        box(0.35, 0.36, 3.1, (0.85, 0.04, 0.5), PALE, yaw=8),
         *_legs(0.35, 3.1, (0.85, 0.36, 0.5), 0.05, PALE, 8),
-        _box(0.25, 0.40, 3.1, (0.21, 0.012, 0.28), Surface("page"), yaw=-30),
-        _ball(0.58, 0.40, 3.15, 0.09, Surface("speckle", tile=0.3)),
+        box(0.25, 0.40, 3.1, (0.21, 0.012, 0.28), Surface("page"), yaw=-30),
+        ball(0.58, 0.40, 3.15, 0.09, Surface("speckle", tile=0.3)),
     ]
     x, z, yaw = -1.75, 3.2, draw.uniform(55, 68)
     c, s = math.cos(math.radians(yaw)), math.sin(math.radians(yaw))
     parts += [
-        _box(x, 0.08, z, (0.72, 0.34, 0.72), cushion, yaw=yaw),
-        _box(x - 0.33 * s, 0.30, z - 0.33 * c, (0.72, 0.55, 0.16), cushion, yaw=yaw),
-        _box(x + 0.38 * c, 0.08, z - 0.38 * s, (0.14, 0.54, 0.72), cushion, yaw=yaw),
-        _box(x - 0.38 * c, 0.08, z + 0.38 * s, (0.14, 0.54, 0.72), cushion, yaw=yaw),
+        box(x, 0.08, z, (0.72, 0.34, 0.72), cushion, yaw=yaw),
+        box(x - 0.33 * s, 0.30, z - 0.33 * c, (0.72, 0.55, 0.16), cushion, yaw=yaw),
+        box(x + 0.38 * c, 0.08, z - 0.38 * s, (0.14, 0.54, 0.72), cushion, yaw=yaw),
+        box(x - 0.38 * c, 0.08, z + 0.38 * s, (0.14, 0.54, 0.72), cushion, yaw=yaw),
     ]
     return parts + _chair(-1.0, 2.6, draw.uniform(-60, -40), OAK)
 
@@ -216,25 +216,25 @@ def _seats(draw: Random) -> list[Solid]:
 def _back_wall(draw: Random) -> list[Solid]:
     z = BACK
     x0, x1, top = -2.15, -0.95, 2.05
-    parts = [_box((x0 + x1) / 2, 0, z - 0.015, (x1 - x0, top, 0.02), OAK)]
-    parts += [_box(x, 0, z - 0.16, (0.03, top, 0.30), OAK) for x in (x0, (x0 + x1) / 2, x1)]
+    parts = [box((x0 + x1) / 2, 0, z - 0.015, (x1 - x0, top, 0.02), OAK)]
+    parts += [box(x, 0, z - 0.16, (0.03, top, 0.30), OAK) for x in (x0, (x0 + x1) / 2, x1)]
     shelves = (0.06, 0.46, 0.86, 1.26, 1.66, 2.03)
-    parts += [_box((x0 + x1) / 2, h, z - 0.16, (x1 - x0, 0.03, 0.30), OAK) for h in shelves]
+    parts += [box((x0 + x1) / 2, h, z - 0.16, (x1 - x0, 0.03, 0.30), OAK) for h in shelves]
     for h in shelves[:-1]:
         for left in (x0 + 0.03, (x0 + x1) / 2 + 0.03):
             parts += _books(draw, left, left + 0.53, h + 0.03, z - 0.15)
     x = 0.15
     parts += [
-        _box(x, 0.08, z - 0.22, (1.5, 0.50, 0.40), WHITE),
-        _box(x, 0.10, z - 0.43, (0.015, 0.46, 0.02), OAK),
-        _box(x, 0.72, z - 0.06, (1.15, 0.66, 0.05), BLACK, faces={NEG_Z: SCREEN}),
-        _box(x - 0.55, 0.58, z - 0.25, (0.13, 0.18, 0.12), Surface("speckle", (0.6, 0.8, 0.9), 0.3), yaw=20),
-        _ball(x - 0.55, 0.74, z - 0.25, 0.13, Surface("leaves", tile=0.4)),
-        _box(x + 0.58, 0.58, z - 0.22, (0.16, 0.22, 0.02), Surface("poster:3"), yaw=-12, pitch=-8),
-        _box(x, 1.60, z - 0.02, (0.85, 0.60, 0.03), Surface("landscape", (0.85, 0.8, 0.75))),
-        _box(1.38, 0.80, z - 0.025, (0.66, 1.16, 0.03), PALE),
-        _box(1.38, 0.84, z - 0.043, (0.58, 1.08, 0.01), PALE, faces={NEG_Z: MIRROR_GLASS}),
-        _box(1.89, 1.55, z - 0.02, (0.30, 0.42, 0.03), Surface("poster:2")),
+        box(x, 0.08, z - 0.22, (1.5, 0.50, 0.40), WHITE),
+        box(x, 0.10, z - 0.43, (0.015, 0.46, 0.02), OAK),
+        box(x, 0.72, z - 0.06, (1.15, 0.66, 0.05), BLACK, faces={NEG_Z: SCREEN}),
+        box(x - 0.55, 0.58, z - 0.25, (0.13, 0.18, 0.12), Surface("speckle", (0.6, 0.8, 0.9), 0.3), yaw=20),
+        ball(x - 0.55, 0.74, z - 0.25, 0.13, Surface("leaves", tile=0.4)),
+        box(x + 0.58, 0.58, z - 0.22, (0.16, 0.22, 0.02), Surface("poster:3"), yaw=-12, pitch=-8),
+        box(x, 1.60, z - 0.02, (0.85, 0.60, 0.03), Surface("landscape", (0.85, 0.8, 0.75))),
+        box(1.38, 0.80, z - 0.025, (0.66, 1.16, 0.03), PALE),
+        box(1.38, 0.84, z - 0.043, (0.58, 1.08, 0.01), PALE, faces={NEG_Z: MIRROR_GLASS}),
+        box(1.89, 1.55, z - 0.02, (0.30, 0.42, 0.03), Surface("poster:2")),
     ]
     return parts
 
@@ -251,7 +251,7 @@ def _books(draw: Random, left: float, right: float, height: float, z: float, *, 
         if x + wide > stop:
             return books
         surface = Surface("spine", _tint(draw))
-        books.append(_box(x + wide / 2, height, z + 0.13 - deep / 2, (wide - 0.003, tall, deep), surface, shadow=False))
+        books.append(box(x + wide / 2, height, z + 0.13 - deep / 2, (wide - 0.003, tall, deep), surface, shadow=False))
         x += wide
 
 
@@ -259,7 +259,7 @@ def _side_walls(draw: Random) -> list[Solid]:
     x, z = RIGHT, BACK - 1.2
     pane = Surface("landscape", (1.12, 1.12, 1.1), 1.7, kind=WINDOW, glow=0.9)
     frame = Surface("plain", (0.95, 0.95, 0.94), 0.7)
-    parts = [_box(x - 0.005, 1.0, z, (0.012, 1.05, 1.2), frame, faces={NEG_X: pane}, shadow=False)]
+    parts = [box(x - 0.005, 1.0, z, (0.012, 1.05, 1.2), frame, faces={NEG_X: pane}, shadow=False)]
     for h, dz, size in (
         (0.94, 0, (0.10, 0.06, 1.36)),
         (2.05, 0, (0.06, 0.06, 1.32)),
@@ -267,17 +267,17 @@ def _side_walls(draw: Random) -> list[Solid]:
         (0.98, 0.63, (0.06, 1.1, 0.06)),
         (0.98, 0, (0.05, 1.1, 0.05)),
     ):
-        parts.append(_box(x - 0.02, h, z + dz, size, frame))
+        parts.append(box(x - 0.02, h, z + dz, size, frame))
     curtain = Surface("fabric", (0.85, 0.72, 0.55), 0.5)
     for dz in (-0.98, -0.90, -0.82, 0.82, 0.90, 0.98):
         parts.append(
-            _box(x - 0.07, 0.55, z + dz, (0.05 + 0.03 * draw.random(), 1.70, 0.07), curtain, yaw=draw.uniform(-25, 25))
+            box(x - 0.07, 0.55, z + dz, (0.05 + 0.03 * draw.random(), 1.70, 0.07), curtain, yaw=draw.uniform(-25, 25))
         )
     for k, (pz, h) in enumerate(((0.6, 1.2), (1.7, 1.3), (3.0, 1.25))):
-        parts.append(_box(LEFT + 0.02, h, pz, (0.03, 0.6, 0.5), Surface(f"poster:{2 + k}")))
+        parts.append(box(LEFT + 0.02, h, pz, (0.03, 0.6, 0.5), Surface(f"poster:{2 + k}")))
     parts += [
-        _box(1.3, 0, FRONT + 0.02, (0.9, 2.05, 0.04), PALE),
-        _box(-0.6, 1.1, FRONT + 0.02, (0.9, 0.7, 0.03), Surface("poster:1")),
-        _box(-1.7, 0, FRONT + 0.25, (1.0, 1.1, 0.45), OAK),
+        box(1.3, 0, FRONT + 0.02, (0.9, 2.05, 0.04), PALE),
+        box(-0.6, 1.1, FRONT + 0.02, (0.9, 0.7, 0.03), Surface("poster:1")),
+        box(-1.7, 0, FRONT + 0.25, (1.0, 1.1, 0.45), OAK),
     ]
     return parts

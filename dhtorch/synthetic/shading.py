@@ -10,6 +10,7 @@ Alphabet: as in :mod:`dhtorch.synthetic.raycast`; L nodes, P rays.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +19,8 @@ import torch
 from torch import Tensor
 
 from dhtorch.geometry.lookup import LUMA
-from dhtorch.synthetic.raycast import Solid, Solids, Surface, Triple, dot
+from dhtorch.geometry.se3 import Pose
+from dhtorch.synthetic.raycast import MOVING, Solid, Solids, Surface, Triple, dot
 from dhtorch.synthetic.textures import SIZE, paint
 
 _STRIP = 1 << 16  # rays shaded at a time: enough to amortise a call, few enough to stay in the cache
@@ -40,19 +42,49 @@ class ShadedRoom:
     """Solids, pictures and light, ready to be looked at."""
 
     def __init__(self, solids: Sequence[Solid], lights: Sequence[Light], *, ambient: float, seed: int):
+        self._lights, self._ambient = tuple(lights), ambient
+        self._names = sorted({s.picture for s in _surfaces(solids)})
+        self._pictures = _Pictures(paint(self._names, torch.Generator().manual_seed(seed)))
+        self._furnish(solids, None)
+
+    def _furnish(self, solids: Sequence[Solid], lit: _Lightmap | None) -> None:
+        """Put up the solids; the first ones keep the light ``lit``."""
+        surfaces = _surfaces(solids)
         self.solids = Solids(solids)
-        surfaces = [s.faces.get(f, s.surface) for s in solids for f in range(6)]
         self.kind = torch.tensor([s.kind for s in surfaces])  # (faces,), also the next ones
-        names = sorted({s.picture for s in surfaces})
-        self._pictures = _Pictures(paint(names, torch.Generator().manual_seed(seed)))
-        self._picture = torch.tensor([names.index(s.picture) for s in surfaces])
+        self._picture = torch.tensor([self._names.index(s.picture) for s in surfaces])
         self._reflect = torch.tensor([s.reflect for s in surfaces])
         self._glow = torch.tensor([s.glow for s in surfaces])
         self._tint = torch.tensor([s.tint for s in surfaces])
         self._scale = _texture_scale(solids, surfaces)
         #: Mean grey of each face (faces,), display values: the surface's brightness to a sensor with its own light.
         self.albedo = (self._pictures.mean[self._picture] * self._tint * torch.tensor(LUMA)).sum(-1)
-        self.light = _Lightmap(self.solids, lights, ambient)
+        self.light = _Lightmap(self.solids, self._lights, self._ambient, lit)
+
+    def joined_by(self, guests: Sequence[Solid]) -> ShadedRoom:
+        """The room and guests in it, who are lit where they stand; what was there before looks as it did.
+
+        Raises:
+            ValueError: a guest is painted with what nothing in the room is painted with, or would cast a shadow.
+        """
+        for guest in guests:
+            if guest.shadow:
+                raise ValueError("shaded room: found a guest that casts a shadow, expected shadow=False")
+        for surface in _surfaces(guests):
+            if surface.picture not in self._names:
+                raise ValueError(f"shaded room: picture is {surface.picture!r}, expected one of {self._names}")
+        whole = copy.copy(self)
+        whole._furnish([*self.solids.each, *guests], self.light)
+        return whole
+
+    def moved(self, motion: Pose) -> ShadedRoom:
+        """The room with its solids of kind ``MOVING`` gone by a rigid motion (1) of the world, in the light they had.
+
+        A surface point keeps its colour wherever it goes, so that it can be tracked like any other.
+        """
+        there = copy.copy(self)
+        there.solids = Solids([s.moved(motion) if s.surface.kind == MOVING else s for s in self.solids.each])
+        return there
 
     def shade(
         self, o: Sequence[Tensor], d: Sequence[Tensor], t: Tensor, index: Tensor, spread: float
@@ -146,9 +178,17 @@ class _Pictures:
 
 
 class _Lightmap:
-    """Light on a grid of nodes over each face, bilinear between."""
+    """Light on a grid of nodes over each face, bilinear between; that of the first faces may be known already."""
 
-    def __init__(self, solids: Solids, lights: Sequence[Light], ambient: float, *, spacing: float = 0.1):
+    def __init__(
+        self,
+        solids: Solids,
+        lights: Sequence[Light],
+        ambient: float,
+        known: _Lightmap | None = None,
+        *,
+        spacing: float = 0.1,
+    ):
         half = solids.half
         size = torch.stack([half[:, [2, 1]], half[:, [0, 2]], half[:, [0, 1]]], 1) * 2
         n = (size / spacing).ceil().long() + 1  # (solids, axis, 2)
@@ -158,6 +198,8 @@ class _Lightmap:
         self.start = count.cumsum(0) - count
         face = torch.arange(len(count)).repeat_interleave(count)
         place = torch.arange(len(face)) - self.start[face]
+        if known is not None:
+            face, place = face[len(known.values) :], place[len(known.values) :]
         n = self.n[face]
         across, down = (place % n[:, 0]) / (n[:, 0] - 1) * 2 - 1, (place // n[:, 0]) / (n[:, 1] - 1) * 2 - 1
         p = solids.points(face, across * 0.995, down * 0.995)
@@ -166,7 +208,8 @@ class _Lightmap:
         power = ambient * _ambient(solids, p, normal)
         for light in lights:
             power = power + _direct(solids, light, p, normal)
-        self.values = power.sqrt()  # (L, 3)
+        values = power.sqrt()
+        self.values: Tensor = values if known is None else torch.cat((known.values, values))  # (L, 3)
 
     def sample(self, face: Tensor, across: Tensor, down: Tensor) -> Tensor:
         """(P, 3) at places in [-1, 1] of faces."""
@@ -239,6 +282,11 @@ def _sphere_directions(n: int = 14) -> list[Triple]:
         directions.append((r * x, h, r * y))
         x, y = c * x - s * y, s * x + c * y
     return directions
+
+
+def _surfaces(solids: Sequence[Solid]) -> list[Surface]:
+    """Of every face, six a solid."""
+    return [s.faces.get(f, s.surface) for s in solids for f in range(6)]
 
 
 def _texture_scale(solids: Sequence[Solid], surfaces: Sequence[Surface]) -> Tensor:

@@ -1,12 +1,15 @@
 """The built-in room under stress: one recording for each thing that goes wrong with a capture, all truth known.
 
 Paths that give little to triangulate with, near returns that hardly fix a pose, a worse sensor, a rolling shutter,
-places that are shown elsewhere, tracks that end elsewhere. Recordings bear the name ``stress_<name>``.
+places that are shown elsewhere, tracks that end elsewhere, things near by that move, motion that is large, exposures
+that jump or smear. Recordings bear the name ``stress_<name>``.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -18,10 +21,11 @@ from dhtorch.data.scene import Scene
 from dhtorch.geometry.camera import Camera, depth_pixels
 from dhtorch.geometry.lookup import round_half_up
 from dhtorch.records import Frame, Pose, Tracks
-from dhtorch.synthetic.paths import hand_held
-from dhtorch.synthetic.raycast import world_rays
-from dhtorch.synthetic.recording import SyntheticRoom, as_scene
-from dhtorch.synthetic.room import furnished_room
+from dhtorch.synthetic.guests import along, in_hand, on_turntable, visited_room
+from dhtorch.synthetic.paths import hand_held, rotation
+from dhtorch.synthetic.raycast import MOVING, world_rays
+from dhtorch.synthetic.recording import SURFACES, SyntheticRoom, as_scene
+from dhtorch.synthetic.shading import ShadedRoom
 
 #: Near returns that are left in ``few_near``.
 FEW = 20
@@ -36,12 +40,23 @@ READOUT_S, BANDS = 0.02, 30
 #: many pixels at 640 columns; the picture in squares of ``TILE_PX`` px.
 MOVED_SHARE, TILE_PX, MOVED_PX = 0.3, 80, (6.0, 24.0)
 
+#: ``fast``: degrees by which the first frame looks farther to the right than the path, and each next one more.
+PAN_DEG = (-6.0, 1.2)
+
+#: ``exposure_jump``: grey values are two to a power between these times as bright or dark, then clipped.
+STOPS = (0.5, 1.0)
+
+#: ``motion_blur``: the camera turns while it exposes, in each frame another way, by so many px at 640 columns.
+SMEAR_PX = (5.0, 15.0)
+
 #: Where samples will be taken: ``(hw, n) -> uv (n, 2)``.
 Places = Callable[[tuple[int, int], int], Tensor]
 
 
 class StressRoom(SyntheticRoom):
     """The built-in room with one thing wrong.
+
+    Where a body moves, what is seen of it has the surface ``moving`` and is counted apart.
 
     Args:
         stress: one of :data:`STRESSES`.
@@ -54,6 +69,9 @@ class StressRoom(SyntheticRoom):
     Raises:
         ValueError: an unknown stress; else as :class:`SyntheticRoom`.
     """
+
+    surfaces = SURFACES | {MOVING: "moving"}
+    odd_surfaces = (*SyntheticRoom.odd_surfaces, "moving")
 
     def __init__(
         self,
@@ -69,10 +87,16 @@ class StressRoom(SyntheticRoom):
             raise ValueError(f"stress room: stress is {stress!r}, expected one of {', '.join(STRESSES)}")
         options = {"name": f"stress_{stress}", **options, **STRESSES[stress].options}
         self.bands: list[Pose] = []
+        way = {k: options[k] for k in _WAY if k in options}
         if stress == "rolling_shutter":
-            self.bands, options["true_poses"] = _rolled(**{k: options[k] for k in _WAY if k in options})
+            self.bands, options["true_poses"] = _rolled(**way)
+        if stress == "fast":
+            options["true_poses"] = _panned(**way)
         super().__init__(**options)
         self.stress, self.places, self.n_places = stress, places, n_places
+        moving = STRESSES[stress].moving
+        #: T_world_from_home (n_frames) of the body that moves, if one does: see :mod:`dhtorch.synthetic.guests`.
+        self.body_poses = None if moving is None else moving.motion(self.true_poses)
         self.near, self.gap = near, gap
         if self.bands:
             self.camera = self.camera.replace(readout=torch.tensor([READOUT_S]))
@@ -82,8 +106,33 @@ class StressRoom(SyntheticRoom):
         i = self._position(index)
         if not self.bands:
             return super().truth(i)
-        parts = [self._true_view(camera, pose, hw) for camera, pose, hw in self._rows(i)]
+        parts = [self._true_view(i, camera, pose, hw) for camera, pose, hw in self._rows(i)]
         return {k: torch.cat([part[k] for part in parts], 1) for k in parts[0]}
+
+    def world(self, index: int) -> ShadedRoom:
+        """As :meth:`SyntheticRoom.world`; a body that moves is where it has gone."""
+        i, moving = self._position(index), STRESSES[self.stress].moving
+        if moving is None or self.body_poses is None:
+            return super().world(i)
+        return visited_room(self.seed, moving.guest).moved(self.body_poses[i : i + 1])
+
+    def gain(self, index: int) -> float:
+        """Factor on the grey values of frame ``index`` before they are clipped; 1 but for ``exposure_jump``."""
+        if self.stress != "exposure_jump":
+            return 1.0
+        i = self._position(index)
+        stops = STOPS[0] + (STOPS[1] - STOPS[0]) * torch.rand(1, generator=self._generator(i, "gain")).item()
+        brighter = (i + i // self.gap) % 2 == 0  # from frame to frame and over a gap it goes up or down
+        return math.pow(2.0, stops if brighter else -stops)
+
+    def smear(self, index: int) -> tuple[float, float]:
+        """Right and down, px: from where to where a far point goes while frame ``index`` is exposed; 0 but for
+        ``motion_blur``."""
+        if self.stress != "motion_blur":
+            return 0.0, 0.0
+        angle, size = torch.rand(2, generator=self._generator(self._position(index), "smear")).tolist()
+        length = (SMEAR_PX[0] + (SMEAR_PX[1] - SMEAR_PX[0]) * size) * self.hw[1] / 640
+        return length * math.cos(2 * math.pi * angle), length * math.sin(2 * math.pi * angle)
 
     def spoil_track(self, track: Callable[..., Tracks]) -> Callable[..., Tracks]:
         """A method's tracker as it works in this room: under ``mistracks`` many of its tracks end elsewhere."""
@@ -92,9 +141,27 @@ class StressRoom(SyntheticRoom):
         return partial(_mistrack, track)
 
     def _picture(self, i: int) -> Tensor:
+        if self.stress == "motion_blur":
+            return self._smeared(i)
         if not self.bands:
-            return super()._picture(i)
-        return torch.cat([self._photograph(camera, pose, hw) for camera, pose, hw in self._rows(i)], 2)
+            return self._photograph(i, self.camera, self.true_poses[i : i + 1], self.hw, exposure=self.gain(i))
+        return torch.cat([self._photograph(i, camera, pose, hw) for camera, pose, hw in self._rows(i)], 2)
+
+    def _smeared(self, i: int) -> Tensor:
+        """The mean of pictures at most a pixel apart, on both sides of the frame's own pose."""
+        right, down = self.smear(i)
+        n = math.ceil(math.hypot(right, down)) + 1
+        pose, f = self.true_poses[i : i + 1], float(self.camera.f[0, 0])
+        total = torch.zeros(1, 3, *self.hw)
+        for k in range(n):
+            at = (
+                k / (n - 1) - 0.5
+            ) / f  # a camera that looks farther to the left and up shifts the picture right, down
+            turn = torch.tensor(
+                [rotation(-math.degrees(right * at), math.degrees(down * at), 0.0)], dtype=torch.float64
+            )
+            total = total + self._photograph(i, self.camera, Pose(pose.R @ turn, pose.t), self.hw)
+        return total / n
 
     def _render(self, i: int) -> Frame:
         return STRESSES[self.stress].spoil(self, i, super()._render(i))
@@ -125,6 +192,13 @@ def _rolled(
     return bands, Pose(every.R[middle], every.t[middle])
 
 
+def _panned(
+    path: str = "lateral", n_frames: int = 12, step_m: float = 0.02, rate_hz: float = 30.0, seed: int = 2
+) -> Pose:
+    """Poses of a camera that turns to the side it goes to."""
+    return hand_held(path, n_frames, step_m=step_m, rate_hz=rate_hz, seed=seed, pan=PAN_DEG)
+
+
 def open_stress(
     stresses: Sequence[str] | None = None,
     *,
@@ -136,11 +210,21 @@ def open_stress(
     places: Places | None = None,
     n_places: int = 2048,
 ) -> list[Scene]:
-    """The room under each of :data:`STRESSES` (None = all), one scene each; options as :class:`StressRoom`."""
+    """The room under each of :data:`STRESSES` (None = all), one scene each; options as :class:`StressRoom`.
+
+    A scene in which a body moves has the role ``moving``, and a cutoff of at most what its stress says.
+    """
     options: dict[str, Any] = {"seed": seed, "n_frames": n_frames, "hw": hw, "near": near, "gap": gap}
     names = STRESSES if stresses is None else stresses
     rooms = [StressRoom(name, places=places, n_places=n_places, **options) for name in names]
-    return [as_scene(room, near, gap) for room in rooms]
+    return [_noted(room, near, gap) for room in rooms]
+
+
+def _noted(room: StressRoom, near: float, gap: int) -> Scene:
+    moving = STRESSES[room.stress].moving
+    if moving is None:
+        return as_scene(room, near, gap)
+    return replace(as_scene(room, min(near, moving.near), gap), role="moving")
 
 
 def _nothing(room: StressRoom, i: int, frame: Frame) -> Frame:
@@ -150,7 +234,7 @@ def _nothing(room: StressRoom, i: int, frame: Frame) -> Frame:
 def _one_plane(room: StressRoom, i: int, frame: Frame) -> Frame:
     """Near returns off the plane that most of them lie on are gone, and so are those off their surface."""
     assert frame.depth_camera is not None
-    scene, pose, hw = furnished_room(room.seed), room.true_poses[i : i + 1], room.depth_hw
+    scene, pose, hw = room.world(i), room.true_poses[i : i + 1], room.depth_hw
     depth, solid = scene.solids.view(frame.depth_camera, pose, hw)
     o, d = world_rays(frame.depth_camera, pose, hw)
     face, _, _ = scene.solids.locate(solid, [o[k] + d[k] * depth for k in range(3)])
@@ -227,11 +311,20 @@ def _without(frame: Frame, gone: Tensor) -> Frame:
     return frame.replace(depth=depth)
 
 
+class Moving(NamedTuple):
+    """A body that moves."""
+
+    guest: str  # which of the room's guests
+    motion: Callable[[Pose], Pose]  # T_world_from_cam (n) → T_world_from_home (n)
+    near: float  # m, a cutoff below which the story holds: what is near belongs to the body, or half of it
+
+
 class Stress(NamedTuple):
-    """Options of the room, and what is done to its frames."""
+    """Options of the room, what is done to its frames, and what moves in it."""
 
     options: dict[str, Any]
     spoil: Callable[[StressRoom, int, Frame], Frame] = _nothing
+    moving: Moving | None = None
 
 
 #: What may go wrong; the hand-held walk where no path is said.
@@ -247,4 +340,11 @@ STRESSES: dict[str, Stress] = {
     "rolling_shutter": Stress({"path": "walk"}),
     "moved": Stress({"path": "walk"}, _elsewhere),
     "mistracks": Stress({"path": "walk"}),
+    "convoy": Stress({"path": "walk"}, moving=Moving("parcels", along, 1.3)),
+    "convoy_slow": Stress({"path": "walk"}, moving=Moving("parcels", partial(along, share=0.5), 1.3)),
+    "held_object": Stress({"path": "walk"}, moving=Moving("held", in_hand, 2.0)),
+    "turntable": Stress({"path": "static"}, moving=Moving("parcels", on_turntable, 1.3)),
+    "fast": Stress({"path": "lateral"}),
+    "exposure_jump": Stress({"path": "walk"}),
+    "motion_blur": Stress({"path": "walk"}),
 }

@@ -14,9 +14,10 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
+from dhtorch import tree
 from dhtorch.data.pairs import around
 from dhtorch.data.scene import Given, Scene, scenes_of
-from dhtorch.evaluate import bootstrap, compare
+from dhtorch.evaluate import bootstrap, compare, errors
 from dhtorch.studies import protocol
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
 from dhtorch.studies.rows import Row
@@ -53,6 +54,7 @@ def run(
     stand_ins: Mapping[str, str] | None = None,
     baseline: str = "window",
     indoor: Sequence[str] = (),
+    moving: Sequence[str] = (),
     progress: Progress = protocol.quiet,
 ) -> Outcome:
     """Run several methods on the same pairs, several seeds each, and compare them with the reference.
@@ -71,6 +73,8 @@ def run(
         stand_ins: method of several views → method of one; None = the first compared method for all.
         baseline: the method of several views that those which choose their views are held against as well.
         indoor: rooms whose scenes make the mean ``<method>.coverage_at_5_indoor``.
+        moving: rooms in which what is near moves; their scenes, whatever their role, make ``<method>.convoy_wrong``,
+            the largest share of the candidates of one scene (all seeds) that is answered and more than 20 % off.
 
     Raises:
         ValueError: no reference, or nothing to compare with it; else as the main job.
@@ -87,7 +91,8 @@ def run(
     outcome = protocol.run(scenes, Protocol(variants), pairs, settings, progress=progress)
     rooms = {scene.name: scene.place for scene in scenes_of(scenes)}
     apart = {scene.name for scene in scenes_of(scenes) if scene.role is not None}
-    found = {name: _by_scene(outcome, name, seeds, apart) for name in (reference, *compared)}
+    everywhere = {name: _by_scene(outcome, name, seeds) for name in (reference, *compared)}
+    found = {name: {s: p for s, p in of.items() if s not in apart} for name, of in everywhere.items()}
     fallback = stand_ins or {name: compared[0] for name in compared if methods[name].views > 1}
     complete = compare.completed(found, reference, fallback)
     judged = compare.method_ratios(complete, reference=reference, rooms=rooms)
@@ -96,6 +101,8 @@ def run(
     outcome.summary = {k: v for k, v in outcome.summary.items() if not any(k.startswith(f"{m}.") for m in later)}
     outcome.summary |= judged.summary
     outcome.summary |= _indoor(judged, rooms, indoor)
+    for name, of in everywhere.items():
+        outcome.summary |= _convoy_wrong(name, [p for scene, p in of.items() if rooms[scene] in moving])
     for name in (n for n in compared if methods[n].choose is not None and baseline in compared):
         numbers, by_scene = compare.against(complete[name], complete[baseline], baseline)
         outcome.summary |= {f"{name}.{k}": v.entry("1") for k, v in numbers.items()}
@@ -133,6 +140,15 @@ def _indoor(judged: compare.Comparison, rooms: Mapping[str, str], indoor: Sequen
     }
 
 
+def _convoy_wrong(name: str, scenes: Sequence[Sequence[errors.Points]]) -> Row:
+    """The worst of the scenes' shares of candidates that are answered and wrong, over the seeds of each."""
+    pools = [pool for pool in map(tree.collate, scenes) if pool.keep.numel()]
+    if not pools:
+        return {}
+    shares = [float((pool.keep & (pool.error > errors.WRONG)).double().mean()) for pool in pools]
+    return {f"{name}.convoy_wrong": bootstrap.single(max(shares), len(shares))}
+
+
 def _variant(method: Method, seed: int, pairs: Pairs) -> Variant:
     """A method that chooses its views is offered those around the anchor; another takes the pair's own."""
     if method.choose is not None:
@@ -150,12 +166,12 @@ def _views(pairs: Pairs, views: int, scene: Scene) -> str | None:
     return "fewer than 3 views" if short else None
 
 
-def _by_scene(outcome: Outcome, method: str, seeds: int, apart: set[str]) -> dict[str, list[Any]]:
-    """Scene → candidates of every seed; scenes with a role stay out."""
+def _by_scene(outcome: Outcome, method: str, seeds: int) -> dict[str, list[Any]]:
+    """Scene → candidates of every seed."""
     scenes: dict[str, list[Any]] = {}
     for k in range(seeds):
         for (scene, variant, cohort), points in outcome.points.items():
-            if (variant, cohort) == (_named(method, k), "full") and scene not in apart:
+            if (variant, cohort) == (_named(method, k), "full"):
                 scenes.setdefault(scene, []).append(points)
     return scenes
 
