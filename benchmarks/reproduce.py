@@ -66,7 +66,7 @@ EXPERIMENTS = {
 
 #: Result of a script of this folder → its arguments.
 SCRIPTS = dict.fromkeys(("frontend", "lk", "pnp", "triangulate", "pair", "loader", "scaling", "readers"), "")
-SCRIPTS |= {"degenerate": "", "mutants": "--quiet", "kornia": "--clock cpu"}
+SCRIPTS |= {"degenerate": "", "mutants": "--quiet", "kornia": "--clock cpu", "xfeat_noise": ""}
 
 #: Scripts of another name than their result: ``kornia.py`` would be imported instead of the library.
 NAMED = {"kornia": "beside_kornia"}
