@@ -14,6 +14,7 @@ import argparse
 import json
 import math
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import torch
@@ -119,19 +120,16 @@ def main() -> int:
     gain, unlike = (float(f"{x:.2g}") for x in fit(fitted))
     limits = tested["similarity"].quantile(torch.tensor([1 / 3, 2 / 3], dtype=torch.float64))
     third = (tested["similarity"][:, None] > limits).sum(-1)
-    result = {
-        "gain": gain,
-        "unlike": unlike,
-        "rooms": {"fitted": FITTED, "tested": TESTED, "paths": PATHS, "gaps": GAPS},
-        "expected": EXPECTED,
-        "fitted": worth(fitted, gain, unlike),
-        "tested": worth(tested, gain, unlike),
-        "tested_by_similarity": [
-            worth({k: v[third == k3] for k, v in tested.items()}, gain, unlike) for k3 in range(3)
-        ],
-        "similarity_thirds": limits.tolist(),
-    }
-    text = json.dumps(result, indent=1)
+    rooms = {"paths": PATHS, "gaps": GAPS}
+    rows = [
+        {"name": "constants", "gain": gain, "unlike": unlike, "expected": EXPECTED},
+        {"name": "fitted", "seeds": FITTED, **rooms, **worth(fitted, gain, unlike)},
+        {"name": "tested", "seeds": TESTED, **rooms, **worth(tested, gain, unlike)},
+    ]
+    for k, (low, high) in enumerate(pairwise([0.0, *limits.tolist(), 1.0])):
+        some = {name: v[third == k] for name, v in tested.items()}
+        rows.append({"name": "tested", "similarity": (low, high), **worth(some, gain, unlike)})
+    text = json.dumps(rows, indent=1)
     print(text)
     if path is not None:
         path.write_text(text + "\n")
