@@ -137,12 +137,17 @@ class Method:
         return self.classify(frame, self.backproject(frame, uv))
 
 
-def networks(*parts: Any) -> Iterator[torch.nn.Module]:
+def parts(*seats: Any) -> Iterator[Any]:
+    """What sits in seats: callables, and what partials of the standard library hold, options that are none included."""
+    for seat in seats:
+        if isinstance(seat, Method):
+            yield from parts(*(getattr(seat, f.name) for f in fields(seat)))
+        elif isinstance(seat, partial):
+            yield from parts(seat.func, *seat.args, *seat.keywords.values())
+        else:
+            yield seat
+
+
+def networks(*seats: Any) -> Iterator[torch.nn.Module]:
     """The networks in seats: modules, and what partials of the standard library hold of them."""
-    for part in parts:
-        if isinstance(part, Method):
-            yield from networks(*(getattr(part, f.name) for f in fields(part)))
-        elif isinstance(part, torch.nn.Module):
-            yield part
-        elif isinstance(part, partial):
-            yield from networks(part.func, *part.args, *part.keywords.values())
+    return (part for part in parts(*seats) if isinstance(part, torch.nn.Module))

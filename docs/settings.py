@@ -26,7 +26,7 @@ import torch
 from dhtorch import first_release
 from dhtorch.method import Method
 from dhtorch.methods import METHODS
-from dhtorch.studies.baselines import opencv
+from dhtorch.studies.baselines import opencv, xfeat
 
 FOLDER = Path(__file__).resolve().parent.parent / "conf" / "method"
 
@@ -40,6 +40,7 @@ WRITTEN: dict[str, Method] = {
     "window_1": first_release.WINDOW_1,
     "opencv": opencv.OPENCV,
     "paper_dlt": opencv.PAPER_DLT,
+    "xfeat": xfeat.XFEAT,
 }
 
 WIDTH = 120
@@ -93,7 +94,7 @@ def _scalar(value: Any) -> str:
 
 def _said(name: str) -> list[str]:
     """The comment above a method's name in its module."""
-    for module in (sys.modules["dhtorch.methods"], first_release, opencv):
+    for module in (sys.modules["dhtorch.methods"], first_release, opencv, xfeat):
         source = inspect.getsource(module)
         if found := re.search(rf"((?:^#: .*\n)+)^{name.upper()} = ", source, re.M):
             return [line.removeprefix("#: ").replace("``", "`") for line in found[1].splitlines()]

@@ -17,7 +17,7 @@ LEVELS = [
     {"records", "drawing"},
     {"stages", "data", "evaluate", "export", "synthetic", "testing", "calibration"},
     {"method"},
-    {"pair", "window", "methods", "views"},
+    {"pair", "window", "methods", "first_release", "views"},
     {"transform", "integrate", "extract", "viewer", "stream"},
     {"studies"},
     {"commands", "__main__"},

@@ -463,7 +463,7 @@ ELSEWHERE = {
     "dhtorch.geometry.filters.gaussian_taps",
     "dhtorch.window.ask_window",
     *(f"dhtorch.pair.{name}" for name in ("ask_pair", "merge", "lifted", "undistort_tracks", "uniform_draws")),
-    "dhtorch.method.networks",
+    *(f"dhtorch.method.{name}" for name in ("parts", "networks")),
     "dhtorch.stages.fuse.inverse_variance",
     "dhtorch.stages.fuse.agree",
     *(f"dhtorch.views.{name}" for name in ("by_probes", "shrunk", "key_views")),

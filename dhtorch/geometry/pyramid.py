@@ -7,7 +7,8 @@ windows are to be searched for and not only searched in, its gradients along x a
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable, Hashable
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -93,6 +94,7 @@ class Pyramids:
         self.image = image  # (B, C, H, W), as build_pyramid takes it
         self._built: dict[tuple[int, int], Pyramid] = {}
         self._parts: dict[tuple[int, int], Pyramids] = {}
+        self._more: dict[Hashable, Any] = {}
 
     def __call__(self, levels: int, window: int) -> Pyramid:
         """``build_pyramid(image, levels, window)``, made once."""
@@ -100,6 +102,13 @@ class Pyramids:
             with torch.no_grad():
                 self._built[levels, window] = build_pyramid(self.image, levels, window)
         return self._built[levels, window]
+
+    def once(self, key: Hashable, make: Callable[[Tensor], Any]) -> Any:
+        """``make(image)``, made once for all who name it by ``key``: what else a tracker knows of its anchor."""
+        if key not in self._more:
+            with torch.no_grad():
+                self._more[key] = make(self.image)
+        return self._more[key]
 
     def __getitem__(self, part: slice) -> Pyramids:
         start, stop, _ = part.indices(len(self.image))

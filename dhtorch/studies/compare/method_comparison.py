@@ -19,6 +19,7 @@ from dhtorch.data.pairs import around
 from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import bootstrap, compare, errors
 from dhtorch.studies import protocol
+from dhtorch.studies.baselines import xfeat
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
 from dhtorch.studies.rows import Row
 
@@ -49,7 +50,7 @@ def run(
     *,
     methods: Mapping[str, Method] | None = None,
     reference: str = "paper",
-    once: Sequence[str] = ("opencv",),
+    once: Sequence[str] = ("opencv", "xfeat"),
     seeds: int = 5,
     stand_ins: Mapping[str, str] | None = None,
     baseline: str = "window",
@@ -152,18 +153,23 @@ def _convoy_wrong(name: str, scenes: Sequence[Sequence[errors.Points]]) -> Row:
 def _variant(method: Method, seed: int, pairs: Pairs) -> Variant:
     """A method that chooses its views is offered those around the anchor; another takes the pair's own."""
     if method.choose is not None:
-        return Variant(method, seed=seed, offers=around)
-    return Variant(method, seed=seed, needs=partial(_views, pairs, method.views))
+        return Variant(method, seed=seed, offers=around, needs=partial(_lacks, method))
+    return Variant(method, seed=seed, needs=partial(_views, pairs, method))
 
 
 def _named(method: str, k: int) -> str:
     return method if k == 0 else f"{method}, seed {k}"
 
 
-def _views(pairs: Pairs, views: int, scene: Scene) -> str | None:
-    """Why a method of several views is not asked on a scene; None where it is."""
-    short = views > 1 and min((j - i for i, j in pairs(scene)), default=2) < 2
-    return "fewer than 3 views" if short else None
+def _lacks(method: Method, _scene: Scene) -> str | None:
+    """Which package a method misses, wherever it is asked; None where there is none."""
+    return xfeat.lacking(method)
+
+
+def _views(pairs: Pairs, method: Method, scene: Scene) -> str | None:
+    """Why a method is not asked on a scene: a package, or views that there are not; None where it is."""
+    short = method.views > 1 and min((j - i for i, j in pairs(scene)), default=2) < 2
+    return xfeat.lacking(method) or ("fewer than 3 views" if short else None)
 
 
 def _by_scene(outcome: Outcome, method: str, seeds: int) -> dict[str, list[Any]]:
