@@ -57,6 +57,14 @@ def test_the_ratio_is_that_to_the_gap_which_is_best_in_hindsight(outcome):
     assert outcome.summary["map, gap 12.coverage_at_5"]["value"] == 0
 
 
+def test_the_worst_scene_is_the_one_that_reaches_least():
+    dark = scene("attic", load=lambda i: frame(10 * i))  # steps of ten are not answered, by nobody
+    found = study([dark, scene()])
+    worst, mean = (found.summary[f"auto.fixed_gap_ratio{end}"]["value"] for end in ("_worst", ""))
+    assert worst == found.scenes("auto")["hall"]["fixed_gap_ratio"] < 0.5
+    assert found.scenes("auto")["attic"]["fixed_gap_ratio"] == 1 and mean == pytest.approx(worst**0.5)
+
+
 def test_scenes_with_one_partner_stand_apart(outcome):
     row = outcome.scenes("auto")["pair"]
     assert row["one_partner"] is True and row["best_gap"] == 1 and row["fixed_gap_ratio"] == pytest.approx(1)
