@@ -8,6 +8,7 @@ import torch
 from hydra import compose as compose_settings
 from hydra import initialize_config_dir
 from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
 
 from dhtorch.commands.run import config_dir
 from dhtorch.data.pairs import by_gap
@@ -130,3 +131,19 @@ def test_a_method_that_chooses_is_offered_the_frames_around_and_held_against_the
     scenes = found.scenes("auto")
     assert "aurc_full_ratio_to_window" in scenes["synthetic_walk"]
     assert scenes["synthetic_walk"]["coverage"] > found.scenes("window")["synthetic_walk"]["coverage"] - 0.02
+
+
+def test_what_is_measured_is_held_against_the_first_release():
+    for experiment in ("method_comparison", "part_ablation"):
+        chosen = OmegaConf.load(config_dir() / f"experiment/{experiment}.yaml").defaults
+        named = {k: v for entry in chosen if isinstance(entry, DictConfig) for k, v in entry.items()}
+        assert (named["/method@methods.map"], named["/method@methods.window"]) == ("map_1", "window_1")
+        assert named["/method@methods.auto"] == "auto"
+
+
+def test_streams_are_of_rooms_that_the_shared_scenes_know_and_whose_coverage_is_asked():
+    with initialize_config_dir(str(config_dir()), version_base="1.3"):
+        streams, shared = (compose_settings("run", [f"data={name}"]).data for name in ("streams", "shared_scenes"))
+        indoor = compose_settings("run", ["experiment=method_comparison"]).experiment.indoor
+    rooms, known = ({scene.get("room", scene.path) for scene in data.scenes} for data in (streams, shared))
+    assert rooms == set(indoor) and rooms < known

@@ -353,6 +353,10 @@ SMALLER = {
         *("data=rh20t_synthetic", "data.hw=[72,128]", "data.tasks=3", "data.n_frames=12"),
         *("experiment.dinov2=null", "experiment.n_folds=3"),
     ],
+    "views_study": [
+        *("experiment.anchors=1", "experiment.rotation_gaps=[1,3]", "experiment.rotations.hw=[96,128]"),
+        *("experiment.rotations.n_frames=4", "experiment.rotations.gap=2"),
+    ],
     "vo_probe": [
         *("data=synthetic", "data.n_frames=12", "data.gap=3", "data.supersample=1"),
         *("experiment.dinov2=null", "experiment.min_pairs=2", "experiment.blocks=3"),

@@ -26,11 +26,12 @@ from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import errors, holdout
 from dhtorch.geometry.lookup import nearest, patches, round_half_up
 from dhtorch.method import Method, Trace
-from dhtorch.records import Estimate, Frame, PoseFit, Samples
+from dhtorch.records import NO_HINT, Estimate, Frame, PoseFit, Samples, TrackHint, Tracks
 from dhtorch.studies.rows import Row, overlay, scene_row, summarise
 from dhtorch.studies.shared_tracks import SharedTracks
 
 Pairs = Callable[[Scene], Sequence[tuple[int, int]]]
+Offers = Callable[[Recording, int], Sequence[int]]  # (recording, anchor) → positions of other views
 Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
 
 #: A pair with fewer candidates says nothing: it is dropped and counted.
@@ -76,7 +77,7 @@ class Batch:
     exact: Frame  # the anchor with the depth it is held against
     surface: Tensor  # (B, H, W) kind of surface, (B, 1, 1) where the recording knows none
     disagreement: Tensor  # (B,) median relative difference of the independent truth from the sensor; NaN = not known
-    around: tuple[Frame, ...] = ()  # offered to variants that choose for themselves, in the order of the recording
+    around: tuple[Frame, ...] = ()  # offered to one variant or another, in the order of the recording
 
     @property
     def odd(self) -> dict[int, str]:
@@ -110,7 +111,7 @@ class Variant:
     fit: Callable[[Batch, int], PoseFit] | None = None  # a pose from elsewhere: (batch, number of samples) → fit
     seed: int | None = None  # None = the job's
     given: Callable[[Batch], Mapping[str, Any]] = lambda _batch: {}  # further options: an oracle may see it all
-    offers: Callable[[Recording, int], Sequence[int]] | None = None  # (recording, anchor) → positions to choose from
+    offers: Offers | None = None  # other views in the place of the pair's own; silent where it is offered none
     needs: Callable[[Scene], str | None] = lambda _scene: None  # scene → why it cannot run there, None = it can
 
 
@@ -179,16 +180,10 @@ class Protocol:
     min_candidates: int = MIN_CANDIDATES
 
     @property
-    def offers(self) -> Callable[[Recording, int], Sequence[int]] | None:
-        """Which frames are offered to the variants that choose for themselves; all are offered the same.
-
-        Raises:
-            ValueError: two variants ask for different offers.
-        """
-        asked = {v.offers for v in self.variants.values()} - {None}
-        if len(asked) > 1:
-            raise ValueError("protocol: found variants with different offers, expected one for all")
-        return next(iter(asked), None)
+    def offers(self) -> Offers | None:
+        """All frames that are offered to any variant, in the order of the recording; None where none asks for them."""
+        asked = list(dict.fromkeys(v.offers for v in self.variants.values() if v.offers is not None))
+        return partial(_all_offered, asked) if asked else None
 
     def batch(self, settings: Settings) -> int:
         """Pairs per call: one where anchors are offered differently many views."""
@@ -298,7 +293,7 @@ class PairData(Dataset[Loaded]):
         pairs: Sequence[tuple[int, int]],
         dtype: torch.dtype,
         views: int = 1,
-        offers: Callable[[Recording, int], Sequence[int]] | None = None,
+        offers: Offers | None = None,
     ) -> None:
         self.recording, self.pairs, self.dtype, self.views, self.offers = recording, pairs, dtype, views, offers
 
@@ -307,10 +302,11 @@ class PairData(Dataset[Loaded]):
 
     def __getitem__(self, index: int) -> Loaded:
         i, j = self.pairs[index]
-        anchor = self.recording[i].to(self.dtype)
-        others = tuple(self.recording[k].to(self.dtype) for k in between(i, j, self.views))
+        own = between(i, j, self.views)
         offered = () if self.offers is None else self.offers(self.recording, i)
-        around = tuple(self.recording[k].to(self.dtype) for k in offered)
+        frames = {k: self.recording[k].to(self.dtype) for k in sorted({i, *own, *offered})}
+        anchor = frames[i]
+        others, around = (tuple(frames[k] for k in some) for some in (own, offered))
         if not isinstance(self.recording, TruthRecording):
             return anchor, others, anchor, torch.zeros(1, 1, 1), torch.full((1,), torch.nan), around
         exact = self.recording.truth(i)
@@ -343,14 +339,13 @@ class _Collected:
         """Run all variants on one batch of pairs."""
         near = self.protocol.hide(batch.anchor, self.cutoff)
         views = tuple(self.protocol.hide(view, self.cutoff) for view in batch.others)
-        offered = [self.protocol.hide(view, self.cutoff) for view in batch.around]
-        seen: dict[int, Frame] = {}
+        offered = self._offered(batch)
+        seen: dict[Any, Frame | None] = {}
         shared, enough = SharedTracks(), [True] * len(batch.pairs)
         for k, (name, variant) in enumerate(self.variants.items()):
-            some = offered if variant.offers is not None else list(views[-variant.method.views :])
-            which = 0 if variant.offers is not None else variant.method.views
+            which, some = self._view_of(variant, batch, views, offered)
             if which not in seen:  # one record for all who see the same, so that they share tracks
-                seen[which] = tree.stack(some) if len(some) > 1 else some[0]
+                seen[which] = tree.stack(some) if len(some) > 1 else next(iter(some), None)
             estimate, trace = self._ask(variant, batch, near, seen[which], shared)
             truths = {cohort: of(batch, trace) for cohort, of in self.protocol.cohorts.items()}
             answer = Answer(batch, name, estimate, trace, truths)
@@ -389,8 +384,24 @@ class _Collected:
                 rows.append(row)
         return rows
 
+    def _offered(self, batch: Batch) -> dict[int, Frame]:
+        """Position → frame, as variants see it, of all that are offered."""
+        if self.protocol.offers is None:
+            return {}
+        positions = self.protocol.offers(self.scene.recording, batch.pairs[0][0])
+        return {k: self.protocol.hide(view, self.cutoff) for k, view in zip(positions, batch.around, strict=True)}
+
+    def _view_of(
+        self, variant: Variant, batch: Batch, views: Sequence[Frame], offered: Mapping[int, Frame]
+    ) -> tuple[Any, list[Frame]]:
+        """Other views of one variant, and what they are told apart by from those of others."""
+        if variant.offers is None:
+            return variant.method.views, list(views[-variant.method.views :])
+        positions = tuple(variant.offers(self.scene.recording, batch.pairs[0][0]))
+        return positions, [offered[k] for k in positions]
+
     def _ask(
-        self, variant: Variant, batch: Batch, near: Frame, seen: Frame, shared: SharedTracks
+        self, variant: Variant, batch: Batch, near: Frame, seen: Frame | None, shared: SharedTracks
     ) -> tuple[Estimate, Trace]:
         method = variant.method
         trace: Trace = {}
@@ -402,14 +413,16 @@ class _Collected:
         if variant.fit is not None:
             told["fit"] = variant.fit(batch, method.n)
         told |= variant.given(batch)
+        if seen is None:  # every sample is counted, none is found again
+            told["track"] = _nowhere
         with torch.no_grad():
             ask = method if variant.ask is None else partial(variant.ask, method)
-            estimate = ask(near, seen, trace=trace, **told)
+            estimate = ask(near, near if seen is None else seen, trace=trace, **told)
         shared.charge(trace["ms"])
         return estimate, trace
 
     def _asked(self, answer: Answer) -> Row:
-        """Which frames a variant chose that was offered some."""
+        """Which of the frames that a variant was offered it chose."""
         offers = self.variants[answer.variant].offers
         if offers is None:
             return {}
@@ -447,8 +460,7 @@ class _Collected:
 def _load(
     recording: Recording, pairs: list[tuple[int, int]], protocol: Protocol, settings: Settings
 ) -> DataLoader[Loaded]:
-    fixed = (v.method.views for v in protocol.variants.values() if v.offers is None)
-    wanted = max(fixed, default=1)
+    wanted = max((v.method.views for v in protocol.variants.values() if v.offers is None), default=1)
     views = min([wanted, *(j - i for i, j in pairs)])  # a short gap holds fewer frames
     return DataLoader(
         PairData(recording, pairs, settings.dtype, views, protocol.offers),
@@ -459,6 +471,18 @@ def _load(
         # A fork would copy the locks of whatever threads torch and OpenCV run here, and may never return.
         multiprocessing_context="spawn" if settings.workers and pairs else None,
     )
+
+
+def _all_offered(asked: Sequence[Offers], recording: Recording, anchor: int) -> list[int]:
+    return sorted({k for offers in asked for k in offers(recording, anchor)})
+
+
+def _nowhere(image_0: Tensor, image_1: Tensor, uv_0: Tensor, *, hint: TrackHint = NO_HINT) -> Tracks:
+    """No sample is found again: there is no other view."""
+    zero = torch.zeros_like(uv_0[..., 0])
+    lost = torch.zeros_like(zero, dtype=torch.bool)
+    cov = torch.eye(2).to(uv_0).expand(*zero.shape, 2, 2)
+    return Tracks(uv_0=uv_0, uv_1=uv_0, error=zero, photometric=zero, cov=cov, valid=lost)
 
 
 def _collate(items: list[Loaded]) -> Loaded:

@@ -47,7 +47,7 @@ class SharedTracks:
         hint: TrackHint = NO_HINT,  # its pyramid says nothing that the image does not
     ) -> Tracks:
         start = time.perf_counter()
-        key = _key(track), hint.levels
+        key = what_it_does(track), hint.levels
         question = (image_0, image_1, uv_0, uv_0 if hint.start is None else hint.start)
         for known, asked, tracks, ms in self._known:
             if known == key and all(map(_same, asked, question)):
@@ -65,8 +65,9 @@ def _same(a: Tensor, b: Tensor) -> bool:
     return (a.data_ptr() == b.data_ptr() and a.stride() == b.stride()) or torch.equal(a, b)
 
 
-def _key(fn: Any) -> Any:
+def what_it_does(fn: Any) -> Any:
     """What a seat does, comparable: partials of one function with equal options are equal."""
     if isinstance(fn, partial):
-        return (_key(fn.func), tuple(map(_key, fn.args)), {k: _key(v) for k, v in fn.keywords.items()})
+        options = {k: what_it_does(v) for k, v in fn.keywords.items()}
+        return what_it_does(fn.func), tuple(map(what_it_does, fn.args)), options
     return fn

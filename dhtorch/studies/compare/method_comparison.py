@@ -10,14 +10,14 @@ What would refute it: any of these numbers missed.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
-from typing import Any
 
 from dhtorch import tree
 from dhtorch.data.pairs import around
 from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import bootstrap, compare, errors
+from dhtorch.evaluate.errors import Points
 from dhtorch.studies import protocol
 from dhtorch.studies.baselines import xfeat
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
@@ -63,7 +63,7 @@ def run(
     Rows are those of the first seed; scene rows of a compared method carry ``against_<reference>``: its numbers over
     all seeds. The summary holds, for every compared method, the numbers of
     :func:`dhtorch.evaluate.compare.method_ratios`. A method of several views is replaced, on scenes too short for
-    three, by its stand-in.
+    three, by its stand-in; one that has none is asked there with the views that there are.
 
     Args:
         scenes, chosen, pairs, settings, progress: as :func:`dhtorch.studies.protocol.run`.
@@ -72,7 +72,7 @@ def run(
         once: methods that are shown for one seed and not compared.
         seeds: how many, from the job's own upwards.
         stand_ins: method of several views → method of one; None = the first compared method for all.
-        baseline: the method of several views that those which choose their views are held against as well.
+        baseline: the method of several views that the others of several views are held against as well.
         indoor: rooms whose scenes make the mean ``<method>.coverage_at_5_indoor``.
         moving: rooms in which what is near moves; their scenes, whatever their role, make ``<method>.convoy_wrong``,
             the largest share of the candidates of one scene (all seeds) that is answered and more than 20 % off.
@@ -84,34 +84,32 @@ def run(
     compared = [name for name in methods if name not in (*once, reference)]
     if reference not in methods or not compared:
         raise ValueError(f"experiment.methods: found {', '.join(methods)}, expected {reference} and one more")
+    fallback = stand_ins or {name: compared[0] for name in compared if methods[name].views > 1}
     variants = {
-        _named(name, k): _variant(method, settings.seed + k, pairs)
+        named(name, k): _variant(method, settings.seed + k, pairs if name in fallback else None)
         for name, method in methods.items()
         for k in range(1 if name in once else seeds)
     }
     outcome = protocol.run(scenes, Protocol(variants), pairs, settings, progress=progress)
     rooms = {scene.name: scene.place for scene in scenes_of(scenes)}
     apart = {scene.name for scene in scenes_of(scenes) if scene.role is not None}
-    everywhere = {name: _by_scene(outcome, name, seeds) for name in (reference, *compared)}
+    everywhere = {name: seeds_of(outcome, name, seeds) for name in (reference, *compared)}
     found = {name: {s: p for s, p in of.items() if s not in apart} for name, of in everywhere.items()}
-    fallback = stand_ins or {name: compared[0] for name in compared if methods[name].views > 1}
     complete = compare.completed(found, reference, fallback)
     judged = compare.method_ratios(complete, reference=reference, rooms=rooms)
-    later = {_named(name, k) for name in methods for k in range(1, seeds)}
-    outcome.rows = [r for r in outcome.rows if r["method"] not in later]
-    outcome.summary = {k: v for k, v in outcome.summary.items() if not any(k.startswith(f"{m}.") for m in later)}
+    leave_first_seed(outcome, methods, seeds)
     outcome.summary |= judged.summary
     outcome.summary |= _indoor(judged, rooms, indoor)
     for name, of in everywhere.items():
         outcome.summary |= _convoy_wrong(name, [p for scene, p in of.items() if rooms[scene] in moving])
-    for name in (n for n in compared if methods[n].choose is not None and baseline in compared):
+    several = [name for name in compared if methods[name].views > 1]
+    for name in (n for n in several if n != baseline and baseline in compared):
         numbers, by_scene = compare.against(complete[name], complete[baseline], baseline)
         outcome.summary |= {f"{name}.{k}": v.entry("1") for k, v in numbers.items()}
         for scene, row in outcome.scenes(name).items():
             row.update(by_scene[scene])
     _annotate(outcome.rows, judged.rows, f"against_{reference}")
-    several = {name for name in compared if methods[name].views > 1}
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(judged, compared, several))
+    return outcome.decide(QUESTION, EXPECTATION, *verdict(judged, compared, set(several)))
 
 
 def verdict(judged: compare.Comparison, compared: Sequence[str], several: set[str]) -> tuple[bool | None, str]:
@@ -141,7 +139,7 @@ def _indoor(judged: compare.Comparison, rooms: Mapping[str, str], indoor: Sequen
     }
 
 
-def _convoy_wrong(name: str, scenes: Sequence[Sequence[errors.Points]]) -> Row:
+def _convoy_wrong(name: str, scenes: Sequence[Sequence[Points]]) -> Row:
     """The worst of the scenes' shares of candidates that are answered and wrong, over the seeds of each."""
     pools = [pool for pool in map(tree.collate, scenes) if pool.keep.numel()]
     if not pools:
@@ -150,14 +148,18 @@ def _convoy_wrong(name: str, scenes: Sequence[Sequence[errors.Points]]) -> Row:
     return {f"{name}.convoy_wrong": bootstrap.single(max(shares), len(shares))}
 
 
-def _variant(method: Method, seed: int, pairs: Pairs) -> Variant:
-    """A method that chooses its views is offered those around the anchor; another takes the pair's own."""
+def _variant(method: Method, seed: int, pairs: Pairs | None) -> Variant:
+    """A method that chooses its views is offered those around the anchor; another takes the pair's own.
+
+    With ``pairs`` it is not asked on scenes of too few views.
+    """
     if method.choose is not None:
         return Variant(method, seed=seed, offers=around, needs=partial(_lacks, method))
     return Variant(method, seed=seed, needs=partial(_views, pairs, method))
 
 
-def _named(method: str, k: int) -> str:
+def named(method: str, k: int) -> str:
+    """The variant that is a method with its seed ``k``; the first bears the method's own name."""
     return method if k == 0 else f"{method}, seed {k}"
 
 
@@ -166,18 +168,25 @@ def _lacks(method: Method, _scene: Scene) -> str | None:
     return xfeat.lacking(method)
 
 
-def _views(pairs: Pairs, method: Method, scene: Scene) -> str | None:
+def _views(pairs: Pairs | None, method: Method, scene: Scene) -> str | None:
     """Why a method is not asked on a scene: a package, or views that there are not; None where it is."""
-    short = method.views > 1 and min((j - i for i, j in pairs(scene)), default=2) < 2
+    short = pairs is not None and method.views > 1 and min((j - i for i, j in pairs(scene)), default=2) < 2
     return xfeat.lacking(method) or ("fewer than 3 views" if short else None)
 
 
-def _by_scene(outcome: Outcome, method: str, seeds: int) -> dict[str, list[Any]]:
-    """Scene → candidates of every seed."""
-    scenes: dict[str, list[Any]] = {}
+def leave_first_seed(outcome: Outcome, methods: Iterable[str], seeds: int) -> None:
+    """Take the later seeds out of the rows and the summary; their points stay."""
+    later = {named(name, k) for name in methods for k in range(1, seeds)}
+    outcome.rows = [r for r in outcome.rows if r["method"] not in later]
+    outcome.summary = {k: v for k, v in outcome.summary.items() if not any(k.startswith(f"{m}.") for m in later)}
+
+
+def seeds_of(outcome: Outcome, method: str, seeds: int, apart: Collection[str] = ()) -> dict[str, list[Points]]:
+    """Scene → candidates of every seed; scenes that stand apart stay out."""
+    scenes: dict[str, list[Points]] = {}
     for k in range(seeds):
         for (scene, variant, cohort), points in outcome.points.items():
-            if (variant, cohort) == (_named(method, k), "full"):
+            if (variant, cohort) == (named(method, k), "full") and scene not in apart:
                 scenes.setdefault(scene, []).append(points)
     return scenes
 

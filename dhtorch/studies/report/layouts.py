@@ -194,7 +194,17 @@ def _comparison(result: Result) -> list[Table]:
 def _part_ablation(result: Result) -> list[Table]:
     columns: tuple[str, ...] = ("n_scenes", "coverage", "median_rel_ratio_at_equal_coverage", "aurc_ratio")
     columns += ("coverage_at_5", "within_sigma", "within_2sigma", "ece", "pair_ms", "extra_ms")
+    beside = ("error_ratio_to_window", "aurc_full_ratio_to_window")
+    columns += tuple(m for m in beside if any(entry(result, v, m) for v in variants(result)))
     return [by_variant(result, "Parts alone and left out, ratios to the paper's method", columns)]
+
+
+def _views_study(result: Result) -> list[Table]:
+    chosen = {**result, "rows": [row for row in result["rows"] if row["method"] == "auto" and not row.get("role")]}
+    return [
+        by_variant(result, "Chosen views and fixed gaps, over scenes", ("n_scenes", "coverage", "coverage_at_5")),
+        by_scene(chosen, "Against the best gap", ("coverage_at_5", "best_gap", "fixed_gap_ratio", "one_partner")),
+    ]
 
 
 def _learned_score(result: Result) -> list[Table]:
@@ -217,6 +227,7 @@ LAYOUTS: dict[str, Callable[[Result], list[Table]]] = {
     "method_comparison": _comparison,
     "learned_score": _learned_score,
     "part_ablation": _part_ablation,
+    "views_study": _views_study,
     "helix_correlation": negatives.helix,
     "icp": negatives.icp,
     "hole_attention": negatives.attention,
