@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import partial
 
 import pytest
+import stepping
 import torch
 from hydra import compose as compose_settings
 from hydra import initialize_config_dir
@@ -147,3 +148,16 @@ def test_streams_are_of_rooms_that_the_shared_scenes_know_and_whose_coverage_is_
         indoor = compose_settings("run", ["experiment=method_comparison"]).experiment.indoor
     rooms, known = ({scene.get("room", scene.path) for scene in data.scenes} for data in (streams, shared))
     assert rooms == set(indoor) and rooms < known
+
+
+def test_a_scene_of_too_few_candidates_keeps_a_row_and_has_no_ratio():
+    blind = stepping.scene("dark", load=lambda i: stepping.frame(i).replace(depth=torch.zeros(1, 48, 64)))
+    methods = {"paper": stepping.MAP, "window": stepping.MAP.replace(views=2), "auto": stepping.choosing(2, 3)}
+    scenes = [blind, stepping.scene()]
+    pairs = partial(by_gap, stride=4)
+    found = method_comparison.run(
+        scenes, {}, pairs, Settings(), methods=methods, seeds=1, stand_ins={"window": "paper"}
+    )
+    rows = found.scenes("auto")
+    assert rows["dark"]["note"] == "too few candidates" and "aurc_full_ratio_to_window" not in rows["dark"]
+    assert rows["hall"]["aurc_full_ratio_to_window"] > 0

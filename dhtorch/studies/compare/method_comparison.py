@@ -107,7 +107,7 @@ def run(
         numbers, by_scene = compare.against(complete[name], complete[baseline], baseline)
         outcome.summary |= {f"{name}.{k}": v.entry("1") for k, v in numbers.items()}
         for scene, row in outcome.scenes(name).items():
-            row.update(by_scene[scene])
+            row.update(by_scene.get(scene, {}))  # none where there were too few candidates
     _annotate(outcome.rows, judged.rows, f"against_{reference}")
     return outcome.decide(QUESTION, EXPECTATION, *verdict(judged, compared, set(several)))
 
