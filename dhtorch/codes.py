@@ -64,6 +64,7 @@ class Gate:
     INCONSISTENT: Final = 8  #: another view, or the patch itself, contradicts the answer
     UNCERTAIN: Final = 9  #: sigma / depth above the limit
     LOW_SCORE: Final = 10  #: score below the threshold
+    CONTRADICTED: Final = 11  #: what lies far contradicts the near returns: these move on their own
 
 
 class PoseCode:

@@ -47,12 +47,12 @@ MAP = PAPER.replace(
 WINDOW = MAP.replace(views=5)
 
 #: Several views chosen among those around the anchor; the search begins where the whole picture went, whatever the
-#: exposures; an answer needs views that agree or one that is sure by itself.
+#: exposures; an answer needs views that agree or one that is sure by itself, and near returns that what lies far does
+#: not contradict. A view may be unsure: what counts is how sure they are together.
 AUTO = MAP.replace(
-    track=partial(
-        lucas_kanade_affine, levels=LEVELS, start=coarse_flow, track=partial(lucas_kanade, normalise="gain_bias")
-    ),
-    fuse=agree,
+    track=partial(lucas_kanade_affine, levels=LEVELS, start=coarse_flow, track=partial(lucas_kanade, normalise="bias")),
+    triangulate={"max_sigma_rel": 1.0, "max_far_noise": 0.0025, "max_in_reach": 0.15},
+    fuse=partial(agree, max_still=0.7),
     score=rank_by_sigma,
     choose=by_probes,
     views=5,

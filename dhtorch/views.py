@@ -30,10 +30,10 @@ LONG = 240
 #: How a candidate is asked: everything that has a sigma counts, and how much is what the sigma says. Few samples, few
 #: hypotheses and few steps: what is asked is which view is better, not where its points are.
 PROBE = Method(
-    n=96,
-    hypotheses=64,
+    n=128,
+    hypotheses=100,
     track=partial(lucas_kanade, levels=4, window=15, normalise="bias"),
-    pose=partial(map_pose, turn_sigma=0.0, near_steps=2, steps=3),
+    pose=partial(map_pose, turn_sigma=0.0),
     triangulate=partial(two_view, min_parallax_deg=None, min_t_snr=1.0, fitted_noise=True, sensor_share=1.0),
 )
 

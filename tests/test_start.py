@@ -10,9 +10,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from dhtorch.geometry import lucas_kanade as lk
 from dhtorch.geometry import start
+from dhtorch.geometry.exact import LANES
+from dhtorch.geometry.pyramid import build_pyramid
 from dhtorch.records import TrackHint
-from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
+from dhtorch.stages import track
+from dhtorch.stages.track import MIN_EIGENVALUE, lucas_kanade, lucas_kanade_affine
 
 H, W = 240, 320
 
@@ -225,3 +229,36 @@ def test_the_gradient_of_a_turned_track_is_finite_and_leaves_its_place() -> None
     torch.testing.assert_close(tracks.uv_1.detach(), plain.uv_1)
     tracks.uv_1.sum().backward()
     assert b.grad is not None and bool(b.grad.isfinite().all()) and bool((b.grad != 0).any())
+
+
+def test_a_start_spares_the_levels_it_does_not_need_and_no_others() -> None:
+    """A point that was told where to look is searched for there and nowhere else; one that was not, everywhere."""
+    a, b, _ = _pair(5, (40.0, 0.0))
+    source, target = build_pyramid(a, 5, 21), build_pyramid(b, 5, 21)
+    o = lk.SearchOptions(21, 30, 0.01, MIN_EIGENVALUE, "bias")
+    x = (60 + 200 * torch.rand(2, LANES * 8, generator=torch.Generator().manual_seed(1))).clamp_max(H - 60)
+    expected = torch.tensor([[40.0], [0.0]]).expand_as(x)
+    every, none = torch.ones_like(x[0], dtype=torch.bool), torch.zeros_like(x[0], dtype=torch.bool)
+
+    def share(d: Tensor, begun: Tensor, near_levels: int) -> float:
+        found, ok, _ = lk.search(
+            source, target, o, x, d, torch.zeros_like(x[0], dtype=torch.long), known=every, alike=False,
+            begun=begun, near_levels=near_levels,
+        )  # fmt: skip
+        right = ok & ((found - expected).square().sum(0).sqrt() < 0.5)
+        return float(right.float().mean())
+
+    zero = torch.zeros_like(x)
+    assert share(zero, none, 2) == share(zero, every, 5) > 0.8, "from nothing, by all levels"
+    assert share(zero, every, 2) < 0.1, "told to look near, where it is not"
+    assert share(expected + 6.0, every, 2) > 0.8
+    half = torch.arange(x.shape[1]) % 2 == 0
+    assert share(torch.where(half, expected + 6.0, zero), half, 2) > 0.8, "each by its own"
+
+
+@pytest.mark.parametrize(("width", "levels"), [(320, 2), (640, 2), (1280, 3), (1920, 4)])
+def test_a_larger_picture_needs_more_levels_from_a_start(width: int, levels: int) -> None:
+    cells = torch.zeros(1, 10, 13)
+    uv = torch.zeros(1, 10, 13, 2)
+    flow = start.Flow(uv, uv, cells, torch.eye(2)[None], torch.ones(1))
+    assert track._reaching(flow, (width * 3 // 4, width), 21) == levels

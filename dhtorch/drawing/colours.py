@@ -68,6 +68,7 @@ GATES = {
     Gate.INCONSISTENT: "#882255",
     Gate.UNCERTAIN: "#44AA99",
     Gate.LOW_SCORE: "#999933",
+    Gate.CONTRADICTED: "#6B4A1F",
 }
 HOLES = {
     Hole.TRACKABLE_NO_LIDAR: "#D55E00",

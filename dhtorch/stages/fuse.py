@@ -114,7 +114,8 @@ def agree(
         ``residual_px`` their weighted rms; ``score`` is 1 where answered.
 
     Gates: NO_BASELINE for all points of an anchor whose views mostly have none; where no view answers, the reason of
-    the last; INCONSISTENT (contradicted), UNCERTAIN (one unsure view, or a joint sigma too large).
+    the last; INCONSISTENT (other views disagree), UNCERTAIN (one unsure view, or a joint sigma too large);
+    CONTRADICTED for all answers where it silences as many views as answer.
 
     Raises:
         ValueError: wrong shapes, or no view.
@@ -142,6 +143,7 @@ def agree(
     unsure = torch.zeros_like(alone) if max_sigma_rel is None else sigma > max_sigma_rel * depth
     gate = first_reason((against, Gate.INCONSISTENT), (alone, Gate.UNCERTAIN), (unsure, Gate.UNCERTAIN))
     gate = torch.where(n < 1, _last_reason(estimates.gate, said), gate)
+    gate = _contradicted(estimates, gate)
     parallax = torch.where(joined | (n < 1), estimates.parallax_deg, torch.zeros_like(estimates.parallax_deg))
     return _joint(
         estimates,
@@ -184,6 +186,15 @@ def _stilled(estimates: Estimate, gate: Tensor, max_still: float) -> Tensor:
     """The gates (B, N); NO_BASELINE for all points of an anchor whose views mostly have none."""
     still = (estimates.gate == Gate.NO_BASELINE).any(-1).sum(0) > max_still * len(estimates.gate)
     return torch.where(still[:, None], Gate.NO_BASELINE, gate).to(torch.int32)
+
+
+def _contradicted(estimates: Estimate, gate: Tensor) -> Tensor:
+    """The gates (B, N); CONTRADICTED for what an anchor answers of whose views with an answer, or with one withheld
+    for that, half are contradicted: what moves on its own is near in all of them."""
+    against = (estimates.gate == Gate.CONTRADICTED).any(-1).sum(0)
+    answering = (estimates.gate == Gate.ANSWER).any(-1).sum(0)
+    moving = (against > 0) & (against >= answering)
+    return torch.where(moving[:, None] & (gate == Gate.ANSWER), Gate.CONTRADICTED, gate)
 
 
 def _joint(

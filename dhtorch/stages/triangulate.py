@@ -15,6 +15,7 @@ from dhtorch.geometry.covariance import median, noise_shape
 from dhtorch.geometry.near_far import straighten
 from dhtorch.geometry.shapes import check
 from dhtorch.records import Camera, Estimate, PoseFit, Samples, Tracks
+from dhtorch.stages.contradict import misses_lines, within_reach
 
 #: Least trackability that a grey difference is divided by.
 MIN_TRACKABILITY = 1e-8
@@ -32,6 +33,8 @@ def two_view(
     max_sigma_rel: float | None = None,
     min_t_snr: float | None = None,
     max_mismatch_px: float | None = None,
+    max_far_noise: float | None = None,
+    max_in_reach: float | None = None,
     fitted_noise: bool = False,
     isotropic: float = 0.1,
     mismatch_px: float | None = None,
@@ -69,6 +72,10 @@ def two_view(
         max_mismatch_px: grey difference of a track's patches above which it may have slid to another place of its
             epipolar line, and is not answered; as the shift that would make it, the rms over the root of the
             sample's trackability. None asks nothing.
+        max_far_noise: spread of the far tracks' residuals, of a ray with z = 1, above which the near returns are taken
+            to move on their own and no point of the pair is answered; None asks nothing.
+        max_in_reach: share of the answers that may lie where the sensor would have seen them
+            (:func:`dhtorch.stages.contradict.within_reach`); with more, none is given. None asks nothing.
         fitted_noise: take the scale of the tracks' noise from the pose's residuals (``fit.sigma_px``), and from the
             tracks' covariances only its shape; else the covariances as they are.
         isotropic: share of that shape which does not depend on the patch, see ``covariance.noise_shape``.
@@ -85,7 +92,8 @@ def two_view(
         the pose's (with it the sensor's noise, which the pose has from the near points); ``sigma_shared`` is the pose's
         part, common to the pair's points.
 
-    Gates, first reason wins: NO_TRACK, NO_POSE, NO_BASELINE, BEHIND, PARALLAX, RESIDUAL, INCONSISTENT, UNCERTAIN.
+    Gates, first reason wins: NO_TRACK, NO_POSE, NO_BASELINE, BEHIND, PARALLAX, RESIDUAL, INCONSISTENT, UNCERTAIN; in
+    the place of an answer CONTRADICTED.
     A rolling shutter that the pose found (``fit.shutter``) is undone in ``uv_1`` and counts in sigma.
 
     Raises:
@@ -130,11 +138,19 @@ def two_view(
         (_above(mismatch, max_mismatch_px), Gate.INCONSISTENT),
         (_above(own + shared, limit), Gate.UNCERTAIN),
     )
+    sigma = _root(own + shared, gate == Gate.ANSWER)
+    moving = torch.zeros_like(fit.ok)
+    if max_far_noise is not None:
+        moving = moving | misses_lines(fit, camera_1, max_far_noise=max_far_noise)
+    if max_in_reach is not None:
+        share = within_reach(samples, fit, geometry.depth.detach(), sigma.detach(), gate == Gate.ANSWER)
+        moving = moving | (share > max_in_reach)
+    gate = torch.where((gate == Gate.ANSWER) & moving[:, None], Gate.CONTRADICTED, gate)
     keep, measured = gate == Gate.ANSWER, tracked & posed
     return Estimate(
         uv=samples.uv,
         depth=_where_or_nan(keep, geometry.depth),
-        sigma=_where_or_nan(keep, _root(own + shared, keep)),
+        sigma=_where_or_nan(keep, sigma),
         sigma_shared=_where_or_nan(keep, _root(shared, keep)),
         parallax_deg=torch.where(measured, parallax_deg, torch.zeros_like(parallax_deg)),
         residual_px=torch.where(measured, geometry.residual_px, torch.zeros_like(geometry.residual_px)),
