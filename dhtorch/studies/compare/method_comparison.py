@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
-from dhtorch.data.pairs import around
+from dhtorch.data.pairs import around, fixed
 from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import bootstrap, compare
 from dhtorch.studies import protocol
@@ -146,7 +146,7 @@ def _named(method: str, k: int) -> str:
 
 def _views(pairs: Pairs, views: int, scene: Scene) -> str | None:
     """Why a method of several views is not asked on a scene; None where it is."""
-    short = views > 1 and min((j - i for i, j in pairs(scene)), default=2) < 2
+    short = views > 1 and min((j - i for i, j in fixed(pairs(scene))), default=2) < 2
     return "fewer than 3 views" if short else None
 
 

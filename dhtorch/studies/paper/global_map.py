@@ -22,6 +22,7 @@ from torch import Tensor
 from dhtorch import integrate
 from dhtorch.codes import Source
 from dhtorch.data.recording import Recording
+from dhtorch.data.pairs import fixed
 from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import bootstrap
 from dhtorch.geometry import sparse_grid
@@ -69,7 +70,7 @@ def run(
     answers: dict[str, dict[Item, PairEstimate]] = {}
 
     def items(scene: Scene) -> list[Item]:
-        chosen = list(pairs(scene))
+        chosen = fixed(pairs(scene))
         return [*chosen, *chain(chosen)]
 
     def ask(scene: Scene, item: Item) -> dict[str, Row]:
