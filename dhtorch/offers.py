@@ -31,7 +31,10 @@ class Picked:
 
     def __str__(self) -> str:
         names = ", ".join(map(str, self.views))
-        said = f"frame {self.anchor}: view{'s' * (len(self.views) > 1)} {names} of {self.n_offered} offered"
+        said = f"frame {self.anchor}: view{'s' * (len(self.views) > 1)} {names}"
+        if len(self.views) == self.n_offered:
+            return f"{said}, all that were offered"
+        said += f", chosen of {self.n_offered}"
         if self.worth is None:
             return said
         worth = f"worth {', '.join(f'{w:.3g}' for w in self.worth)}"

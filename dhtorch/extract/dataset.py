@@ -116,7 +116,7 @@ class _Opened:
         if self.offers is None:
             number = int(self.recording.number[i])
             return [self._frame(self.position.get(number - step)) for step in self.steps]
-        readable = [frame for k in self.offers.get(i, ()) if (frame := self._frame(k)) is not None]
+        readable: list[Frame | None] = [f for k in self.offers.get(i, ()) if (f := self._frame(k)) is not None]
         return readable or [None]
 
     def _frame(self, at: int | None) -> Frame | None:
