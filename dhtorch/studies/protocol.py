@@ -380,8 +380,11 @@ class _Collected:
                 self._count_holes(variant.method, batch.anchor, answer.samples.uv)
                 enough = [int(ok.sum()) >= self.least for ok in truths[self.last].ok]
                 self.n_few += enough.count(False)
-            for b in (b for b in range(len(batch.pairs)) if enough[b]):
-                self._note(answer.one(b))
+            for b, counts in enumerate(enough):
+                one = answer.one(b)
+                choice = self._picked(one)
+                if counts:
+                    self._note(one, choice)
             if not self.examples:
                 first = answer.one(0)
                 records = (near[:1], first.samples, first.estimate, first.truths[self.last])
@@ -442,12 +445,12 @@ class _Collected:
             total = max(int((hole != Hole.NONE).sum()), 1)
             self.census.append({k: float((hole == k).sum()) / total for k in names(Hole)})
 
-    def _note(self, answer: Answer) -> None:
+    def _note(self, answer: Answer, choice: Picked | None) -> None:
         """Rows and points of one pair."""
         estimate, fit, kinds = answer.estimate, answer.trace["fit"], answer.batch.kinds(answer.samples.uv)
         hole = ~answer.samples.usable
         share = {gate.lower(): float((estimate.gate == code).float().mean()) for code, gate in names(Gate).items()}
-        pair, choice = [answer.batch.pairs[0].anchor, answer.other[0]], self._picked(answer)
+        pair = [answer.batch.pairs[0].anchor, answer.other[0]]
         common: Row = {"scene": self.scene.name, "pair": pair, "method": answer.variant}
         found: Row = {"pnp_ok": bool(fit.ok[0]), "n_inlier": int(fit.n_inlier[0]), "n_holes": int(hole.sum())}
         found |= {"n_recovered": int((estimate.keep & hole).sum()), "gate_share": share, "ms": answer.trace["ms"]}
