@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from dhtorch import tree
-from dhtorch.records import NO_HINT, Estimate, Frame, PoseFit, Samples, TrackHint, Tracks
+from dhtorch.records import NO_HINT, Choice, Estimate, Frame, PoseFit, Samples, TrackHint, Tracks
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.fuse import inverse_variance
 from dhtorch.stages.holes import classify
@@ -53,7 +53,7 @@ class Method:
     triangulate: Callable[..., Estimate] = two_view  # (samples, tracks, fit, camera_0, camera_1)
     score: Callable[..., Estimate] = rank  # (estimate, samples, tracks, fit)
     fuse: Callable[..., Estimate] = inverse_variance  # (estimates (V, B, N)); asked where there are several views
-    choose: Callable[..., Tensor] | None = None  # (anchor, others, views, *, fit) -> (views, B) indices
+    choose: Callable[..., Tensor | Choice] | None = None  # (anchor, others, views, *, fit) -> (views, B) indices
 
     n: int = 2048  # samples per anchor
     hypotheses: int = 200  # minimal samples drawn by the pose search

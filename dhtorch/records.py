@@ -19,7 +19,19 @@ from dhtorch.geometry.se3 import Pose
 from dhtorch.geometry.start import Flow
 from dhtorch.tree import KEEP_DTYPE, Record, record
 
-__all__ = ["Camera", "Estimate", "Frame", "Map", "Pose", "PoseFit", "Samples", "Shutter", "TrackHint", "Tracks"]
+__all__ = [
+    "Camera",
+    "Choice",
+    "Estimate",
+    "Frame",
+    "Map",
+    "Pose",
+    "PoseFit",
+    "Samples",
+    "Shutter",
+    "TrackHint",
+    "Tracks",
+]
 
 
 @record
@@ -123,6 +135,15 @@ class PoseFit(Record):
     def ok(self) -> Tensor:
         """(B,) bool: there is a pose."""
         return (self.code == PoseCode.OK) | (self.code == PoseCode.KEPT_PNP)
+
+
+@record
+class Choice(Record):
+    """Which of V offered views are asked, and why these."""
+
+    index: Tensor  # (views, B) int64, rising
+    worth: Tensor | None = None  # (views, B) what each added to those chosen before it; None = nobody said
+    mute: Tensor | None = None  # (V, B) bool: the view answered nothing, no pose or no baseline; None = nobody said
 
 
 @record

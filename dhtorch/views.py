@@ -19,7 +19,7 @@ from dhtorch.geometry.shapes import check
 from dhtorch.geometry.start import small
 from dhtorch.method import Method
 from dhtorch.pair import ask_pair, lifted
-from dhtorch.records import Estimate, Frame, PoseFit
+from dhtorch.records import Choice, Estimate, Frame, PoseFit
 from dhtorch.stages.pose import map_pose
 from dhtorch.stages.track import lucas_kanade
 from dhtorch.stages.triangulate import two_view
@@ -46,8 +46,8 @@ def by_probes(
     fit: PoseFit | None = None,  # (V, B)
     long: int = LONG,
     good_sigma_rel: float = 0.1,
-) -> Tensor:
-    """The views to ask of many candidates: (views, B) indices, rising.
+) -> Choice:
+    """The views to ask of many candidates, and what each is worth.
 
     Args:
         anchor: B views.
@@ -72,7 +72,7 @@ def by_probes(
         known = None if fit is None else fit.map(lambda x: x.flatten(0, 1))
         estimate = ask_pair(PROBE, several, shrunk(flat, long)[0], fit=known)
         estimate = estimate.map(lambda x: x.unflatten(0, (V, B)))
-        return key_views(estimate.replace(sigma=estimate.sigma / k), views, good_sigma_rel=good_sigma_rel)
+        return weighed(estimate.replace(sigma=estimate.sigma / k), views, good_sigma_rel=good_sigma_rel)
 
 
 def shrunk(frame: Frame, long: int) -> tuple[Frame, int]:
@@ -89,13 +89,18 @@ def shrunk(frame: Frame, long: int) -> tuple[Frame, int]:
     return frame.replace(image=picture.grey, camera=camera, depth_camera=depth_camera), picture.scale
 
 
-def key_views(
+def key_views(estimates: Estimate, views: int, *, good_sigma_rel: float = 0.1) -> Tensor:
+    """Which views to keep, (views, B) indices, rising: those of :func:`weighed`."""
+    return weighed(estimates, views, good_sigma_rel=good_sigma_rel).index
+
+
+def weighed(
     estimates: Estimate,  # (V, B, N), one per view
     views: int,
     *,
     good_sigma_rel: float = 0.1,
-) -> Tensor:
-    """Which views to keep, by the sigma to expect of the points together: (views, B) indices, rising.
+) -> Choice:
+    """Which views to keep, by the sigma to expect of the points together, and what each adds to those before it.
 
     A wide view is sure of what it sees, a near one sees more. What a set of views is worth is the sum over the points
     of log(1 + sum of (good_sigma_rel · depth / sigma)² over its views); views are added one by one, each the one that
@@ -103,6 +108,8 @@ def key_views(
 
     Raises:
         ValueError: wrong shapes, or not 1 <= views <= V.
+
+    Gradient: none; a choice.
     """
     V = check("key_views", gate=(estimates.gate, "V B N"), sigma=(estimates.sigma, "V B N"))["V"]
     if not 1 <= views <= V:
@@ -112,9 +119,12 @@ def key_views(
     worth = torch.where(said, ratio, 0.0).detach().double().square().flip(0)  # argmax takes the first of equals
     known = torch.zeros_like(worth[0])
     free = torch.ones_like(worth[:, :, 0], dtype=torch.bool)
+    added = torch.zeros_like(worth[:, :, 0])
     for _ in range(views):
         gain = steady(torch.log1p, known + worth).sum(-1).masked_fill(~free, -torch.inf)
         best = F.one_hot(gain.argmax(0), V).T.bool()
+        added = torch.where(best, gain - steady(torch.log1p, known).sum(-1), added)
         known = known + torch.where(best[..., None], worth, 0.0).sum(0)
         free = free & ~best
-    return free.flip(0).long().argsort(dim=0, stable=True)[:views]
+    index = free.flip(0).long().argsort(dim=0, stable=True)[:views]
+    return Choice(index, added.flip(0).gather(0, index), ~said.any(-1))

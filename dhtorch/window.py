@@ -20,9 +20,9 @@ from dhtorch.geometry.pyramid import Pyramids
 from dhtorch.geometry.shapes import check
 from dhtorch.method import Method, Trace
 from dhtorch.pair import Clock, lifted, tracked, under_pose
-from dhtorch.records import NO_HINT, Estimate, Frame, PoseFit, Samples, TrackHint, Tracks
+from dhtorch.records import NO_HINT, Choice, Estimate, Frame, PoseFit, Samples, TrackHint, Tracks
 from dhtorch.tree import R, stack
-from dhtorch.views import key_views
+from dhtorch.views import weighed
 
 #: Samples, about, by which key views are chosen.
 PROBES = 256
@@ -44,7 +44,7 @@ def ask_window(
     Views are tracked into one after the other, then all poses are solved together.
     The first three seats see the anchor once; ``score`` sees the fused estimate, with tracks and pose of the last
     view. Of more than ``method.views`` the best are chosen, by ``method.choose`` or by a few of the samples
-    (:func:`dhtorch.views.key_views`).
+    (:func:`dhtorch.views.weighed`); ``trace`` then has the :class:`dhtorch.records.Choice`.
     ``method.chain`` only gives a start: what is searched for is always the anchor's window.
 
     Raises:
@@ -59,12 +59,13 @@ def ask_window(
     samples = method.look(anchor)
     ms["samples"] = 1e3 * (time.perf_counter() - began)
     hint = hint if hint.pyramid is not None else hint.replace(pyramid=Pyramids(anchor.image))
-    index = torch.arange(len(others.image), device=samples.uv.device)[:, None].expand(-1, len(samples.uv))
+    every = torch.arange(len(others.image), device=samples.uv.device)[:, None].expand(-1, len(samples.uv))
+    choice = Choice(every)
     if len(others.image) > method.views:
         began = time.perf_counter()
-        index = _chosen(method, anchor, others, samples, seed=seed, fit=fit, hint=hint)
+        choice = _chosen(method, anchor, others, samples, seed=seed, fit=fit, hint=hint)
         ms["choose"] = 1e3 * (time.perf_counter() - began)
-        pick = index, torch.arange(index.shape[1], device=index.device)
+        pick = choice.index, torch.arange(len(samples.uv), device=choice.index.device)
         others, fit = others[pick], None if fit is None else fit[pick]
     traces = _ask_views(method, anchor, others, samples, seed=seed, fit=fit, hint=hint, ms=ms)
     last, began = traces[-1], time.perf_counter()
@@ -72,7 +73,9 @@ def ask_window(
     estimate = method.score(estimate, samples, last["tracks_ideal"], last["fit"])
     ms["fuse"] = 1e3 * (time.perf_counter() - began)
     if trace is not None:
-        trace.update({**last, "estimate": estimate, "ms": ms, "views": traces, "chosen": index})
+        trace.update(
+            {**last, "estimate": estimate, "ms": ms, "views": traces, "chosen": choice.index, "choice": choice}
+        )
     return estimate
 
 
@@ -85,13 +88,14 @@ def _chosen(
     seed: int | Tensor,
     fit: PoseFit | None,
     hint: TrackHint,
-) -> Tensor:
-    """Which of the views are asked: (views, B) indices, as the method chooses them or by a few of the samples."""
+) -> Choice:
+    """Which of the views are asked, as the method chooses them or by a few of the samples."""
     if method.choose is not None:
-        return method.choose(anchor, others, method.views, fit=fit)
+        found = method.choose(anchor, others, method.views, fit=fit)
+        return found if isinstance(found, Choice) else Choice(found)
     thin = samples[:, :: max(1, method.n // PROBES)]
     probes = _ask_views(method, anchor, others, thin, seed=seed, fit=fit, hint=hint, ms={})
-    return key_views(stack([t["estimate"] for t in probes]), method.views)
+    return weighed(stack([t["estimate"] for t in probes]), method.views)
 
 
 def _ask_views(

@@ -466,7 +466,7 @@ ELSEWHERE = {
     *(f"dhtorch.method.{name}" for name in ("parts", "networks")),
     "dhtorch.stages.fuse.inverse_variance",
     "dhtorch.stages.fuse.agree",
-    *(f"dhtorch.views.{name}" for name in ("by_probes", "shrunk", "key_views")),
+    *(f"dhtorch.views.{name}" for name in ("by_probes", "shrunk", "key_views", "weighed")),
     *(f"dhtorch.geometry.start.{name}" for name in ("small", "is_turned", "inverse")),
     "dhtorch.stages.track.coarse",
     "dhtorch.geometry.exact.filled",

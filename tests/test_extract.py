@@ -66,7 +66,8 @@ def command(tmp_path, monkeypatch, capsys):
 
 
 def asked(root, *more, out="features", gap=GAP):
-    return ["data=lerobot", f"data.root={root}", f"data.gap={gap}", f"out={out}", "extract.shard_rows=5", *PAPER, *more]
+    place = ["data=lerobot", f"data.root={root}", f"out={out}"]
+    return [*place, f"extract.gap={gap}", "extract.shard_rows=5", *PAPER, *more]
 
 
 def files(folder):
@@ -169,7 +170,14 @@ def test_workers_make_the_same_files(robot, command):
 def many(tmp_path, shots):
     """Numbered frames on the disk, each a shard."""
     writers.write_counted_frames(tmp_path / "set", shots)
-    return ["data=auto", f"data.root={tmp_path / 'set'}", "data.gap=2", "out=features", "extract.shard_rows=1", *PAPER]
+    return [
+        "data=auto",
+        f"data.root={tmp_path / 'set'}",
+        "extract.gap=2",
+        "out=features",
+        "extract.shard_rows=1",
+        *PAPER,
+    ]
 
 
 def test_kill_9_in_the_middle_loses_and_doubles_nothing(tmp_path, many, command):
@@ -230,7 +238,14 @@ def damaged(tmp_path, shots):
     writers.write_counted_frames(tmp_path / "set", shots[:8])
     image = tmp_path / "set" / "images" / "00003.png"
     image.write_bytes(image.read_bytes()[:500])
-    return ["data=auto", f"data.root={tmp_path / 'set'}", "data.gap=2", "out=features", "extract.shard_rows=3", *PAPER]
+    return [
+        "data=auto",
+        f"data.root={tmp_path / 'set'}",
+        "extract.gap=2",
+        "out=features",
+        "extract.shard_rows=3",
+        *PAPER,
+    ]
 
 
 def test_a_corrupt_frame_raises_in_one_line(damaged, command):
@@ -285,7 +300,7 @@ def test_bad_input_gets_one_clear_line(command, args, words):
 
 
 def test_a_recording_without_a_gap_asks_for_one(robot, command):
-    code, _, err = command("data=lerobot", f"data.root={robot}", "out=x", *PAPER)
+    code, _, err = command("data=lerobot", f"data.root={robot}", "extract.gap=null", "out=x", *PAPER)
     assert code == 2 and "extract.gap" in err and "0 = front end alone" in err
 
 
@@ -352,6 +367,19 @@ def test_a_method_of_many_views_looks_back_several_times(command):
     assert code == 0 and "6 rows" in out, err
     problems = [int(row["dhtorch.problem"]) for row in Features("window")]
     assert problems == [1, 1, 0, 0, 0, 0], "the nearer view, two frames back, is there before the farther one"
+
+
+def test_without_a_gap_the_method_chooses_among_earlier_frames(command):
+    room = ["data.hw=[120,160]", "data.n_frames=6", "data.supersample=1", "data.step_m=0.04", "data.lidar=exact"]
+    room += ["method.n=256", "extract.columns=[T_1_from_0,pose_ok,problem]"]
+    code, out, err = command(*room, "out=chosen")
+    assert code == 0 and "6 rows" in out, err
+    rows = list(Features("chosen"))
+    assert [int(row["dhtorch.problem"]) for row in rows] == [1, 0, 0, 0, 0, 0], "the first has none before it"
+    command(*room, "extract.gap=1", "out=one")
+    gap = list(Features("one"))
+    assert all(torch.equal(rows[1][k], gap[1][k]) for k in gap[1]), "one earlier frame is asked as a pair"
+    assert rows[5]["dhtorch.pose_ok"] and not gap[5]["dhtorch.pose_ok"], "a wider one is worth more"
 
 
 def test_settings_are_the_defaults():

@@ -229,6 +229,22 @@ def test_many_views_are_the_nearest_first_and_the_anchor_pads():
     assert len(Seen.calls) == 2 and made[1].features["problem"] == 1 and len(Seen.calls) == 2
 
 
+def test_a_row_chooses_among_the_earlier_frames_that_can_be_read():
+    first, alone = recording(5, load=Load(bad={1})), recording(1, name="alone", load=Load(30))
+    method = Stub(answer=Seen(), n=N)
+    made = Rows([first, alone], plan.make([first, alone], "auto", 5), columns.columns(N, P), method=method, gap="auto",
+                tokens_hw=(H, W))  # fmt: skip
+    asked = {}
+    for position in (0, 2, 3, 4, 5):
+        Seen.calls = []
+        answer = made[position]
+        assert answer.features["problem"] == (0 if Seen.calls else 1)
+        for _, other, _ in Seen.calls:
+            views = other.image if other.image.dim() == 5 else other.image[None]
+            asked[position] = [next(s for s in range(9) if torch.equal(frame(s).image, x)) for x in views]
+    assert asked == {2: [0], 3: [0, 2], 4: [2, 3]}, "steps 1, 2, 3, 5 back; frame 1 is damaged, the first has none"
+
+
 def test_rows_are_the_same_in_any_order_and_after_a_pickle():
     both = [recording(3, load=Load(0)), recording(3, name="two", load=Load(30))]
     made = rows(both, 1)
@@ -249,6 +265,7 @@ def test_options_of_an_extraction_are_checked():
         ({"fit": "squash"}, "extract.fit: found 'squash', expected one of stretch, pad, crop"),
         ({"gap": -1}, "extract.gap: found -1, expected a whole number of at least 0"),
         ({"gap": 1.5}, "extract.gap: found 1.5"),
+        ({"gap": "car"}, "extract.gap: found 'car'"),
         ({"patch": 0}, "extract.patch: found 0, expected a whole number of at least 1"),
         ({"patch": None}, "extract.patch: found None"),
         ({"shard_rows": 0}, "extract.shard_rows: found 0, expected a whole number of at least 1"),

@@ -121,7 +121,7 @@ def test_a_corrupt_frame_and_a_missing_cluster_are_one_line(tmp_path):
     writers.write_counted_frames(tmp_path / "set", [room[i] for i in range(6)])
     image = tmp_path / "set" / "images" / "00003.png"
     image.write_bytes(image.read_bytes()[:300])
-    options = ["data=auto", f"data.root={tmp_path / 'set'}", "data.gap=2", "method=paper", "method.n=64", "out=x"]
+    options = ["data=auto", f"data.root={tmp_path / 'set'}", "extract.gap=2", "method=paper", "method.n=64", "out=x"]
     for extra, words in (
         (["extract.engine=ray"], ["00003.png", "frame 3"]),
         (["extract.engine=ray", "extract.address=127.0.0.1:1"], ["127.0.0.1:1"]),

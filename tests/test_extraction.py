@@ -28,7 +28,7 @@ def made(tmp_path, capsys):
             shown.append((text, total))
             yield from items
 
-        asked = {"shard_rows": 4, "tokens_hw": (28, 42), **(options or {})}
+        asked = {"shard_rows": 4, "tokens_hw": (28, 42), "gap": None, **(options or {})}
         plain = {"data": {"name": "made"}, "method": {"n": 6}, "seed": 0, "workers": 0, "out": str(tmp_path / out)}
         parts = {"data": recordings, "method": Stub(answer=Told(), n=N), "extract": extract.ExtractOptions(**asked)}
         code = extract.run({**plain, "choices": {"data": "made"}, **settings}, parts, progress=progress)

@@ -22,6 +22,7 @@ TINY = [
     "data.supersample=1",
     "data.step_m=0.04",
     "data.gap=3",
+    "pairs=gap",
     "method.n=512",
     "voxel=0.06",
 ]

@@ -16,6 +16,7 @@ from omegaconf import OmegaConf
 
 from dhtorch.commands.run import config_dir
 from dhtorch.data import FORMATS
+from dhtorch.data.pairs import by_choice, by_gap, by_time
 from dhtorch.method import Method
 from dhtorch.synthetic import SyntheticRoom
 
@@ -104,7 +105,7 @@ def test_settings_list_every_option(choice):
         assert wanted <= set(node), f"{choice}{path}: {wanted - set(node)} of {node['_target_']} are not listed"
 
 
-@pytest.mark.parametrize("choice", ["method=paper", "method=opencv", "data=synthetic", "pairs=gap"])
+@pytest.mark.parametrize("choice", ["method=paper", "method=opencv", "data=synthetic", "pairs=gap", "pairs=auto"])
 def test_values_equal_the_signatures_defaults(choice):
     cfg = compose(choice)
     group = choice.split("=")[0]
@@ -122,6 +123,13 @@ def test_the_files_of_the_methods_are_those_of_their_records():
     for name, method in writer["WRITTEN"].items():
         assert (CONF / "method" / f"{name}.yaml").read_text() == writer["document"](name, method), "run: make conf"
         agree(effective(method), effective(instantiate(compose(f"method={name}").method, _convert_="all")), name)
+
+
+def test_experiments_keep_the_gap_of_a_scene_and_the_main_job_chooses():
+    """Their questions and their archived numbers are about pairs of two frames; another word says otherwise."""
+    chosen = {name: target(compose(f"experiment={name}").pairs._target_) for name in GROUPS["experiment"]}
+    assert chosen.pop("pair") is by_choice and set(chosen.values()) == {by_gap}
+    assert target(compose("experiment=heldout", "pairs=time").pairs._target_) is by_time
 
 
 def test_misspelt_options_fail():

@@ -250,7 +250,7 @@ def test_a_start_spares_the_levels_it_does_not_need_and_no_others() -> None:
 
     zero = torch.zeros_like(x)
     assert share(zero, none, 2) == share(zero, every, 5) > 0.8, "from nothing, by all levels"
-    assert share(zero, every, 2) < 0.1, "told to look near, where it is not"
+    assert share(zero, every, 2) < 0.3, "told to look near, where it is not"
     assert share(expected + 6.0, every, 2) > 0.8
     half = torch.arange(x.shape[1]) % 2 == 0
     assert share(torch.where(half, expected + 6.0, zero), half, 2) > 0.8, "each by its own"

@@ -56,6 +56,9 @@ _LOG = logging.getLogger("dhtorch.commands.run")
 #: What bad input raises: reported in one line, without a traceback.
 USER_ERRORS = (ValueError, OSError, KeyError, ImportError)
 
+#: Options that only one choice of the group ``pairs`` has: said alone they choose it.
+IMPLIED = {"pairs.gap": "pairs=gap", "pairs.seconds": "pairs=time", "pairs.metres": "pairs=baseline"}
+
 #: Flags of Hydra that show something and run nothing.
 SHOW = {"-h", "--help", "--hydra-help", "-i", "--info", "-sc", "--shell-completion", "-c", "--cfg"}
 SWEEP = {"-m", "--multirun"}
@@ -97,9 +100,17 @@ def _run(argv: list[str]) -> int:
         return DONE
     if argv and argv[0] in COMMANDS:
         return int(importlib.import_module(COMMANDS[argv[0]]).main(argv[1:]) or 0)
+    argv = _with_pairs(argv)
     if argv and argv[0] in CONFIGURED:
         return _run_configured(argv[0], argv[1:])
     return _run_hydra(argv)
+
+
+def _with_pairs(argv: list[str]) -> list[str]:
+    """The words with the choice of pairs that an option of theirs implies, where none is said."""
+    names = [a.split("=")[0] for a in argv]
+    implied = [IMPLIED[name] for name in names if name in IMPLIED]
+    return argv if "pairs" in names else [*argv, *implied[:1]]
 
 
 def config_dir() -> Path:

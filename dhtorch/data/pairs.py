@@ -1,12 +1,13 @@
-"""Which two frames make a pair: by frame gap, by time, or by baseline.
+"""What an anchor may see: one other frame, by frame gap, by time or by baseline; or several, to choose among.
 
-A pair is (i, j), positions in the recording with i < j; i is the anchor whose depth is extended. Gaps are counted in
-the capture's own frame numbers: where a frame was lost the pairs that need it are missing, the others do not shift.
+Positions are those in the recording; the anchor is the frame whose depth is extended. Gaps and steps are counted in the
+capture's own frame numbers: where a frame was lost the pairs that need it are missing, the others do not shift.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 import torch
 
@@ -16,8 +17,64 @@ from dhtorch.data.scene import Given, Scene
 #: From this many frames on, neighbouring anchors are nearly the same picture: take every other one.
 _MANY = 25
 
+#: Steps from an anchor, in frames, to those around it that are offered to a method which chooses for itself.
+LADDER = (1, 2, 3, 5, 8, 12, 20, 30)
 
-def by_gap(scene: Given, gap: int | None = None, stride: int | None = None) -> list[tuple[int, int]]:
+
+class Pair(NamedTuple):
+    """An anchor and what it may see: one other frame, or several among which the method chooses.
+
+    Equal to the plain tuple ``(i, j)`` or ``(i, (k1, k2, …))``, which ``Pair(*item)`` reads.
+    """
+
+    anchor: int
+    other: int | tuple[int, ...]
+
+    @property
+    def offered(self) -> tuple[int, ...]:
+        """The frames to choose among, in rising order; none where the other frame is fixed."""
+        return () if isinstance(self.other, int) else tuple(self.other)
+
+
+def fixed(pairs: Iterable[Sequence[int]] | Iterable[Pair]) -> list[tuple[int, int]]:
+    """The pairs as (i, j), for what cannot let a method choose.
+
+    Raises:
+        ValueError: frames to choose among.
+    """
+    found = []
+    for i, j in pairs:
+        if not isinstance(j, int):
+            raise ValueError(
+                f"pairs: found {len(j)} frames to choose among (pairs=auto), expected one: pairs=gap, time or baseline"
+            )
+        found.append((i, j))
+    return found
+
+
+def by_choice(scene: Given, steps: Sequence[int] = LADDER, stride: int | None = None, past: bool = False) -> list[Pair]:
+    """Every anchor with the frames around it, among which a method chooses: nobody has to know a gap.
+
+    Args:
+        scene: its recording's frames.
+        steps: how far before and after the anchor frames are offered, see :func:`around`.
+        stride: step from anchor to anchor. None = 2 where there are 25 frames or more, else 1.
+        past: only frames before the anchor; the first frame is none then.
+
+    Raises:
+        ValueError: one frame alone, no steps or one below 1, stride below 1, or no anchor.
+    """
+    recording = Scene.of(scene).recording
+    number = recording.number.tolist()
+    if len(number) < 2:
+        raise ValueError(f"pairs: {recording.name} has one frame, expected two at least")
+    steps, place = _steps(steps), {k: p for p, k in enumerate(number)}
+    anchors = [i for i in range(0, len(number), _stride(recording, stride)) if i > 0 or not past]
+    pairs = [Pair(i, tuple(_around(number, place, i, steps, past))) for i in anchors]
+    return _some(pairs, recording, f"stride {stride}, past frames alone")
+
+
+def by_gap(scene: Given, gap: int | None = None, stride: int | None = None) -> list[Pair]:
     """Pairs whose frame numbers differ by ``gap``.
 
     Args:
@@ -39,12 +96,11 @@ def by_gap(scene: Given, gap: int | None = None, stride: int | None = None) -> l
         raise ValueError(f"pairs.gap: found {gap} for {span}, expected at most {number[-1] - number[0]}")
     place = {k: i for i, k in enumerate(number)}
     anchors = range(0, len(number), _stride(recording, stride))
-    return _some([(i, place[number[i] + gap]) for i in anchors if number[i] + gap in place], recording, f"gap {gap}")
+    pairs = [Pair(i, place[number[i] + gap]) for i in anchors if number[i] + gap in place]
+    return _some(pairs, recording, f"gap {gap}")
 
 
-def by_time(
-    scene: Given, seconds: float, tolerance: float | None = None, stride: int | None = None
-) -> list[tuple[int, int]]:
+def by_time(scene: Given, seconds: float, tolerance: float | None = None, stride: int | None = None) -> list[Pair]:
     """Pairs whose stamps differ by ``seconds``, give or take ``tolerance``; the closest frame counts.
 
     Args:
@@ -66,13 +122,11 @@ def by_time(
     for i in range(0, len(recording), _stride(recording, stride)):
         miss = (recording.times[i + 1 :] - recording.times[i] - seconds).abs()
         if miss.numel() and float(miss.min()) <= tolerance:
-            pairs.append((i, i + 1 + int(miss.argmin())))
+            pairs.append(Pair(i, i + 1 + int(miss.argmin())))
     return _some(pairs, recording, f"{seconds} s ± {tolerance:g} s")
 
 
-def by_baseline(
-    scene: Given, metres: float, tolerance: float | None = None, stride: int | None = None
-) -> list[tuple[int, int]]:
+def by_baseline(scene: Given, metres: float, tolerance: float | None = None, stride: int | None = None) -> list[Pair]:
     """Pairs whose camera centres lie ``metres`` apart, give or take ``tolerance``; the earliest such frame counts.
 
     The earliest, because a camera that comes back later has seldom the same view.
@@ -96,11 +150,11 @@ def by_baseline(
     for i in range(0, len(recording), _stride(recording, stride)):
         good = ((centre[i + 1 :] - centre[i]).norm(dim=-1) - metres).abs() <= tolerance
         if bool(good.any()):
-            pairs.append((i, i + 1 + int(torch.nonzero(good)[0])))
+            pairs.append(Pair(i, i + 1 + int(torch.nonzero(good)[0])))
     return _some(pairs, recording, f"{metres} m ± {tolerance:g} m")
 
 
-def by_scaled_gap(scene: Given, factor: float, stride: int | None = None) -> list[tuple[int, int]]:
+def by_scaled_gap(scene: Given, factor: float, stride: int | None = None) -> list[Pair]:
     """Pairs at ``factor`` times the scene's own gap, rounded, at least one frame; none where it is too short.
 
     Raises:
@@ -118,28 +172,23 @@ def by_scaled_gap(scene: Given, factor: float, stride: int | None = None) -> lis
         return []
 
 
-#: Steps from an anchor, in frames, to those around it that are offered to a method which chooses for itself.
-LADDER = (1, 2, 3, 5, 8, 12, 20, 30)
-
-
-def around(recording: Recording, i: int, steps: Sequence[int] = LADDER) -> list[int]:
+def around(recording: Recording, i: int, steps: Sequence[int] = LADDER, past: bool = False) -> list[int]:
     """Positions of frames before and after ``i`` among which a method may choose its other views, in rising order.
 
     Steps count in the capture's own frame numbers; a frame that was lost is left out. A recording that is shorter than
-    the longest step offers what it has, and one of two frames the other one.
+    the longest step offers what it has, and where no step fits the nearest frame is offered. ``past``: frames before
+    ``i`` alone.
 
     Raises:
-        ValueError: no such frame, or the recording has no other.
+        ValueError: no such frame, no steps or one below 1, or no other frame.
     """
     number = recording.number.tolist()
     if not 0 <= i < len(number):
         raise ValueError(f"pairs: found frame {i} of {recording.name}, expected 0 to {len(number) - 1}")
-    place = {k: p for p, k in enumerate(number)}
-    offered = sorted(place[k] for s in steps for k in (number[i] - s, number[i] + s) if k in place)
-    if not offered and len(number) > 1:
-        offered = [min((p for p in range(len(number)) if p != i), key=lambda p: abs(number[p] - number[i]))]
+    offered = _around(number, {k: p for p, k in enumerate(number)}, i, _steps(steps), past)
     if not offered:
-        raise ValueError(f"pairs: {recording.name} has one frame, expected two at least")
+        found, expected = ("nothing before frame 0", "a later one") if past else ("one frame", "two at least")
+        raise ValueError(f"pairs: {recording.name} has {found}, expected {expected}")
     return offered
 
 
@@ -154,13 +203,29 @@ def between(i: int, j: int, views: int) -> list[int]:
     return [i + round((j - i) * (k + 1) / views) for k in range(views)]
 
 
+def _around(number: Sequence[int], place: Mapping[int, int], i: int, steps: Sequence[int], past: bool) -> list[int]:
+    """:func:`around`, of frame numbers whose places are known; empty where there is no other frame."""
+    ways = (-1,) if past else (-1, 1)
+    offered = sorted(place[k] for s in steps for k in (number[i] + way * s for way in ways) if k in place)
+    if offered:
+        return offered
+    others = [p for p in (i - 1, i + 1) if 0 <= p < len(number) and (p < i or not past)]
+    return [min(others, key=lambda p: abs(number[p] - number[i]))] if others else []
+
+
+def _steps(steps: Sequence[int]) -> list[int]:
+    if not steps:
+        raise ValueError("pairs.steps: found none, expected whole numbers of at least 1")
+    return sorted({_positive_int("pairs.steps", step) for step in steps})
+
+
 def _stride(recording: Recording, stride: int | None) -> int:
     if stride is None:
         return 2 if len(recording) >= _MANY else 1
     return _positive_int("pairs.stride", stride)
 
 
-def _some(pairs: list[tuple[int, int]], recording: Recording, wanted: str) -> list[tuple[int, int]]:
+def _some(pairs: list[Pair], recording: Recording, wanted: str) -> list[Pair]:
     if not pairs:
         found = f"no two of {len(recording)} frames of {recording.name}"
         raise ValueError(f"pairs: found {found} at {wanted}, expected at least one pair")

@@ -50,7 +50,9 @@ class ExtractOptions:
 
     engine: str = "local"  # local: this machine; ray: a cluster, through Ray Data
     address: str | None = None  # of the Ray cluster; None = one that is started here
-    gap: int | None = None  # frames back to the other view; None = the recording's own, 0 = none: front end alone
+    gap: int | str | None = (
+        plan.CHOICE
+    )  # auto = chosen among earlier frames, a number of frames back, 0 = front end alone
     patch: int = 14  # px
     tokens_hw: Sequence[int] = (224, 224)  # size of the network's picture: with it all rows have one shape
     fit: str = "stretch"  # how the picture is brought to that size
@@ -65,7 +67,7 @@ class ExtractOptions:
                 raise ValueError(f"extract.{name}: found {getattr(self, name)!r}, expected one of {', '.join(known)}")
         for name, low in {"gap": 0, "patch": 1, "shard_rows": 1}.items():
             value = getattr(self, name)
-            if not (isinstance(value, int) and value >= low) and not (name == "gap" and value is None):
+            if not (isinstance(value, int) and value >= low) and not (name == "gap" and value in (None, plan.CHOICE)):
                 raise ValueError(f"extract.{name}: found {value!r}, expected a whole number of at least {low}")
         if not (isinstance(self.tokens_hw, Sequence) and len(self.tokens_hw) == 2):
             raise ValueError(f"extract.tokens_hw: found {self.tokens_hw!r}, expected height and width")

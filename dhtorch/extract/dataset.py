@@ -12,9 +12,10 @@ from torch.utils.data import Dataset
 
 from dhtorch.data.scene import Scene
 from dhtorch.extract.columns import PLACE, Column, Row
-from dhtorch.extract.plan import Plan, steps_back
+from dhtorch.extract.plan import Plan, offers, steps_back
 from dhtorch.geometry import camera as cam
 from dhtorch.method import Method
+from dhtorch.offers import choosing
 from dhtorch.records import Camera, Frame
 from dhtorch.transform import ExtendDepth
 
@@ -33,16 +34,18 @@ class Extracted(NamedTuple):
 class Rows(Dataset[Extracted]):
     """Position in the plan → answer. Depends on nothing but the position: not on the worker, its engine or the order.
 
-    The sample is what a robot's data loader with ``delta_timestamps`` makes: the picture ``gap`` frames earlier (for a
-    method of many views several, spread over the way), then the frame itself. Where there is no such frame, or it
-    cannot be read, a copy of the frame pads, and the front end runs alone.
+    The sample is what a robot's data loader with ``delta_timestamps`` makes: earlier pictures, then the frame itself.
+    Earlier ones are those among which the method chooses, or that of ``gap`` frames earlier (for a method of many views
+    several, spread over the way). Where there is no such frame, or it cannot be read, a copy of the frame pads, and the
+    front end runs alone; among several to choose from it is left out.
 
     Args:
         scenes: of the data set.
         plan: from :func:`dhtorch.extract.plan.make`.
         wanted: columns of the rows.
         method: of one other view or several.
-        gap: frames back to the other view; None = the scene's own, 0 = no other view.
+        gap: ``auto`` = the method chooses among earlier frames; a number of frames back to the other view, 0 = none;
+            None = the scene's own.
         options: of :class:`dhtorch.transform.ExtendDepth`.
     """
 
@@ -53,7 +56,7 @@ class Rows(Dataset[Extracted]):
         wanted: dict[str, Column],
         *,
         method: Method,
-        gap: int | None,
+        gap: int | str | None,
         **options: Any,
     ) -> None:
         self.scenes, self.plan, self.wanted = scenes, plan, wanted
@@ -89,25 +92,34 @@ class Rows(Dataset[Extracted]):
 class _Opened:
     """One recording, and the transforms that fit its frames."""
 
-    def __init__(self, scene: Scene, method: Method, gap: int | None, options: dict[str, Any]) -> None:
-        self.scene, self.recording, self.method, self.options = scene, scene.recording, method, options
-        self.steps = steps_back(scene, gap, method.views)
+    def __init__(self, scene: Scene, method: Method, gap: int | str | None, options: dict[str, Any]) -> None:
+        self.scene, self.recording, self.options = scene, scene.recording, options
+        self.offers = offers(scene) if isinstance(gap, str) else None
+        self.method = method if self.offers is None else choosing(method)
+        self.steps = [] if isinstance(gap, str) else steps_back(scene, gap, method.views)
         self.position = {int(number): i for i, number in enumerate(self.recording.number)} if self.steps else {}
-        self.transforms: dict[tuple[str, ...], ExtendDepth] = {}
+        self.transforms: dict[tuple[Any, ...], ExtendDepth] = {}
 
     def answer(self, i: int) -> dict[str, Tensor]:
         anchor: Frame = self.recording[i]
-        sample = _sample(anchor, [self._earlier(i, step) for step in self.steps])
+        sample = _sample(anchor, self._others(i))
         optional = tuple(key for key in ("confidence", "distortion", "depth_intrinsics") if key in sample)
-        if optional not in self.transforms:
-            self.transforms[optional] = self._transform(optional)
-        transform = self.transforms[optional]
+        kind = (len(sample["image"]), *optional)
+        if kind not in self.transforms:
+            self.transforms[kind] = self._transform(len(sample["image"]) - 1, optional)
+        transform = self.transforms[kind]
         out = transform(sample)
         assert out is not None  # on_error is raise
         return {k.removeprefix(transform.prefix): v for k, v in out.items() if k.startswith(transform.prefix)}
 
-    def _earlier(self, i: int, step: int) -> Frame | None:
-        at = self.position.get(int(self.recording.number[i]) - step)
+    def _others(self, i: int) -> list[Frame | None]:
+        if self.offers is None:
+            number = int(self.recording.number[i])
+            return [self._frame(self.position.get(number - step)) for step in self.steps]
+        readable: list[Frame | None] = [f for k in self.offers.get(i, ()) if (f := self._frame(k)) is not None]
+        return readable or [None]
+
+    def _frame(self, at: int | None) -> Frame | None:
         try:
             return None if at is None else self.recording[at]
         except MemoryError:
@@ -115,10 +127,10 @@ class _Opened:
         except Exception:
             return None  # said where that frame is the anchor
 
-    def _transform(self, optional: tuple[str, ...]) -> ExtendDepth:
+    def _transform(self, views: int, optional: tuple[str, ...]) -> ExtendDepth:
         options: dict[str, Any] = {**_TRUSTED, **self.options, **{key: key for key in optional}}
         options |= {"sparse": self.recording.sparse, "hint": self.scene.hint}
-        other_at = list(range(len(self.steps))) if len(self.steps) > 1 else 0
+        other_at = list(range(views)) if views > 1 else 0
         return ExtendDepth(method=self.method, other_at=other_at, **options)
 
 

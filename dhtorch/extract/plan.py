@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
 
-from dhtorch.data.pairs import between
+from dhtorch.data.pairs import between, by_choice
 from dhtorch.data.scene import Scene
 
 
@@ -49,6 +49,17 @@ class Plan:
         return [Shard(k, len(starts), range(i, min(i + rows, len(self)))) for k, i in enumerate(starts)]
 
 
+#: The ``gap`` with which the method chooses among past frames.
+CHOICE = "auto"
+
+
+def offers(scene: Scene) -> dict[int, tuple[int, ...]]:
+    """Frame → the frames before it among which the method chooses; the first has none."""
+    if len(scene.recording) < 2:
+        return {}
+    return {pair.anchor: pair.offered for pair in by_choice(scene, stride=1, past=True)}
+
+
 def steps_back(scene: Scene, gap: int | None, views: int) -> list[int]:
     """How many frames before a frame its other views are, the farthest last; none with gap 0.
 
@@ -63,12 +74,12 @@ def steps_back(scene: Scene, gap: int | None, views: int) -> list[int]:
     return between(0, gap, views) if gap else []
 
 
-def make(scenes: Sequence[Scene], gap: int | None, views: int) -> Plan:
+def make(scenes: Sequence[Scene], gap: int | str | None, views: int) -> Plan:
     """The plan of a data set; opens each recording once, for its length.
 
     Args:
         scenes: of the data set.
-        gap, views: see :func:`steps_back`.
+        gap, views: see :func:`steps_back`; a gap of :data:`CHOICE` is right for all.
 
     Raises:
         ValueError: two recordings of one episode, or no gap.
@@ -78,7 +89,8 @@ def make(scenes: Sequence[Scene], gap: int | None, views: int) -> Plan:
     roots: dict[Path, None] = {}
     for k, scene in enumerate(scenes):
         recording = scene.recording
-        steps_back(scene, gap, views)
+        if not isinstance(gap, str):
+            steps_back(scene, gap, views)
         number = recording.episode
         number = k if number is None else number
         if number in found:

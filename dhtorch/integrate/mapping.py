@@ -15,6 +15,7 @@ from torch import Tensor
 from dhtorch import archive, export, integrate
 from dhtorch.codes import Source
 from dhtorch.data import files as data_files
+from dhtorch.data.pairs import Pair
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene, scenes_of
 from dhtorch.evaluate import bootstrap
@@ -29,7 +30,7 @@ from dhtorch.records import Camera, Frame
 
 Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
 Row = dict[str, Any]
-Pairs = Callable[[Scene], Iterable[tuple[int, int]]]
+Pairs = Callable[[Scene], Iterable[Pair]]
 
 #: Settings groups whose names are kept with the result.
 GROUPS = ("method", "data", "pairs")
@@ -96,14 +97,15 @@ def make(scene: Scene, method: Method, pairs: Pairs, settings: Mapping[str, Any]
     """
     recording, chosen = scene.recording, list(pairs(scene))
     anchored = settings["poses"] == "anchored"
-    links = recordings.chain(chosen) if anchored else []
     options = {k: settings[k] for k in ("cutoff", "seed", "device")} | {"dtype": getattr(torch, settings["dtype"])}
-    asked = recordings.ask(scene, method, [*chosen, *links], **options)
-    found = list(progress(asked, f"{recording.name}: pairs", len(chosen) + len(links)))
+    asked = recordings.ask(scene, method, chosen, **options)
+    answers = list(progress(asked, f"{recording.name}: pairs", len(chosen)))
+    links = _links(answers) if anchored else []
+    linked = recordings.ask(scene, method, links, **options)
+    found = [*answers, *progress(linked, f"{recording.name}: links", len(links))]
     places = recordings.place(recording, found, poses=settings["poses"])
     if not places.poses:
         raise ValueError(f"{recording.name}: found no frame with a finite pose, expected one at least")
-    answers = found[: len(chosen)]
     volume = integrate.empty(settings["voxel"], truncation=settings["truncation"])
     fuse = {"cutoff": settings["cutoff"], "min_conf": settings["min_conf"], "progress": progress}
     fuse |= {"sigma_m": settings["sensor_sigma_m"], "sigma_rel": settings["sensor_sigma_rel"]}
@@ -188,11 +190,18 @@ def _triangulated(answer: PairEstimate, number: Mapping[int, int], poses: Mappin
     return [x[keep] for x in (world, answer.rgb[0], answer.estimate.residual_px[0], views, uv)]
 
 
+def _links(answers: Sequence[PairEstimate]) -> list[tuple[int, int]]:
+    """Further pairs that hold the frames together."""
+    asked = [(a.pair[0], k) for a in answers for k in a.links]
+    return recordings.chain(asked, chosen=any(a.picked is not None for a in answers))
+
+
 def _pair_rows(scene: MappedScene) -> list[Row]:
     common = {k: scene.row[k] for k in ("scene", "method", "truth")}
     return [
         {**common, "pair": list(a.pair), "pnp_ok": int(a.fit.ok[0]), "n_kept": int(a.estimate.keep.sum())}
         | {"n_recovered": int(a.recovered.sum()), "placed": int(a.pair[0] in scene.places.poses)}
+        | ({} if a.picked is None else a.picked.row())
         for a in scene.answers
     ]
 

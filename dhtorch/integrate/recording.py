@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from dhtorch.codes import Source
-from dhtorch.data.pairs import between
+from dhtorch.data.pairs import Pair, between
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Given, Scene
 from dhtorch.evaluate.holdout import range_split
@@ -26,6 +26,7 @@ from dhtorch.geometry import se3, sparse_grid
 from dhtorch.geometry.lookup import nearest
 from dhtorch.integrate.volume import View, Volume, fuse, splat
 from dhtorch.method import Method
+from dhtorch.offers import Picked, choosing, picked
 from dhtorch.records import Camera, Estimate, Frame, Pose, PoseFit, Samples, Tracks
 from dhtorch.tree import stack
 
@@ -39,7 +40,7 @@ PATCH = 1.5
 class PairEstimate:
     """What the method said about one pair, and what of the pictures a map needs."""
 
-    pair: tuple[int, int]
+    pair: tuple[int, int]  # of several views that were chosen the last
     samples: Samples
     estimate: Estimate
     tracks: Tracks  # as tracked, in the pictures' own pixels
@@ -47,6 +48,13 @@ class PairEstimate:
     rgb: Tensor  # (1, N, 3) in [0, 1] at the samples
     camera: Camera  # of the anchor
     hw: tuple[int, int]
+    picked: Picked | None = None  # where the method chose among several
+    others: Mapping[int, PoseFit] = field(default_factory=dict)  # the poses of all views that it chose
+
+    @property
+    def links(self) -> dict[int, PoseFit]:
+        """The frames that were asked, with their poses."""
+        return {self.pair[1]: self.fit, **self.others}
 
     @property
     def recovered(self) -> Tensor:
@@ -72,7 +80,7 @@ class Places:
 def ask(
     scene: Given,
     method: Method,
-    pairs: Iterable[tuple[int, int]],
+    pairs: Iterable[Pair] | Iterable[tuple[int, int]],
     *,
     cutoff: float | None = None,
     seed: int = 0,
@@ -83,7 +91,7 @@ def ask(
 
     Args:
         scene, pairs: see ``dhtorch.data``.
-        method: of one view or several; the others lie between the two of the pair.
+        method: of one view or several; the others lie between the two of the pair, or are chosen among those offered.
         cutoff: m; returns beyond it are hidden from the method. None hides nothing.
         seed, device, dtype: of the method's run; answers come back on the CPU.
 
@@ -91,18 +99,24 @@ def ask(
         ValueError: as the method, the readers and the hold-out raise it.
     """
     scene = Scene.of(scene)
-    views, hint, recording = method.views, scene.hint, scene.recording
+    hint, recording = scene.hint, scene.recording
     for i, j in pairs:
-        shown = [range_split(recording[k].to(dtype).to(device), cutoff) for k in (i, *between(i, j, views))]
+        offered = () if isinstance(j, int) else j
+        seen = between(i, j, min(method.views, j - i)) if isinstance(j, int) else offered
+        shown = [range_split(recording[k].to(dtype).to(device), cutoff) for k in (i, *seen)]
+        asked = choosing(method) if offered else method
         trace: dict[str, Any] = {}
         with torch.no_grad():
-            estimate = method(shown[0], stack(shown[1:]) if views > 1 else shown[-1], seed=seed, hint=hint, trace=trace)
+            others = stack(shown[1:]) if len(seen) > 1 else shown[-1]
+            estimate = asked(shown[0], others, seed=seed, hint=hint, trace=trace)
             samples = trace["samples"].to("cpu")
             rgb = _colour(shown[0], trace["samples"].uv)
         tracks, fit = (trace[k].to("cpu") for k in ("tracks", "fit"))
         camera = shown[0].camera.to("cpu")
+        choice = picked(i, offered, trace) if offered else None
+        fits = [t["fit"].to("cpu") for t in trace.get("views", ())]
         yield PairEstimate(
-            pair=(i, j),
+            pair=(i, seen[-1] if choice is None else choice.views[-1]),
             samples=samples,
             estimate=estimate.to("cpu"),
             tracks=tracks,
@@ -110,6 +124,8 @@ def ask(
             rgb=rgb.cpu(),
             camera=camera,
             hw=shown[0].hw,
+            picked=choice,
+            others={} if choice is None else dict(zip(choice.views, fits or [fit], strict=True)),
         )
 
 
@@ -128,7 +144,7 @@ def place(recording: Recording, answers: Sequence[PairEstimate], *, poses: str =
     """
     if poses not in POSES:
         raise ValueError(f"poses: found {poses!r}, expected one of {', '.join(POSES)}")
-    frames = sorted({k for answer in answers for k in answer.pair})
+    frames = sorted({k for answer in answers for k in (answer.pair[0], *answer.links)})
     given = {} if recording.poses is None else {k: _own(recording, k) for k in frames}
     given = {k: T for k, T in given.items() if bool(T.R.isfinite().all() and T.t.isfinite().all())}
     if poses == "device":
@@ -137,10 +153,12 @@ def place(recording: Recording, answers: Sequence[PairEstimate], *, poses: str =
         return Places(given, int(bool(given)), len(frames) - len(given))
     links: dict[int, list[tuple[int, Pose]]] = {k: [] for k in frames}
     for answer in answers:
-        if bool(answer.fit.ok[0]):
-            (i, j), T = answer.pair, answer.fit.T_1_from_0.to(torch.float64)
-            links[i].append((j, se3.invert(T)))
-            links[j].append((i, T))
+        i = answer.pair[0]
+        for j, fit in answer.links.items():
+            if bool(fit.ok[0]):
+                T = fit.T_1_from_0.to(torch.float64)
+                links[i].append((j, se3.invert(T)))
+                links[j].append((i, T))
     fragments: list[dict[int, Pose]] = []
     for k in frames:
         if not any(k in fragment for fragment in fragments):
@@ -150,20 +168,23 @@ def place(recording: Recording, answers: Sequence[PairEstimate], *, poses: str =
     return Places(largest, len(fragments), len(frames) - len(largest))
 
 
-def chain(pairs: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+def chain(pairs: Sequence[tuple[int, int]], *, chosen: bool = False) -> list[tuple[int, int]]:
     """Further pairs, nearly as wide as the given ones, so that poses found for all of them can reach every frame.
 
     Steps of one width alone never join neighbours; steps of two widths without a common factor do. The wider a step
-    the surer its translation, so the second is the widest that does it.
+    the surer its translation, so the second is the widest that does it. Pairs that a method has ``chosen`` are of many
+    widths and on both sides: steps of their median width are then among the further ones.
     """
     frames = sorted({k for pair in pairs for k in pair})
     place = {k: n for n, k in enumerate(frames)}
-    widths = sorted(place[j] - place[i] for i, j in pairs)
+    widths = sorted(abs(place[j] - place[i]) for i, j in pairs)
     wide = widths[len(widths) // 2] if widths else 1
     other = [w for w in range(1, wide) if math.gcd(w, wide) == 1 and w + wide - 1 <= len(frames)]
     step = other[-1] if other else 1
-    links = [(frames[n], frames[n + step]) for n in range(len(frames) - step)]
-    return [link for link in links if link not in set(pairs)]
+    steps = sorted({step, wide}) if chosen else [step]
+    links = [(frames[n], frames[n + step]) for step in steps for n in range(len(frames) - step)]
+    known = {*pairs, *((j, i) for i, j in pairs)}
+    return [link for link in links if link not in known]
 
 
 def build(

@@ -42,9 +42,9 @@ class HeldOut:
         self.method, self.seed = method, seed
 
     def variant(self, **more: Any) -> Variant:
-        """The method with set B hidden from it."""
+        """The method with set B hidden from it; views chosen by the returns of both sets would know B."""
         half = PoseHalf(self.method.classify, self.seed, self.method.min_trackability)
-        return Variant(self.method.replace(classify=half), **more)
+        return Variant(self.method.replace(classify=half), two_frames=True, **more)
 
     def whole(self, batch: Batch, uv: Tensor) -> Samples:
         """The samples with every return."""

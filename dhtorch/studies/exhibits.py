@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from dhtorch.data.scene import Given, Scene
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.lookup import nearest
+from dhtorch.offers import picked
 from dhtorch.pair import merge
 from dhtorch.records import Camera, Frame, Pose
 from dhtorch.studies import protocol
@@ -41,7 +43,7 @@ def look(
     Args:
         given: one scene, or a recording as a scene without notes.
         method: of one other view or several.
-        pairs: scene → list of (anchor, other).
+        pairs: scene → list of :class:`dhtorch.data.pairs.Pair`, or plain (anchor, other).
         settings: cutoff, seed, device, batch, workers.
         most: pairs that are shown; of more, as many spread evenly.
         progress: wraps the loop over the pairs.
@@ -56,7 +58,7 @@ def look(
 
     def keep(answer: Answer) -> protocol.Row:
         batch = answer.batch
-        for k, frame in zip(batch.pairs[0], (batch.anchor, batch.others[-1]), strict=True):
+        for k, frame in ((batch.pairs[0][0], batch.anchor), answer.other):
             if k not in views:
                 views[k] = _view(recording, k, frame)
         shots.append(_shot(answer, list(views)))
@@ -71,7 +73,7 @@ def look(
 def _shot(answer: Answer, shown: Sequence[int]) -> Shot:
     batch, samples, estimate = answer.batch, answer.samples, answer.estimate
     tracks, fit, truth = answer.trace["tracks"], answer.trace["fit"], answer.truths["full"]
-    whole, anchor, (i, j) = merge(samples, estimate), batch.anchor, batch.pairs[0]
+    whole, anchor, i, j = merge(samples, estimate), batch.anchor, batch.pairs[0].anchor, answer.other[0]
     filled = whole.source != Source.NONE
     xyz = cam.unproject(anchor.camera, whole.uv, whole.depth)
     error = (estimate.depth - truth.depth).abs() / truth.depth.clamp_min(1e-9)
@@ -97,6 +99,8 @@ def _shot(answer: Answer, shown: Sequence[int]) -> Shot:
     if ok:
         facts["pose"] = f"{int(fit.n_inlier[0])} near returns agree, {float(fit.rms_px[0]):.2f} px"
         facts["baseline"] = f"{100 * float(fit.T_1_from_0.t.norm()):.1f} cm"
+    if offered := batch.pairs[0].offered:
+        facts["views"] = str(picked(i, offered, answer.trace)).partition(": ")[2]
     return Shot(
         label=f"{i} → {j}",
         samples={name: x[0].detach().cpu().numpy() for name, x in columns.items()},
@@ -178,7 +182,7 @@ def _matrix(pose: Pose) -> np.ndarray:
     return se3.to_matrix(pose)[0].detach().cpu().double().numpy()
 
 
-def _spread(items: Sequence[tuple[int, int]], most: int) -> list[tuple[int, int]]:
+def _spread(items: Sequence[Any], most: int) -> list[Any]:
     """At most ``most`` of them, evenly spread, the first and the last among them."""
     n = len(items)
     if n <= most:

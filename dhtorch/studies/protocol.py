@@ -20,17 +20,18 @@ from torch.utils.data import DataLoader, Dataset
 from dhtorch import tree
 from dhtorch.codes import Gate, Hole, names
 from dhtorch.data.files import set_opencv_threads
-from dhtorch.data.pairs import between
+from dhtorch.data.pairs import Pair, between, fixed
 from dhtorch.data.recording import Recording, TruthRecording
 from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import errors, holdout
 from dhtorch.geometry.lookup import nearest, patches, round_half_up
 from dhtorch.method import Method, Trace
+from dhtorch.offers import Picked, choosing, picked
 from dhtorch.records import NO_HINT, Estimate, Frame, PoseFit, Samples, TrackHint, Tracks
 from dhtorch.studies.rows import Row, overlay, scene_row, summarise
 from dhtorch.studies.shared_tracks import SharedTracks
 
-Pairs = Callable[[Scene], Sequence[tuple[int, int]]]
+Pairs = Callable[[Scene], Sequence[Pair] | Sequence[tuple[int, int]]]
 Offers = Callable[[Recording, int], Sequence[int]]  # (recording, anchor) → positions of other views
 Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
 
@@ -70,10 +71,10 @@ class Batch:
     """Some pairs of one scene, loaded: all that a protocol may look at."""
 
     scene: Scene
-    pairs: Sequence[tuple[int, int]]
+    pairs: Sequence[Pair]
     cutoff: float | None  # m
     anchor: Frame
-    others: tuple[Frame, ...]  # further views, the pair's own last
+    others: tuple[Frame, ...]  # further views, the pair's own last; none where frames are offered instead
     exact: Frame  # the anchor with the depth it is held against
     surface: Tensor  # (B, H, W) kind of surface, (B, 1, 1) where the recording knows none
     disagreement: Tensor  # (B,) median relative difference of the independent truth from the sensor; NaN = not known
@@ -113,6 +114,7 @@ class Variant:
     given: Callable[[Batch], Mapping[str, Any]] = lambda _batch: {}  # further options: an oracle may see it all
     offers: Offers | None = None  # other views in the place of the pair's own; silent where it is offered none
     needs: Callable[[Scene], str | None] = lambda _scene: None  # scene → why it cannot run there, None = it can
+    two_frames: bool = False  # cannot choose: what it is judged by would take part in the choice
 
 
 @dataclass(frozen=True)
@@ -131,12 +133,20 @@ class Answer:
         samples: Samples = self.trace["samples"]
         return samples
 
+    @property
+    def other(self) -> tuple[int, Frame]:
+        """The view (B = 1) that tracks and pose of the trace belong to: its position in the recording, and the view."""
+        pair = self.batch.pairs[0]
+        if isinstance(pair.other, int):
+            return pair.other, self.batch.others[-1]
+        k = int(self.trace["chosen"][-1, 0]) if "chosen" in self.trace else 0
+        return pair.offered[k], self.batch.around[k]
+
     def one(self, b: int) -> Answer:
         """Pair ``b`` alone; milliseconds are the batch's share."""
         size, cut = len(self.batch.pairs), slice(b, b + 1)
         records = {k: v[cut] for k, v in self.trace.items() if isinstance(v, tree.Record)}
-        if "chosen" in self.trace:
-            records["chosen"] = self.trace["chosen"][:, cut]
+        records |= {k: self.trace[k][:, cut] for k in ("chosen", "choice") if k in self.trace}
         return replace(
             self,
             batch=replace(
@@ -185,9 +195,18 @@ class Protocol:
         asked = list(dict.fromkeys(v.offers for v in self.variants.values() if v.offers is not None))
         return partial(_all_offered, asked) if asked else None
 
-    def batch(self, settings: Settings) -> int:
+    def batch(self, settings: Settings, pairs: Sequence[Pair]) -> int:
         """Pairs per call: one where anchors are offered differently many views."""
-        return settings.batch if self.offers is None else 1
+        return settings.batch if self.offers is None and not any(pair.offered for pair in pairs) else 1
+
+    def allows(self, pairs: Sequence[Pair]) -> None:
+        """Refuse frames to choose among where a variant cannot choose.
+
+        Raises:
+            ValueError: such a variant and such pairs.
+        """
+        if any(v.two_frames or v.fit is not None or v.ask is not None for v in self.variants.values()):
+            fixed(pairs)
 
 
 @dataclass(frozen=True)
@@ -256,7 +275,7 @@ def run(
     Args:
         scenes: see :class:`dhtorch.data.scene.Scene`; a recording is a scene without notes.
         protocol: variants, cohorts and what is hidden.
-        pairs: scene → list of (anchor, other).
+        pairs: scene → list of :class:`dhtorch.data.pairs.Pair`, or plain (anchor, other).
         settings: cutoff, seed, device, batch, workers.
         progress: wraps the loop over a scene's batches: (items, text, number of items) → items.
 
@@ -265,9 +284,10 @@ def run(
     """
     outcome = Outcome()
     for scene in scenes_of(scenes):
-        chosen = list(pairs(scene))  # first: a data set without pairs of views says so
+        chosen = [Pair(*pair) for pair in pairs(scene)]  # first: a data set without pairs of views says so
+        protocol.allows(chosen)
         collected = _Collected(scene, protocol, settings)
-        loader, size = _load(scene.recording, chosen, protocol, settings), protocol.batch(settings)
+        loader, size = _load(scene.recording, chosen, protocol, settings), protocol.batch(settings, chosen)
         for at, items in zip(range(0, len(chosen), size), progress(loader, scene.name, len(loader)), strict=True):
             moved = [_to(item, settings.device) for item in items]
             collected.add(Batch(scene, chosen[at : at + size], collected.cutoff, *moved))
@@ -290,7 +310,7 @@ class PairData(Dataset[Loaded]):
     def __init__(
         self,
         recording: Recording,
-        pairs: Sequence[tuple[int, int]],
+        pairs: Sequence[Pair],
         dtype: torch.dtype,
         views: int = 1,
         offers: Offers | None = None,
@@ -301,9 +321,9 @@ class PairData(Dataset[Loaded]):
         return len(self.pairs)
 
     def __getitem__(self, index: int) -> Loaded:
-        i, j = self.pairs[index]
-        own = between(i, j, self.views)
-        offered = () if self.offers is None else self.offers(self.recording, i)
+        i, other = pair = self.pairs[index]
+        own = between(i, other, self.views) if isinstance(other, int) else []
+        offered = _offered(pair, self.recording, self.offers)
         frames = {k: self.recording[k].to(self.dtype) for k in sorted({i, *own, *offered})}
         anchor = frames[i]
         others, around = (tuple(frames[k] for k in some) for some in (own, offered))
@@ -353,8 +373,11 @@ class _Collected:
                 self._count_holes(variant.method, batch.anchor, answer.samples.uv)
                 enough = [int(ok.sum()) >= self.least for ok in truths[self.last].ok]
                 self.n_few += enough.count(False)
-            for b in (b for b in range(len(batch.pairs)) if enough[b]):
-                self._note(answer.one(b))
+            for b, counts in enumerate(enough):
+                one = answer.one(b)
+                choice = self._picked(one)
+                if counts:
+                    self._note(one, choice)
             if not self.examples:
                 first = answer.one(0)
                 records = (near[:1], first.samples, first.estimate, first.truths[self.last])
@@ -386,24 +409,22 @@ class _Collected:
 
     def _offered(self, batch: Batch) -> dict[int, Frame]:
         """Position → frame, as variants see it, of all that are offered."""
-        if self.protocol.offers is None:
-            return {}
-        positions = self.protocol.offers(self.scene.recording, batch.pairs[0][0])
+        positions = _offered(batch.pairs[0], self.scene.recording, self.protocol.offers)
         return {k: self.protocol.hide(view, self.cutoff) for k, view in zip(positions, batch.around, strict=True)}
 
     def _view_of(
         self, variant: Variant, batch: Batch, views: Sequence[Frame], offered: Mapping[int, Frame]
     ) -> tuple[Any, list[Frame]]:
         """Other views of one variant, and what they are told apart by from those of others."""
-        if variant.offers is None:
+        if variant.offers is None and views:
             return variant.method.views, list(views[-variant.method.views :])
-        positions = tuple(variant.offers(self.scene.recording, batch.pairs[0][0]))
+        positions = tuple(_offered(batch.pairs[0], self.scene.recording, variant.offers))
         return positions, [offered[k] for k in positions]
 
     def _ask(
         self, variant: Variant, batch: Batch, near: Frame, seen: Frame | None, shared: SharedTracks
     ) -> tuple[Estimate, Trace]:
-        method = variant.method
+        method = variant.method if batch.others and variant.offers is None else choosing(variant.method)
         trace: Trace = {}
         spoil = getattr(
             self.scene.recording, "spoil_track", lambda track: track
@@ -421,15 +442,11 @@ class _Collected:
         shared.charge(trace["ms"])
         return estimate, trace
 
-    def _asked(self, answer: Answer) -> Row:
-        """Which of the frames that a variant was offered it chose."""
-        offers = self.variants[answer.variant].offers
-        if offers is None:
-            return {}
-        offered = offers(self.scene.recording, answer.batch.pairs[0][0])
-        if "chosen" not in answer.trace:  # a single view is asked as a pair
-            return {"views": list(offered)}
-        return {"views": [offered[k] for k in answer.trace["chosen"][:, 0].tolist()]}
+    def _picked(self, answer: Answer) -> Picked | None:
+        """Which frames a variant chose that was offered some."""
+        pair, offers = answer.batch.pairs[0], self.variants[answer.variant].offers
+        offered = _offered(pair, self.scene.recording, offers)
+        return picked(pair.anchor, offered, answer.trace) if offered else None
 
     def _count_holes(self, method: Method, anchor: Frame, uv: Tensor) -> None:
         """The sensor's own holes, before anything is held back."""
@@ -437,15 +454,16 @@ class _Collected:
             total = max(int((hole != Hole.NONE).sum()), 1)
             self.census.append({k: float((hole == k).sum()) / total for k in names(Hole)})
 
-    def _note(self, answer: Answer) -> None:
+    def _note(self, answer: Answer, choice: Picked | None) -> None:
         """Rows and points of one pair."""
         estimate, fit, kinds = answer.estimate, answer.trace["fit"], answer.batch.kinds(answer.samples.uv)
         hole = ~answer.samples.usable
         share = {gate.lower(): float((estimate.gate == code).float().mean()) for code, gate in names(Gate).items()}
-        common: Row = {"scene": self.scene.name, "pair": list(answer.batch.pairs[0]), "method": answer.variant}
+        pair = [answer.batch.pairs[0].anchor, answer.other[0]]
+        common: Row = {"scene": self.scene.name, "pair": pair, "method": answer.variant}
         found: Row = {"pnp_ok": bool(fit.ok[0]), "n_inlier": int(fit.n_inlier[0]), "n_holes": int(hole.sum())}
         found |= {"n_recovered": int((estimate.keep & hole).sum()), "gate_share": share, "ms": answer.trace["ms"]}
-        more = self.protocol.columns(answer) | self._asked(answer)
+        more = self.protocol.columns(answer) | ({} if choice is None else choice.row())
         self.overlays.setdefault(answer.variant, overlay(answer.samples, estimate, answer.batch.anchor.hw))
         for cohort, truth in answer.truths.items():
             points = errors.select(estimate, truth)
@@ -457,20 +475,23 @@ class _Collected:
                 self.apart.setdefault((answer.variant, cohort, kind), []).append(errors.select(estimate, there))
 
 
-def _load(
-    recording: Recording, pairs: list[tuple[int, int]], protocol: Protocol, settings: Settings
-) -> DataLoader[Loaded]:
+def _load(recording: Recording, pairs: list[Pair], protocol: Protocol, settings: Settings) -> DataLoader[Loaded]:
     wanted = max((v.method.views for v in protocol.variants.values() if v.offers is None), default=1)
-    views = min([wanted, *(j - i for i, j in pairs)])  # a short gap holds fewer frames
+    views = min([wanted, *(j - i for i, j in pairs if isinstance(j, int))])  # a short gap holds fewer frames
     return DataLoader(
         PairData(recording, pairs, settings.dtype, views, protocol.offers),
-        batch_size=protocol.batch(settings),
+        batch_size=protocol.batch(settings, pairs),
         num_workers=settings.workers if pairs else 0,
         collate_fn=_collate,
         worker_init_fn=_one_thread,
         # A fork would copy the locks of whatever threads torch and OpenCV run here, and may never return.
         multiprocessing_context="spawn" if settings.workers and pairs else None,
     )
+
+
+def _offered(pair: Pair, recording: Recording, offers: Offers | None) -> Sequence[int]:
+    """The frames among which a variant chooses; none where it takes the pair's own."""
+    return pair.offered or (() if offers is None else offers(recording, pair.anchor))
 
 
 def _all_offered(asked: Sequence[Offers], recording: Recording, anchor: int) -> list[int]:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 
 from dhtorch import tree
-from dhtorch.data.pairs import around
+from dhtorch.data.pairs import around, fixed
 from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import bootstrap, compare, errors
 from dhtorch.evaluate.errors import Points
@@ -170,7 +170,7 @@ def _lacks(method: Method, _scene: Scene) -> str | None:
 
 def _views(pairs: Pairs | None, method: Method, scene: Scene) -> str | None:
     """Why a method is not asked on a scene: a package, or views that there are not; None where it is."""
-    short = pairs is not None and method.views > 1 and min((j - i for i, j in pairs(scene)), default=2) < 2
+    short = pairs is not None and method.views > 1 and min((j - i for i, j in fixed(pairs(scene))), default=2) < 2
     return xfeat.lacking(method) or ("fewer than 3 views" if short else None)
 
 

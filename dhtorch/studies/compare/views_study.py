@@ -14,6 +14,7 @@ from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 
 from dhtorch.data.pairs import LADDER, around
+from dhtorch.data.pairs import fixed as of_two_frames
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import bootstrap, risk
@@ -152,7 +153,7 @@ def _variants(methods: Mapping[str, Method], fixed: Mapping[int, str], seed: int
 
 def _spread(pairs: Pairs, anchors: int | None, scene: Scene) -> list[tuple[int, int]]:
     """Some of the scene's pairs, evenly spread."""
-    found = list(pairs(scene))
+    found = of_two_frames(pairs(scene))
     if anchors is None or len(found) <= anchors:
         return found
     return [found[(2 * k + 1) * len(found) // (2 * anchors)] for k in range(anchors)]

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from dhtorch.data.pairs import fixed
 from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import bootstrap, holdout
 from dhtorch.evaluate.correlation import pearson, spearman
@@ -106,7 +107,9 @@ def run(
         correlated = partial(correlate, window=window, max_lag=lag, min_peak=min_peak)
         return _pair(scene.hint, method, views[0], views[1], correlated=correlated, blur_px=blur_px, wind=arms)
 
-    outcome = screen(scenes_of(scenes), pairs, ask, VARIANTS, truth="full", progress=progress)
+    outcome = screen(
+        scenes_of(scenes), lambda scene: fixed(pairs(scene)), ask, VARIANTS, truth="full", progress=progress
+    )
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 
 

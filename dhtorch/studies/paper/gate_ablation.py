@@ -9,10 +9,11 @@ What would refute it: taking away the parallax gate does not cost more correlati
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from dhtorch.data.pairs import by_gap, by_scaled_gap
+from dhtorch.data.pairs import Pair, by_gap, by_scaled_gap
 from dhtorch.data.scene import Given, Scene
 from dhtorch.studies import protocol
 from dhtorch.studies.cohorts import HeldOut, everything
@@ -21,7 +22,7 @@ from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Protocol,
 QUESTION = "Which gate carries the abstention, and how does the frame gap trade error for coverage?"
 EXPECTATION = "Without the parallax gate correlation falls by more than without the reprojection gate."
 
-Gaps = dict[str, Callable[[Any], list[tuple[int, int]]]]
+Gaps = dict[str, Callable[[Any], list[Pair]]]
 
 
 def run(
@@ -57,7 +58,7 @@ def run(
     variants = {}
     for name, off in ways.items():
         whole = split.variant()
-        variants[name] = protocol.Variant(whole.method.replace(triangulate=off))
+        variants[name] = replace(whole, method=whole.method.replace(triangulate=off))
     main = protocol.run(
         scenes, Protocol(variants, {"heldout": split.heldout}, everything), pairs, settings, progress=progress
     )
@@ -101,7 +102,7 @@ def verdict(summary: Mapping[str, Any]) -> tuple[bool | None, str]:
     return both - without_parallax > both - without_residual, f"correlation: {why} (medians over scenes)"
 
 
-def _fixed(scene: Scene, gap: int) -> list[tuple[int, int]]:
+def _fixed(scene: Scene, gap: int) -> list[Pair]:
     number = scene.recording.number
     span = int(number[-1] - number[0])
     return by_gap(scene, gap) if gap <= span else []

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from dhtorch import integrate
 from dhtorch.codes import Source
+from dhtorch.data.pairs import fixed
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import bootstrap
@@ -69,7 +70,7 @@ def run(
     answers: dict[str, dict[Item, PairEstimate]] = {}
 
     def items(scene: Scene) -> list[Item]:
-        chosen = list(pairs(scene))
+        chosen = fixed(pairs(scene))
         return [*chosen, *chain(chosen)]
 
     def ask(scene: Scene, item: Item) -> dict[str, Row]:
@@ -85,7 +86,7 @@ def run(
 
     def whole(scene: Scene, _found: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
         recording, found = scene.recording, answers.pop(scene.name, {})
-        maps = _Maps(recording, [found[p] for p in pairs(scene)], settings.cutoff_of(scene), voxel)
+        maps = _Maps(recording, [found[p] for p in fixed(pairs(scene))], settings.cutoff_of(scene), voxel)
         rows: dict[str, Row] = {}
         for poses in POSES:
             if poses == "anchored" or recording.poses is not None:

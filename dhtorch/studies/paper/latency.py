@@ -28,6 +28,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from dhtorch.data.pairs import fixed
 from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import holdout
 from dhtorch.evaluate.bootstrap import Interval
@@ -187,7 +188,7 @@ def judge(
 
 def _views(scene: Scene, pairs: Pairs, settings: Settings) -> tuple[Frame, Frame]:
     """The first pair, as a method may see it."""
-    chosen = pairs(scene)
+    chosen = fixed(pairs(scene))
     if not chosen:
         raise ValueError(f"latency: {scene.name} has no pair, expected at least one")
     cutoff = settings.cutoff_of(scene)

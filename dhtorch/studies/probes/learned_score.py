@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dhtorch.data.pairs import fixed
 from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import bootstrap, compare, risk
 from dhtorch.method import Trace
@@ -219,7 +220,7 @@ class _Answers:
 
 
 def _key(batch: Batch) -> tuple[str, tuple[tuple[int, int], ...]]:
-    return batch.scene.name, tuple(batch.pairs)
+    return batch.scene.name, tuple(fixed(batch.pairs))
 
 
 def _room(scene: Scene) -> str:
