@@ -51,7 +51,7 @@ WINDOW = MAP.replace(views=5)
 #: not contradict. A view may be unsure: what counts is how sure they are together.
 AUTO = MAP.replace(
     track=partial(lucas_kanade_affine, levels=LEVELS, start=coarse_flow, track=partial(lucas_kanade, normalise="bias")),
-    triangulate={"max_sigma_rel": 1.0, "max_far_noise": 0.0025, "max_in_reach": 0.15},
+    triangulate={"max_sigma_rel": 1.0, "max_far_noise": 0.0025, "max_in_reach": 0.18},
     fuse=partial(agree, max_still=0.7),
     score=rank_by_sigma,
     choose=by_probes,

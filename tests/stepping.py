@@ -36,13 +36,15 @@ def track(image_0, image_1, uv_0, *, hint):
 
 
 def pose(samples, _tracks, _camera_0, _camera_1, _draws):
-    return given_pose(Pose(torch.eye(3)[None], torch.zeros(1, 3)), samples.uv.shape[1])
+    still = Pose(torch.eye(3).expand(len(samples.uv), 3, 3), torch.zeros(len(samples.uv), 3))
+    return given_pose(still, samples.uv.shape[1])
 
 
 def triangulate(samples, tracks, _fit, _camera_0, _camera_1):
-    step = round(float((tracks.uv_1 - tracks.uv_0)[0, 0, 0]))
-    share = SHARES.get(step, 0.0) if bool(tracks.valid.all()) else 0.0
-    says = (torch.arange(samples.uv.shape[1]) % 10 < 10 * share)[None]
+    steps = (tracks.uv_1 - tracks.uv_0)[:, 0, 0].round().int().tolist()
+    lost = (~tracks.valid).any(-1).tolist()
+    shares = torch.tensor([0.0 if out else SHARES.get(step, 0.0) for step, out in zip(steps, lost, strict=True)])
+    says = torch.arange(samples.uv.shape[1]) % 10 < 10 * shares[:, None]
     silent = Estimate.silent(samples, Gate.NO_TRACK, n_views=2)
     answer = torch.where(says, FAR, torch.nan)
     gate = torch.where(says, Gate.ANSWER, silent.gate)

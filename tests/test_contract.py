@@ -462,10 +462,14 @@ ELSEWHERE = {
     ),
     "dhtorch.geometry.filters.gaussian_taps",
     "dhtorch.window.ask_window",
-    *(f"dhtorch.pair.{name}" for name in ("ask_pair", "merge", "lifted", "undistort_tracks", "uniform_draws")),
+    *(
+        f"dhtorch.pair.{name}"
+        for name in ("ask_pair", "tracked", "under_pose", "merge", "lifted", "undistort_tracks", "uniform_draws")
+    ),
     *(f"dhtorch.method.{name}" for name in ("parts", "networks")),
     "dhtorch.stages.fuse.inverse_variance",
     "dhtorch.stages.fuse.agree",
+    "dhtorch.geometry.reach.within_reach",
     *(f"dhtorch.views.{name}" for name in ("by_probes", "shrunk", "key_views", "weighed")),
     *(f"dhtorch.geometry.start.{name}" for name in ("small", "is_turned", "inverse")),
     "dhtorch.stages.track.coarse",

@@ -115,7 +115,7 @@ def agree(
 
     Gates: NO_BASELINE for all points of an anchor whose views mostly have none; where no view answers, the reason of
     the last; INCONSISTENT (other views disagree), UNCERTAIN (one unsure view, or a joint sigma too large);
-    CONTRADICTED for all answers where it silences as many views as answer.
+    CONTRADICTED for all answers where it silences more views than answer.
 
     Raises:
         ValueError: wrong shapes, or no view.
@@ -189,11 +189,11 @@ def _stilled(estimates: Estimate, gate: Tensor, max_still: float) -> Tensor:
 
 
 def _contradicted(estimates: Estimate, gate: Tensor) -> Tensor:
-    """The gates (B, N); CONTRADICTED for what an anchor answers of whose views with an answer, or with one withheld
-    for that, half are contradicted: what moves on its own is near in all of them."""
+    """The gates (B, N); CONTRADICTED for what an anchor answers of whose views more are contradicted than answer: what
+    moves on its own is near in all of them."""
     against = (estimates.gate == Gate.CONTRADICTED).any(-1).sum(0)
     answering = (estimates.gate == Gate.ANSWER).any(-1).sum(0)
-    moving = (against > 0) & (against >= answering)
+    moving = against > answering
     return torch.where(moving[:, None] & (gate == Gate.ANSWER), Gate.CONTRADICTED, gate)
 
 

@@ -8,14 +8,14 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from dhtorch.codes import Gate, PoseCode, first_reason
+from dhtorch.codes import Gate, Hole, PoseCode, first_reason
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import epipolar
 from dhtorch.geometry.covariance import median, noise_shape
 from dhtorch.geometry.near_far import straighten
+from dhtorch.geometry.reach import within_reach
 from dhtorch.geometry.shapes import check
 from dhtorch.records import Camera, Estimate, PoseFit, Samples, Tracks
-from dhtorch.stages.contradict import misses_lines, within_reach
 
 #: Least trackability that a grey difference is divided by.
 MIN_TRACKABILITY = 1e-8
@@ -75,7 +75,7 @@ def two_view(
         max_far_noise: spread of the far tracks' residuals, of a ray with z = 1, above which the near returns are taken
             to move on their own and no point of the pair is answered; None asks nothing.
         max_in_reach: share of the answers that may lie where the sensor would have seen them
-            (:func:`dhtorch.stages.contradict.within_reach`); with more, none is given. None asks nothing.
+            (:func:`dhtorch.geometry.reach.within_reach`); with more, none is given. None asks nothing.
         fitted_noise: take the scale of the tracks' noise from the pose's residuals (``fit.sigma_px``), and from the
             tracks' covariances only its shape; else the covariances as they are.
         isotropic: share of that shape which does not depend on the patch, see ``covariance.noise_shape``.
@@ -141,9 +141,11 @@ def two_view(
     sigma = _root(own + shared, gate == Gate.ANSWER)
     moving = torch.zeros_like(fit.ok)
     if max_far_noise is not None:
-        moving = moving | misses_lines(fit, camera_1, max_far_noise=max_far_noise)
+        moving = moving | (fit.sigma_px > max_far_noise * camera_1.f.detach().amin(-1))
     if max_in_reach is not None:
-        share = within_reach(samples, fit, geometry.depth.detach(), sigma.detach(), gate == Gate.ANSWER)
+        seen = torch.where(samples.usable, samples.depth, torch.zeros_like(samples.depth))
+        asked = (gate == Gate.ANSWER) & (samples.hole == Hole.TRACKABLE_NO_LIDAR)
+        share = within_reach(samples.uv, seen, fit.inlier, asked, geometry.depth, sigma)
         moving = moving | (share > max_in_reach)
     gate = torch.where((gate == Gate.ANSWER) & moving[:, None], Gate.CONTRADICTED, gate)
     keep, measured = gate == Gate.ANSWER, tracked & posed

@@ -446,7 +446,9 @@ class _Collected:
         """Which frames a variant chose that was offered some."""
         pair, offers = answer.batch.pairs[0], self.variants[answer.variant].offers
         offered = _offered(pair, self.scene.recording, offers)
-        return picked(pair.anchor, offered, answer.trace) if offered else None
+        if not offered:  # silent, where frames were asked for and there are none
+            return None if offers is None else Picked(pair.anchor, (), 0)
+        return picked(pair.anchor, offered, answer.trace)
 
     def _count_holes(self, method: Method, anchor: Frame, uv: Tensor) -> None:
         """The sensor's own holes, before anything is held back."""

@@ -42,6 +42,8 @@ PAPER_GATES: dict[str, Any] = {
     "max_sigma_rel": None,
     "min_t_snr": None,
     "max_mismatch_px": None,
+    "max_far_noise": None,
+    "max_in_reach": None,
 }
 PAPER_SIGMA: dict[str, Any] = {
     "fitted_noise": False,
@@ -147,10 +149,11 @@ def put_together(window: Method, auto: Method) -> dict[str, Method]:
 
     What is not in one of :data:`PARTS` is a part of its own, under the name of its seat, where the two differ in it.
     """
+    gated = _contradiction(_unsure(window, auto), auto)
     parts = PARTS | {
         f"{seat} of auto": partial(_seat, seat)
         for seat in ("sample", "backproject", "classify", "pose", "triangulate", "n", "hypotheses", "min_trackability")
-        if what_it_does(getattr(window, seat)) != what_it_does(getattr(auto, seat))
+        if what_it_does(getattr(gated, seat)) != what_it_does(getattr(auto, seat))
     }
     alone = {f"+ {name}": part(window, auto) for name, part in parts.items()}
     return {**alone, "auto": auto, **{f"- {name}": part(auto, window) for name, part in parts.items()}}
@@ -171,6 +174,18 @@ def _views(method: Method, other: Method) -> Method:
     return method.replace(choose=other.choose, views=other.views, chain=method.chain and other.chain)
 
 
+def _gates(names: Sequence[str], method: Method, other: Method) -> Method:
+    """Limits of the other's seat 6."""
+    own, theirs = ({name: _option(m.triangulate, name) for name in names} for m in (method, other))
+    changed = {name: value for name, value in theirs.items() if value != own[name]}
+    return method.replace(triangulate=changed) if changed else method
+
+
+#: Views that may be unsure as long as they are sure together, and near returns that what lies far contradicts.
+_unsure = partial(_gates, ("max_sigma_rel",))
+_contradiction = partial(_gates, ("max_far_noise", "max_in_reach"))
+
+
 def _seat(seat: str, method: Method, other: Method) -> Method:
     return method.replace(**{seat: getattr(other, seat)})
 
@@ -182,6 +197,8 @@ PARTS: dict[str, Callable[[Method, Method], Method]] = {
     "chosen views": _views,
     "agreement": partial(_seat, "fuse"),
     "score by sigma": partial(_seat, "score"),
+    "unsure views": _unsure,
+    "contradiction": _contradiction,
 }
 
 
