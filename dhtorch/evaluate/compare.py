@@ -10,12 +10,13 @@ from __future__ import annotations
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import torch
 
 from dhtorch import tree
-from dhtorch.evaluate import bootstrap, errors, reliability, risk
+from dhtorch.evaluate import bootstrap, control, errors, reliability, risk
 from dhtorch.evaluate.bootstrap import Interval
 from dhtorch.evaluate.errors import Points
 from dhtorch.evaluate.score_calibration import fit
@@ -72,7 +73,9 @@ def method_ratios(
         seed by seed), ``aurc_ratio``. ``worst_scene_ratio``: the largest ratio at equal coverage. ``coverage_at_5``:
         mean over scenes (on many it is zero, so that their median jumps). In rooms not learnt from, means over
         scenes: ``within_sigma`` and ``within_2sigma`` after the correction of sigma; ``realised_risk_<per cent>``,
-        mean capped error at the plug-in threshold, where a silent scene counts 0; ``within_target_<per cent>``, share
+        mean capped error at the threshold that nine in ten of the other scenes keep, where a silent scene counts 0
+        (``risk_of_speaking_<per cent>``: without those); ``coverage_within_<per cent>``, what is answered above it;
+        ``within_target_<per cent>``, share
         of the scenes that meet it among those with a hundred answers above the threshold; ``ece_scenes``, scene by
         scene what :func:`dhtorch.evaluate.reliability.excess_ece` says. And over all answers, every scene of the same
         weight: ``ece`` of the table, ``ece_sigmoid`` of the simple control, ``ece_raw`` of the score as it came.
@@ -192,7 +195,8 @@ def _promises(
     for others, held in reliability.leave_one_room_out(pooled, rooms):
         if not any(bool(s.keep.any()) for s in others.values()):
             continue  # nothing to learn from: these scenes have no such number
-        learnt = fit(list(others.values()), targets=TARGETS)
+        few = MIN_ABOVE * max(map(len, ours.values()))
+        learnt = fit(list(others.values()), targets=TARGETS, choose=partial(control.most_scenes, few=few))
         for scene, points in held.items():
             table[scene] = learnt.apply(points)
             sigmoid[scene] = points.replace(score=torch.where(points.keep, learnt.sigmoid(points.score), 0.0))
@@ -201,6 +205,7 @@ def _promises(
             rows[scene]["ece"] = reliability.excess_ece(table[scene], seed=seed)
             for percent, threshold in learnt.thresholds.items():
                 rows[scene][f"realised_risk_{percent}"] = risk.realised(points, threshold)
+                rows[scene][f"coverage_within_{percent}"] = _coverage_above(points, threshold)
                 above = 0 if threshold is None else int((points.keep & (points.score >= threshold)).sum())
                 rows[scene][f"n_above_{percent}"] = above / len(ours[scene])
 
@@ -213,11 +218,21 @@ def _promises(
         realised = [row[f"realised_risk_{percent}"] or 0.0 for row in judged]
         numbers[f"realised_risk_{percent}"] = mean(realised)
         enough = [r for r, row in zip(realised, judged, strict=True) if row[f"n_above_{percent}"] >= MIN_ABOVE]
+        spoke = [row[f"realised_risk_{percent}"] for row in judged if row[f"realised_risk_{percent}"] is not None]
+        numbers[f"risk_of_speaking_{percent}"] = mean(spoke)
+        numbers[f"coverage_within_{percent}"] = mean([row[f"coverage_within_{percent}"] for row in judged])
         numbers[f"within_target_{percent}"] = mean([float(r <= percent / 100) for r in enough])
     numbers["ece_scenes"] = mean([row["ece"] for row in judged])
     for name, scenes in (("ece", table), ("ece_sigmoid", sigmoid), ("ece_raw", pooled)):
         numbers[name] = reliability.ece_interval([scenes[s] for s in table], draws=draws, seed=seed)
     return numbers
+
+
+def _coverage_above(points: Points, threshold: float | None) -> float:
+    """Share of the candidates that are answered with a score from the threshold on; None answers nothing."""
+    if threshold is None or not points.keep.numel():
+        return 0.0
+    return float((points.keep & (points.score >= threshold)).double().mean())
 
 
 def completed(

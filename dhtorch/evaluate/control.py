@@ -1,7 +1,8 @@
-"""Where to cut the score so that the error stays below a target: two controls, two kinds of promise.
+"""Where to cut the score so that the error stays below a target: three controls, two kinds of promise.
 
 *Plug-in* looks at the error among the answers, on the scenes it is given, and leaves room for one standard error. It
-promises nothing about another scene. *Conformal* promises: if the scenes, the next one included, could have come in
+promises nothing about another scene. *Most scenes* asks the same of nine scenes in ten, one by one, instead of their
+mean. *Conformal* promises: if the scenes, the next one included, could have come in
 any order (are exchangeable), the loss of the next scene meets the target. The loss there is per candidate, capped
 error × answered / candidates, because it must not rise when less is answered; and a promise takes scenes: with fewer
 than it needs it says how many.
@@ -76,6 +77,35 @@ def plug_in(scenes: Sequence[Points], target: float) -> Control:
     variance = (risk - mean).square().sum(0) / (n - 1) if n > 1 else torch.full_like(thresholds, torch.inf)
     bound = mean + (variance / max(n, 1)).sqrt()
     return _lowest(thresholds, bound <= target, bound, risk, coverage, target=target)
+
+
+def most_scenes(scenes: Sequence[Points], target: float, *, share: float = 0.9, few: int = 0) -> Control:
+    """The largest coverage at which that share of the scenes meets the target, each by itself.
+
+    A mean over scenes may be met although half of them are above it; this asks how many are not. No guarantee is
+    claimed.
+
+    Args:
+        scenes: candidates with scores, one entry a scene; scenes without candidates are passed over.
+        target: mean capped error allowed of the answers of one scene, in (0, 1).
+        share: of the scenes, in (0, 1].
+        few: a scene with fewer answers above a threshold says nothing against it.
+
+    Returns:
+        Control; its ``bound`` is the share of the scenes that meet the target.
+
+    Raises:
+        ValueError: a target outside (0, 1), or a share outside (0, 1].
+    """
+    if not 0 < share <= 1:
+        raise ValueError(f"control.share: found {share}, expected a number above 0, at most 1")
+    scenes = _checked(scenes, target)
+    answers = [_ordered(scene) for scene in scenes]
+    thresholds = _thresholds(answers)
+    loss, answered = _accepted(answers, thresholds)
+    risk = loss / answered.clamp_min(1)
+    kept = ((risk <= target) | (answered < few)).to(risk.dtype).mean(0)
+    return _lowest(thresholds, kept >= share - 1e-12, kept, risk, answered / _sizes(scenes), target=target)
 
 
 def conformal(scenes: Sequence[Points], target: float, *, confidence: float | None = None) -> Control:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -64,7 +64,7 @@ class Calibration:
     expected_error: Table  # score → mean capped relative error
     sigmoid: Sigmoid  # score in [0, 1] → P(relative error < 10 %), the simple control
     sigma: SigmaModel | None  # None = no sigma was stated
-    thresholds: Mapping[int, float | None]  # per cent of mean error → plug-in threshold on the score; None = none fits
+    thresholds: Mapping[int, float | None]  # per cent of mean error → threshold on the score; None = none fits
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def apply(self, scene: Points) -> Points:
@@ -101,6 +101,7 @@ def fit(
     *,
     min_share: float = MIN_SHARE,
     targets: Sequence[int] = TARGETS,
+    choose: Callable[[Sequence[Points], float], control.Control] = control.plug_in,
     provenance: Mapping[str, Any] | None = None,
 ) -> Calibration:
     """Learn from scenes with truth what their scores and sigmas are worth; every scene has the same weight.
@@ -108,7 +109,8 @@ def fit(
     Args:
         scenes: candidates with answers, scores and, where stated, sigmas; any depth source.
         min_share: share of the weight on which a step of a table must rest.
-        targets: mean errors, in per cent, for which :func:`dhtorch.evaluate.control.plug_in` chooses a threshold.
+        targets: mean errors, in per cent, for which thresholds are chosen.
+        choose: the control that chooses them, such as :func:`dhtorch.evaluate.control.most_scenes`.
         provenance: where the scenes come from, as JSON can hold it; ``n_scenes`` and ``n_answers`` are added. A file
             that is shipped names ``method`` and ``scenes``.
 
@@ -126,7 +128,7 @@ def fit(
         expected_error=isotonic(score, loss, weight, rising=False, min_share=min_share, ends=ends),
         sigmoid=platt(score, good, weight),
         sigma=fit_sigma(scenes),
-        thresholds={percent: control.plug_in(scenes, percent / 100).threshold for percent in targets},
+        thresholds={percent: choose(scenes, percent / 100).threshold for percent in targets},
         provenance=note,
     )
 
