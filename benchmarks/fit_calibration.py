@@ -1,7 +1,8 @@
 """Fit the calibration that travels with the package: what a score and a sigma of ``map`` turned out to be worth.
 
 python benchmarks/fit_calibration.py      on the shared scenes, five seeds; writes dhtorch/calibration/map.json
-python benchmarks/fit_calibration.py --method window --output FILE --seeds 2
+python benchmarks/fit_calibration.py --method auto --seeds 2          the same of methods of several views, whose
+python benchmarks/fit_calibration.py --method window_1 --seeds 2      thresholds nine scenes in ten keep, one by one
 
 Scenes with a role are left out; every scene has the same weight, its seeds are pooled. What the same recipe is worth in
 rooms it was not fitted on is measured by ``dhtorch experiment=method_comparison`` (rows ``ece``, ``realised_risk_…``).
@@ -12,6 +13,7 @@ from __future__ import annotations
 import argparse
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +23,9 @@ from hydra.utils import instantiate
 
 from dhtorch import calibration, tree
 from dhtorch.commands.run import config_dir
-from dhtorch.data.pairs import by_gap
-from dhtorch.evaluate import score_calibration
+from dhtorch.data.pairs import around, by_gap
+from dhtorch.evaluate import control, score_calibration
+from dhtorch.evaluate.compare import MIN_ABOVE as FEW
 from dhtorch.studies import protocol
 
 HERE = Path(__file__).resolve().parent
@@ -44,7 +47,8 @@ def main() -> int:
     options = parser.parse_args()
     torch.set_num_threads(1)
     method, chosen = settings(options.method)
-    variants = {f"{k}": protocol.Variant(method, seed=k) for k in range(options.seeds)}
+    offers = None if method.choose is None else around
+    variants = {f"{k}": protocol.Variant(method, seed=k, offers=offers) for k in range(options.seeds)}
     outcome = protocol.run(chosen, protocol.Protocol(variants), by_gap, protocol.Settings())
     scenes = [scene.name for scene in chosen if scene.role is None]
     found = {s: [p for (name, _, _), p in outcome.points.items() if name == s] for s in scenes}
@@ -53,7 +57,8 @@ def main() -> int:
         ["git", "rev-parse", "--short", "HEAD"], cwd=HERE, capture_output=True, text=True, check=False
     ).stdout.strip()
     origin = {"method": options.method, "scenes": [*pooled], "truth": "full", "seeds": options.seeds, "git": commit}
-    fitted = score_calibration.fit(list(pooled.values()), provenance=origin)
+    choose = control.plug_in if method.views == 1 else partial(control.most_scenes, few=FEW * options.seeds)
+    fitted = score_calibration.fit(list(pooled.values()), choose=choose, provenance=origin)
     target = options.output or HERE.parent / "dhtorch" / "calibration" / f"{options.method}.json"
     print(calibration.save(fitted, target))
     return 0

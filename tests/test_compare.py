@@ -1,5 +1,6 @@
 """One method against another, over seeds, scenes and rooms: by plain loops."""
 
+import functools
 import itertools
 import math
 import statistics
@@ -8,7 +9,7 @@ import pytest
 import torch
 
 from dhtorch import tree
-from dhtorch.evaluate import bootstrap, compare, errors, reliability, risk, score_calibration
+from dhtorch.evaluate import bootstrap, compare, control, errors, reliability, risk, score_calibration
 
 
 def scene_of(n, seed=0, spread=1.0, silent=0.2, boast=1.0, floor=0.0):
@@ -93,7 +94,8 @@ def test_promises_equal_plain_loops():
     applied, sigmoid, realised = {}, {}, {5: [], 10: []}
     for scene, row in zip("abcd", found.rows, strict=True):
         others = [joined[s] for s in "abcd" if room.get(s, s) != room.get(scene, scene)]
-        learnt = score_calibration.fit(others, targets=(10, 5))
+        nine_in_ten = functools.partial(control.most_scenes, few=100 * len(ours[scene]))
+        learnt = score_calibration.fit(others, targets=(10, 5), choose=nine_in_ten)
         applied[scene] = learnt.apply(joined[scene])
         claimed = learnt.sigmoid(joined[scene].score)
         sigmoid[scene] = joined[scene].replace(score=torch.where(joined[scene].keep, claimed, 0.0))
@@ -103,12 +105,19 @@ def test_promises_equal_plain_loops():
         for percent, values in realised.items():
             values.append(risk.realised(joined[scene], learnt.thresholds[percent]))
             assert row[f"realised_risk_{percent}"] == values[-1]
+            above = joined[scene].keep & (joined[scene].score >= (learnt.thresholds[percent] or math.inf))
+            assert row[f"coverage_within_{percent}"] == pytest.approx(float(above.double().mean()))
     for name in ("within_sigma", "within_2sigma"):
         wanted = bootstrap.interval([row[name] for row in found.rows], statistic="mean", draws=200, seed=2)
         assert list(found.summary[f"map.{name}"].values())[:3] == list(wanted[:3]), name
     for percent, values in realised.items():
         counted = [v or 0.0 for v in values]
         assert found.summary[f"map.realised_risk_{percent}"]["value"] == pytest.approx(statistics.mean(counted))
+        covered = statistics.mean(row[f"coverage_within_{percent}"] for row in found.rows)
+        assert found.summary[f"map.coverage_within_{percent}"]["value"] == pytest.approx(covered)
+        spoke = [v for v in values if v is not None]
+        speaking = found.summary[f"map.risk_of_speaking_{percent}"]["value"]
+        assert speaking == (pytest.approx(statistics.mean(spoke)) if spoke else None)
         enough = [row[f"n_above_{percent}"] >= 100 for row in found.rows]
         met = [v <= percent / 100 for v, counts in zip(counted, enough, strict=True) if counts]
         expected = pytest.approx(statistics.mean(met)) if met else None
@@ -145,7 +154,7 @@ def test_errors_below_a_millionth_count_as_one():
 
 
 def test_a_scene_without_any_error_is_not_silent():
-    perfect, paper = ({name: [exact(30, error)] for name in "abc"} for error in (0.0, 0.5))
+    perfect, paper = ({name: [exact(130, error)] for name in "abc"} for error in (0.0, 0.5))
     found = compare.method_ratios({"paper": paper, "map": perfect}, draws=20)
     assert found.silent == {"map.10": [], "map.5": []} and found.summary["map.realised_risk_5"]["value"] == 0
     back = compare.method_ratios({"map": perfect, "paper": paper}, reference="map", draws=20)

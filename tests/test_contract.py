@@ -491,7 +491,10 @@ ELSEWHERE = {
     ),
     *(f"dhtorch.evaluate.score_calibration.{name}" for name in ("fit", "fit_sigma", "from_json")),
     *(f"dhtorch.evaluate.monotone.{name}" for name in ("isotonic", "pool_adjacent_violators", "platt")),
-    *(f"dhtorch.evaluate.control.{name}" for name in ("plug_in", "conformal", "scenes_needed", "p_value")),
+    *(
+        f"dhtorch.evaluate.control.{name}"
+        for name in ("plug_in", "most_scenes", "conformal", "scenes_needed", "p_value")
+    ),
     *(
         f"dhtorch.evaluate.compare.{name}"
         for name in ("method_ratios", "against", "completed", "ratio_over_seeds", "equal_coverage")

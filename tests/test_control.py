@@ -57,6 +57,15 @@ def brute_plug_in(scenes, target):
     return None
 
 
+def brute_most(scenes, target, share, few):
+    for threshold in every_threshold(scenes):
+        losses = [table(p, threshold) for p in scenes]
+        kept = [statistics.mean(x or [0.0]) <= target or len(x) < few for x in losses]
+        if sum(kept) >= share * len(kept):
+            return threshold
+    return None
+
+
 def brute_conformal(scenes, target):
     n, best = len(scenes), None
     for threshold in reversed(every_threshold(scenes)):
@@ -303,3 +312,30 @@ def test_bad_targets_raise(wrong):
             call([], wrong)
     with pytest.raises(ValueError, match=r"control\.confidence: found"):
         control.conformal([], 0.1, confidence=wrong)
+
+
+@pytest.mark.parametrize(("share", "few"), [(0.9, 0), (1.0, 0), (0.6, 0), (0.9, 12), (1.0, 20)])
+@pytest.mark.parametrize("target", [0.03, 0.08, 0.2])
+def test_most_scenes_is_the_lowest_threshold_that_so_many_keep(target, share, few):
+    scenes = scenes_of(12, seed=4)
+    found = control.most_scenes(scenes, target, share=share, few=few)
+    expected = brute_most(scenes, target, share, few)
+    assert found.threshold == expected
+    if expected is not None:
+        losses = [table(p, expected) for p in scenes]
+        assert found.risk == pytest.approx(statistics.mean(statistics.mean(x or [0.0]) for x in losses))
+        assert found.bound >= share - 1e-9 and found.n == 12
+
+
+def test_a_mean_may_keep_what_scenes_do_not():
+    """One bad scene among many good ones: the mean is met, and nine in ten are; all are at a higher threshold alone."""
+    good, bad = (
+        errors.points(torch.tensor([1.0 + e, 1.0]), torch.ones(2), torch.tensor([0.3, 0.9])) for e in (0.01, 0.4)
+    )
+    scenes = [good] * 19 + [bad]
+    assert control.plug_in(scenes, 0.05).threshold == pytest.approx(0.3)
+    assert control.most_scenes(scenes, 0.05).threshold == pytest.approx(0.3)
+    assert control.most_scenes(scenes, 0.05, share=1.0).threshold == pytest.approx(0.9)
+    assert control.most_scenes([good] * 3 + [bad], 0.05).threshold == pytest.approx(0.9)
+    with pytest.raises(ValueError, match=r"control\.share"):
+        control.most_scenes(scenes, 0.05, share=0.0)

@@ -48,6 +48,7 @@ def text_of(page):
     return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", body)).split())
 
 
+@pytest.mark.slow
 def test_there_is_a_page_for_every_promise(site):
     _, pages = site
     assert {f"{p.stem}.html" for p in DOCS.glob("*.md")} <= set(pages)
@@ -55,6 +56,7 @@ def test_there_is_a_page_for_every_promise(site):
         assert f"api/{module}.html" in pages
 
 
+@pytest.mark.slow
 def test_no_internal_link_leads_nowhere(site):
     """Pages, anchors, pictures, scripts and styles; other people's sites are not asked."""
     folder, pages = site
@@ -77,6 +79,7 @@ def test_no_internal_link_leads_nowhere(site):
     assert found > 1000
 
 
+@pytest.mark.slow
 def test_nothing_is_fetched_from_elsewhere(site):
     """No font, script or style of another host: the site works offline."""
     _, pages = site
@@ -87,11 +90,13 @@ def test_nothing_is_fetched_from_elsewhere(site):
         assert not [link for pair in loaded for link in pair if link.startswith(("http", "//"))], name
 
 
+@pytest.mark.slow
 def test_every_mark_is_filled(site):
     _, pages = site
     assert not [name for name, text in pages.items() if "make:" in text or "<!-- results" in text]
 
 
+@pytest.mark.slow
 def test_docstrings_arrive_whole(site):
     """Sections, our closing words, shapes from the signature, comments of fields."""
     _, pages = site
@@ -103,6 +108,7 @@ def test_docstrings_arrive_whole(site):
     assert ":class:" not in two_view and ":func:" not in text_of(pages["api/transform.html"])
 
 
+@pytest.mark.slow
 def test_every_experiment_has_its_row_and_words(site):
     _, pages = site
     asked = script("hooks").asked()
@@ -114,6 +120,7 @@ def test_every_experiment_has_its_row_and_words(site):
         assert " ".join(first) in shown, name
 
 
+@pytest.mark.slow
 def test_the_command_s_help_is_shown(site):
     _, pages = site
     shown = text_of(pages["command.html"])

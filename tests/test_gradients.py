@@ -100,8 +100,8 @@ def with_gradients(fn, args):
 # ------------------------------------------------------------------------------------------------ one graph
 
 
-CHEAP = ("two_view of map", "learned_score", "merge")
-MORE = ("backproject", "classify", "undistort_tracks", "two_view", "rank", "rank_by_error")
+CHEAP = ("learned_score", "merge")
+MORE = ("two_view of map", "backproject", "classify", "undistort_tracks", "two_view", "rank", "rank_by_error")
 LARGE = ("lucas_kanade", "lucas_kanade_affine", "pnp_ransac", "map_pose", "extend", "map")
 
 

@@ -107,6 +107,7 @@ def test_the_wheel_works_where_no_checkout_is(wheel, tmp_path):
     assert version.stdout.startswith("dhtorch ")
 
 
+@pytest.mark.slow
 def test_the_source_archive_makes_the_same_wheel(wheel, tmp_path):
     archive = build(REPO, "sdist", tmp_path)
     with tarfile.open(archive) as tar:

@@ -125,6 +125,7 @@ def test_a_failing_job_stops_no_other(command, tmp_path):
     assert code == 1 and "3 jobs: 0 finished, 2 left untouched, 1 failed" in out and seen(before) == before
 
 
+@pytest.mark.slow
 def test_an_unforeseen_error_is_one_failed_job(command, monkeypatch):
     real = job.run
 
@@ -145,6 +146,7 @@ def test_a_wrong_option_of_one_job_fails_before_any_runs(command, tmp_path):
         assert code == 2 and len(err.strip().splitlines()) == 1 and not results(tmp_path), err
 
 
+@pytest.mark.slow
 def test_single_jobs_resume_in_folders_of_their_own(command, tmp_path):
     assert command("resume=true", *TINY)[0] == 0
     (first,) = results(tmp_path)
@@ -156,6 +158,7 @@ def test_single_jobs_resume_in_folders_of_their_own(command, tmp_path):
     assert first.relative_to(tmp_path).parts[:2] == ("outputs", "resumed")
 
 
+@pytest.mark.slow
 def test_another_question_in_the_same_folder_is_done_again(command, tmp_path):
     assert command("output=here", *TINY)[0] == 0
     (path,) = results(tmp_path)

@@ -292,14 +292,10 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("Rows.__getitem__", ".astype(c.kind)", ""),
         ("Rows.__getitem__", "float(recording.times[i])", "float(recording.times[0])"),
         ("_Opened.answer", '"confidence", ', ""),
-        ("_Opened._earlier", "int(self.recording.number[i]) - step", "int(self.recording.number[i]) + step"),
-        (
-            "_Opened._earlier",
-            "self.position.get(int(self.recording.number[i]) - step)",
-            "i - step if i >= step else None",
-        ),
+        ("_Opened._others", "self.position.get(number - step)", "self.position.get(number + step)"),
+        ("_Opened._others", "self.position.get(number - step)", "i - step if i >= step else None"),
         ("_Opened._transform", "**self.options, ", ""),
-        ("_Opened._transform", "list(range(len(self.steps)))", "list(range(len(self.steps)))[::-1]"),
+        ("_Opened._transform", "list(range(views))", "list(range(views))[::-1]"),
         ("_sample", "other is None for other in others", "False for other in others"),
         ("_sample", "_distortion(camera, anchor.camera.distortion)", "anchor.camera.distortion"),
         (

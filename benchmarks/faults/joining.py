@@ -4,10 +4,11 @@ TESTS: dict[str, list[str]] = {
     "pair": ["tests/test_merge.py", "tests/test_pair.py", "tests/test_method.py"],
     "method": ["tests/test_method.py"],
     "methods": ["tests/test_merge.py", "tests/test_method.py"],
-    "stages.fuse": ["tests/test_fusion.py", "tests/test_agree.py", "tests/test_window.py"],
+    "stages.fuse": ["tests/test_fusion.py", "tests/test_agree.py", "tests/test_window.py", "tests/test_contradict.py"],
     "views": ["tests/test_agree.py", "tests/test_fusion.py"],
     "stream": ["tests/test_stream.py"],
     "window": ["tests/test_fusion.py", "tests/test_window.py"],
+    "offers": ["tests/test_offers.py"],
 }
 
 FAULTS: dict[str, list[tuple[str, ...]]] = {
@@ -77,7 +78,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("Method.replace", "partial(getattr(self, k), **v)", "partial(getattr(Method, k), **v)"),
         ("Method.look", "dtype=like.dtype", "dtype=torch.float32"),
         ("Method.look_at", "self.classify(frame, self.backproject(frame, uv))", "self.backproject(frame, uv)"),
-        ("networks", "*part.args, ", ""),
+        ("parts", "*seat.args, ", ""),
     ],
     "methods": [
         ("LEVELS", "5", "4"),
@@ -114,6 +115,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("Stream.push", "Gate.NO_BASELINE", "Gate.ANSWER"),
     ],
     "stages.fuse": [
+        ("_contradicted", "against > answering", "against >= answering"),
+        ("agree", "gate = _contradicted(estimates, gate)", "gate = gate"),
         ("agree", "inverse.square() / variance", "1 / variance"),
         ("agree", "max_against * torch", "0 * torch"),
         ("agree", "(weight * part).sum(0).square()", "(weight * part).square().sum(0)"),
@@ -168,6 +171,12 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_inverse_depth", "OWN_SHARE * whole.square()", "OWN_SHARE * whole"),
         ("_inverse_depth", "whole.square() - shared.square()", "whole.square()"),
         ("_last_reason", "zip(gate, said, strict=True)", "zip(gate.flip(0), said.flip(0), strict=True)"),
+    ],
+    "offers": [
+        ("choosing", "method if method.choose is not None", "method if method.choose is None"),
+        ("choosing", "chain=False", "chain=True"),
+        ("picked", "choice.index[:, b]", "choice.index[:, 0]"),
+        ("picked", "choice.mute[:, b].sum()", "(~choice.mute[:, b]).sum()"),
     ],
     "window": [
         ("_chosen", "thin = samples[:, :: max(1, method.n // PROBES)]", "thin = samples"),

@@ -2,7 +2,13 @@
 
 TESTS: dict[str, list[str]] = {
     "geometry.affine": ["tests/test_affine_by_hand.py", "tests/test_affine.py", "tests/test_contract.py"],
-    "geometry.lucas_kanade": ["tests/test_lucas_kanade.py", "tests/test_track.py", "tests/test_contract.py"],
+    "geometry.reach": ["tests/test_contradict.py"],
+    "geometry.lucas_kanade": [
+        "tests/test_lucas_kanade.py",
+        "tests/test_start.py",
+        "tests/test_track.py",
+        "tests/test_contract.py",
+    ],
     "stages.track": [
         "tests/test_affine_by_hand.py",
         "tests/test_lucas_kanade.py",
@@ -224,7 +230,17 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("components", "new = new[new]", "break"),
         ("_steps", "torch.arange(-1, 2, device=like.device)", "torch.arange(-1, 1, device=like.device)"),
     ],
+    "geometry.reach": [
+        ("within_reach", "depth.detach() + 2 * sigma.detach()", "depth.detach() + sigma.detach()"),
+        ("within_reach", "asked & (around == 0)", "asked"),
+        ("within_reach", "median(sensed.detach(), held)", "median(sensed.detach(), given)"),
+        ("within_reach", "DENSE * given.sum(-1)", "0 * given.sum(-1)"),
+        ("within_reach", "n >= FEW", "n > FEW"),
+        ("_share_around", "columns * row.clamp_max(rows - 1)", "rows * row.clamp_max(rows - 1)"),
+    ],
     "geometry.lucas_kanade": [
+        ("search", "level + 1 >= near_levels", "level >= near_levels"),
+        ("search", "for_some(~begun", "for_some(begun"),
         ("search", "o.epsilon_px * COARSE_EPSILON", "o.epsilon_px"),
         ("search", "return d * 0.5**top", "return d"),
         ("search", "x, d, batch) * 2\n        return coarse", "x, d, batch)\n        return coarse"),
