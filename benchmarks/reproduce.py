@@ -32,6 +32,7 @@ EXPERIMENTS = {
     "method_comparison": "experiment=method_comparison data=shared_scenes",
     "part_ablation": "experiment=part_ablation data=shared_scenes",
     "stress": "experiment=method_comparison data=synthetic_stress experiment.seeds=2",
+    "views_study": "experiment=views_study data=shared_scenes experiment.anchors=3",
     "shared_scenes": "experiment=opencv_twin data=shared_scenes",
     "room_exact": "experiment=opencv_twin data=synthetic_seeds data.lidar=exact data.image_noise=0",
     "room_phone": "experiment=opencv_twin data=synthetic_seeds",
@@ -66,7 +67,7 @@ EXPERIMENTS = {
 
 #: Result of a script of this folder → its arguments.
 SCRIPTS = dict.fromkeys(("frontend", "lk", "pnp", "triangulate", "pair", "loader", "scaling", "readers"), "")
-SCRIPTS |= {"degenerate": "", "mutants": "--quiet", "kornia": "--clock cpu", "xfeat_noise": ""}
+SCRIPTS |= {"stream": "", "degenerate": "", "mutants": "--quiet", "kornia": "--clock cpu", "xfeat_noise": ""}
 
 #: Scripts of another name than their result: ``kornia.py`` would be imported instead of the library.
 NAMED = {"kornia": "beside_kornia"}
@@ -75,7 +76,7 @@ NAMED = {"kornia": "beside_kornia"}
 ASIDE = {"figures", "traceback", "root"}
 
 #: Files that were made with other settings than today's, and wait for a quiet machine.
-OUTDATED: set[str] = {"method_comparison", "stress", "part_ablation"}
+OUTDATED: set[str] = {"part_ablation"}
 
 
 def command(name: str) -> str:

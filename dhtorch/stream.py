@@ -14,13 +14,11 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from dhtorch.codes import Gate
+from dhtorch.data.pairs import LADDER
 from dhtorch.geometry.start import coarse_flow
 from dhtorch.method import Method, Trace
 from dhtorch.methods import AUTO
 from dhtorch.records import NO_HINT, Estimate, Frame, TrackHint
-
-#: Frames back that are offered as other views, of those that are remembered.
-STEPS = (1, 2, 3, 5, 8, 12, 20, 30)
 
 #: Mean support of the coarse motion below which two frames in a row show different things. Real frames in a row reach
 #: 0.65 and more, pictures of different rooms 0.07 to 0.33 (``data=shared_scenes``); built-in rooms of different seeds,
@@ -50,7 +48,7 @@ class Stream:
         self,
         method: Method = AUTO,
         *,
-        steps: Sequence[int] = STEPS,
+        steps: Sequence[int] = LADDER,
         seed: int = 0,
         hint: TrackHint = NO_HINT,
     ) -> None:

@@ -321,7 +321,7 @@ class PairData(Dataset[Loaded]):
         return len(self.pairs)
 
     def __getitem__(self, index: int) -> Loaded:
-        i, other = pair = self.pairs[index]
+        i, other = pair = Pair(*self.pairs[index])
         own = between(i, other, self.views) if isinstance(other, int) else []
         offered = _offered(pair, self.recording, self.offers)
         frames = {k: self.recording[k].to(self.dtype) for k in sorted({i, *own, *offered})}

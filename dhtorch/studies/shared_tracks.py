@@ -66,8 +66,13 @@ def _same(a: Tensor, b: Tensor) -> bool:
 
 
 def what_it_does(fn: Any) -> Any:
-    """What a seat does, comparable: partials of one function with equal options are equal."""
-    if isinstance(fn, partial):
-        options = {k: what_it_does(v) for k, v in fn.keywords.items()}
-        return what_it_does(fn.func), tuple(map(what_it_does, fn.args)), options
-    return fn
+    """What a seat does, comparable: partials of one function with equal options are equal, however often they are
+    nested."""
+    if not isinstance(fn, partial):
+        return fn
+    options = {k: what_it_does(v) for k, v in fn.keywords.items()}
+    args = tuple(map(what_it_does, fn.args))
+    if isinstance(fn.func, partial):
+        inner, before, others = what_it_does(fn.func)
+        return inner, before + args, others | options
+    return fn.func, args, options

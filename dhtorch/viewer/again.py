@@ -27,6 +27,7 @@ NAMED = {
     "method": (
         *("dhtorch.method", "dhtorch.views", "dhtorch.geometry.epipolar", "dhtorch.geometry.start"),
         "dhtorch.studies.baselines.opencv",
+        "dhtorch.studies.baselines.xfeat",
         *(
             f"dhtorch.stages.{name}"
             for name in ("sample", "backproject", "holes", "track", "pose", "triangulate", "score", "fuse")
