@@ -67,7 +67,13 @@ EXPERIMENTS = {
 
 #: Result of a script of this folder → its arguments.
 SCRIPTS = dict.fromkeys(("frontend", "lk", "pnp", "triangulate", "pair", "loader", "scaling", "readers"), "")
-SCRIPTS |= {"stream": "--clock cpu --repeats 5", "degenerate": "", "mutants": "--quiet", "kornia": "--clock cpu", "xfeat_noise": ""}
+SCRIPTS |= {
+    "stream": "--clock cpu --repeats 5",
+    "degenerate": "",
+    "mutants": "--quiet",
+    "kornia": "--clock cpu",
+    "xfeat_noise": "",
+}
 
 #: Scripts of another name than their result: ``kornia.py`` would be imported instead of the library.
 NAMED = {"kornia": "beside_kornia"}
