@@ -28,7 +28,7 @@ from dhtorch.stages.triangulate import two_view
 LONG = 240
 
 #: How a candidate is asked: everything that has a sigma counts, and how much is what the sigma says. Few samples, few
-#: hypotheses and few steps: what is asked is which view is better, not where its points are.
+#: hypotheses and no turn of rows: what is asked is which view is better, not where its points are.
 PROBE = Method(
     n=128,
     hypotheses=100,
@@ -55,7 +55,7 @@ def by_probes(
         views: how many to choose.
         fit: known poses of the candidates; their search is then skipped.
         long: longest side of the small pictures, px; smaller images stay as they are.
-        good_sigma_rel: see :func:`key_views`.
+        good_sigma_rel: see :func:`weighed`.
 
     Raises:
         ValueError: wrong shapes, or not 1 <= views <= V.

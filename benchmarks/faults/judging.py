@@ -60,7 +60,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_ratios", "reached, statistic", "reached[1:], statistic"),
         ("_promises", "fit(list(others.values()), targets", "fit(list(pooled.values()), targets"),
         ("_promises", "partial(control.most_scenes, few=few)", "control.plug_in"),
-        ("_coverage_above", "points.score >= threshold", "points.score < threshold"),
+        ("_promises", "above / max(points.keep.numel(), 1)", "above / max(int(points.keep.sum()), 1)"),
         ("_promises", "leave_one_room_out(pooled, rooms)", "leave_one_room_out(pooled)"),
         ("_promises", "risk.realised(points, threshold)", "risk.realised(table[scene], threshold)"),
         ("_promises", "float(r <= percent / 100)", "float(r >= percent / 100)"),

@@ -75,10 +75,10 @@ def method_ratios(
         scenes: ``within_sigma`` and ``within_2sigma`` after the correction of sigma; ``realised_risk_<per cent>``,
         mean capped error at the threshold that nine in ten of the other scenes keep, where a silent scene counts 0
         (``risk_of_speaking_<per cent>``: without those); ``coverage_within_<per cent>``, what is answered above it;
-        ``within_target_<per cent>``, share
-        of the scenes that meet it among those with a hundred answers above the threshold; ``ece_scenes``, scene by
-        scene what :func:`dhtorch.evaluate.reliability.excess_ece` says. And over all answers, every scene of the same
-        weight: ``ece`` of the table, ``ece_sigmoid`` of the simple control, ``ece_raw`` of the score as it came.
+        ``within_target_<per cent>``, share of the scenes that meet it among those with a hundred answers above the
+        threshold; ``ece_scenes``, scene by scene what :func:`dhtorch.evaluate.reliability.excess_ece` says. And over
+        all answers, every scene of the same weight: ``ece`` of the table, ``ece_sigmoid`` of the simple control,
+        ``ece_raw`` of the score as it came.
 
     Raises:
         ValueError: no reference, or methods that differ in scenes or number of seeds.
@@ -205,9 +205,9 @@ def _promises(
             rows[scene]["ece"] = reliability.excess_ece(table[scene], seed=seed)
             for percent, threshold in learnt.thresholds.items():
                 rows[scene][f"realised_risk_{percent}"] = risk.realised(points, threshold)
-                rows[scene][f"coverage_within_{percent}"] = _coverage_above(points, threshold)
                 above = 0 if threshold is None else int((points.keep & (points.score >= threshold)).sum())
                 rows[scene][f"n_above_{percent}"] = above / len(ours[scene])
+                rows[scene][f"coverage_within_{percent}"] = above / max(points.keep.numel(), 1)
 
     def mean(values: list[float | None]) -> Interval:
         return bootstrap.interval(values, statistic="mean", draws=draws, seed=seed)
@@ -226,13 +226,6 @@ def _promises(
     for name, scenes in (("ece", table), ("ece_sigmoid", sigmoid), ("ece_raw", pooled)):
         numbers[name] = reliability.ece_interval([scenes[s] for s in table], draws=draws, seed=seed)
     return numbers
-
-
-def _coverage_above(points: Points, threshold: float | None) -> float:
-    """Share of the candidates that are answered with a score from the threshold on; None answers nothing."""
-    if threshold is None or not points.keep.numel():
-        return 0.0
-    return float((points.keep & (points.score >= threshold)).double().mean())
 
 
 def completed(

@@ -50,9 +50,7 @@ class ExtractOptions:
 
     engine: str = "local"  # local: this machine; ray: a cluster, through Ray Data
     address: str | None = None  # of the Ray cluster; None = one that is started here
-    gap: int | str | None = (
-        plan.CHOICE
-    )  # auto = chosen among earlier frames, a number of frames back, 0 = front end alone
+    gap: int | str | None = plan.CHOICE  # auto = chosen among earlier frames; else frames back, 0 = front end alone
     patch: int = 14  # px
     tokens_hw: Sequence[int] = (224, 224)  # size of the network's picture: with it all rows have one shape
     fit: str = "stretch"  # how the picture is brought to that size

@@ -7,8 +7,6 @@ of a sensor that saw nothing there.
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -72,6 +70,6 @@ def _share_around(uv: Tensor, given: Tensor) -> Tensor:
     column, row = place.long().unbind(-1)
     cell = column.clamp_max(columns - 1) + columns * row.clamp_max(rows - 1)
     one = torch.ones_like(uv[..., 0])
-    none = one.new_zeros(len(one), math.prod((columns, rows)))
+    none = one.new_zeros(len(one), columns * rows)
     in_cell, returns = (none.scatter_add(1, cell, x) for x in (one, torch.where(given, one, 0)))  # whole numbers: exact
     return returns.gather(1, cell) / in_cell.gather(1, cell)

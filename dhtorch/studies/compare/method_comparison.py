@@ -154,18 +154,13 @@ def _variant(method: Method, seed: int, pairs: Pairs | None) -> Variant:
     With ``pairs`` it is not asked on scenes of too few views.
     """
     if method.choose is not None:
-        return Variant(method, seed=seed, offers=around, needs=partial(_lacks, method))
+        return Variant(method, seed=seed, offers=around, needs=partial(_views, None, method))
     return Variant(method, seed=seed, needs=partial(_views, pairs, method))
 
 
 def named(method: str, k: int) -> str:
     """The variant that is a method with its seed ``k``; the first bears the method's own name."""
     return method if k == 0 else f"{method}, seed {k}"
-
-
-def _lacks(method: Method, _scene: Scene) -> str | None:
-    """Which package a method misses, wherever it is asked; None where there is none."""
-    return xfeat.lacking(method)
 
 
 def _views(pairs: Pairs | None, method: Method, scene: Scene) -> str | None:
