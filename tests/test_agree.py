@@ -31,10 +31,18 @@ def one_point(q, variance, weight_of, *, max_chi2, max_against):
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"max_chi2": 1.0}, {"max_against": 0.0}, {"max_against": 10.0}, {"sure_rel": 0.0}, {"max_sigma_rel": 0.03}],
+    [
+        {},
+        {"max_chi2": 1.0},
+        {"max_against": 0.0},
+        {"max_against": 10.0},
+        {"sure_rel": 0.0},
+        {"max_sigma_rel": 0.03},
+        {"sure_rel_each": 0.01},
+    ],
 )
 def test_views_are_joined_as_a_loop_over_points_joins_them(options):
-    o = {"max_chi2": 9.0, "max_against": 0.25, "sure_rel": 0.05, "max_sigma_rel": 0.2} | options
+    o = {"max_chi2": 9.0, "max_against": 0.25, "sure_rel": 0.05, "sure_rel_each": 0.08, "max_sigma_rel": 0.2} | options
     views = views_of(spread=3.0, N=60)
     found = agree(views, **options)
     seen = set()
@@ -63,7 +71,7 @@ def test_views_are_joined_as_a_loop_over_points_joins_them(options):
         both = (sum(weight[u] * math.sqrt(common[u]) for u in stand) / total) ** 2
         joint = math.sqrt((alike + both) * max(chi2, 1.0)) / mean**2
         expected = Gate.ANSWER
-        if joint * mean > o["max_sigma_rel"] or (len(stand) < 2 and joint * mean > o["sure_rel"]):
+        if joint * mean > min(o["max_sigma_rel"], o["sure_rel_each"] * len(stand) if stand[1:] else o["sure_rel"]):
             expected = Gate.UNCERTAIN
         expected = Gate.INCONSISTENT if against else expected
         seen.add(int(expected))
@@ -161,7 +169,7 @@ def test_an_answer_that_more_views_give_is_surer():
     samples = Samples(uv, zero, zero, torch.zeros(1, 1, 3), zero, zero.int(), zero, zero.int())
     tracks = Tracks(uv, uv, zero, zero, torch.zeros(1, 1, 2, 2), zero > 0)
     scores = [float(rank_by_sigma(e, samples, tracks, None).score) for e in some]
-    assert scores == pytest.approx([0.1 / (0.1 + 0.05 / n) for n in (1, 2, 4)])
+    assert scores == pytest.approx([0.1 / (0.1 + 0.05 / math.sqrt(n)) for n in (1, 2, 4)])
 
 
 # -------------------------------------------------------------------------------------------------- which views

@@ -61,7 +61,7 @@ def brute_most(scenes, target, share, few):
     for threshold in every_threshold(scenes):
         losses = [table(p, threshold) for p in scenes]
         kept = [statistics.mean(x or [0.0]) <= target or len(x) < few for x in losses]
-        if sum(kept) >= share * len(kept):
+        if sum(kept) >= min(len(kept), math.ceil(share * (len(kept) + 1) - 1e-9)):
             return threshold
     return None
 

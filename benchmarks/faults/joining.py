@@ -121,7 +121,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("agree", "max_against * torch", "0 * torch"),
         ("agree", "(weight * part).sum(0).square()", "(weight * part).square().sum(0)"),
         ("agree", "chi2.clamp_min(1)", "1"),
-        ("agree", "(n < 2) & (sigma", "(n < 1) & (sigma"),
+        ("agree", "torch.where(n < 2, sure_rel", "torch.where(n < 1, sure_rel"),
+        ("agree", "sure_rel_each * n", "sure_rel_each"),
         ("_stilled", "> max_still * len(estimates.gate)", "> len(estimates.gate)"),
         (
             "_mean",

@@ -209,7 +209,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
             "v.clamp(0, h - 1)[..., :, None] * w + u.clamp(0, w - 1)",
             "u.clamp(0, h - 1)[..., :, None] * w + v.clamp(0, w - 1)",
         ),
-        ("_told", "return V + told + (", "return V + 0 * ("),
+        ("_told", "V + _both_ways(V) + ", "V + 0 * _both_ways(V) + "),
         ("_message", "- round(SLOPE * UNIT**2)", "- 0"),
         ("_spread", "offset * weight", "offset"),
     ],

@@ -80,15 +80,16 @@ def plug_in(scenes: Sequence[Points], target: float) -> Control:
 
 
 def most_scenes(scenes: Sequence[Points], target: float, *, share: float = 0.9, few: int = 0) -> Control:
-    """The largest coverage at which that share of the scenes meets the target, each by itself.
+    """The largest coverage at which so many scenes meet the target, each by itself, that the next one likely does.
 
-    A mean over scenes may be met although half of them are above it; this asks how many are not. No guarantee is
-    claimed.
+    A mean over scenes may be met although half of them are above it; this asks how many are not: of n scenes
+    share · (n + 1), rounded up, so that of n + 1 exchangeable ones that share would. Where that is more than all, all
+    are asked, and no more is claimed.
 
     Args:
         scenes: candidates with scores, one entry a scene; scenes without candidates are passed over.
         target: mean capped error allowed of the answers of one scene, in (0, 1).
-        share: of the scenes, in (0, 1].
+        share: of the scenes that are to meet it, in (0, 1].
         few: a scene with fewer answers above a threshold says nothing against it.
 
     Returns:
@@ -105,7 +106,10 @@ def most_scenes(scenes: Sequence[Points], target: float, *, share: float = 0.9, 
     loss, answered = _accepted(answers, thresholds)
     risk = loss / answered.clamp_min(1)
     kept = ((risk <= target) | (answered < few)).to(risk.dtype).mean(0)
-    return _lowest(thresholds, kept >= share - 1e-12, kept, risk, answered / _sizes(scenes), target=target)
+    needed = min(len(scenes), math.ceil(share * (len(scenes) + 1) - 1e-9))
+    return _lowest(
+        thresholds, kept * len(scenes) >= needed - 1e-6, kept, risk, answered / _sizes(scenes), target=target
+    )
 
 
 def conformal(scenes: Sequence[Points], target: float, *, confidence: float | None = None) -> Control:

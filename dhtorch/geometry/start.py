@@ -252,7 +252,7 @@ def _match(a: Tensor, b: Tensor, A: Tensor, reach: float, window: int, step: int
     joined = _told(V)
     D = 2 * most + 1
     i = joined.flatten(-2).argmax(-1)
-    near = _highest(_highest(V, -1), -2)
+    near = _highest(V)
     fit = near.flatten(-2).gather(-1, i[..., None])[..., 0] / UNIT**2
     shift = torch.stack([i % D, i // D], -1) - most
     stays = ((moved > -0.5) & (moved < moved.new_tensor([w_1 - 0.5, h_1 - 0.5]))).all(-1)
@@ -337,9 +337,13 @@ def _around(S: Tensor, at: Tensor, most: int) -> Tensor:
 
 def _told(V: Tensor) -> Tensor:
     """V (B, G, R, C, D, D) and what the cells to all four sides make of it, as sums of best chains of neighbours."""
-    across = V.transpose(2, 3)
-    told = _chain(V) + _chain(V.flip(2)).flip(2)
-    return V + told + (_chain(across) + _chain(across.flip(2)).flip(2)).transpose(2, 3)
+    return V + _both_ways(V) + _both_ways(V.transpose(2, 3)).transpose(2, 3)
+
+
+def _both_ways(V: Tensor) -> Tensor:
+    """What each row of cells hears from those before it and from those after it, along dim 2."""
+    onwards, back = _chain(torch.cat([V, V.flip(2)])).chunk(2)
+    return onwards + back.flip(2)
 
 
 def _chain(V: Tensor) -> Tensor:
@@ -355,16 +359,15 @@ def _message(x: Tensor) -> Tensor:
     floor = x.amax((-2, -1), keepdim=True) - round(MOST * UNIT**2)
     best = torch.maximum(x, floor)
     for _ in range(2):
-        best = torch.maximum(best, _highest(_highest(best, -1), -2) - round(SLOPE * UNIT**2))
+        best = torch.maximum(best, _highest(best) - round(SLOPE * UNIT**2))
     return best - floor
 
 
-def _highest(x: Tensor, dim: int) -> Tensor:
-    """The highest of each value and its two neighbours along ``dim``."""
-    n = x.shape[dim]
-    pairs = torch.maximum(x.narrow(dim, 0, n - 1), x.narrow(dim, 1, n - 1))
-    inner = torch.maximum(pairs.narrow(dim, 0, n - 2), pairs.narrow(dim, 1, n - 2))
-    return torch.cat([pairs.narrow(dim, 0, 1), inner, pairs.narrow(dim, n - 2, 1)], dim)
+def _highest(x: Tensor) -> Tensor:
+    """The highest of each value of x (…, D, D) and its eight neighbours."""
+    x = F.pad(x, (1, 1, 1, 1), value=-math.inf)
+    x = torch.maximum(torch.maximum(x[..., :-2], x[..., 1:-1]), x[..., 2:])
+    return torch.maximum(torch.maximum(x[..., :-2, :], x[..., 1:-1, :]), x[..., 2:, :])
 
 
 def _spread(offset: Tensor, say: Tensor) -> Tensor:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -88,6 +90,7 @@ def agree(
     max_chi2: float = 9.0,
     max_against: float = 0.25,
     sure_rel: float = 0.05,
+    sure_rel_each: float = 0.08,
     max_sigma_rel: float | None = 0.2,
     max_still: float = 0.5,
 ) -> Estimate:
@@ -103,6 +106,7 @@ def agree(
         max_against: (depth / sigma)² of the views that disagree, as a share of that of the views that agree, above
             which the point is silenced.
         sure_rel: sigma / depth up to which one view answers without another that agrees.
+        sure_rel_each: sigma / depth up to which several answer, for each that agrees: what is unsure needs many.
         max_sigma_rel: sigma / depth of the joint answer above which it is withheld; None asks nothing.
         max_still: share of the views without a baseline above which none is believed.
 
@@ -114,7 +118,7 @@ def agree(
         ``residual_px`` their weighted rms; ``score`` is 1 where answered.
 
     Gates: NO_BASELINE for all points of an anchor whose views mostly have none; where no view answers, the reason of
-    the last; INCONSISTENT (other views disagree), UNCERTAIN (one unsure view, or a joint sigma too large);
+    the last; INCONSISTENT (other views disagree), UNCERTAIN (a sigma too large for so many views);
     CONTRADICTED for all answers where it silences more views than answer.
 
     Raises:
@@ -139,9 +143,10 @@ def agree(
     own_2, shared_2 = ((weight * part).sum(0).square() * chi2.clamp_min(1) for part in (own, shared))
     depth = 1 / mean
     sigma = depth * depth * _root(own_2 + shared_2)
-    alone = (n < 2) & (sigma > sure_rel * depth)
-    unsure = torch.zeros_like(alone) if max_sigma_rel is None else sigma > max_sigma_rel * depth
-    gate = first_reason((against, Gate.INCONSISTENT), (alone, Gate.UNCERTAIN), (unsure, Gate.UNCERTAIN))
+    limit = torch.where(n < 2, sure_rel, sure_rel_each * n).clamp(
+        max=math.inf if max_sigma_rel is None else max_sigma_rel
+    )
+    gate = first_reason((against, Gate.INCONSISTENT), (sigma > limit * depth, Gate.UNCERTAIN))
     gate = torch.where(n < 1, _last_reason(estimates.gate, said), gate)
     gate = _contradicted(estimates, gate)
     parallax = torch.where(joined | (n < 1), estimates.parallax_deg, torch.zeros_like(estimates.parallax_deg))

@@ -149,7 +149,7 @@ def rank_by_sigma(
 ) -> Estimate:
     """Score every answer of several views by its sigma and by how many of them agree: h / (h + e).
 
-    e = sigma / depth / views: views that agree share too much for sigma to shrink with their number, but an answer that
+    e = sigma / depth / √views: views that agree share too much for sigma to shrink with their number, but an answer that
     is wrong by far more than its sigma is seldom found twice.
 
     Args:
@@ -169,7 +169,7 @@ def rank_by_sigma(
     stated = estimate.keep & (estimate.depth > 0) & estimate.sigma.isfinite()
     depth = torch.where(stated, estimate.depth, torch.ones_like(estimate.depth))
     sigma = torch.where(stated, estimate.sigma, torch.ones_like(estimate.sigma))
-    expected = (sigma / depth).clamp(max=LARGEST) / (estimate.n_views - 1).clamp_min(1)
+    expected = (sigma / depth).clamp(max=LARGEST) / (estimate.n_views - 1).clamp_min(1).to(depth).sqrt()
     zero = torch.zeros_like(expected)
     score = torch.where(stated, half_error / (half_error + expected), zero)
     if recalibration is not None:
