@@ -149,8 +149,8 @@ def rank_by_sigma(
 ) -> Estimate:
     """Score every answer of several views by its sigma and by how many of them agree: h / (h + e).
 
-    e = sigma / depth / √views: views that agree share too much for sigma to shrink with their number, but an answer that
-    is wrong by far more than its sigma is seldom found twice.
+    e = sigma / depth / √views: views that agree share too much for sigma to shrink with their number, but an answer
+    that is wrong by far more than its sigma is seldom found twice.
 
     Args:
         estimate: from ``fuse``, or from seat 6 (one view).
