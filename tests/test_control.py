@@ -57,12 +57,27 @@ def brute_plug_in(scenes, target):
     return None
 
 
+def student(share, freedom):
+    """Quantile of Student's t by its expansion, term by term; held against tables below."""
+    z = statistics.NormalDist().inv_cdf(share)
+    return z + (z**3 + z) / 4 / freedom + (5 * z**5 + 16 * z**3 + 3 * z) / 96 / freedom**2
+
+
 def brute_most(scenes, target, share, few):
     for threshold in every_threshold(scenes):
         losses = [table(p, threshold) for p in scenes]
         kept = [statistics.mean(x or [0.0]) <= target or len(x) < few for x in losses]
-        if sum(kept) >= min(len(kept), math.ceil(share * (len(kept) + 1) - 1e-9)):
-            return threshold
+        needed = math.ceil(share * (len(kept) + 1) - 1e-9)
+        spoke = [statistics.mean(x) for x in losses if len(x) >= max(few, 1)]
+        if sum(kept) < min(len(kept), needed):
+            continue
+        if share < 1 and needed > len(kept) >= 5:
+            if len(spoke) < 2:
+                continue
+            spread = statistics.stdev(spoke) * math.sqrt(1 + 1 / len(spoke))
+            if statistics.mean(spoke) + student(share, len(spoke) - 1) * spread > target:
+                continue
+        return threshold
     return None
 
 
@@ -314,7 +329,7 @@ def test_bad_targets_raise(wrong):
         control.conformal([], 0.1, confidence=wrong)
 
 
-@pytest.mark.parametrize(("share", "few"), [(0.9, 0), (1.0, 0), (0.6, 0), (0.9, 12), (1.0, 20)])
+@pytest.mark.parametrize(("share", "few"), [(0.9, 0), (1.0, 0), (0.6, 0), (0.9, 12), (1.0, 20), (0.95, 0), (0.95, 12)])
 @pytest.mark.parametrize("target", [0.03, 0.08, 0.2])
 def test_most_scenes_is_the_lowest_threshold_that_so_many_keep(target, share, few):
     scenes = scenes_of(12, seed=4)
@@ -325,6 +340,24 @@ def test_most_scenes_is_the_lowest_threshold_that_so_many_keep(target, share, fe
         losses = [table(p, expected) for p in scenes]
         assert found.risk == pytest.approx(statistics.mean(statistics.mean(x or [0.0]) for x in losses))
         assert found.bound >= share - 1e-9 and found.n == 12
+
+
+@pytest.mark.parametrize(("freedom", "table"), [(4, 1.533), (6, 1.440), (9, 1.383), (30, 1.310)])
+def test_the_quantile_of_few_scenes_is_that_of_the_tables(freedom, table):
+    assert student(0.9, freedom) == pytest.approx(table, rel=0.005)
+
+
+def test_of_few_scenes_the_worst_to_come_is_read_from_their_spread():
+    """Seven scenes just below the target: close together they are believed, far apart they are not."""
+
+    def scene(error, score):
+        return errors.points(torch.tensor([1.0 + error, 1.0]), torch.ones(2), torch.tensor([score, 0.9]))
+
+    close = [scene(e, 0.3) for e in (0.090, 0.091, 0.092, 0.093, 0.090, 0.091, 0.092)]
+    apart = [scene(e, 0.3) for e in (0.001, 0.098, 0.001, 0.098, 0.001, 0.098, 0.05)]
+    assert control.most_scenes(close, 0.05).threshold == pytest.approx(0.3)
+    assert control.most_scenes(apart, 0.05).threshold == pytest.approx(0.9)
+    assert control.most_scenes(apart[:4], 0.05).threshold == pytest.approx(0.3), "of four no spread is known"
 
 
 def test_a_mean_may_keep_what_scenes_do_not():

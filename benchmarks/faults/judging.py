@@ -72,6 +72,9 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     ],
     "evaluate.control": [
         ("most_scenes", "share * (len(scenes) + 1)", "share * len(scenes)"),
+        ("most_scenes", "fits & (_one_more", "fits | (_one_more"),
+        ("_one_more", "(1 + 1 / n.clamp_min(1))", "1"),
+        ("_one_more", "(4 * freedom)", "(8 * freedom)"),
         ("most_scenes", "(answered < few)", "(answered <= few)"),
         ("most_scenes", "risk <= target", "loss <= target"),
         ("plug_in", "loss / answered.clamp_min(1)", "loss / _sizes(scenes)"),

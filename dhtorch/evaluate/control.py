@@ -17,12 +17,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from statistics import NormalDist
 
 import torch
 from torch import Tensor
 
 from dhtorch.evaluate.errors import Points
 from dhtorch.evaluate.risk import capped
+
+#: Scenes of which the spread of their risks is taken to be known.
+FEW_SCENES = 5
 
 #: Thresholds tried at most; where there are more distinct scores, evenly spaced ones among them.
 MOST_THRESHOLDS = 4096
@@ -84,7 +88,9 @@ def most_scenes(scenes: Sequence[Points], target: float, *, share: float = 0.9, 
 
     A mean over scenes may be met although half of them are above it; this asks how many are not: of n scenes
     share · (n + 1), rounded up, so that of n + 1 exchangeable ones that share would. Where that is more than all, all
-    are asked, and no more is claimed.
+    are asked; of so few the worst to come is read from their spread as well: mean + t · s · √(1 + 1/n), which the risk
+    of one more scene exceeds with probability 1 − share were the risks normal, meets the target too. Of fewer than
+    :data:`FEW_SCENES` no spread is known, and no more is claimed than that all meet it.
 
     Args:
         scenes: candidates with scores, one entry a scene; scenes without candidates are passed over.
@@ -106,10 +112,11 @@ def most_scenes(scenes: Sequence[Points], target: float, *, share: float = 0.9, 
     loss, answered = _accepted(answers, thresholds)
     risk = loss / answered.clamp_min(1)
     kept = ((risk <= target) | (answered < few)).to(risk.dtype).mean(0)
-    needed = min(len(scenes), math.ceil(share * (len(scenes) + 1) - 1e-9))
-    return _lowest(
-        thresholds, kept * len(scenes) >= needed - 1e-6, kept, risk, answered / _sizes(scenes), target=target
-    )
+    needed = math.ceil(share * (len(scenes) + 1) - 1e-9)
+    fits = kept * len(scenes) >= min(needed, len(scenes)) - 1e-6
+    if needed > len(scenes) >= FEW_SCENES and share < 1:
+        fits = fits & (_one_more(risk, answered >= max(few, 1), share) <= target)
+    return _lowest(thresholds, fits, kept, risk, answered / _sizes(scenes), target=target)
 
 
 def conformal(scenes: Sequence[Points], target: float, *, confidence: float | None = None) -> Control:
@@ -153,6 +160,18 @@ def conformal(scenes: Sequence[Points], target: float, *, confidence: float | No
         fits = risk.sum(0) / max(n, 1) <= _largest_mean(n, target, 1 - confidence)
     fits = fits & (n >= needed)
     return _lowest(thresholds, fits, bound, risk, answered / sizes, target=target, needed=needed, confidence=confidence)
+
+
+def _one_more(risk: Tensor, speaks: Tensor, share: float) -> Tensor:
+    """Risk (thresholds,) that one more scene stays below with that probability, by those (scenes, thresholds) that
+    speak, were they normal; infinite where fewer than two do."""
+    n = speaks.sum(0)
+    mean = torch.where(speaks, risk, 0.0).sum(0) / n.clamp_min(1)
+    variance = torch.where(speaks, (risk - mean).square(), 0.0).sum(0) / (n - 1).clamp_min(1)
+    z, freedom = NormalDist().inv_cdf(share), (n - 1).clamp_min(1)
+    # Student's t by its expansion around the normal quantile (Abramowitz and Stegun 1964, 26.7.5)
+    t = z + (z**3 + z) / (4 * freedom) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * freedom.square())
+    return torch.where(n > 1, mean + t * (variance * (1 + 1 / n.clamp_min(1))).sqrt(), torch.inf)
 
 
 def scenes_needed(target: float, *, confidence: float | None = None) -> int:
