@@ -78,11 +78,12 @@ class PoseCode:
 
 
 class Source:
-    """Where a value of the merged map comes from."""
+    """Where a value of a merged map comes from."""
 
     NONE: Final = 0
     SENSOR: Final = 1
-    RECOVERED: Final = 2
+    RECOVERED: Final = 2  #: a tracked sample, triangulated
+    SWEPT: Final = 3  #: a pixel of a dense map, found on its epipolar line
 
 
 def names(table: type) -> dict[int, str]:

@@ -184,6 +184,22 @@ class Estimate(Record):
 
 
 @record
+class DepthMap(Record):
+    """Depth of every pixel of a view, or the reason for silence, on a picture of its own size over the same field."""
+
+    depth: Tensor  # (B, h, w) m; NaN where silent
+    sigma: Tensor  # (B, h, w) m, standard deviation of depth; NaN where silent
+    score: Tensor  # (B, h, w) in [0, 1]; 0 where silent
+    source: Tensor  # (B, h, w) int32, codes.Source
+    gate: Tensor  # (B, h, w) int32, codes.Gate; 0 = there is a depth
+
+    @property
+    def keep(self) -> Tensor:
+        """(B, h, w) bool: there is a depth."""
+        return self.gate == Gate.ANSWER
+
+
+@record
 class Map(Record):
     """Sensor and recovered depth side by side: what a user of the pipeline wants."""
 

@@ -18,7 +18,7 @@ LEVELS = [
     {"stages", "data", "evaluate", "export", "synthetic", "testing", "calibration"},
     {"method"},
     {"pair", "window", "methods", "first_release", "views", "offers"},
-    {"transform", "integrate", "extract", "viewer", "stream"},
+    {"transform", "integrate", "extract", "viewer", "stream", "dense"},
     {"studies"},
     {"commands", "__main__"},
 ]

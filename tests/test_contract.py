@@ -9,7 +9,7 @@ import pytest
 import torch
 from contract import PROMISES, NoMasksAsNumbers, Row, equal, leaves, reorder, take, tensor_map
 
-from dhtorch import method, pair, views, window
+from dhtorch import dense, method, pair, views, window
 from dhtorch.evaluate import holdout, probe
 from dhtorch.geometry import (
     affine,
@@ -29,6 +29,7 @@ from dhtorch.geometry import (
     small,
     sparse_grid,
     start,
+    sweep,
     thin_lens,
 )
 from dhtorch.methods import MAP, PAPER, WINDOW
@@ -106,6 +107,19 @@ def tracked(batch, n, dtype, noise=0.2):
 def estimated(batch, n, dtype):
     samples, tracks, fit, camera_0, camera_1 = tracked(batch, n, dtype)
     return triangulate.two_view(samples, tracks, fit, camera_0, camera_1), samples, tracks, fit
+
+
+def swept(batch, n, dtype):
+    """View 0, view 1 and an inverse depth for every pixel of the former."""
+    v, u = (uniform(batch, 1, 48, 64, dtype=dtype, seed=k) for k in (6, 7))
+    T = se3.Pose(poses(batch, dtype, seed=2).R, uniform(batch, 3, dtype=dtype, low=-0.1, high=0.1, seed=3))
+    view = sweep.View(filters.gaussian(v, 2.0), cameras(batch, dtype, True, seed=5), T)
+    q = uniform(batch, 48, 64, dtype=dtype, low=0.2, high=0.5)
+    return sweep.base(filters.gaussian(u, 2.0), cameras(batch, dtype, True)), view, q
+
+
+def volumes(batch, n, dtype):
+    return torch.randint(0, 31, (batch, 9, 12, 6), generator=generator(), dtype=torch.uint8)
 
 
 def probed(batch, n, dtype):
@@ -369,6 +383,19 @@ ROWS = [
     Row(start.coarse_flow, lambda b, n, d: shifted(b, n, d)[:2], "batch capture", slow="capture"),
     Row(start.upright, lambda b, n, d: (shifted(b, n, d)[0], turns(b, d), uniform(b, dtype=d, low=0.5, high=2.0)), "dtype batch vmap capture gradcheck", grad=(0,)),
     Row(start.turned, lambda b, n, d: (turns(b, d), pixels(b, n, d), HW), "dtype batch vmap capture gradcheck empty shuffle padding", (1,), (1,)),
+    Row(sweep.pixel_rays, lambda b, n, d: (cameras(b, d, True), HW, 2), "dtype batch capture gradcheck", grad=(0,)),
+    Row(sweep.base, lambda b, n, d: (uniform(b, 1, *HW, dtype=d), cameras(b, d)), "dtype batch capture raises", bad=lambda a: (a[0][0], a[1])),
+    Row(sweep.seen_at, lambda b, n, d: (swept(b, n, d)[1], camera.rays(cameras(b, d), pixels(b, n, d)), uniform(b, n, dtype=d)), "dtype batch vmap capture gradcheck empty shuffle padding raises", (1, 2), (0, 1, 2), bad=wrong_last_axis(2)),
+    Row(sweep.bilinear, lambda b, n, d: (uniform(b, 3, *HW, dtype=d), pixels(b, n, d)), "dtype batch capture gradcheck empty", grad=(0, 1)),
+    Row(sweep.travel, lambda b, n, d: swept(b, n, d)[:2], "dtype batch capture"),
+    Row(sweep.census, lambda b, n, d: (uniform(b, 1, *HW, dtype=d),), "batch capture raises", bad=lambda a: (a[0][0],)),
+    Row(sweep.count_bits, lambda b, n, d: (torch.randint(0, 2**31 - 1, (b, n), generator=generator(), dtype=torch.int32),), "batch vmap capture empty shuffle padding", (0,)),
+    Row(sweep.aggregate, lambda b, n, d: (volumes(b, n, d), torch.arange(1, b + 1)), "batch capture raises", bad=lambda a: (a[0][0], a[1])),
+    Row(sweep.winner, lambda b, n, d: (sweep.aggregate(volumes(b, n, d)),), "batch capture raises", bad=lambda a: (a[0][0],)),
+    Row(sweep.with_gradients, lambda b, n, d: (uniform(b, 1, *HW, dtype=d),), POINTLESS, grad=(0,)),
+    Row(sweep.fit_windows, lambda b, n, d: (*swept(b, n, d)[:2], sweep.with_gradients(swept(b, n, d)[1].image), swept(b, n, d)[2]), "dtype batch capture"),
+    Row(sweep.smooth, lambda b, n, d: (uniform(b, 12, 15, dtype=d), uniform(b, dtype=d)), "dtype batch vmap capture gradcheck", grad=(0,)),
+    Row(sweep.hidden, lambda b, n, d: (sweep.travel(*swept(b, n, d)[:2]), swept(b, n, d)[2], uniform(b, dtype=d, high=0.1)), "batch capture"),
     Row(track.lucas_kanade_affine, shifted, "dtype batch capture empty shuffle padding nan raises", (2,), bad=wrong_last_axis(2), atol=1e-4, slow="capture"),
     Row(affine.register, lambda b, n, d: (*pyramids(b, n, d), *nearby(b, n, d)), "dtype batch capture empty shuffle padding nan raises", (2, 3), bad=wrong_last_axis(2), atol=1e-4, slow="capture"),
     Row(affine.step, lambda b, n, d: (*pyramids(b, n, d), *nearby(b, n, d), torch.eye(2, dtype=d).expand(b, n, 2, 2)), "dtype batch capture gradcheck empty shuffle padding nan raises", (2, 3, 4), (0, 1), bad=wrong_last_axis(2), atol=1e-4),
@@ -473,6 +500,8 @@ ELSEWHERE = {
     *(f"dhtorch.views.{name}" for name in ("by_probes", "shrunk", "key_views", "weighed")),
     *(f"dhtorch.geometry.start.{name}" for name in ("small", "is_turned", "inverse")),
     "dhtorch.stages.track.coarse",
+    "dhtorch.geometry.sweep.add_costs",
+    *(f"dhtorch.dense.{name}" for name in ("complete", "resized")),
     "dhtorch.geometry.exact.filled",
     "dhtorch.geometry.least_squares.minimise",
     *(
@@ -684,7 +713,7 @@ ESTIMATORS = (arms, clusters, registration, blur, filling, sharpness)
 
 
 def public_functions():
-    parts = [method, pair, views, window, *ESTIMATORS]
+    parts = [method, pair, views, window, dense, *ESTIMATORS]
     for package in ("geometry", "stages", "evaluate", "integrate"):
         module = importlib.import_module(f"dhtorch.{package}")
         found = pkgutil.iter_modules(module.__path__, f"dhtorch.{package}.")

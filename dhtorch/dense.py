@@ -1,0 +1,340 @@
+"""Every pixel: a depth with a sigma beyond the sensor's reach, and silence where the pictures do not tell.
+
+    method ─ motions, worth of the views ─┐
+    anchor picture ───────────────────────┼─ sweep ─ surface ─ fit ─ gates ─┐
+    other pictures ───────────────────────┘                                 ├─ DepthMap
+    sensor ─────────────────────────────────────────────────────────────────┘
+
+The sparse method gives what the sweep stands on: metric motions with their covariances, and which views are worth
+asking. What is searched for is one number a pixel, its inverse depth. Returns of the sensor are no input to that
+search: where both speak, they judge it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from dhtorch import tree
+from dhtorch.codes import Gate, PoseCode, Source, first_reason
+from dhtorch.geometry import camera as cam
+from dhtorch.geometry import epipolar, se3, sweep
+from dhtorch.geometry.covariance import median
+from dhtorch.geometry.filters import grey
+from dhtorch.geometry.se3 import Pose
+from dhtorch.geometry.shapes import is_static
+from dhtorch.method import Method
+from dhtorch.methods import AUTO
+from dhtorch.records import Camera, DepthMap, Estimate, Frame, PoseFit, Samples
+
+#: Share of the sensor's reach (the depth that nearly all its returns are nearer than) at which the sweep ends: what the
+#: sensor sees as well is what tells whether the sweep is right.
+OVERLAP, REACH = 0.7, 0.98
+
+#: What a view must be worth to be asked, as Σ log(1 + (0.1 · depth / sigma)²) over its answers without a return.
+WORTH = 5.0
+
+#: A pixel's own noise of grey values (a step of eight bits is 0.004), and how many of a window's pixels err by
+#: themselves: noise is shared through the lens, the resampling and the texture.
+GREY_NOISE, INDEPENDENT = 0.002, 5.0
+
+#: Correlation of its windows from which on a view has a say in a pixel's depth.
+SAY = 0.5
+
+#: Planes that a fit may move a pixel in one step and in all, and by which one surface must be nearer to hide another.
+STEP, ALL_STEPS, NEARER = 1.0, 1.5, 1.5
+
+#: Planes by which neighbours differ at most that lie on one surface.
+SURFACE = 1.5
+
+#: Pixels where sensor and sweep both speak by which a motion may be refuted; a difference counts beyond so many sigmas
+#: and such a share of the depth.
+WITNESSES, SIGMAS, APART = 200, 3.0, 0.1
+
+
+class Asked(NamedTuple):
+    """The other views of an anchor and what the sparse method made of each."""
+
+    frames: Frame  # (V, B)
+    estimates: Estimate  # (V, B, N)
+    fits: PoseFit  # (V, B)
+    samples: Samples  # (B, N) of the anchor
+
+
+class Partner(NamedTuple):
+    """A view that is swept, and how well its motion is known."""
+
+    view: sweep.View
+    fit: PoseFit
+    use: Tensor  # (B,) bool
+
+
+class Fitted(NamedTuple):
+    """What the views together say of every pixel, (B, h, w) each."""
+
+    q: Tensor  # 1/m
+    own: Tensor  # 1/m², variance of q by the grey values
+    shared: Tensor  # 1/m², by the motions
+    correlation: Tensor  # of the view that fits best, -1 where none sees the pixel
+    seen: Tensor  # bool, by one view at least, and not hidden there
+
+
+def complete(
+    anchor: Frame,
+    others: Frame | Sequence[Frame],
+    *,
+    method: Method = AUTO,
+    partners: int = 3,
+    planes: int = 96,
+    size: int = 640,
+    refinements: int = 2,
+    min_correlation: float = 0.75,
+    max_sigma_rel: float = 0.1,
+    seed: int | Tensor = 0,
+    fit: PoseFit | None = None,
+) -> DepthMap:
+    """A depth for every pixel of the anchor views that the sensor left out and the other views tell.
+
+    Args:
+        anchor: B views.
+        others: as :class:`dhtorch.method.Method` takes them: B views, or V × B of them, or a sequence of V.
+        method: the sparse method that gives motions; it chooses among the views as it does by itself.
+        partners: views that are swept at most, those worth most (at most eight).
+        planes: inverse depths that are tried, evenly from infinity to within the sensor's reach.
+        size: longer side of the map and of the pictures that are swept, px; smaller pictures stay as they are.
+        refinements: Gauss-Newton steps from the best plane.
+        min_correlation: of the windows of a pixel in the view that fits best, below which it is silent.
+        max_sigma_rel: sigma / depth above which it is silent.
+        seed, fit: as :class:`dhtorch.method.Method` takes them.
+
+    Returns:
+        DepthMap (B, h, w) over the field of the anchor's picture: returns of the sensor where it has usable ones (as
+        ``method.backproject`` reads them), swept depths, silence. Score is h / (h + sigma / depth), h = 0.1.
+
+    Gates: that of the pair for all pixels where no other view is of use (NO_BASELINE, NO_POSE, CONTRADICTED, or
+    UNCERTAIN where all are worth too little); NO_TRACK (seen by no view, nearer than what is swept, or found in none),
+    UNCERTAIN. CONTRADICTED where the sensor refutes the sweep.
+
+    Raises:
+        ValueError: wrong shapes, no other view, or an option out of range.
+
+    Gradient: swept depth to all images, to intrinsics and through the motions to the near depth, by one step of the
+    last fit; planes, partners, sigma and gates carry none.
+    Memory: three bytes for every pixel and plane, whatever the number of views, and pictures.
+    Cost: linear in planes, pixels and partners.
+    """
+    _check_options(partners=partners, planes=planes, size=size, refinements=refinements)
+    trace: dict[str, Any] = {}
+    sparse = method(anchor, others, seed=seed, fit=fit, trace=trace)
+    asked = _asked(trace, others)
+    index, wanted = _partners(asked, partners)
+    base = sweep.base(*resized(anchor, size))
+    partner = [_partner(asked, k, size, use, base.image) for k, use in zip(index, wanted, strict=True)]
+    q = torch.linspace(0, 1, planes).to(base.ray) / _nearest(asked.samples)[:, None].to(base.ray)
+    start = _best_planes(base, partner, q)
+    found = _fitted(base, partner, start, q, refinements)
+    silent = _silent_pairs(sparse, asked, wanted)
+    swept = _gated(base, found, start >= q[:, -1, None, None] * (1 - 1e-6), silent, min_correlation, max_sigma_rel)
+    return _with_sensor(swept, anchor, method, asked.samples)
+
+
+def resized(frame: Frame, size: int) -> tuple[Tensor, Camera]:
+    """Grey picture (B, 1, h, w) with a longer side of at most ``size``, each pixel the mean of what it covers, and its
+    camera. Gradient: to the image and the intrinsics."""
+    picture = grey(frame.image)
+    picture = picture.to(torch.promote_types(picture.dtype, torch.float32))
+    H, W = picture.shape[-2:]
+    if max(H, W) <= size:
+        return picture, frame.camera
+    hw = max(1, round(H * size / max(H, W))), max(1, round(W * size / max(H, W)))
+    return F.interpolate(picture, hw, mode="area"), cam.resize(frame.camera, (H, W), hw)
+
+
+def _check_options(**options: int) -> None:
+    low = {"partners": 1, "planes": 3, "size": 16, "refinements": 0}
+    high = {"partners": sweep.VIEWS}
+    for name, value in options.items():
+        if not low[name] <= value <= high.get(name, value):
+            upper = f" to {high[name]}" if name in high else ""
+            raise ValueError(f"complete: {name} is {value}, expected at least {low[name]}{upper}")
+
+
+def _asked(trace: dict[str, Any], others: Frame | Sequence[Frame]) -> Asked:
+    """The views that the method asked, and its answers, from its trace."""
+    if not isinstance(others, Frame):
+        others = tree.stack(others)
+    if others.image.dim() == 4:
+        others = tree.stack([others])
+    if "views" not in trace:
+        return Asked(others, tree.stack([trace["estimate"]]), tree.stack([trace["fit"]]), trace["samples"])
+    index = trace["choice"].index
+    frames = others[index, torch.arange(index.shape[1], device=index.device)]
+    estimates, fits = (tree.stack([view[name] for view in trace["views"]]) for name in ("estimate", "fit"))
+    return Asked(frames, estimates, fits, trace["samples"])
+
+
+def _partners(asked: Asked, partners: int) -> tuple[Tensor, Tensor]:
+    """Which views are swept, (K, B) indices, those worth most first, and which of them are worth it (K, B) bool."""
+    said = asked.estimates.keep & ~asked.samples.usable & (asked.estimates.sigma > 0)
+    ratio = torch.where(said, 0.1 * asked.estimates.depth / asked.estimates.sigma, 0.0).detach()
+    worth = torch.where(asked.fits.ok, torch.log1p(ratio.square()).sum(-1), -1.0)
+    worth, index = worth.sort(dim=0, descending=True, stable=True)
+    return index[:partners], worth[:partners] > WORTH
+
+
+def _partner(asked: Asked, index: Tensor, size: int, use: Tensor, like: Tensor) -> Partner:
+    """The views (B,) of that index and their motions, harmless ones where there are none."""
+    at = index, torch.arange(len(index), device=index.device)
+    frame, fit = asked.frames[at], asked.fits[at]
+    image, camera = resized(frame, size)
+    eye = torch.eye(3).to(like)
+    R = torch.where(fit.ok[:, None, None], fit.T_1_from_0.R.to(like), eye)
+    t = torch.where(fit.ok[:, None], fit.T_1_from_0.t.to(like), eye[0])
+    turn = None if fit.shutter is None else torch.where(fit.ok[:, None], fit.shutter.turn.to(like), 0.0)
+    return Partner(sweep.View(image.to(like), camera, Pose(R, t), turn), fit, use)
+
+
+def _nearest(samples: Samples) -> Tensor:
+    """Depth (B,) in m at which the sweep ends; 1 where the sensor sees nothing."""
+    depth = torch.where(samples.usable, samples.depth, torch.inf).detach().sort(-1).values
+    n = samples.usable.sum(-1)
+    last = depth.gather(-1, (REACH * (n - 1).clamp_min(0)).long()[:, None])[:, 0]
+    return torch.where(n > 0, OVERLAP * last, torch.ones_like(last))
+
+
+@torch.no_grad()
+def _best_planes(base: sweep.Base, partners: list[Partner], q: Tensor) -> Tensor:
+    """Inverse depth (B, h, w) of the best surface through the planes q (B, D), between them by a parabola."""
+    C = torch.zeros(len(q), *base.hw, q.shape[1], dtype=torch.uint8, device=q.device)
+    for view, _, use in partners:
+        if is_static(use) or bool(use.any()):
+            sweep.add_costs(C, base, view, q, use)
+    count = torch.stack([use for _, _, use in partners]).sum(0)
+    found = sweep.winner(sweep.aggregate(C, count.clamp_min(1)))
+    return (found.plane + found.shift) * (q[:, 1] - q[:, 0])[:, None, None]
+
+
+def _fitted(base: sweep.Base, partners: list[Partner], start: Tensor, q: Tensor, steps: int) -> Fitted:
+    """The surface fitted by grey values to all views that are of use."""
+    plane = q[:, 1] - q[:, 0]
+    near = ALL_STEPS * plane[:, None, None]
+    with torch.no_grad():
+        at = sweep.smooth(start, SURFACE * plane)
+        for _ in range(steps):
+            moved = at + _joined(base, partners, at, plane)[0]
+            at = torch.minimum(torch.maximum(moved, start - near), start + near).clamp_min(0)
+            at = sweep.smooth(at, SURFACE * plane)
+    step, found = _joined(base, partners, at, plane)
+    return found._replace(q=at + (step - step.detach()))
+
+
+def _joined(base: sweep.Base, partners: list[Partner], at: Tensor, plane: Tensor) -> tuple[Tensor, Fitted]:
+    """The step (B, h, w) that the views together ask for at inverse depths ``at``, each by its own variance, and how
+    well they fit there. The gradient is the step's."""
+    total, weight, shared = (torch.zeros_like(at) for _ in range(3))
+    best, seen = torch.full_like(at, -1), torch.zeros_like(at, dtype=torch.bool)
+    most = STEP * plane[:, None, None]
+    for view, fit, use in partners:
+        one = sweep.fit_windows(base, view, sweep.with_gradients(view.image), at)
+        with torch.no_grad():
+            here = one.seen & use[:, None, None] & ~sweep.hidden(sweep.travel(base, view), at, NEARER * plane)
+            own = (one.noise + GREY_NOISE**2) / (INDEPENDENT * one.contrast)
+            say = torch.where(here & (one.correlation > SAY), 1 / own, 0.0)
+            shared = shared + say * _pose_variance(base, view, fit, at, one.motion.detach())
+            weight, seen = weight + say, seen | here
+            best = torch.where(here, torch.maximum(best, one.correlation), best)
+        total = total + say * torch.minimum(torch.maximum(one.step, -most), most)
+    given = weight > 0
+    weight, infinite = torch.where(given, weight, 1.0), torch.full_like(at, torch.inf)
+    own, shared = (torch.where(given, x / weight, infinite) for x in (torch.ones_like(at), shared))
+    return total / weight, Fitted(at, own, shared, best, seen)
+
+
+def _pose_variance(base: sweep.Base, view: sweep.View, fit: PoseFit, q: Tensor, motion: Tensor) -> Tensor:
+    """Variance (B, h, w) of q, 1/m², by the motion's covariance."""
+    flat = q.flatten(1).clamp_min(1e-6)
+    X = se3.rotate(view.T_1_from_0.R, base.ray) / flat[..., None] + view.T_1_from_0.t[:, None]
+    _, J = epipolar.point_jacobians(view.camera, X)
+    cov = fit.cov if fit.shutter is None else fit.shutter.cov
+    if fit.shutter is not None:
+        J = torch.cat((J, J[..., :3] * base.ray[..., 1, None, None]), -1)
+    cov = torch.where(fit.ok[:, None, None], cov, 0.0).nan_to_num().to(J)
+    along = motion.flatten(1, 2)
+    row = (along[..., None] * J).sum(-2) / along.square().sum(-1, keepdim=True).clamp_min(1e-12)
+    carried = sum(row[..., k, None] * cov[:, None, k] for k in range(cov.shape[-1]))
+    return (carried * row).sum(-1).clamp_min(0).unflatten(-1, base.hw)
+
+
+def _silent_pairs(sparse: Estimate, asked: Asked, wanted: Tensor) -> Tensor:
+    """Gate (B,) for all pixels of anchors that no other view is of use for, else ANSWER."""
+    still = (asked.fits.code == PoseCode.NO_BASELINE) | (asked.estimates.gate == Gate.NO_BASELINE).any(-1)
+    moving = (sparse.gate == Gate.CONTRADICTED).any(-1) & ~sparse.keep.any(-1)
+    none = ~wanted.any(0)
+    return first_reason(
+        (moving, Gate.CONTRADICTED),
+        (none & still.any(0), Gate.NO_BASELINE),
+        (none & ~asked.fits.ok.any(0), Gate.NO_POSE),
+        (none, Gate.UNCERTAIN),
+    )
+
+
+def _gated(
+    base: sweep.Base,
+    found: Fitted,
+    beyond: Tensor,  # (B, h, w) bool, nearer than the nearest plane
+    silent: Tensor,  # (B,)
+    min_correlation: float,
+    max_sigma_rel: float,
+) -> DepthMap:
+    """The swept map: depths, and what speaks against them."""
+    depth = 1 / found.q.clamp_min(1e-9)
+    sigma_rel = (found.own + found.shared).sqrt() * depth.detach()
+    lost = ~base.known.unflatten(-1, base.hw) | ~found.seen | beyond | (found.correlation < min_correlation)
+    gate = first_reason((lost, Gate.NO_TRACK), (~(sigma_rel <= max_sigma_rel), Gate.UNCERTAIN))
+    pair = silent[:, None, None].expand_as(gate)
+    gate = torch.where(pair != Gate.ANSWER, pair, gate)
+    keep = gate == Gate.ANSWER
+    nan = torch.full_like(depth, torch.nan)
+    return DepthMap(
+        depth=torch.where(keep, depth, nan),
+        sigma=torch.where(keep, sigma_rel * depth.detach(), nan),
+        score=torch.where(keep, 0.1 / (0.1 + sigma_rel), 0.0),
+        source=torch.where(keep, Source.SWEPT, Source.NONE).to(torch.int32),
+        gate=gate,
+    )
+
+
+def _with_sensor(swept: DepthMap, anchor: Frame, method: Method, near: Samples) -> DepthMap:
+    """The sensor where it answers, else the sweep; which is silent where the sensor refutes it."""
+    h, w = swept.depth.shape[-2:]
+    H, W = anchor.hw
+    rows, columns = (torch.arange(n, device=swept.depth.device).to(anchor.camera.f) for n in (h, w))
+    v, u = torch.meshgrid((rows + 0.5) * (H / h) - 0.5, (columns + 0.5) * (W / w) - 0.5, indexing="ij")
+    samples = method.backproject(anchor, torch.stack([u, v], -1).reshape(-1, 2))
+    usable, depth, sigma = (x.unflatten(-1, (h, w)) for x in (samples.usable, samples.depth, samples.sigma))
+    sigma_swept = swept.sigma.detach()
+    both = usable & swept.keep
+    miss = (torch.where(both, swept.depth.detach() - depth.detach(), 0.0)).abs()
+    spread = torch.where(both, (sigma_swept.square() + sigma.detach().square()).sqrt(), 1.0)
+    wrong = both & (miss > SIGMAS * spread) & (miss > APART * depth.detach())
+    n = both.sum((1, 2))
+    refuted = (n >= WITNESSES) & (2 * wrong.sum((1, 2)) > n)
+    gate = torch.where(refuted[:, None, None] & swept.keep, Gate.CONTRADICTED, swept.gate)
+    keep = (gate == Gate.ANSWER) & ~usable
+    noise = near.usable & (near.depth > 0)
+    share = median(near.sigma / torch.where(noise, near.depth, torch.ones_like(near.depth)), noise)
+    share = torch.where(noise.any(-1, keepdim=True), share, 0.0)[..., None].detach()  # a wrong scale passes whole
+    sigma_swept = (sigma_swept.square() + (share * swept.depth.detach()).square()).sqrt()
+    nan = torch.full_like(swept.depth, torch.nan)
+    confidence = samples.confidence.unflatten(-1, (h, w)).to(swept.score)
+    return DepthMap(
+        depth=torch.where(usable, depth.to(nan), torch.where(keep, swept.depth, nan)),
+        sigma=torch.where(usable, sigma.to(nan), torch.where(keep, sigma_swept, nan)),
+        score=torch.where(usable, confidence, torch.where(keep, swept.score, 0.0)),
+        source=torch.where(usable, Source.SENSOR, torch.where(keep, Source.SWEPT, Source.NONE)).to(torch.int32),
+        gate=torch.where(usable, Gate.ANSWER, gate).to(torch.int32),
+    )

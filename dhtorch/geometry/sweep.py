@@ -1,0 +1,356 @@
+"""A plane sweep: how well every pixel of a view fits another view at every depth, and the surface that fits best.
+
+Alphabet: q inverse depth (1/m), of D *planes*, rising from 0 (infinity); N = h · w pixels of view 0, row by row, and
+their rays r (z = 1); R, t the motion to view 1, so that a pixel is seen at π(R r + q t); a *code* is the census of a
+window, 31 signs in one int32; C (B, h, w, D) the cost, how many signs differ; S the cost of the best surface through a
+place; W the windows in which the surface found is fitted once more, by grey values.
+
+View 1 is read once, into a picture that is turned as view 0 is (*level*): there a plane moves pixels only along their
+epipolar lines, windows are not turned against each other, and codes can be looked up without being made again. A lens
+and a shutter's turn are in that reading; no picture is undistorted first.
+
+All costs are whole numbers: they depend on no order of summation, so not on batch, threads, tiles or device.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from dhtorch.geometry import camera as cam
+from dhtorch.geometry import se3
+from dhtorch.geometry.camera import Camera
+from dhtorch.geometry.filters import box
+from dhtorch.geometry.se3 import Pose
+from dhtorch.geometry.shapes import check
+from dhtorch.tree import Record, record
+
+#: Offsets (down, right) of the signs of a census: a checkerboard of 9 x 7 pixels without its middle.
+OFFSETS = tuple((i, j) for i in range(-3, 4) for j in range(-4, 5) if (i + j) % 2 and (i, j) != (-3, -4))[:31]
+
+#: What a step of one plane and a jump of any height cost a surface, and what a pixel costs that view 1 does not show:
+#: less than a misfit (half of the signs), more than a fit. In signs.
+STEP, JUMP, UNSEEN = 3, 18, 11
+
+#: Most views whose costs one byte can add up.
+VIEWS = 8
+
+#: Planes that are looked up before they are written, and rows whose best planes are read at once.
+PLANES, ROWS = 8, 32
+
+#: How far beyond view 0's border its points are looked for: the longer side over this.
+MARGIN = 4
+
+#: Gains between two windows that are believed, and the variance of grey values under which nothing is seen.
+GAIN, FLAT = (0.5, 2.0), 1e-8
+
+
+@record
+class Base(Record):
+    """View 0, whose pixels are asked for their depth; made by :func:`base`."""
+
+    image: Tensor  # (B, 1, h, w) grey
+    camera: Camera
+    ray: Tensor  # (B, N, 3) z = 1; straight ahead where the lens knows none
+    known: Tensor  # (B, N) bool, the lens knows a ray
+    code: Tensor  # (B, h, w) int32, see census
+
+    @property
+    def hw(self) -> tuple[int, int]:
+        """Height and width of the picture."""
+        return self.image.shape[-2], self.image.shape[-1]
+
+
+@record
+class View(Record):
+    """View 1 and how it stands to view 0."""
+
+    image: Tensor  # (B, 1, H, W) grey
+    camera: Camera
+    T_1_from_0: Pose
+    turn: Tensor | None = None  # (B, 3) rad per unit of y, of a rolling shutter
+
+
+class Travel(NamedTuple):
+    """Where the level picture sees every pixel of view 0: inverse depth q at (a + q b) / (1 + q c), px of view 0."""
+
+    a: Tensor  # (B, N, 2)
+    b: Tensor  # (B, 1, 2)
+    c: Tensor  # (B, 1, 1)
+
+    def at(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels (B, N, 2) at inverse depths q (B, N) or (B, 1), and whether they lie before view 1."""
+        z = 1 + q[..., None] * self.c
+        return (self.a + q[..., None] * self.b) / z.clamp_min(1e-3), z[..., 0] > 1e-3
+
+
+def pixel_rays(camera: Camera, hw: tuple[int, int], margin: int = 0) -> Tensor:
+    """Rays (B, N, 3) with z = 1 of all pixels of a picture and of ``margin`` more around it; NaN outside the lens."""
+    rows, columns = (torch.arange(-margin, n + margin, device=camera.f.device).to(camera.f) for n in hw)
+    v, u = torch.meshgrid(rows, columns, indexing="ij")
+    return cam.rays(camera, torch.stack([u, v], -1).reshape(1, -1, 2).expand(len(camera.f), -1, -1))
+
+
+def base(image: Tensor, camera: Camera) -> Base:
+    """View 0 of a grey picture (B, 1, h, w). Gradient: to the picture and, through the rays, to the camera."""
+    check("sweep.base", image=(image, "B 1 h w"), f=(camera.f, "B 2"))
+    ray = pixel_rays(camera, (image.shape[-2], image.shape[-1]))
+    known = ray.isfinite().all(-1)
+    ahead = torch.where(known[..., None], ray, ray.new_tensor([0.0, 0.0, 1.0]))
+    return Base(image, camera, ahead, known, census(image.detach()))
+
+
+def seen_at(view: View, ray: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
+    """Where view 1 sees the points on rays (B, N, 3) at inverse depths q (B, N): pixels (B, N, 2) of its picture, and
+    whether they lie before it (B, N). Gradient: to everything."""
+    check("seen_at", ray=(ray, "B N 3"), q=(q, "B N"), t=(view.T_1_from_0.t, "B 3"))
+    x = se3.rotate(view.T_1_from_0.R, ray) + q[..., None] * view.T_1_from_0.t[:, None]
+    if view.turn is not None:
+        x = x + torch.linalg.cross(view.turn[:, None] * ray[..., 1:2], x, dim=-1)
+    front = x[..., 2] > 1e-3
+    return cam.project(view.camera, torch.where(front[..., None], x, torch.ones_like(x))), front
+
+
+def bilinear(image: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
+    """Values (B, C, N) of pictures (B, C, H, W) at pixels (B, N, 2), and which lie inside (B, N). Gradient: to both."""
+    H, W = image.shape[-2:]
+    size = uv.new_tensor([W, H])
+    inside = ((uv >= 0) & (uv <= size - 1)).all(-1)
+    place = ((2 * uv + 1) / size - 1).clamp(-2, 2)[:, :, None]
+    values = F.grid_sample(image, place, mode="bilinear", padding_mode="border", align_corners=False)
+    return values[..., 0], inside
+
+
+def travel(base: Base, view: View) -> Travel:
+    """How the pixels of view 0 travel in the level picture of view 1. Gradient: to cameras and motion."""
+    s = se3.rotate(view.T_1_from_0.R.mT, view.T_1_from_0.t[:, None])
+    f, c = base.camera.f[:, None], base.camera.c[:, None]
+    return Travel(base.ray[..., :2] * f + c, s[..., :2] * f + c * s[..., 2:], s[..., 2:])
+
+
+def census(grey: Tensor) -> Tensor:
+    """Codes (B, h, w) int32 of pictures (B, 1, h, w): of each of 31 neighbours whether it is darker than the middle."""
+    check("census", grey=(grey, "B 1 h w"))
+    h, w = grey.shape[-2:]
+    padded, middle = F.pad(grey, (4, 4, 3, 3), mode="replicate")[:, 0], grey[:, 0]
+    code = torch.zeros_like(middle, dtype=torch.int32)
+    for k, (i, j) in enumerate(OFFSETS):
+        code = code | ((padded[:, 3 + i : 3 + i + h, 4 + j : 4 + j + w] < middle).to(torch.int32) << k)
+    return code
+
+
+def count_bits(x: Tensor) -> Tensor:
+    """How many of the lower 31 bits of int32 (…) are set."""
+    x = x - ((x >> 1) & 0x55555555)
+    x = (x & 0x33333333) + ((x >> 2) & 0x33333333)
+    x = (x + (x >> 4)) & 0x0F0F0F0F
+    x = x + (x >> 8)
+    return (x + (x >> 16)) & 0x3F
+
+
+def add_costs(
+    C: Tensor,  # (B, h, w, D) uint8, in place
+    base: Base,
+    view: View,
+    q: Tensor,  # (B, D)
+    wanted: Tensor,  # (B,) bool, others cost UNSEEN everywhere
+) -> None:
+    """Add to C how badly every pixel fits a view at every plane.
+
+    At most :data:`VIEWS` views fit into a byte. Memory: pictures of view 0's size, whatever D. Gradient: none.
+    """
+    B, h, w, D = C.shape
+    go = travel(base, view)
+    margin = max(h, w) // MARGIN
+    code_1, seen = _level(view, cam.ideal(base.camera), (h, w), margin)
+    H, W = code_1.shape[-2:]
+    code_0, code_1, seen = base.code.flatten(1), code_1.flatten(1), (seen & wanted[:, None, None]).flatten(1)
+    limit = go.a.new_tensor([W, H])
+    for first in range(0, D, PLANES):
+        block = []
+        for k in range(first, min(first + PLANES, D)):
+            uv, front = go.at(q[:, k, None])
+            uv = (uv + (margin + 0.5)).floor()
+            inside = ((uv >= 0) & (uv < limit)).all(-1) & front
+            u, v = torch.minimum(uv.clamp_min(0), limit - 1).long().unbind(-1)
+            index = v * W + u
+            differ = count_bits(code_0 ^ code_1.gather(1, index))
+            fine = inside & seen.gather(1, index)
+            block.append(torch.where(fine, differ, UNSEEN).to(torch.uint8))
+        C[..., first : first + PLANES] += torch.stack(block, -1).reshape(B, h, w, -1)
+
+
+def _level(view: View, camera: Camera, hw: tuple[int, int], margin: int) -> tuple[Tensor, Tensor]:
+    """Codes (B, h', w') of view 1 as it would be seen without its turn, and where there are any."""
+    ray = pixel_rays(camera, hw, margin)
+    uv, front = seen_at(view, ray, ray.new_zeros(ray.shape[:2]))
+    grey, inside = bilinear(view.image, uv)
+    size = hw[0] + 2 * margin, hw[1] + 2 * margin
+    return census(grey.unflatten(-1, size)), (inside & front).unflatten(-1, size)
+
+
+def aggregate(
+    C: Tensor,  # (B, h, w, D) whole numbers
+    views: Tensor | int = 1,  # (B,) how many views' costs are in C
+    *,
+    step: int = STEP,
+    jump: int = JUMP,
+) -> Tensor:
+    """Cost (B, h, w, D) int16 of the best surface through every pixel at every plane, from its four sides.
+
+    Memory: two bytes for every place. Gradient: none.
+    Source: H. Hirschmueller, "Stereo processing by semiglobal matching and mutual information", 2008, of four paths.
+    """
+    check("aggregate", C=(C, "B h w D"))
+    price = torch.as_tensor(views, dtype=torch.int16, device=C.device).reshape(-1, 1, 1)
+    S = torch.zeros_like(C, dtype=torch.int16)
+    for dim in (1, 2):
+        _both_ways(C, S, dim, price * step, price * jump)
+    return S
+
+
+def _both_ways(C: Tensor, S: Tensor, dim: int, step: Tensor, jump: Tensor) -> None:
+    """Add to S the costs of the best paths from the first row of C along ``dim``, and from the last."""
+    n = C.shape[dim]
+    path = None
+    for k in range(n):
+        here = torch.stack([C.select(dim, k), C.select(dim, n - 1 - k)]).to(torch.int16)
+        if path is not None:
+            low = path.amin(-1, keepdim=True)
+            edge = torch.full_like(low, torch.iinfo(torch.int16).max // 2)
+            beside = torch.minimum(torch.cat([edge, path[..., :-1]], -1), torch.cat([path[..., 1:], edge], -1))
+            here = here + torch.minimum(torch.minimum(path, beside + step), low + jump) - low
+        path = here
+        S.select(dim, k).add_(path[0])
+        S.select(dim, n - 1 - k).add_(path[1])
+
+
+class Winner(NamedTuple):
+    """The best plane of every pixel."""
+
+    plane: Tensor  # (B, h, w) int64
+    shift: Tensor  # (B, h, w) in [-0.5, 0.5] planes, to where the cost would be least
+    margin: Tensor  # (B, h, w) how much more the best plane costs that is no neighbour
+
+
+def winner(S: Tensor) -> Winner:
+    """The plane of least cost S (B, h, w, D), the first of equals, and the parabola through its neighbours' costs."""
+    check("winner", S=(S, "B h w D"))
+    return Winner(*(torch.cat(part, 1) for part in zip(*map(_winner, S.split(ROWS, 1)), strict=True)))
+
+
+def _winner(S: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    D = S.shape[-1]
+    cost, index = S.min(-1)
+    centre = index.clamp(1, D - 2)
+    low, middle, high = (S.gather(-1, (centre + o)[..., None])[..., 0].float() for o in (-1, 0, 1))
+    bend = low + high - 2 * middle
+    shift = (0.5 * (low - high) / bend.clamp_min(1e-6)).clamp(-0.5, 0.5)
+    shift = torch.where((bend > 0) & (index == centre), shift, torch.zeros_like(shift))
+    near = (torch.arange(D, device=S.device) - index[..., None]).abs() <= 2
+    rival = torch.where(near, torch.iinfo(S.dtype).max, S).amin(-1)
+    return index, shift, rival - cost
+
+
+class Fit(NamedTuple):
+    """How the grey values around every pixel fit one view at the depths given; (B, h, w) each."""
+
+    step: Tensor  # 1/m, the Gauss-Newton step of inverse depth
+    contrast: Tensor  # m², variance in W of the grey value's change with q: what a step is told by
+    noise: Tensor  # variance in W of the grey values' differences
+    correlation: Tensor  # normalised, in [-1, 1]
+    seen: Tensor  # bool
+    motion: Tensor  # (B, h, w, 2) px·m, d pixel / d q
+
+
+def with_gradients(grey: Tensor) -> Tensor:
+    """Pictures (B, 3, H, W): grey and its central differences along u and v, from (B, 1, H, W)."""
+    padded = F.pad(grey, (1, 1, 1, 1), mode="replicate")
+    du, dv = padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2], padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]
+    return torch.cat([grey, 0.5 * du, 0.5 * dv], 1)
+
+
+def fit_windows(
+    base: Base,
+    view: View,
+    picture_1: Tensor,  # (B, 3, H, W), view 1's by with_gradients
+    q: Tensor,  # (B, h, w) 1/m
+    *,
+    radius: int = 4,
+) -> Fit:
+    """One step of every pixel's inverse depth towards equal grey values in its window, whatever bias and gain.
+
+    Every pixel of a window is read at its own depth, so that slanted and curved surfaces are compared as they are.
+
+    Gradient: to everything; at the depth that fits the step is 0 and its derivative that of the depth (implicit
+    function theorem, with the Gauss-Newton Hessian).
+    """
+    h, w = base.hw
+    flat = q.flatten(1)
+    little = 1e-3 * flat.detach().amax(1, keepdim=True).clamp_min(1e-3)
+    uv, front = seen_at(view, base.ray, flat)
+    motion = (seen_at(view, base.ray, flat + little)[0] - uv) / little[..., None]
+    values, inside = bilinear(picture_1, uv)
+    J, du, dv = values[:, :, None].unbind(1)
+    J, g = J.unflatten(-1, (h, w)), (du * motion[:, None, :, 0] + dv * motion[:, None, :, 1]).unflatten(-1, (h, w))
+    I = base.image  # noqa: E741  (the alphabet of registration)
+    means = box(torch.cat([I, J, g, I * I, J * J, I * J, g * g, g * I, g * J], 1), radius)
+    i, j, k, ii, jj, ij, kk, ki, kj = means.unbind(1)
+    ii, jj, ij = (ii - i * i).clamp_min(FLAT), (jj - j * j).clamp_min(FLAT), ij - i * j
+    kk = (kk - k * k).clamp_min(1e-12)
+    gain = (ij / jj).clamp(*GAIN)
+    return Fit(
+        step=((ki - k * i) - gain * (kj - k * j)) / (gain * kk),
+        contrast=kk * gain * gain,
+        noise=(ii + gain * gain * jj - 2 * gain * ij).clamp_min(0),
+        correlation=ij / (ii * jj).sqrt(),
+        seen=(inside & front).unflatten(-1, (h, w)),
+        motion=motion.unflatten(1, (h, w)),
+    )
+
+
+def smooth(q: Tensor, tolerance: Tensor, *, radius: int = 4) -> Tensor:
+    """Inverse depths (B, h, w), each the mean of those along its column, then along its row, up to ``radius`` away that
+    differ from it by no more than ``tolerance`` (B,) 1/m: planes stay what they are, and so do edges.
+
+    A window cannot see how its pixels scatter about their mean, so what is fitted by windows must be smooth within
+    them. Gradient: to q.
+    """
+    near = tolerance[:, None, None]
+    for dim in (1, 2):
+        n = q.shape[dim]
+        total, count = q, torch.ones_like(q)
+        for k in range(1, min(radius, n - 1) + 1):
+            # a plane is kept where both sides are read: k before with k after
+            before, after = (_beside(q, dim, step) for step in (-k, k))
+            fine = ((before - q).abs() <= near) & ((after - q).abs() <= near)
+            total = total + torch.where(fine, before + after, 0.0)
+            count = count + torch.where(fine, 2.0, 0.0)
+        q = total / count
+    return q
+
+
+def _beside(q: Tensor, dim: int, step: int) -> Tensor:
+    """The value ``step`` further along ``dim``; infinite beyond the border."""
+    n = q.shape[dim]
+    none = torch.full_like(q.narrow(dim, 0, abs(step)), torch.inf)
+    if step > 0:
+        return torch.cat([q.narrow(dim, step, n - step), none], dim)
+    return torch.cat([none, q.narrow(dim, 0, n + step)], dim)
+
+
+def hidden(go: Travel, q: Tensor, tolerance: Tensor) -> Tensor:
+    """Which pixels (B, h, w) of a map of inverse depths another one covers in view 1, nearer by more than
+    ``tolerance`` (B,) 1/m. Gradient: none."""
+    B, h, w = q.shape
+    uv, _ = go.at(q.flatten(1))
+    edge = max(h, w) // MARGIN
+    size = uv.new_tensor([w + 2 * edge, h + 2 * edge])
+    u, v = torch.minimum((uv + (edge + 0.5)).floor().clamp_min(0), size - 1).long().unbind(-1)
+    index = v * (w + 2 * edge) + u
+    front = q.new_full((B, (h + 2 * edge) * (w + 2 * edge)), -1.0)
+    front = front.scatter_reduce(1, index, q.flatten(1), "amax")
+    return (front.gather(1, index) > q.flatten(1) + tolerance[:, None]).unflatten(1, (h, w))
