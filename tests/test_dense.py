@@ -19,13 +19,13 @@ FAST = {"method": MAP.replace(n=512), "planes": 48}
 
 @pytest.fixture(scope="module")
 def room():
-    return SyntheticRoom(n_frames=8, hw=(240, 320), depth_hw=(240, 320), lidar="exact", image_noise=0.0)
+    return SyntheticRoom(n_frames=12, hw=(240, 320), depth_hw=(240, 320), lidar="exact", image_noise=0.0)
 
 
 @pytest.fixture(scope="module")
 def views(room):
     """An anchor whose returns end at two metres, another view, and what is true of all pixels."""
-    return range_split(room[3], NEAR), range_split(room[7], NEAR), room[3].depth
+    return range_split(room[3], NEAR), range_split(room[11], NEAR), room[3].depth
 
 
 @pytest.fixture(scope="module")
@@ -47,17 +47,17 @@ def test_far_pixels_of_the_room_are_found_and_know_how_well(views, found):
     depth = views[2]
     far = (depth > NEAR) & (found.source == Source.SWEPT)
     error = (found.depth - depth).abs() / depth
-    assert far.sum() > 0.4 * (depth > NEAR).sum()
-    assert float(error[far].median()) < 0.02 and float((error[far] > 0.2).float().mean()) < 0.05
+    assert far.sum() > 0.6 * (depth > NEAR).sum()
+    assert float(error[far].median()) < 0.015 and float((error[far] > 0.2).float().mean()) < 0.1  # a mirror hangs there
     within = (error[far] <= found.sigma[far] / found.depth[far]).float().mean()
     assert 0.4 < float(within) < 0.95
     sure = error[far][found.score[far].argsort(descending=True)]
     assert float(sure[: len(sure) // 2].mean()) < 0.7 * float(sure.mean()), "the score ranks"
 
 
-def test_under_the_true_motion_textured_pixels_are_within_a_hundredth(room, views):
+def test_under_the_true_motion_textured_pixels_are_within_hundredths(room, views):
     """Exact pose and depth: what both views show and bears texture."""
-    fit = exact(room, 3, 7, n=512)
+    fit = exact(room, 3, 11, n=512)
     with torch.no_grad():
         got = complete(views[0], views[1], fit=fit, method=FAST["method"], planes=96)
     depth, picture = views[2], resized(views[0], 640)[0][:, 0]
@@ -68,7 +68,8 @@ def test_under_the_true_motion_textured_pixels_are_within_a_hundredth(room, view
     asked = (depth > NEAR) & (contrast > 0.02) & smooth & (got.source == Source.SWEPT)
     error = (got.depth - depth).abs() / depth
     assert asked.sum() > 3000
-    assert float((error[asked] < 0.01).float().mean()) > 0.9
+    assert float(error[asked].median()) < 0.006
+    assert float((error[asked] < 0.01).float().mean()) > 0.7 and float((error[asked] < 0.02).float().mean()) > 0.82
 
 
 def test_the_sensor_speaks_where_it_answers_and_is_no_input(views, found):
@@ -103,7 +104,7 @@ def test_a_camera_that_only_turns_gets_the_sensor_alone():
 
 def test_a_motion_that_the_sensor_refutes_is_not_believed(room, views):
     """A pose with half as much again of translation: depths in sensor's reach would be wrong by a third."""
-    fit = exact(room, 3, 7, n=512)
+    fit = exact(room, 3, 11, n=512)
     wrong = fit.replace(T_1_from_0=fit.T_1_from_0.replace(t=1.5 * fit.T_1_from_0.t))
     with torch.no_grad():
         got = complete(views[0], views[1], fit=wrong, **FAST)
@@ -112,7 +113,7 @@ def test_a_motion_that_the_sensor_refutes_is_not_believed(room, views):
 
 
 def test_more_views_say_more(room, views):
-    others = stack([range_split(room[k], NEAR) for k in (0, 7)])
+    others = stack([range_split(room[k], NEAR) for k in (0, 11)])
     method = MAP.replace(n=512, views=2)
     with torch.no_grad():
         one = complete(views[0], others, method=method, planes=48, partners=1)
