@@ -239,7 +239,7 @@ def caught() -> str:
 
 TABLES = {"room": room, "room seeds": room_by_seed, "shared": shared, "truths": truths, "comparison": comparison}
 TABLES |= {"comparison scenes": partial(by_scene, "method_comparison"), "stress": partial(by_scene, "stress")}
-TABLES |= {"chosen views": partial(chosen_views, "method_comparison"), "beside chosen": beside_chosen}
+TABLES |= {"chosen views": partial(chosen_views, "method_comparison", "streams"), "beside chosen": beside_chosen}
 TABLES |= {"bars": speed_tables.bars, "speed": speed_tables.stages}
 
 #: Numbers of the method comparison in words, and on which side of its bar each belongs.

@@ -30,6 +30,7 @@ RESULTS = HERE / "results"
 #: Result of an experiment → what ``dhtorch`` is told; pictures are left out of all of them.
 EXPERIMENTS = {
     "method_comparison": "experiment=method_comparison data=shared_scenes",
+    "streams": "experiment=method_comparison data=streams",
     "part_ablation": "experiment=part_ablation data=shared_scenes",
     "stress": "experiment=method_comparison data=synthetic_stress experiment.seeds=2",
     "views_study": "experiment=views_study data=shared_scenes experiment.anchors=3",
