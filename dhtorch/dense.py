@@ -236,7 +236,8 @@ def _joined(base: sweep.Base, partners: list[Partner], at: Tensor, plane: Tensor
     """The step (B, h, w) that the views together ask for at inverse depths ``at``, each by its own variance, and how
     well they fit there. The gradient is the step's."""
     total, weight, shared = (torch.zeros_like(at) for _ in range(3))
-    best, seen = torch.full_like(at, -1), torch.zeros_like(at, dtype=torch.bool)
+    best = torch.full_like(at, -1)
+    seen = torch.zeros_like(at, dtype=torch.bool)
     most = STEP * plane[:, None, None]
     for view, fit, use in partners:
         one = sweep.fit_windows(base, view, sweep.with_gradients(view.image), at)
@@ -249,7 +250,8 @@ def _joined(base: sweep.Base, partners: list[Partner], at: Tensor, plane: Tensor
             best = torch.where(here, torch.maximum(best, one.correlation), best)
         total = total + say * torch.minimum(torch.maximum(one.step, -most), most)
     given = weight > 0
-    weight, infinite = torch.where(given, weight, 1.0), torch.full_like(at, torch.inf)
+    weight = torch.where(given, weight, 1.0)
+    infinite = torch.full_like(at, torch.inf)
     own, shared = (torch.where(given, x / weight, infinite) for x in (torch.ones_like(at), shared))
     return total / weight, Fitted(at, own, shared, best, seen)
 

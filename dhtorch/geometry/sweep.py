@@ -167,7 +167,8 @@ def add_costs(
     margin = max(h, w) // MARGIN
     code_1, seen = _level(view, cam.ideal(base.camera), (h, w), margin)
     H, W = code_1.shape[-2:]
-    code_0, code_1, seen = base.code.flatten(1), code_1.flatten(1), (seen & wanted[:, None, None]).flatten(1)
+    code_0, code_1 = base.code.flatten(1), code_1.flatten(1)
+    seen = (seen & wanted[:, None, None]).flatten(1)
     limit = go.a.new_tensor([W, H])
     for first in range(0, D, PLANES):
         block = []
@@ -295,7 +296,8 @@ def fit_windows(
     motion = (seen_at(view, base.ray, flat + little)[0] - uv) / little[..., None]
     values, inside = bilinear(picture_1, uv)
     J, du, dv = values[:, :, None].unbind(1)
-    J, g = J.unflatten(-1, (h, w)), (du * motion[:, None, :, 0] + dv * motion[:, None, :, 1]).unflatten(-1, (h, w))
+    J = J.unflatten(-1, (h, w))
+    g = (du * motion[:, None, :, 0] + dv * motion[:, None, :, 1]).unflatten(-1, (h, w))
     I = base.image  # noqa: E741  (the alphabet of registration)
     means = box(torch.cat([I, J, g, I * I, J * J, I * J, g * g, g * I, g * J], 1), radius)
     i, j, k, ii, jj, ij, kk, ki, kj = means.unbind(1)
