@@ -167,7 +167,7 @@ def add_costs(
     margin = max(h, w) // MARGIN
     code_1, seen = _level(view, cam.ideal(base.camera), (h, w), margin)
     H, W = code_1.shape[-2:]
-    code_0, code_1 = base.code.flatten(1), code_1.flatten(1)
+    code_0, code_1 = (code.flatten(1) for code in (base.code, code_1))
     seen = (seen & wanted[:, None, None]).flatten(1)
     limit = go.a.new_tensor([W, H])
     for first in range(0, D, PLANES):
