@@ -86,7 +86,7 @@ def measure(threads: int, options: Any) -> list[dict[str, Any]]:
         stream.push(view(i), trace=trace)
 
     push()
-    asked = [view(i - s) for s in trace["chosen"][:, 0].tolist()]
+    asked = [view(i - s) for s in trace["back"][:, 0].tolist()]
 
     def peer() -> None:
         with torch.no_grad():

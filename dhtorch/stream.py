@@ -77,7 +77,7 @@ class Stream:
 
         Args:
             frame: one view, on the device of those before it.
-            trace: as :class:`dhtorch.method.Method`; ``chosen`` then counts frames back.
+            trace: as :class:`dhtorch.method.Method`; ``back`` (views, 1) says how many frames back the views asked lie.
 
         Raises:
             ValueError: more than one view in the frame; else as the method.
@@ -96,9 +96,9 @@ class Stream:
             if others:
                 told = others if len(others) > 1 else others[0]
                 estimate = self.method(frame, told, seed=self.seed, hint=self.hint, trace=trace)
-                if trace is not None and "chosen" in trace:
-                    back = torch.tensor(list(reversed(steps)), device=trace["chosen"].device)
-                    trace["chosen"] = back[trace["chosen"]]
+                if trace is not None and "choice" in trace:
+                    index = trace["choice"].index
+                    trace["back"] = torch.tensor(list(reversed(steps)), device=index.device)[index]
             else:
                 estimate = Estimate.silent(self.method.look(frame), Gate.NO_BASELINE, n_views=1)
             self.past.append(frame)

@@ -11,7 +11,6 @@ from functools import partial
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
 
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.exact import steady
@@ -89,11 +88,6 @@ def shrunk(frame: Frame, long: int) -> tuple[Frame, int]:
     return frame.replace(image=picture.grey, camera=camera, depth_camera=depth_camera), picture.scale
 
 
-def key_views(estimates: Estimate, views: int, *, good_sigma_rel: float = 0.1) -> Tensor:
-    """Which views to keep, (views, B) indices, rising: those of :func:`weighed`."""
-    return weighed(estimates, views, good_sigma_rel=good_sigma_rel).index
-
-
 def weighed(
     estimates: Estimate,  # (V, B, N), one per view
     views: int,
@@ -111,9 +105,9 @@ def weighed(
 
     Gradient: none; a choice.
     """
-    V = check("key_views", gate=(estimates.gate, "V B N"), sigma=(estimates.sigma, "V B N"))["V"]
+    V = check("weighed", gate=(estimates.gate, "V B N"), sigma=(estimates.sigma, "V B N"))["V"]
     if not 1 <= views <= V:
-        raise ValueError(f"key_views: views is {views}, expected 1 to {V}")
+        raise ValueError(f"weighed: views is {views}, expected 1 to {V}")
     said = estimates.keep & (estimates.sigma > 0) & estimates.sigma.isfinite()
     ratio = good_sigma_rel * estimates.depth / torch.where(said, estimates.sigma, 1.0)
     worth = torch.where(said, ratio, 0.0).detach().double().square().flip(0)  # argmax takes the first of equals

@@ -73,9 +73,7 @@ def ask_window(
     estimate = method.score(estimate, samples, last["tracks_ideal"], last["fit"])
     ms["fuse"] = 1e3 * (time.perf_counter() - began)
     if trace is not None:
-        trace.update(
-            {**last, "estimate": estimate, "ms": ms, "views": traces, "chosen": choice.index, "choice": choice}
-        )
+        trace.update({**last, "estimate": estimate, "ms": ms, "views": traces, "choice": choice})
     return estimate
 
 

@@ -13,7 +13,7 @@ from dhtorch.stages.fuse import agree
 from dhtorch.stages.score import rank_by_sigma
 from dhtorch.synthetic import open_room
 from dhtorch.tree import collate, stack
-from dhtorch.views import by_probes, key_views, shrunk
+from dhtorch.views import by_probes, shrunk, weighed
 from tests.test_fusion import still_views, views_of
 
 
@@ -213,4 +213,4 @@ def test_a_small_frame_sees_the_same_rays(room):
 def test_key_views_takes_what_adds_most():
     views = views_of(V=3, B=1, N=4, silent=0.0)
     sigma = views.depth * torch.tensor([0.5, 0.01, 0.02]).double()[:, None, None]
-    assert key_views(views.replace(sigma=sigma), 1).tolist() == [[1]]
+    assert weighed(views.replace(sigma=sigma), 1).index.tolist() == [[1]]

@@ -497,7 +497,7 @@ ELSEWHERE = {
     "dhtorch.stages.fuse.inverse_variance",
     "dhtorch.stages.fuse.agree",
     "dhtorch.geometry.reach.within_reach",
-    *(f"dhtorch.views.{name}" for name in ("by_probes", "shrunk", "key_views", "weighed")),
+    *(f"dhtorch.views.{name}" for name in ("by_probes", "shrunk", "weighed")),
     *(f"dhtorch.geometry.start.{name}" for name in ("small", "is_turned", "inverse")),
     "dhtorch.stages.track.coarse",
     "dhtorch.geometry.sweep.add_costs",

@@ -18,7 +18,7 @@ from dhtorch.stages.fuse import inverse_variance
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 from dhtorch.studies.baselines.device_pose import given_pose
 from dhtorch.tree import collate, stack
-from dhtorch.views import key_views
+from dhtorch.views import weighed
 
 extend_window = PAPER.replace(views=5)
 
@@ -238,21 +238,21 @@ def test_key_views_are_added_one_by_one_each_the_one_that_adds_most(good):
     views = views.replace(gate=lone, depth=views.depth.nan_to_num(4.0), sigma=views.sigma.nan_to_num(0.3))
     for count in range(1, 7):
         expected = plain_key_views(views, count, good)
-        assert key_views(views, count, good_sigma_rel=good).T.tolist() == expected
+        assert weighed(views, count, good_sigma_rel=good).index.T.tolist() == expected
         if good == 0.1:
-            assert key_views(views, count).T.tolist() == expected
+            assert weighed(views, count).index.T.tolist() == expected
     for bad in (0, 7):
         with pytest.raises(ValueError, match="expected 1 to 6"):
-            key_views(views, bad)
+            weighed(views, bad)
 
 
 def test_answers_without_a_sigma_add_nothing():
     views = views_of(V=3, B=1, N=4, silent=0.0)
     sigma = views.sigma.clone()
     sigma[2], sigma[1, 0, :2], sigma[1, 0, 2:] = torch.nan, 0.0, torch.inf
-    assert key_views(views.replace(sigma=sigma), 1).tolist() == [[0]]
+    assert weighed(views.replace(sigma=sigma), 1).index.tolist() == [[0]]
     mute = views.replace(gate=torch.full_like(views.gate, Gate.NO_TRACK))
-    assert key_views(mute, 2).T.tolist() == [[1, 2]], "the wider of equals"
+    assert weighed(mute, 2).index.T.tolist() == [[1, 2]], "the wider of equals"
 
 
 # ---------------------------------------------------------------------------------------------------- the window
@@ -403,7 +403,7 @@ def test_of_more_views_the_key_views_are_asked_again_with_their_own_poses():
     n = 512
     seats = Seats(V=5, n=n)
     fits = stack(seats.fits)
-    known = key_views(seats.answers[:, :, ::2], 2)
+    known = weighed(seats.answers[:, :, ::2], 2).index
     assert not torch.equal(known[:, 0], known[:, 1]), "the two anchors choose otherwise"
     options = seats.seats() | {"track": lambda image_0, image_1, uv, hint: seats.tracks(0, uv)}
     asked = []

@@ -57,7 +57,7 @@ def test_a_single_view_answers_as_the_pair_does(room):
     anchor, others = room[0], [room[k] for k in (1, 2, 4)]
     trace = {}
     found = choosing(SMALL["map"])(anchor, stack(others), trace=trace)
-    k = int(trace["chosen"][0, 0])
+    k = int(trace["choice"].index[0, 0])
     alone = SMALL["map"](anchor, others[k])
     for name in ("depth", "sigma", "gate", "score"):
         assert torch.equal(getattr(found, name).nan_to_num(), getattr(alone, name).nan_to_num()), name
@@ -93,7 +93,7 @@ def test_a_seat_may_give_indices_alone(room):
     )
     trace = {}
     last(room[0], stack([room[k] for k in (1, 2, 4)]), trace=trace)
-    assert trace["chosen"].tolist() == [[2]] and trace["choice"].worth is None
+    assert trace["choice"].index.tolist() == [[2]] and trace["choice"].worth is None
     assert str(picked(0, (1, 2, 4), trace)) == "frame 0: view 4, chosen of 3"
 
 

@@ -47,7 +47,7 @@ def test_the_newest_frame_is_answered_from_those_before_it(frames: list[Frame]) 
     trace: dict = {}
     found = stream.push(frames[4], trace=trace)
     assert same(found, FAST(frames[4], stack([frames[0], frames[2], frames[3]])))
-    assert int(found.keep.sum()) > 30 and set(trace["chosen"][:, 0].tolist()) <= {1, 2, 4}
+    assert int(found.keep.sum()) > 30 and set(trace["back"][:, 0].tolist()) <= {1, 2, 4}
     assert stream.pushed == 5 and stream.cuts == []
 
 

@@ -12,7 +12,7 @@ from dhtorch.records import Estimate
 from dhtorch.stages.fuse import inverse_variance
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 from dhtorch.studies.baselines import opencv
-from dhtorch.views import key_views
+from dhtorch.views import weighed
 
 extend_window = PAPER.replace(views=5)
 
@@ -144,15 +144,15 @@ def test_key_views_are_those_that_leave_the_smallest_sigma():
     gate = torch.zeros(5, 10, dtype=torch.int32)
     gate[1, 5:], gate[2, :5], gate[3, :5], gate[4] = (Gate.NO_TRACK,) * 4
     views = answers(torch.full((5, 10), 4.0), sigma, gate=gate.tolist())
-    assert key_views(views, 2)[:, 0].tolist() == [1, 2]
-    assert key_views(views, 3)[:, 0].tolist() == [1, 2, 3]
-    assert key_views(views, 5)[:, 0].tolist() == [0, 1, 2, 3, 4]
+    assert weighed(views, 2).index[:, 0].tolist() == [1, 2]
+    assert weighed(views, 3).index[:, 0].tolist() == [1, 2, 3]
+    assert weighed(views, 5).index[:, 0].tolist() == [0, 1, 2, 3, 4]
     both = tree.stack([views[:, 0], views[[4, 3, 2, 1, 0], 0]], 1)  # a batch of two, each with its own choice
-    assert key_views(both, 2).T.tolist() == [[1, 2], [2, 3]]
+    assert weighed(both, 2).index.T.tolist() == [[1, 2], [2, 3]]
     same = answers(torch.full((3, 10), 4.0), torch.full((3, 10), 0.1))
-    assert key_views(same, 1)[:, 0].tolist() == [2]
-    with pytest.raises(ValueError, match="key_views"):
-        key_views(views, 6)
+    assert weighed(same, 1).index[:, 0].tolist() == [2]
+    with pytest.raises(ValueError, match="weighed"):
+        weighed(views, 6)
 
 
 def test_it_captures():
@@ -213,7 +213,7 @@ def test_one_view_is_a_pair(room):
     for field in FLOATS:
         assert torch.equal(getattr(window, field).nan_to_num(), getattr(pair, field).nan_to_num()), field
     pairs = tree.stack([extend(anchor, others[k], **PAIR) for k in range(3)])
-    best = pairs[key_views(pairs, 1)[0], torch.arange(2)]
+    best = pairs[weighed(pairs, 1).index[0], torch.arange(2)]
     chosen = extend_window(anchor, others, views=1, chain=False, **PAIR)
     assert torch.equal(chosen.gate, best.gate) and torch.equal(chosen.depth.nan_to_num(), best.depth.nan_to_num())
 

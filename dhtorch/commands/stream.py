@@ -60,7 +60,7 @@ def streamed(scene: Scene, method: Method, settings: Mapping[str, Any], *, progr
         estimate = stream.push(frame, trace=trace)
         row: Row = {"frame": int(recording.number[k]), "ms": 1e3 * (time.perf_counter() - began)}
         row["cut"] = len(stream.cuts) > cuts
-        row["back"] = sorted(trace["chosen"][:, 0].tolist()) if "chosen" in trace else []
+        row["back"] = sorted(trace["back"][:, 0].tolist()) if "back" in trace else []
         hole = ~(trace["samples"] if "samples" in trace else method.look_at(frame, estimate.uv[0])).usable
         row |= {"n_holes": int(hole.sum()), "n_recovered": int((estimate.keep & hole).sum())}
         rows.append(row)

@@ -139,14 +139,14 @@ class Answer:
         pair = self.batch.pairs[0]
         if isinstance(pair.other, int):
             return pair.other, self.batch.others[-1]
-        k = int(self.trace["chosen"][-1, 0]) if "chosen" in self.trace else 0
+        k = int(self.trace["choice"].index[-1, 0]) if "choice" in self.trace else 0
         return pair.offered[k], self.batch.around[k]
 
     def one(self, b: int) -> Answer:
         """Pair ``b`` alone; milliseconds are the batch's share."""
         size, cut = len(self.batch.pairs), slice(b, b + 1)
         records = {k: v[cut] for k, v in self.trace.items() if isinstance(v, tree.Record)}
-        records |= {k: self.trace[k][:, cut] for k in ("chosen", "choice") if k in self.trace}
+        records |= {k: self.trace[k][:, cut] for k in ("choice",) if k in self.trace}
         return replace(
             self,
             batch=replace(
