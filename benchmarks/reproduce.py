@@ -32,6 +32,7 @@ EXPERIMENTS = {
     "method_comparison": "experiment=method_comparison data=shared_scenes",
     "streams": "experiment=method_comparison data=streams",
     "part_ablation": "experiment=part_ablation data=shared_scenes",
+    "part_ablation_auto": "experiment=part_ablation data=shared_scenes experiment.groups=[auto] experiment.seeds=1",
     "stress": "experiment=method_comparison data=synthetic_stress experiment.seeds=2",
     "views_study": "experiment=views_study data=shared_scenes experiment.anchors=3",
     "shared_scenes": "experiment=opencv_twin data=shared_scenes",
