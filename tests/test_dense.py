@@ -112,6 +112,7 @@ def test_a_motion_that_the_sensor_refutes_is_not_believed(room, views):
     assert bool((got.gate[got.source == Source.NONE] != Gate.ANSWER).all())
 
 
+@pytest.mark.slow
 def test_more_views_say_more(room, views):
     others = stack([range_split(room[k], NEAR) for k in (0, 11)])
     method = MAP.replace(n=512, views=2)

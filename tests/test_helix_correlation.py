@@ -149,6 +149,7 @@ def test_a_turning_picture_is_seen_and_a_growing_one_is_not():
     assert 0.9 < seen["turns"] < 1.1 and seen["grows"] < 0.35
 
 
+@pytest.mark.slow
 def test_forward_motion_is_not_seen_where_plain_flow_sees_it():
     base = method()
     ahead = room(path="forward", step_m=0.03)

@@ -203,6 +203,7 @@ def asked(room, installed, **options):
     return learned.run([noted(room)], {"paper": PAPER}, pairs, Settings(), **{"models": models, **options})
 
 
+@pytest.mark.slow
 def test_networks_are_measured_on_our_candidates(room, installed):
     outcome = asked(room, installed)
     rows = {r["method"]: r for r in outcome.rows if r["pair"] is None}

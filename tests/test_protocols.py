@@ -233,6 +233,7 @@ def test_gates_and_gaps():
     assert verdict(0.8, 0.1, 0.7) is True and verdict(0.8, 0.75, 0.5) is False and verdict(0.8, None, 0.1) is None
 
 
+@pytest.mark.slow
 def test_recovery_rises_with_the_baseline():
     rooms = [
         noted(Changed(room(n_frames=6, hw=(144, 192), path=path), name=f"synthetic_{path}"), gap=2)

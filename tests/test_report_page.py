@@ -81,6 +81,7 @@ def test_the_page_holds_every_scene_and_every_number(result):
     assert result["verdict"] is None or result["verdict"] in said
 
 
+@pytest.mark.slow
 def test_several_results_stand_on_one_page_in_their_order():
     tree = parse(page.page(RESULTS))
     links = [a for a in tree.iter("a") if a.get("class") != "skip"]
