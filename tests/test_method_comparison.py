@@ -115,6 +115,7 @@ def test_nothing_to_compare_is_an_error():
         method_comparison.run([], {}, by_gap, Settings(), methods={"paper": method(), "opencv": method("opencv")})
 
 
+@pytest.mark.slow
 def test_a_method_that_chooses_is_offered_the_frames_around_and_held_against_the_window():
     rooms = open_rooms(("walk", "lateral"), n_frames=7, hw=(192, 256), gap=3, lidar="exact")
     rooms = [replace(room, room=name) for room, name in zip(rooms, ("hall", "attic"), strict=True)]

@@ -169,6 +169,7 @@ def test_another_question_in_the_same_folder_is_done_again(command, tmp_path):
         assert code == 0 and "wrote" in out and len(keys) == n and results(tmp_path) == [path]
 
 
+@pytest.mark.slow
 def test_joblib_runs_jobs_and_any_launcher_resumes_them(tmp_path, command):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     sweep = ["-m", "output=sweep", *TINY, "pairs.gap=2,9"]
