@@ -180,6 +180,7 @@ def room():
     return open_room(seed=1, n_frames=12, hw=(240, 320), near=2.0).recording
 
 
+@pytest.mark.slow
 def test_small_pictures_choose_views_as_large_ones_do(room):
     frames = [room[k] for k in (0, 1, 2, 4, 6, 9)]
     anchor = frames[0]

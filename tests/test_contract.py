@@ -383,7 +383,7 @@ ROWS = [
     Row(start.coarse_flow, lambda b, n, d: shifted(b, n, d)[:2], "batch capture", slow="capture"),
     Row(start.upright, lambda b, n, d: (shifted(b, n, d)[0], turns(b, d), uniform(b, dtype=d, low=0.5, high=2.0)), "dtype batch vmap capture gradcheck", grad=(0,)),
     Row(start.turned, lambda b, n, d: (turns(b, d), pixels(b, n, d), HW), "dtype batch vmap capture gradcheck empty shuffle padding", (1,), (1,)),
-    Row(sweep.pixel_rays, lambda b, n, d: (cameras(b, d), (5, 7), 2), "dtype batch capture gradcheck", grad=(0,)),
+    Row(sweep.pixel_rays, lambda b, n, d: (cameras(b, d), (5, 7), 2), "dtype batch capture gradcheck", grad=(0,), slow="capture"),
     Row(sweep.base, lambda b, n, d: (uniform(b, 1, *HW, dtype=d), cameras(b, d)), "dtype batch capture raises", bad=lambda a: (a[0][0], a[1])),
     Row(sweep.seen_at, lambda b, n, d: (swept(b, n, d)[1], camera.rays(cameras(b, d), pixels(b, n, d)), uniform(b, n, dtype=d)), "dtype batch vmap capture gradcheck empty shuffle padding raises", (1, 2), (0, 1, 2), bad=wrong_last_axis(2)),
     Row(sweep.bilinear, lambda b, n, d: (uniform(b, 3, *HW, dtype=d), pixels(b, n, d)), "dtype batch capture gradcheck empty", grad=(0, 1)),
