@@ -69,6 +69,7 @@ class Partner(NamedTuple):
     """A view that is swept, and how well its motion is known."""
 
     view: sweep.View
+    picture: Tensor  # (B, 3, H, W) the view's, with its gradients
     fit: PoseFit
     use: Tensor  # (B,) bool
 
@@ -195,7 +196,8 @@ def _partner(asked: Asked, index: Tensor, size: int, use: Tensor, like: Tensor) 
     R = torch.where(fit.ok[:, None, None], fit.T_1_from_0.R.to(like), eye)
     t = torch.where(fit.ok[:, None], fit.T_1_from_0.t.to(like), eye[0])
     turn = None if fit.shutter is None else torch.where(fit.ok[:, None], fit.shutter.turn.to(like), 0.0)
-    return Partner(sweep.View(image.to(like), camera, Pose(R, t), turn), fit, use)
+    image = image.to(like)
+    return Partner(sweep.View(image, camera, Pose(R, t), turn), sweep.with_gradients(image), fit, use)
 
 
 def _nearest(samples: Samples) -> Tensor:
@@ -210,10 +212,10 @@ def _nearest(samples: Samples) -> Tensor:
 def _best_planes(base: sweep.Base, partners: list[Partner], q: Tensor) -> Tensor:
     """Inverse depth (B, h, w) of the best surface through the planes q (B, D), between them by a parabola."""
     C = torch.zeros(len(q), *base.hw, q.shape[1], dtype=torch.uint8, device=q.device)
-    for view, _, use in partners:
+    for view, _, _, use in partners:
         if is_static(use) or bool(use.any()):
             sweep.add_costs(C, base, view, q, use)
-    count = torch.stack([use for _, _, use in partners]).sum(0)
+    count = torch.stack([partner.use for partner in partners]).sum(0)
     found = sweep.winner(sweep.aggregate(C, count.clamp_min(1)))
     return (found.plane + found.shift) * (q[:, 1] - q[:, 0])[:, None, None]
 
@@ -239,8 +241,8 @@ def _joined(base: sweep.Base, partners: list[Partner], at: Tensor, plane: Tensor
     best = torch.full_like(at, -1)
     seen = torch.zeros_like(at, dtype=torch.bool)
     most = STEP * plane[:, None, None]
-    for view, fit, use in partners:
-        one = sweep.fit_windows(base, view, sweep.with_gradients(view.image), at)
+    for view, picture, fit, use in partners:
+        one = sweep.fit_windows(base, view, picture, at)
         with torch.no_grad():
             here = one.seen & use[:, None, None] & ~sweep.hidden(sweep.travel(base, view), at, NEARER * plane)
             own = (one.noise + GREY_NOISE**2) / (INDEPENDENT * one.contrast)
