@@ -21,15 +21,16 @@ from torch import Tensor
 
 from dhtorch import tree
 from dhtorch.codes import Gate, PoseCode, Source, first_reason
+from dhtorch.evaluate.score_calibration import Calibration
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import epipolar, se3, sweep
 from dhtorch.geometry.covariance import median
 from dhtorch.geometry.filters import grey
 from dhtorch.geometry.se3 import Pose
 from dhtorch.geometry.shapes import is_static
-from dhtorch.method import Method
+from dhtorch.method import Method, Trace
 from dhtorch.methods import AUTO
-from dhtorch.records import Camera, DepthMap, Estimate, Frame, PoseFit, Samples
+from dhtorch.records import NO_HINT, Camera, DepthMap, Estimate, Frame, PoseFit, Samples, TrackHint
 
 #: Share of the sensor's reach (the depth that nearly all its returns are nearer than) at which the sweep ends: what the
 #: sensor sees as well is what tells whether the sweep is right.
@@ -95,8 +96,11 @@ def complete(
     refinements: int = 2,
     min_correlation: float = 0.75,
     max_sigma_rel: float = 0.1,
+    calibration: Calibration | None = None,
     seed: int | Tensor = 0,
     fit: PoseFit | None = None,
+    hint: TrackHint = NO_HINT,
+    trace: Trace | None = None,
 ) -> DepthMap:
     """A depth for every pixel of the anchor views that the sensor left out and the other views tell.
 
@@ -109,8 +113,10 @@ def complete(
         size: longer side of the map and of the pictures that are swept, px; smaller pictures stay as they are.
         refinements: Gauss-Newton steps from the best plane.
         min_correlation: of the windows of a pixel in the view that fits best, below which it is silent.
-        max_sigma_rel: sigma / depth above which it is silent.
-        seed, fit: as :class:`dhtorch.method.Method` takes them.
+        max_sigma_rel: sigma / depth above which it is silent, before ``calibration``.
+        calibration: what makes sigma and score of swept pixels honest; None leaves them as the pictures tell them.
+        seed, fit, hint, trace: as :class:`dhtorch.method.Method` takes them; the trace also gets ``sparse``, the
+            sparse answers.
 
     Returns:
         DepthMap (B, h, w) over the field of the anchor's picture: returns of the sensor where it has usable ones (as
@@ -129,8 +135,8 @@ def complete(
     Cost: linear in planes, pixels and partners.
     """
     _check_options(partners=partners, planes=planes, size=size, refinements=refinements)
-    trace: dict[str, Any] = {}
-    sparse = method(anchor, others, seed=seed, fit=fit, trace=trace)
+    trace = {} if trace is None else trace
+    sparse = trace["sparse"] = method(anchor, others, seed=seed, fit=fit, hint=hint, trace=trace)
     asked = _asked(trace, others)
     index, wanted = _partners(asked, partners)
     base = sweep.base(*resized(anchor, size))
@@ -140,7 +146,34 @@ def complete(
     found = _fitted(base, partner, start, q, refinements)
     silent = _silent_pairs(sparse, asked, wanted)
     swept = _gated(base, found, start >= q[:, -1, None, None] * (1 - 1e-6), silent, min_correlation, max_sigma_rel)
+    swept = swept if calibration is None else calibration.apply(swept)
     return _with_sensor(swept, anchor, method, asked.samples)
+
+
+def sensed(anchor: Frame, *, method: Method = AUTO, size: int = 640) -> DepthMap:
+    """The map of views that have no other view: the sensor where it answers, else silence (NO_TRACK).
+
+    Arguments, result, errors and gradient as of :func:`complete`.
+    """
+    _check_options(size=size)
+    nan = torch.full((len(anchor.camera.f), *map_hw(anchor.hw, size)), torch.nan).to(anchor.camera.f)
+    code = torch.zeros_like(nan, dtype=torch.int32)
+    silent = DepthMap(nan, nan, torch.zeros_like(nan), code, torch.full_like(code, Gate.NO_TRACK))
+    return _joined_with(silent, _returns(anchor, method, map_hw(anchor.hw, size)))
+
+
+def map_hw(hw: tuple[int, int], size: int) -> tuple[int, int]:
+    """Height and width of the map of a picture: its own, or so that the longer side is ``size`` px."""
+    longer = max(hw)
+    return hw if longer <= size else (max(1, round(hw[0] * size / longer)), max(1, round(hw[1] * size / longer)))
+
+
+def pixels(anchor: Frame, hw: tuple[int, int]) -> Tensor:
+    """Where the picture shows what the pixels of its map of size ``hw`` stand for: (h · w, 2) px, row by row."""
+    rows, columns = (torch.arange(n, device=anchor.camera.f.device).to(anchor.camera.f) for n in hw)
+    scale = anchor.hw[0] / hw[0], anchor.hw[1] / hw[1]
+    v, u = torch.meshgrid((rows + 0.5) * scale[0] - 0.5, (columns + 0.5) * scale[1] - 0.5, indexing="ij")
+    return torch.stack([u, v], -1).reshape(-1, 2)
 
 
 def resized(frame: Frame, size: int) -> tuple[Tensor, Camera]:
@@ -148,11 +181,10 @@ def resized(frame: Frame, size: int) -> tuple[Tensor, Camera]:
     camera. Gradient: to the image and the intrinsics."""
     picture = grey(frame.image)
     picture = picture.to(torch.promote_types(picture.dtype, torch.float32))
-    H, W = picture.shape[-2:]
-    if max(H, W) <= size:
+    hw = map_hw(frame.hw, size)
+    if hw == frame.hw:
         return picture, frame.camera
-    hw = max(1, round(H * size / max(H, W))), max(1, round(W * size / max(H, W)))
-    return F.interpolate(picture, hw, mode="area"), cam.resize(frame.camera, (H, W), hw)
+    return F.interpolate(picture, hw, mode="area"), cam.resize(frame.camera, frame.hw, hw)
 
 
 def _check_options(**options: int) -> None:
@@ -312,33 +344,40 @@ def _gated(
     )
 
 
+def _returns(anchor: Frame, method: Method, hw: tuple[int, int]) -> Samples:
+    """What the sensor says at every pixel of a map of that size, (B, h, w) each."""
+    samples = method.backproject(anchor, pixels(anchor, hw))
+    return samples.map(lambda x: x.unflatten(1, hw))
+
+
 def _with_sensor(swept: DepthMap, anchor: Frame, method: Method, near: Samples) -> DepthMap:
     """The sensor where it answers, else the sweep; which is silent where the sensor refutes it."""
     h, w = swept.depth.shape[-2:]
-    H, W = anchor.hw
-    rows, columns = (torch.arange(n, device=swept.depth.device).to(anchor.camera.f) for n in (h, w))
-    v, u = torch.meshgrid((rows + 0.5) * (H / h) - 0.5, (columns + 0.5) * (W / w) - 0.5, indexing="ij")
-    samples = method.backproject(anchor, torch.stack([u, v], -1).reshape(-1, 2))
-    usable, depth, sigma = (x.unflatten(-1, (h, w)) for x in (samples.usable, samples.depth, samples.sigma))
+    returns = _returns(anchor, method, (h, w))
+    usable, depth, sigma = returns.usable, returns.depth.detach(), returns.sigma.detach()
     sigma_swept = swept.sigma.detach()
     both = usable & swept.keep
-    miss = (torch.where(both, swept.depth.detach() - depth.detach(), 0.0)).abs()
-    spread = torch.where(both, (sigma_swept.square() + sigma.detach().square()).sqrt(), 1.0)
-    wrong = both & (miss > SIGMAS * spread) & (miss > APART * depth.detach())
+    miss = (torch.where(both, swept.depth.detach() - depth, 0.0)).abs()
+    spread = torch.where(both, (sigma_swept.square() + sigma.square()).sqrt(), 1.0)
+    wrong = both & (miss > SIGMAS * spread) & (miss > APART * depth)
     n = both.sum((1, 2))
     refuted = (n >= WITNESSES) & (2 * wrong.sum((1, 2)) > n)
     gate = torch.where(refuted[:, None, None] & swept.keep, Gate.CONTRADICTED, swept.gate)
-    keep = (gate == Gate.ANSWER) & ~usable
     noise = near.usable & (near.depth > 0)
     share = median(near.sigma / torch.where(noise, near.depth, torch.ones_like(near.depth)), noise)
     share = torch.where(noise.any(-1, keepdim=True), share, 0.0)[..., None].detach()  # a wrong scale passes whole
     sigma_swept = (sigma_swept.square() + (share * swept.depth.detach()).square()).sqrt()
+    return _joined_with(swept.replace(sigma=sigma_swept, gate=gate), returns)
+
+
+def _joined_with(swept: DepthMap, returns: Samples) -> DepthMap:
+    """Returns of the sensor where they are usable, else the sweep where it answers."""
+    usable, keep = returns.usable, swept.keep & ~returns.usable
     nan = torch.full_like(swept.depth, torch.nan)
-    confidence = samples.confidence.unflatten(-1, (h, w)).to(swept.score)
     return DepthMap(
-        depth=torch.where(usable, depth.to(nan), torch.where(keep, swept.depth, nan)),
-        sigma=torch.where(usable, sigma.to(nan), torch.where(keep, sigma_swept, nan)),
-        score=torch.where(usable, confidence, torch.where(keep, swept.score, 0.0)),
+        depth=torch.where(usable, returns.depth.to(nan), torch.where(keep, swept.depth, nan)),
+        sigma=torch.where(usable, returns.sigma.to(nan), torch.where(keep, swept.sigma, nan)),
+        score=torch.where(usable, returns.confidence.to(nan), torch.where(keep, swept.score, 0.0)),
         source=torch.where(usable, Source.SENSOR, torch.where(keep, Source.SWEPT, Source.NONE)).to(torch.int32),
-        gate=torch.where(usable, Gate.ANSWER, gate).to(torch.int32),
+        gate=torch.where(usable, Gate.ANSWER, swept.gate).to(torch.int32),
     )

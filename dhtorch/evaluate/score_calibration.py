@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -23,8 +23,11 @@ from dhtorch.evaluate.errors import Points
 from dhtorch.evaluate.monotone import Sigmoid, Table, isotonic, platt
 from dhtorch.evaluate.reliability import GOOD, pool
 from dhtorch.evaluate.risk import capped
+from dhtorch.records import DepthMap
 
 SCHEMA = 1
+
+Answers = TypeVar("Answers", Points, DepthMap)
 
 #: Share of the fitting scenes' weight on which a step of a table must rest.
 MIN_SHARE = 0.02
@@ -67,9 +70,9 @@ class Calibration:
     thresholds: Mapping[int, float | None]  # per cent of mean error → threshold on the score; None = none fits
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
-    def apply(self, scene: Points) -> Points:
-        """The same answers with calibrated score and sigma."""
-        score = torch.where(scene.keep, self.probability(scene.score), 0.0)
+    def apply(self, scene: Answers) -> Answers:
+        """The same answers, of a scene or every pixel of a map, with calibrated score and sigma."""
+        score = torch.where(scene.keep, self.probability(scene.score), 0.0).to(scene.score)
         return scene.replace(score=score, sigma=self.sigma(scene.sigma, scene.depth) if self.sigma else scene.sigma)
 
     def min_score(self, percent: int) -> float | None:
