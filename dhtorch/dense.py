@@ -20,6 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch import tree
+from dhtorch.calibration import available, load
 from dhtorch.codes import Gate, PoseCode, Source, first_reason
 from dhtorch.evaluate.score_calibration import Calibration
 from dhtorch.geometry import camera as cam
@@ -381,3 +382,8 @@ def _joined_with(swept: DepthMap, returns: Samples) -> DepthMap:
         source=torch.where(usable, Source.SENSOR, torch.where(keep, Source.SWEPT, Source.NONE)).to(torch.int32),
         gate=torch.where(usable, Gate.ANSWER, swept.gate).to(torch.int32),
     )
+
+
+def shipped() -> Calibration | None:
+    """The calibration of swept depths that travels with the package."""
+    return load("dense") if "dense" in available() else None
