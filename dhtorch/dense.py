@@ -13,7 +13,7 @@ search: where both speak, they judge it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -44,6 +44,14 @@ WORTH = 5.0
 #: themselves: noise is shared through the lens, the resampling and the texture.
 GREY_NOISE, INDEPENDENT = 0.002, 5.0
 
+#: Cost of a surface (of one view, as sweep.aggregate counts) at which grey values tell as much as they seem to: where
+#: signs fit less well, windows show something else as well, and where they fit better, less noise.
+MISFIT = 40.0
+
+#: A pixel whose window of so many pixels to each side holds a step of the surface may belong to the other side of it:
+#: standard deviation as a share of the step.
+WINDOW, EDGE = 4, 0.17
+
 #: Correlation of its windows from which on a view has a say in a pixel's depth.
 SAY = 0.5
 
@@ -59,8 +67,9 @@ WITNESSES, SIGMAS, APART = 200, 3.0, 0.1
 
 
 class Asked(NamedTuple):
-    """The other views of an anchor and what the sparse method made of each."""
+    """The other views of an anchor and what the sparse method made of them."""
 
+    joined: Estimate  # (B, N) what they say together
     frames: Frame  # (V, B)
     estimates: Estimate  # (V, B, N)
     fits: PoseFit  # (V, B)
@@ -80,7 +89,7 @@ class Fitted(NamedTuple):
     """What the views together say of every pixel, (B, h, w) each."""
 
     q: Tensor  # 1/m
-    own: Tensor  # 1/m², variance of q by the grey values
+    own: Tensor  # 1/m², variance of q by the grey values and by the surface around
     shared: Tensor  # 1/m², by the motions
     correlation: Tensor  # of the view that fits best, -1 where none sees the pixel
     seen: Tensor  # bool, by one view at least, and not hidden there
@@ -96,7 +105,7 @@ def complete(
     size: int = 640,
     refinements: int = 2,
     min_correlation: float = 0.75,
-    max_sigma_rel: float = 0.1,
+    max_sigma_rel: float = 0.2,
     calibration: Calibration | None = None,
     seed: int | Tensor = 0,
     fit: PoseFit | None = None,
@@ -135,20 +144,50 @@ def complete(
     Memory: three bytes for every pixel and plane, whatever the number of views, and pictures.
     Cost: linear in planes, pixels and partners.
     """
-    _check_options(partners=partners, planes=planes, size=size, refinements=refinements)
     trace = {} if trace is None else trace
-    sparse = trace["sparse"] = method(anchor, others, seed=seed, fit=fit, hint=hint, trace=trace)
-    asked = _asked(trace, others)
-    index, wanted = _partners(asked, partners)
+    joined = trace["sparse"] = method(anchor, others, seed=seed, fit=fit, hint=hint, trace=trace)
+    return swept(
+        anchor,
+        views_asked(joined, others, trace),
+        method=method,
+        partners=partners,
+        planes=planes,
+        size=size,
+        refinements=refinements,
+        min_correlation=min_correlation,
+        max_sigma_rel=max_sigma_rel,
+        calibration=calibration,
+    )
+
+
+def swept(
+    anchor: Frame,
+    asked: Asked,
+    *,
+    method: Method = AUTO,
+    partners: int = 3,
+    planes: int = 96,
+    size: int = 640,
+    refinements: int = 2,
+    min_correlation: float = 0.75,
+    max_sigma_rel: float = 0.2,
+    calibration: Calibration | None = None,
+) -> DepthMap:
+    """The second half of :func:`complete`: the sweep, under motions that are known already.
+
+    Arguments, result, errors, gradient, memory and cost as there; of ``method`` the reading of the sensor counts.
+    """
+    _check_options(partners=partners, planes=planes, size=size, refinements=refinements)
+    index, wanted = worthiest(asked, partners)
     base = sweep.base(*resized(anchor, size))
     partner = [_partner(asked, k, size, use, base.image) for k, use in zip(index, wanted, strict=True)]
     q = torch.linspace(0, 1, planes).to(base.ray) / _nearest(asked.samples)[:, None].to(base.ray)
     start = _best_planes(base, partner, q)
     found = _fitted(base, partner, start, q, refinements)
-    silent = _silent_pairs(sparse, asked, wanted)
-    swept = _gated(base, found, start >= q[:, -1, None, None] * (1 - 1e-6), silent, min_correlation, max_sigma_rel)
-    swept = swept if calibration is None else calibration.apply(swept)
-    return _with_sensor(swept, anchor, method, asked.samples)
+    beyond = start.q >= q[:, -1, None, None] * (1 - 1e-6)
+    told = _gated(base, found, beyond, _silent_pairs(asked, wanted), min_correlation, max_sigma_rel)
+    told = told if calibration is None else calibration.apply(told)
+    return _with_sensor(told, anchor, method, asked.samples)
 
 
 def sensed(anchor: Frame, *, method: Method = AUTO, size: int = 640) -> DepthMap:
@@ -197,21 +236,22 @@ def _check_options(**options: int) -> None:
             raise ValueError(f"complete: {name} is {value}, expected at least {low[name]}{upper}")
 
 
-def _asked(trace: dict[str, Any], others: Frame | Sequence[Frame]) -> Asked:
-    """The views that the method asked, and its answers, from its trace."""
+def views_asked(joined: Estimate, others: Frame | Sequence[Frame], trace: Trace) -> Asked:
+    """The views that a method asked and their answers: what it was given, what it said, and its trace."""
     if not isinstance(others, Frame):
         others = tree.stack(others)
     if others.image.dim() == 4:
         others = tree.stack([others])
     if "views" not in trace:
-        return Asked(others, tree.stack([trace["estimate"]]), tree.stack([trace["fit"]]), trace["samples"])
+        estimates, fits = (tree.stack([trace[name]]) for name in ("estimate", "fit"))
+        return Asked(joined, others, estimates, fits, trace["samples"])
     index = trace["choice"].index
     frames = others[index, torch.arange(index.shape[1], device=index.device)]
     estimates, fits = (tree.stack([view[name] for view in trace["views"]]) for name in ("estimate", "fit"))
-    return Asked(frames, estimates, fits, trace["samples"])
+    return Asked(joined, frames, estimates, fits, trace["samples"])
 
 
-def _partners(asked: Asked, partners: int) -> tuple[Tensor, Tensor]:
+def worthiest(asked: Asked, partners: int) -> tuple[Tensor, Tensor]:
     """Which views are swept, (K, B) indices, those worth most first, and which of them are worth it (K, B) bool."""
     said = asked.estimates.keep & ~asked.samples.usable & (asked.estimates.sigma > 0)
     ratio = torch.where(said, 0.1 * asked.estimates.depth / asked.estimates.sigma, 0.0).detach()
@@ -241,30 +281,40 @@ def _nearest(samples: Samples) -> Tensor:
     return torch.where(n > 0, OVERLAP * last, torch.ones_like(last))
 
 
+class Found(NamedTuple):
+    """The best surface through the planes, (B, h, w) each."""
+
+    q: Tensor  # 1/m, between the planes by a parabola
+    misfit: Tensor  # cost of the surface there for each view, see sweep.aggregate
+
+
 @torch.no_grad()
-def _best_planes(base: sweep.Base, partners: list[Partner], q: Tensor) -> Tensor:
-    """Inverse depth (B, h, w) of the best surface through the planes q (B, D), between them by a parabola."""
-    C = torch.zeros(len(q), *base.hw, q.shape[1], dtype=torch.uint8, device=q.device)
+def _best_planes(base: sweep.Base, partners: list[Partner], q: Tensor) -> Found:
+    """The best surface through the planes q (B, D)."""
+    C = torch.zeros(len(q), q.shape[1], *base.hw, dtype=torch.uint8, device=q.device)
     for view, _, _, use in partners:
         if is_static(use) or bool(use.any()):
             sweep.add_costs(C, base, view, q, use)
-    count = torch.stack([partner.use for partner in partners]).sum(0)
-    found = sweep.winner(sweep.aggregate(C, count.clamp_min(1)))
-    return (found.plane + found.shift) * (q[:, 1] - q[:, 0])[:, None, None]
+    views = torch.stack([partner.use for partner in partners]).sum(0).clamp_min(1)
+    best = sweep.winner(sweep.aggregate(C.movedim(1, -1).contiguous(), views))
+    step = (q[:, 1] - q[:, 0])[:, None, None]
+    return Found((best.plane + best.shift) * step, best.cost / views[:, None, None].to(q))
 
 
-def _fitted(base: sweep.Base, partners: list[Partner], start: Tensor, q: Tensor, steps: int) -> Fitted:
+def _fitted(base: sweep.Base, partners: list[Partner], start: Found, q: Tensor, steps: int) -> Fitted:
     """The surface fitted by grey values to all views that are of use."""
     plane = q[:, 1] - q[:, 0]
     near = ALL_STEPS * plane[:, None, None]
     with torch.no_grad():
-        at = sweep.smooth(start, SURFACE * plane)
+        at = sweep.smooth(start.q, SURFACE * plane)
         for _ in range(steps):
             moved = at + _joined(base, partners, at, plane)[0]
-            at = torch.minimum(torch.maximum(moved, start - near), start + near).clamp_min(0)
+            at = torch.minimum(torch.maximum(moved, start.q - near), start.q + near).clamp_min(0)
             at = sweep.smooth(at, SURFACE * plane)
     step, found = _joined(base, partners, at, plane)
-    return found._replace(q=at + (step - step.detach()))
+    edge = EDGE * sweep.spread(at, WINDOW)
+    own = found.own * (start.misfit / MISFIT).square() + edge.square()
+    return found._replace(q=at + (step - step.detach()), own=own)
 
 
 def _joined(base: sweep.Base, partners: list[Partner], at: Tensor, plane: Tensor) -> tuple[Tensor, Fitted]:
@@ -306,10 +356,10 @@ def _pose_variance(base: sweep.Base, view: sweep.View, fit: PoseFit, q: Tensor, 
     return (carried * row).sum(-1).clamp_min(0).unflatten(-1, base.hw)
 
 
-def _silent_pairs(sparse: Estimate, asked: Asked, wanted: Tensor) -> Tensor:
+def _silent_pairs(asked: Asked, wanted: Tensor) -> Tensor:
     """Gate (B,) for all pixels of anchors that no other view is of use for, else ANSWER."""
     still = (asked.fits.code == PoseCode.NO_BASELINE) | (asked.estimates.gate == Gate.NO_BASELINE).any(-1)
-    moving = (sparse.gate == Gate.CONTRADICTED).any(-1) & ~sparse.keep.any(-1)
+    moving = (asked.joined.gate == Gate.CONTRADICTED).any(-1) & ~asked.joined.keep.any(-1)
     none = ~wanted.any(0)
     return first_reason(
         (moving, Gate.CONTRADICTED),
@@ -351,36 +401,36 @@ def _returns(anchor: Frame, method: Method, hw: tuple[int, int]) -> Samples:
     return samples.map(lambda x: x.unflatten(1, hw))
 
 
-def _with_sensor(swept: DepthMap, anchor: Frame, method: Method, near: Samples) -> DepthMap:
+def _with_sensor(told: DepthMap, anchor: Frame, method: Method, near: Samples) -> DepthMap:
     """The sensor where it answers, else the sweep; which is silent where the sensor refutes it."""
-    h, w = swept.depth.shape[-2:]
+    h, w = told.depth.shape[-2:]
     returns = _returns(anchor, method, (h, w))
     usable, depth, sigma = returns.usable, returns.depth.detach(), returns.sigma.detach()
-    sigma_swept = swept.sigma.detach()
-    both = usable & swept.keep
-    miss = (torch.where(both, swept.depth.detach() - depth, 0.0)).abs()
-    spread = torch.where(both, (sigma_swept.square() + sigma.square()).sqrt(), 1.0)
+    sigma_told = told.sigma.detach()
+    both = usable & told.keep
+    miss = (torch.where(both, told.depth.detach() - depth, 0.0)).abs()
+    spread = torch.where(both, (sigma_told.square() + sigma.square()).sqrt(), 1.0)
     wrong = both & (miss > SIGMAS * spread) & (miss > APART * depth)
     n = both.sum((1, 2))
     refuted = (n >= WITNESSES) & (2 * wrong.sum((1, 2)) > n)
-    gate = torch.where(refuted[:, None, None] & swept.keep, Gate.CONTRADICTED, swept.gate)
+    gate = torch.where(refuted[:, None, None] & told.keep, Gate.CONTRADICTED, told.gate)
     noise = near.usable & (near.depth > 0)
     share = median(near.sigma / torch.where(noise, near.depth, torch.ones_like(near.depth)), noise)
     share = torch.where(noise.any(-1, keepdim=True), share, 0.0)[..., None].detach()  # a wrong scale passes whole
-    sigma_swept = (sigma_swept.square() + (share * swept.depth.detach()).square()).sqrt()
-    return _joined_with(swept.replace(sigma=sigma_swept, gate=gate), returns)
+    sigma_told = (sigma_told.square() + (share * told.depth.detach()).square()).sqrt()
+    return _joined_with(told.replace(sigma=sigma_told, gate=gate), returns)
 
 
-def _joined_with(swept: DepthMap, returns: Samples) -> DepthMap:
+def _joined_with(told: DepthMap, returns: Samples) -> DepthMap:
     """Returns of the sensor where they are usable, else the sweep where it answers."""
-    usable, keep = returns.usable, swept.keep & ~returns.usable
-    nan = torch.full_like(swept.depth, torch.nan)
+    usable, keep = returns.usable, told.keep & ~returns.usable
+    nan = torch.full_like(told.depth, torch.nan)
     return DepthMap(
-        depth=torch.where(usable, returns.depth.to(nan), torch.where(keep, swept.depth, nan)),
-        sigma=torch.where(usable, returns.sigma.to(nan), torch.where(keep, swept.sigma, nan)),
-        score=torch.where(usable, returns.confidence.to(nan), torch.where(keep, swept.score, 0.0)),
+        depth=torch.where(usable, returns.depth.to(nan), torch.where(keep, told.depth, nan)),
+        sigma=torch.where(usable, returns.sigma.to(nan), torch.where(keep, told.sigma, nan)),
+        score=torch.where(usable, returns.confidence.to(nan), torch.where(keep, told.score, 0.0)),
         source=torch.where(usable, Source.SENSOR, torch.where(keep, Source.SWEPT, Source.NONE)).to(torch.int32),
-        gate=torch.where(usable, Gate.ANSWER, swept.gate).to(torch.int32),
+        gate=torch.where(usable, Gate.ANSWER, told.gate).to(torch.int32),
     )
 
 

@@ -501,7 +501,8 @@ ELSEWHERE = {
     *(f"dhtorch.geometry.start.{name}" for name in ("small", "is_turned", "inverse")),
     "dhtorch.stages.track.coarse",
     "dhtorch.geometry.sweep.add_costs",
-    *(f"dhtorch.dense.{name}" for name in ("complete", "resized", "sensed", "pixels", "map_hw", "shipped")),
+    *(f"dhtorch.dense.{name}" for name in ("complete", "map_hw", "pixels", "resized", "sensed", "shipped")),
+    *(f"dhtorch.dense.{name}" for name in ("swept", "views_asked", "worthiest")),
     "dhtorch.geometry.exact.filled",
     "dhtorch.geometry.least_squares.minimise",
     *(

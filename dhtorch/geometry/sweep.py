@@ -23,7 +23,6 @@ from torch import Tensor
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.camera import Camera
-from dhtorch.geometry.filters import box
 from dhtorch.geometry.se3 import Pose
 from dhtorch.geometry.shapes import check
 from dhtorch.tree import Record, record
@@ -38,8 +37,8 @@ STEP, JUMP, UNSEEN = 3, 18, 11
 #: Most views whose costs one byte can add up.
 VIEWS = 8
 
-#: Planes that are looked up before they are written, and rows whose best planes are read at once.
-PLANES, ROWS = 8, 32
+#: Rows whose best planes are read at once.
+ROWS = 32
 
 #: How far beyond view 0's border its points are looked for: the longer side over this.
 MARGIN = 4
@@ -77,14 +76,24 @@ class View(Record):
 class Travel(NamedTuple):
     """Where the level picture sees every pixel of view 0: inverse depth q at (a + q b) / (1 + q c), px of view 0."""
 
-    a: Tensor  # (B, N, 2)
-    b: Tensor  # (B, 1, 2)
-    c: Tensor  # (B, 1, 1)
+    a: Tensor  # (B, 2, N)
+    b: Tensor  # (B, 2, 1)
+    c: Tensor  # (B, 1)
 
     def at(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels (B, N, 2) at inverse depths q (B, N) or (B, 1), and whether they lie before view 1."""
-        z = 1 + q[..., None] * self.c
-        return (self.a + q[..., None] * self.b) / z.clamp_min(1e-3), z[..., 0] > 1e-3
+        """Pixels u and v, (B, N) each, at inverse depths q (B, N) or (B, 1); far outside where behind view 1."""
+        z = 1 + q * self.c
+        scale = torch.where(z > 1e-3, 1 / z, 1e9)
+        u, v = ((self.a[:, k] + q * self.b[:, k]) * scale for k in (0, 1))
+        return u, v
+
+
+class Level(NamedTuple):
+    """View 1 as it would be seen without its turn, around the place of view 0's picture."""
+
+    code: Tensor  # (B, H · W) int32, see census; negative where view 1 shows nothing, so along the border
+    hw: tuple[int, int]  # H and W
+    margin: int  # px by which pixel (0, 0) of view 0 lies inside
 
 
 def pixel_rays(camera: Camera, hw: tuple[int, int], margin: int = 0) -> Tensor:
@@ -126,9 +135,10 @@ def bilinear(image: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
 
 def travel(base: Base, view: View) -> Travel:
     """How the pixels of view 0 travel in the level picture of view 1. Gradient: to cameras and motion."""
-    s = se3.rotate(view.T_1_from_0.R.mT, view.T_1_from_0.t[:, None])
-    f, c = base.camera.f[:, None], base.camera.c[:, None]
-    return Travel(base.ray[..., :2] * f + c, s[..., :2] * f + c * s[..., 2:], s[..., 2:])
+    s = se3.rotate(view.T_1_from_0.R.mT, view.T_1_from_0.t[:, None]).mT
+    f, c = base.camera.f[..., None], base.camera.c[..., None]
+    a = base.ray[..., :2].mT * f + c
+    return Travel(a.contiguous(), s[:, :2] * f + c * s[:, 2:], s[:, 2])
 
 
 def census(grey: Tensor) -> Tensor:
@@ -137,22 +147,54 @@ def census(grey: Tensor) -> Tensor:
     h, w = grey.shape[-2:]
     padded, middle = F.pad(grey, (4, 4, 3, 3), mode="replicate")[:, 0], grey[:, 0]
     code = torch.zeros_like(middle, dtype=torch.int32)
-    for k, (i, j) in enumerate(OFFSETS):
-        code = code | ((padded[:, 3 + i : 3 + i + h, 4 + j : 4 + j + w] < middle).to(torch.int32) << k)
+    for first in range(0, len(OFFSETS), 8):  # a byte at a time is a quarter of the memory
+        byte = torch.zeros_like(middle, dtype=torch.uint8)
+        for k, (i, j) in enumerate(OFFSETS[first : first + 8]):
+            byte += (padded[:, 3 + i : 3 + i + h, 4 + j : 4 + j + w] < middle).to(torch.uint8).mul_(1 << k)
+        code += byte.to(torch.int32) << first
     return code
 
 
 def count_bits(x: Tensor) -> Tensor:
-    """How many of the lower 31 bits of int32 (…) are set."""
-    x = x - ((x >> 1) & 0x55555555)
-    x = (x & 0x33333333) + ((x >> 2) & 0x33333333)
-    x = (x + (x >> 4)) & 0x0F0F0F0F
-    x = x + (x >> 8)
-    return (x + (x >> 16)) & 0x3F
+    """How many of the lower 31 bits of int32 (…) are set; x is used up."""
+    x = x.sub_(x.bitwise_right_shift(1).bitwise_and_(0x55555555))
+    high = x.bitwise_right_shift(2).bitwise_and_(0x33333333)
+    x = x.bitwise_and_(0x33333333).add_(high)
+    x = x.add_(x.bitwise_right_shift(4)).bitwise_and_(0x0F0F0F0F)
+    return x.mul_(0x01010101).bitwise_right_shift_(24)  # the sum of the bytes stands in the highest
 
 
+def level(base: Base, view: View, wanted: Tensor | None = None) -> Level:
+    """View 1 turned as view 0 is; showing nothing to pairs that are not ``wanted`` (B,). Gradient: none."""
+    margin = max(base.hw) // MARGIN
+    hw = base.hw[0] + 2 * margin, base.hw[1] + 2 * margin
+    ray = pixel_rays(cam.ideal(base.camera), base.hw, margin)
+    uv, front = seen_at(view, ray, ray.new_zeros(ray.shape[:2]))
+    grey, inside = bilinear(view.image, uv)
+    seen = (inside & front).unflatten(-1, hw)
+    if wanted is not None:
+        seen = seen & wanted[:, None, None]
+    seen = F.pad(seen[:, 1:-1, 1:-1], (1, 1, 1, 1))
+    code = census(grey.detach().unflatten(-1, hw)[:, 0, None])
+    return Level(torch.where(seen, code, -1).flatten(1), hw, margin)
+
+
+def misfit(base: Base, seen: Level, go: Travel, q: Tensor) -> Tensor:
+    """How badly pixels fit at inverse depths q (B, N) or (B, 1): signs that differ, (B, N) int32; UNSEEN where view 1
+    does not show them. Gradient: none."""
+    u, v = go.at(q)
+    column, row = (
+        x.add_(seen.margin + 0.5).clamp_(0, size - 1).to(torch.int32)  # cut off, which is floor
+        for x, size in ((u, seen.hw[1]), (v, seen.hw[0]))
+    )
+    code = seen.code.gather(1, row.mul_(seen.hw[1]).add_(column).long())
+    count = count_bits(code ^ base.code.flatten(1))
+    return count.masked_fill_(code < 0, UNSEEN)
+
+
+@torch.no_grad()
 def add_costs(
-    C: Tensor,  # (B, h, w, D) uint8, in place
+    C: Tensor,  # (B, D, h, w) uint8, in place
     base: Base,
     view: View,
     q: Tensor,  # (B, D)
@@ -162,35 +204,10 @@ def add_costs(
 
     At most :data:`VIEWS` views fit into a byte. Memory: pictures of view 0's size, whatever D. Gradient: none.
     """
-    B, h, w, D = C.shape
     go = travel(base, view)
-    margin = max(h, w) // MARGIN
-    code_1, seen = _level(view, cam.ideal(base.camera), (h, w), margin)
-    H, W = code_1.shape[-2:]
-    code_0, code_1 = (code.flatten(1) for code in (base.code, code_1))
-    seen = (seen & wanted[:, None, None]).flatten(1)
-    limit = go.a.new_tensor([W, H])
-    for first in range(0, D, PLANES):
-        block = []
-        for k in range(first, min(first + PLANES, D)):
-            uv, front = go.at(q[:, k, None])
-            uv = (uv + (margin + 0.5)).floor()
-            inside = ((uv >= 0) & (uv < limit)).all(-1) & front
-            u, v = torch.minimum(uv.clamp_min(0), limit - 1).long().unbind(-1)
-            index = v * W + u
-            differ = count_bits(code_0 ^ code_1.gather(1, index))
-            fine = inside & seen.gather(1, index)
-            block.append(torch.where(fine, differ, UNSEEN).to(torch.uint8))
-        C[..., first : first + PLANES] += torch.stack(block, -1).reshape(B, h, w, -1)
-
-
-def _level(view: View, camera: Camera, hw: tuple[int, int], margin: int) -> tuple[Tensor, Tensor]:
-    """Codes (B, h', w') of view 1 as it would be seen without its turn, and where there are any."""
-    ray = pixel_rays(camera, hw, margin)
-    uv, front = seen_at(view, ray, ray.new_zeros(ray.shape[:2]))
-    grey, inside = bilinear(view.image, uv)
-    size = hw[0] + 2 * margin, hw[1] + 2 * margin
-    return census(grey.unflatten(-1, size)), (inside & front).unflatten(-1, size)
+    seen = level(base, view, wanted)
+    for k in range(q.shape[1]):
+        C[:, k] += misfit(base, seen, go, q[:, k, None]).to(torch.uint8).unflatten(-1, base.hw)
 
 
 def aggregate(
@@ -215,18 +232,20 @@ def aggregate(
 
 def _both_ways(C: Tensor, S: Tensor, dim: int, step: Tensor, jump: Tensor) -> None:
     """Add to S the costs of the best paths from the first row of C along ``dim``, and from the last."""
-    n = C.shape[dim]
-    path = None
+    n, D = C.shape[dim], C.shape[-1]
+    here = torch.stack([C.select(dim, 0), C.select(dim, n - 1)]).to(torch.int16)
+    path = F.pad(here, (1, 1), value=torch.iinfo(torch.int16).max // 2)  # no plane lies beyond the ends
     for k in range(n):
-        here = torch.stack([C.select(dim, k), C.select(dim, n - 1 - k)]).to(torch.int16)
-        if path is not None:
-            low = path.amin(-1, keepdim=True)
-            edge = torch.full_like(low, torch.iinfo(torch.int16).max // 2)
-            beside = torch.minimum(torch.cat([edge, path[..., :-1]], -1), torch.cat([path[..., 1:], edge], -1))
-            here = here + torch.minimum(torch.minimum(path, beside + step), low + jump) - low
-        path = here
-        S.select(dim, k).add_(path[0])
-        S.select(dim, n - 1 - k).add_(path[1])
+        now = path[..., 1:-1]
+        if k:
+            low = now.amin(-1, keepdim=True)
+            best = torch.minimum(path[..., :D], path[..., 2:]).add_(step)
+            best = torch.minimum(torch.minimum(best, now), low + jump)
+            now.copy_(best.sub_(low))
+            now[0].add_(C.select(dim, k))
+            now[1].add_(C.select(dim, n - 1 - k))
+        S.select(dim, k).add_(now[0])
+        S.select(dim, n - 1 - k).add_(now[1])
 
 
 class Winner(NamedTuple):
@@ -234,6 +253,7 @@ class Winner(NamedTuple):
 
     plane: Tensor  # (B, h, w) int64
     shift: Tensor  # (B, h, w) in [-0.5, 0.5] planes, to where the cost would be least
+    cost: Tensor  # (B, h, w) of that plane
     margin: Tensor  # (B, h, w) how much more the best plane costs that is no neighbour
 
 
@@ -243,17 +263,19 @@ def winner(S: Tensor) -> Winner:
     return Winner(*(torch.cat(part, 1) for part in zip(*map(_winner, S.split(ROWS, 1)), strict=True)))
 
 
-def _winner(S: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _winner(S: Tensor) -> tuple[Tensor, ...]:
     D = S.shape[-1]
-    cost, index = S.min(-1)
+    plane = torch.arange(D, dtype=torch.int32, device=S.device)
+    both = (S.to(torch.int32) * D + plane).amin(-1)  # the least cost, and of equals the first
+    index, cost = (both % D).long(), both // D
     centre = index.clamp(1, D - 2)
     low, middle, high = (S.gather(-1, (centre + o)[..., None])[..., 0].float() for o in (-1, 0, 1))
     bend = low + high - 2 * middle
     shift = (0.5 * (low - high) / bend.clamp_min(1e-6)).clamp(-0.5, 0.5)
     shift = torch.where((bend > 0) & (index == centre), shift, torch.zeros_like(shift))
-    near = (torch.arange(D, device=S.device) - index[..., None]).abs() <= 2
+    near = (plane - index[..., None].to(torch.int32)).abs() <= 2
     rival = torch.where(near, torch.iinfo(S.dtype).max, S).amin(-1)
-    return index, shift, rival - cost
+    return index, shift, cost.to(S.dtype), (rival - cost).to(S.dtype)
 
 
 class Fit(NamedTuple):
@@ -289,18 +311,18 @@ def fit_windows(
     Gradient: to everything; at the depth that fits the step is 0 and its derivative that of the depth (implicit
     function theorem, with the Gauss-Newton Hessian).
     """
-    h, w = base.hw
     flat = q.flatten(1)
     little = 1e-3 * flat.detach().amax(1, keepdim=True).clamp_min(1e-3)
     uv, front = seen_at(view, base.ray, flat)
     motion = (seen_at(view, base.ray, flat + little)[0] - uv) / little[..., None]
     values, inside = bilinear(picture_1, uv)
-    J, du, dv = values[:, :, None].unbind(1)
-    J = J.unflatten(-1, (h, w))
-    g = (du * motion[:, None, :, 0] + dv * motion[:, None, :, 1]).unflatten(-1, (h, w))
-    I = base.image  # noqa: E741  (the alphabet of registration)
-    means = box(torch.cat([I, J, g, I * I, J * J, I * J, g * g, g * I, g * J], 1), radius)
-    i, j, k, ii, jj, ij, kk, ki, kj = means.unbind(1)
+    J, du, dv = (x.unflatten(-1, base.hw) for x in values.unbind(1))
+    du_dq, dv_dq = (x.unflatten(-1, base.hw) for x in motion.unbind(-1))
+    g = du * du_dq + dv * dv_dq
+    I = base.image[:, 0]  # noqa: E741  (the alphabet of registration)
+    share = 1 / (2 * radius + 1) ** 2
+    products = (I, J, g, I * I, J * J, I * J, g * g, g * I, g * J)
+    i, j, k, ii, jj, ij, kk, ki, kj = (share * window_sum(x, radius) for x in products)
     ii, jj, ij = (ii - i * i).clamp_min(FLAT), (jj - j * j).clamp_min(FLAT), ij - i * j
     kk = (kk - k * k).clamp_min(1e-12)
     gain = (ij / jj).clamp(*GAIN)
@@ -309,8 +331,8 @@ def fit_windows(
         contrast=kk * gain * gain,
         noise=(ii + gain * gain * jj - 2 * gain * ij).clamp_min(0),
         correlation=ij / (ii * jj).sqrt(),
-        seen=(inside & front).unflatten(-1, (h, w)),
-        motion=motion.unflatten(1, (h, w)),
+        seen=(inside & front).unflatten(-1, base.hw),
+        motion=motion.unflatten(1, base.hw),
     )
 
 
@@ -344,14 +366,38 @@ def _beside(q: Tensor, dim: int, step: int) -> Tensor:
     return torch.cat([none, q.narrow(dim, 0, n + step)], dim)
 
 
+def window_sum(x: Tensor, radius: int) -> Tensor:
+    """Sum (B, h, w) of the (2 radius + 1)² pixels around each, the border's repeated outside. Gradient: to x."""
+    for dim in (1, 2):
+        n, side = x.shape[dim], 2 * radius + 1
+        first, last = (x.narrow(dim, k, 1) for k in (0, n - 1))
+        part = torch.cat([first] * radius + [x] + [last] * radius, dim)  # sums of 1, 2, 4, … neighbours
+        x, width, begin = part.narrow(dim, 0, n), 1, 1
+        while 2 * width <= side:
+            length = part.shape[dim] - width
+            part = part.narrow(dim, 0, length) + part.narrow(dim, width, length)
+            width *= 2
+            if side & width:
+                x = x + part.narrow(dim, begin, n)
+                begin += width
+    return x
+
+
+def spread(q: Tensor, radius: int) -> Tensor:
+    """Largest minus smallest value (B, h, w) of a map in the window around each pixel. Gradient: none."""
+    q, side = q.detach()[:, None], 2 * radius + 1
+    return (F.max_pool2d(q, side, 1, radius) + F.max_pool2d(-q, side, 1, radius))[:, 0]
+
+
 def hidden(go: Travel, q: Tensor, tolerance: Tensor) -> Tensor:
     """Which pixels (B, h, w) of a map of inverse depths another one covers in view 1, nearer by more than
     ``tolerance`` (B,) 1/m. Gradient: none."""
     B, h, w = q.shape
-    uv, _ = go.at(q.flatten(1))
     edge = max(h, w) // MARGIN
-    size = uv.new_tensor([w + 2 * edge, h + 2 * edge])
-    u, v = torch.minimum((uv + (edge + 0.5)).floor().clamp_min(0), size - 1).long().unbind(-1)
+    u, v = (
+        (x + (edge + 0.5)).clamp(0, n + 2 * edge - 1).to(torch.int32).long()
+        for x, n in zip(go.at(q.flatten(1)), (w, h), strict=True)
+    )
     index = v * (w + 2 * edge) + u
     front = q.new_full((B, (h + 2 * edge) * (w + 2 * edge)), -1.0)
     front = front.scatter_reduce(1, index, q.flatten(1), "amax")
