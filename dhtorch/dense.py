@@ -311,15 +311,17 @@ def _fitted(base: sweep.Base, partners: list[Partner], start: Found, q: Tensor, 
             moved = at + _joined(base, partners, at, plane)[0]
             at = torch.minimum(torch.maximum(moved, start.q - near), start.q + near).clamp_min(0)
             at = sweep.smooth(at, SURFACE * plane)
-    step, found = _joined(base, partners, at, plane)
+    step, found = _joined(base, partners, at, plane, last=True)
     edge = EDGE * sweep.spread(at, WINDOW)
     own = found.own * (start.misfit / MISFIT).square() + edge.square()
     return found._replace(q=at + (step - step.detach()), own=own)
 
 
-def _joined(base: sweep.Base, partners: list[Partner], at: Tensor, plane: Tensor) -> tuple[Tensor, Fitted]:
+def _joined(
+    base: sweep.Base, partners: list[Partner], at: Tensor, plane: Tensor, *, last: bool = False
+) -> tuple[Tensor, Fitted]:
     """The step (B, h, w) that the views together ask for at inverse depths ``at``, each by its own variance, and how
-    well they fit there. The gradient is the step's."""
+    well they fit there; what the motions add to that (``shared``) where it is the last. The gradient is the step's."""
     total, weight, shared = (torch.zeros_like(at) for _ in range(3))
     best = torch.full_like(at, -1)
     seen = torch.zeros_like(at, dtype=torch.bool)
@@ -330,7 +332,8 @@ def _joined(base: sweep.Base, partners: list[Partner], at: Tensor, plane: Tensor
             here = one.seen & use[:, None, None] & ~sweep.hidden(sweep.travel(base, view), at, NEARER * plane)
             own = (one.noise + GREY_NOISE**2) / (INDEPENDENT * one.contrast)
             say = torch.where(here & (one.correlation > SAY), 1 / own, 0.0)
-            shared = shared + say * _pose_variance(base, view, fit, at, one.motion.detach())
+            if last:
+                shared = shared + say * _pose_variance(base, view, fit, at, one.motion)
             weight, seen = weight + say, seen | here
             best = torch.where(here, torch.maximum(best, one.correlation), best)
         total = total + say * torch.minimum(torch.maximum(one.step, -most), most)
@@ -352,7 +355,7 @@ def _pose_variance(base: sweep.Base, view: sweep.View, fit: PoseFit, q: Tensor, 
     cov = torch.where(fit.ok[:, None, None], cov, 0.0).nan_to_num().to(J)
     along = motion.flatten(1, 2)
     row = (along[..., None] * J).sum(-2) / along.square().sum(-1, keepdim=True).clamp_min(1e-12)
-    carried = sum(row[..., k, None] * cov[:, None, k] for k in range(cov.shape[-1]))
+    carried = sum(row[..., k, None] * cov[:, None, k] for k in range(cov.shape[-1]))  # bmm differs with the batch
     return (carried * row).sum(-1).clamp_min(0).unflatten(-1, base.hw)
 
 

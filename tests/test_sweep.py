@@ -69,11 +69,11 @@ def test_the_plane_of_least_cost_is_the_walls(t, angle):
     """Whatever the motion: sideways, turned by seventeen degrees, forwards."""
     base, view, _ = wall(2.0, t, angle=angle)
     q = torch.linspace(0, 1, 33)[None]  # plane 16 is the wall's
-    C = torch.zeros(1, *base.hw, 33, dtype=torch.uint8)
+    C = torch.zeros(1, 33, *base.hw, dtype=torch.uint8)
     sweep.add_costs(C, base, view, q, torch.tensor([True]))
-    inner = C[:, 24:-24, 32:-32]
-    assert (inner.argmin(-1) - 16).abs().float().mean() < 2
-    best = sweep.winner(sweep.aggregate(C))
+    inner = C[:, :, 24:-24, 32:-32]
+    assert (inner.argmin(1) - 16).abs().float().mean() < 2
+    best = sweep.winner(sweep.aggregate(C.movedim(1, -1)))
     apart = (best.plane + best.shift - 16)[:, 24:-24, 32:-32].abs()
     assert (apart < 1.5).float().mean() > 0.99 and float(apart.median()) < 0.5
     again = torch.zeros_like(C)
@@ -112,7 +112,7 @@ def test_aggregated_costs_are_those_of_four_paths(views, step, jump):
             assert int(S[b, i, j, d]) == down + across
 
 
-def test_the_winner_its_shift_and_its_rival():
+def test_the_winner_its_shift_and_its_cost():
     S = torch.randint(0, 400, (1, 40, 5, 12), generator=generator(4), dtype=torch.int16)
     S[0, 0, 0] = torch.tensor([90, 60, 20, 4, 8, 40, 50, 60, 70, 80, 90, 99], dtype=torch.int16)
     found = sweep.winner(S)
@@ -120,7 +120,7 @@ def test_the_winner_its_shift_and_its_rival():
         cost = S[0, i, j].tolist()
         best = cost.index(min(cost))
         assert found.plane[0, i, j] == best
-        assert found.margin[0, i, j] == min(c for k, c in enumerate(cost) if abs(k - best) > 2) - cost[best]
+        assert found.cost[0, i, j] == cost[best]
         shift = 0.0
         if 0 < best < 11:
             low, mid, high = cost[best - 1 : best + 2]
@@ -186,6 +186,17 @@ def test_a_lens_is_in_the_reading():
     plain = ray[..., :2] * straight.f[:, None] + straight.c[:, None]
     seen = sweep.bilinear(base.image, plain)[0].unflatten(-1, base.hw)
     q = torch.linspace(0, 1, 33)[None]
-    C = torch.zeros(1, *base.hw, 33, dtype=torch.uint8)
+    C = torch.zeros(1, 33, *base.hw, dtype=torch.uint8)
     sweep.add_costs(C, sweep.base(seen, camera), view, q, torch.tensor([True]))
-    assert (sweep.winner(sweep.aggregate(C)).plane[:, 24:-24, 32:-32] == 16).float().mean() > 0.9
+    assert (sweep.winner(sweep.aggregate(C.movedim(1, -1))).plane[:, 24:-24, 32:-32] == 16).float().mean() > 0.9
+
+
+def test_windows_are_summed_and_their_spread_is_known():
+    q = torch.rand(2, 9, 11, generator=generator(), dtype=torch.float64)
+    padded = torch.nn.functional.pad(q[:, None], (4, 4, 4, 4), mode="replicate")[:, 0]
+    for radius in (1, 2, 4):
+        total, spread = sweep.window_sum(q, radius), sweep.spread(q, radius)
+        for i, j in itertools.product((0, 4, 8), (0, 5, 10)):
+            window = padded[:, 4 + i - radius : 5 + i + radius, 4 + j - radius : 5 + j + radius].flatten(1)
+            torch.testing.assert_close(total[:, i, j], window.sum(-1))
+            torch.testing.assert_close(spread[:, i, j], window.amax(-1) - window.amin(-1))

@@ -90,7 +90,7 @@ def method_ratios(
             continue
         rows: dict[str, dict[str, Any]] = {scene: {"method": method, "scene": scene} for scene in ours}
         numbers = _ratios(ours, complete[reference], rows, found.left_out.setdefault(method, []), draws, seed)
-        numbers |= _promises(ours, rooms, rows, draws, seed)
+        numbers |= promises(ours, rooms, rows, draws, seed)
         for percent in TARGETS:
             key = f"realised_risk_{percent}"
             found.silent[f"{method}.{percent}"] = [s for s, row in rows.items() if key in row and row[key] is None]
@@ -186,10 +186,17 @@ def _ratios(
     }
 
 
-def _promises(
+def promises(
     ours: Seeds, rooms: Mapping[str, str] | None, rows: dict[str, dict[str, Any]], draws: int, seed: int
 ) -> dict[str, Interval]:
-    """What was promised in every room by what the other rooms taught."""
+    """What was promised in every room by what the other rooms taught: the second half of :func:`method_ratios`.
+
+    Args:
+        ours: scene → candidates of every seed.
+        rooms: scene → room.
+        rows: scene → its numbers, filled.
+        draws, seed: of the bootstrap over scenes.
+    """
     pooled = {scene: tree.collate(points) for scene, points in ours.items()}
     table, sigmoid = {}, {}
     for others, held in reliability.leave_one_room_out(pooled, rooms):

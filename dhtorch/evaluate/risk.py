@@ -87,6 +87,24 @@ def measure(pooled: Points, *, min_points: int = MIN_POINTS) -> Numbers:
     return numbers
 
 
+def ause(pooled: Points) -> float | None:
+    """Area between the sparsification curve of the score and that of the errors themselves, over random's.
+
+    The curve is the mean capped error of what is left when the worst-scored 0, 1, … 95 % of the answers are removed;
+    a random order leaves the mean. 0 is a perfect order, 1 no better than chance; None where undefined.
+
+    Source: E. Ilg et al., "Uncertainty estimates and multi-hypotheses networks for optical flow", 2018.
+    """
+    answered = pooled.answered()
+    loss, n = capped(answered.error), answered.keep.numel()
+    if not n:
+        return None
+    left = torch.tensor([max(round(n * (100 - k) / 100), 1) - 1 for k in range(96)], device=loss.device)
+    best = curve(loss, -loss)[left].mean()
+    chance = loss.mean() - best
+    return float((curve(loss, answered.score)[left].mean() - best) / chance) if float(chance) > 0 else None
+
+
 def realised(pooled: Points, threshold: float | None) -> float | None:
     """Mean capped error of the answers that score at least ``threshold`` (None answers nothing); None where silent."""
     accepted = pooled.keep & (pooled.score >= (torch.inf if threshold is None else threshold))

@@ -156,8 +156,8 @@ def census(grey: Tensor) -> Tensor:
 
 
 def count_bits(x: Tensor) -> Tensor:
-    """How many of the lower 31 bits of int32 (…) are set; x is used up."""
-    x = x.sub_(x.bitwise_right_shift(1).bitwise_and_(0x55555555))
+    """How many of the lower 31 bits of int32 (…) are set."""
+    x = x - x.bitwise_right_shift(1).bitwise_and_(0x55555555)
     high = x.bitwise_right_shift(2).bitwise_and_(0x33333333)
     x = x.bitwise_and_(0x33333333).add_(high)
     x = x.add_(x.bitwise_right_shift(4)).bitwise_and_(0x0F0F0F0F)
@@ -254,7 +254,6 @@ class Winner(NamedTuple):
     plane: Tensor  # (B, h, w) int64
     shift: Tensor  # (B, h, w) in [-0.5, 0.5] planes, to where the cost would be least
     cost: Tensor  # (B, h, w) of that plane
-    margin: Tensor  # (B, h, w) how much more the best plane costs that is no neighbour
 
 
 def winner(S: Tensor) -> Winner:
@@ -273,9 +272,7 @@ def _winner(S: Tensor) -> tuple[Tensor, ...]:
     bend = low + high - 2 * middle
     shift = (0.5 * (low - high) / bend.clamp_min(1e-6)).clamp(-0.5, 0.5)
     shift = torch.where((bend > 0) & (index == centre), shift, torch.zeros_like(shift))
-    near = (plane - index[..., None].to(torch.int32)).abs() <= 2
-    rival = torch.where(near, torch.iinfo(S.dtype).max, S).amin(-1)
-    return index, shift, cost.to(S.dtype), (rival - cost).to(S.dtype)
+    return index, shift, cost.to(S.dtype)
 
 
 class Fit(NamedTuple):
@@ -385,8 +382,10 @@ def window_sum(x: Tensor, radius: int) -> Tensor:
 
 def spread(q: Tensor, radius: int) -> Tensor:
     """Largest minus smallest value (B, h, w) of a map in the window around each pixel. Gradient: none."""
-    q, side = q.detach()[:, None], 2 * radius + 1
-    return (F.max_pool2d(q, side, 1, radius) + F.max_pool2d(-q, side, 1, radius))[:, 0]
+    side = 2 * radius + 1
+    both = torch.stack([q, -q], 1).detach()
+    both = F.max_pool2d(both, (1, side), 1, (0, radius))
+    return F.max_pool2d(both, (side, 1), 1, (radius, 0)).sum(1)
 
 
 def hidden(go: Travel, q: Tensor, tolerance: Tensor) -> Tensor:

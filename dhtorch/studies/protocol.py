@@ -174,6 +174,14 @@ def held_back(batch: Batch, trace: Trace, *, test: str = "full") -> holdout.Trut
     return holdout.candidates(samples, found, batch.cutoff if _is_cut(batch.cutoff) else None, excluded=odd)
 
 
+def spread(pairs: Pairs, anchors: int | None, scene: Scene) -> list[tuple[int, int]]:
+    """Some of the scene's pairs of two frames, evenly spread; None = all."""
+    found = fixed(pairs(scene))
+    if anchors is None or len(found) <= anchors:
+        return found
+    return [found[(2 * k + 1) * len(found) // (2 * anchors)] for k in range(anchors)]
+
+
 def no_columns(_answer: Answer) -> Row:
     """Nothing beyond the usual columns."""
     return {}

@@ -14,7 +14,6 @@ from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 
 from dhtorch.data.pairs import LADDER, around
-from dhtorch.data.pairs import fixed as of_two_frames
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import bootstrap, risk
@@ -77,7 +76,7 @@ def run(
     _check(methods, gaps, rotation_gaps, anchors)
     every = list(scenes_of(scenes))
     every += [scene for scene in scenes_of(rotations) if scene.name not in {known.name for known in every}]
-    asked = partial(_spread, pairs, anchors)
+    asked = partial(protocol.spread, pairs, anchors)
     turning = [scene for scene in every if scene.role == "rotation"]
     moving = [scene for scene in every if scene.role != "rotation"]
     fixed = {gap: f"map, gap {gap}" for gap in (*gaps, *rotation_gaps)}
@@ -149,14 +148,6 @@ def _variants(methods: Mapping[str, Method], fixed: Mapping[int, str], seed: int
         for gap, name in fixed.items():
             found[named(name, k)] = Variant(methods["map"], seed=seed + k, offers=partial(partner, gap=gap))
     return found
-
-
-def _spread(pairs: Pairs, anchors: int | None, scene: Scene) -> list[tuple[int, int]]:
-    """Some of the scene's pairs, evenly spread."""
-    found = of_two_frames(pairs(scene))
-    if anchors is None or len(found) <= anchors:
-        return found
-    return [found[(2 * k + 1) * len(found) // (2 * anchors)] for k in range(anchors)]
 
 
 def _one_partner(scene: Scene, pairs: Pairs) -> bool:
