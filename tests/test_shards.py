@@ -116,6 +116,8 @@ def test_codes_fit_a_byte_and_are_named():
         "gate": Gate,
         "pose_code": PoseCode,
         "problem": SampleProblem,
+        "source_map": Source,
+        "gate_map": Gate,
     }
     assert tables == {k: names(t) for k, t in wanted.items()}
     assert sum(tables["flag"]) == 255 and max(max(t) for t in tables.values()) == 128

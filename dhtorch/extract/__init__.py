@@ -21,10 +21,10 @@ from dhtorch import archive, storage
 from dhtorch.data.files import need
 from dhtorch.data.scene import Scene, scenes_of
 from dhtorch.extract import columns, engines, plan, shards
-from dhtorch.extract.dataset import Extracted, Rows
+from dhtorch.extract.dataset import Extracted, Rows, maps_hw
 from dhtorch.extract.features import Features, JoinedDataset
 from dhtorch.method import Method
-from dhtorch.transform import CHANNELS, SampleError, grid
+from dhtorch.transform import CHANNELS, Maps, SampleError, grid, maps
 from dhtorch.transform.extend_depth import ON_ERROR
 from dhtorch.transform.tokens import FITS
 
@@ -54,10 +54,11 @@ class ExtractOptions:
     patch: int = 14  # px
     tokens_hw: Sequence[int] = (224, 224)  # size of the network's picture: with it all rows have one shape
     fit: str = "stretch"  # how the picture is brought to that size
+    dense: bool | Mapping[str, Any] = False  # maps of every pixel: True, or options as ExtendDepth takes them
     on_error: str = "raise"  # a frame that cannot be read: raise, skip, or flag = zeros and a problem
     columns: Sequence[str] | None = None  # to write; None = all
-    half: bool = False  # depths, scores and tokens as float16
-    shard_rows: int = 512
+    half: bool = False  # depths, scores, maps and tokens as float16
+    shard_rows: int = 512  # of one file: what a kill loses at most
 
     def __post_init__(self) -> None:
         for name, known in {"engine": ("local", "ray"), "on_error": ON_ERROR, "fit": FITS}.items():
@@ -67,6 +68,7 @@ class ExtractOptions:
             value = getattr(self, name)
             if not (isinstance(value, int) and value >= low) and not (name == "gap" and value in (None, plan.CHOICE)):
                 raise ValueError(f"extract.{name}: found {value!r}, expected a whole number of at least {low}")
+        Maps.asked(self.dense, "extract.dense")
         if not (isinstance(self.tokens_hw, Sequence) and len(self.tokens_hw) == 2):
             raise ValueError(f"extract.tokens_hw: found {self.tokens_hw!r}, expected height and width")
 
@@ -115,7 +117,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Call
 def _rows(scenes: Sequence[Scene], whole: plan.Plan, method: Method, seed: int, options: ExtractOptions) -> Rows:
     hw = (int(options.tokens_hw[0]), int(options.tokens_hw[1]))
     rows, across = grid(hw, patch=options.patch, tokens_hw=hw)
-    every = columns.columns(method.n, rows * across, half=options.half)
+    every = columns.columns(method.n, rows * across, half=options.half, map_hw=_map_hw(scenes, options))
     return Rows(
         scenes,
         whole,
@@ -126,7 +128,15 @@ def _rows(scenes: Sequence[Scene], whole: plan.Plan, method: Method, seed: int, 
         patch=options.patch,
         tokens_hw=hw,
         fit=options.fit,
+        dense=options.dense,
     )
+
+
+def _map_hw(scenes: Sequence[Scene], options: ExtractOptions) -> tuple[int, int] | None:
+    """Size of the maps, where there is a column of one: all pictures must then have one shape."""
+    asked = Maps.asked(options.dense, "extract.dense")
+    named = options.columns is None or not {*maps.NUMBERS, *maps.CODES}.isdisjoint(options.columns)
+    return maps_hw(scenes, asked) if asked is not None and named else None
 
 
 def _engine(options: ExtractOptions, rows: Rows, positions: Sequence[int], workers: int) -> Iterator[Extracted]:

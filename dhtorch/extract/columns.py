@@ -5,6 +5,7 @@ Alphabet: N samples of a frame, P patches of its token grid.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from dhtorch.codes import Flag, Gate, Hole, PoseCode, Source, names
 from dhtorch.data.files import need
-from dhtorch.transform import CHANNELS, SampleProblem
+from dhtorch.transform import CHANNELS, SampleProblem, maps
 
 Row = dict[str, Any]  # column → number, text or array
 
@@ -27,10 +28,12 @@ CODES: dict[str, type] = {
     "gate": Gate,
     "pose_code": PoseCode,
     "problem": SampleProblem,
+    "source_map": Source,
+    "gate_map": Gate,
 }
 
 #: Columns of floats that keep their meaning with eleven bits; pixels and poses do not.
-MAY_BE_HALF = ("xyz", "depth", "sigma", "score", "tokens")
+MAY_BE_HALF = ("xyz", "depth", "sigma", "score", "tokens", *maps.NUMBERS)
 
 
 class Column(NamedTuple):
@@ -41,9 +44,14 @@ class Column(NamedTuple):
     unit: str
     about: str
 
+    @property
+    def n_bytes(self) -> int:
+        """In memory, of one row; texts count as none."""
+        return 0 if self.kind == "str" else np.dtype(self.kind).itemsize * math.prod(self.shape)
 
-def columns(n: int, patches: int, *, half: bool = False) -> dict[str, Column]:
-    """All columns of rows with ``n`` samples and ``patches`` tokens, in order."""
+
+def columns(n: int, patches: int, *, half: bool = False, map_hw: tuple[int, int] | None = None) -> dict[str, Column]:
+    """All columns of rows with ``n`` samples, ``patches`` tokens and maps of that size (None = no maps), in order."""
     f, byte, flag = "float32", "uint8", "bool"
     found = {
         "episode_index": Column("int64", (), "1", "number of the episode in its data set, else of the recording"),
@@ -66,10 +74,23 @@ def columns(n: int, patches: int, *, half: bool = False) -> dict[str, Column]:
         "pose_code": Column(byte, (), "code", "how the search for the pose ended"),
         "tokens": Column(f, (patches, len(CHANNELS)), "1/m, 1/m, share", "depth tokens of the patches, row by row"),
         "tokens_valid": Column(flag, (patches,), "1", "a sample of the patch has a depth"),
+        **({} if map_hw is None else _maps(map_hw)),
         "problem": Column(byte, (), "code", "what was wrong with the frame"),
     }
     half_names = MAY_BE_HALF if half else ()
     return {k: c._replace(kind="float16") if k in half_names else c for k, c in found.items()}
+
+
+def _maps(hw: tuple[int, int]) -> dict[str, Column]:
+    """Columns of every pixel, over the field of the picture (:func:`dhtorch.dense.pixels`)."""
+    f, byte, none = "float32", "uint8", "0 = none, where a DepthMap has NaN"
+    return {
+        "depth_map": Column(f, hw, "m", f"z of every pixel, by sensor or sweep; {none}"),
+        "sigma_map": Column(f, hw, "m", f"standard deviation of depth_map; {none}"),
+        "score_map": Column(f, hw, "1", "confidence of the sensor, or score of the swept depth, in [0, 1]"),
+        "source_map": Column(byte, hw, "code", "where the depth of a pixel comes from"),
+        "gate_map": Column(byte, hw, "code", "why a pixel has no depth"),
+    }
 
 
 def choose(found: Mapping[str, Column], wanted: Sequence[str] | None) -> dict[str, Column]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
 from dhtorch.extract.columns import PLACE, Column, Row
 from dhtorch.extract.plan import Plan, offers, steps_back
@@ -17,7 +18,7 @@ from dhtorch.geometry import camera as cam
 from dhtorch.method import Method
 from dhtorch.offers import choosing
 from dhtorch.records import Camera, Frame
-from dhtorch.transform import ExtendDepth
+from dhtorch.transform import ExtendDepth, Maps, SampleError
 
 #: Readers give metres, and the camera of these very pixels: there is no unit that could be wrong.
 _TRUSTED = {"depth_unit": "m", "layout": "chw", "max_depth": np.inf, "min_depth": 0.0, "max_offset": np.inf}
@@ -77,6 +78,7 @@ class Rows(Dataset[Extracted]):
         try:
             with torch.no_grad():
                 added = opened.answer(i)
+            _check_shapes(added, self.wanted)
         except Exception as error:  # whatever a decoder raises; lack of memory is no property of a frame
             if isinstance(error, MemoryError | torch.OutOfMemoryError):
                 raise
@@ -120,18 +122,59 @@ class _Opened:
         return readable or [None]
 
     def _frame(self, at: int | None) -> Frame | None:
-        try:
-            return None if at is None else self.recording[at]
-        except MemoryError:
-            raise
-        except Exception:
-            return None  # said where that frame is the anchor
+        return None if at is None else _readable(self.recording, at)
 
     def _transform(self, views: int, optional: tuple[str, ...]) -> ExtendDepth:
         options: dict[str, Any] = {**_TRUSTED, **self.options, **{key: key for key in optional}}
         options |= {"sparse": self.recording.sparse, "hint": self.scene.hint}
         other_at = list(range(views)) if views > 1 else 0
         return ExtendDepth(method=self.method, other_at=other_at, **options)
+
+
+def maps_hw(scenes: Sequence[Scene], maps: Maps) -> tuple[int, int]:
+    """Height and width of all maps of a data set, by the first frame of each recording that can be read.
+
+    Raises:
+        ValueError: recordings whose maps have different sizes, or no frame that can be read.
+    """
+    first: tuple[str, tuple[int, int]] | None = None
+    for recording in (scene.recording for scene in scenes):
+        frames = (_readable(recording, i) for i in range(len(recording)))
+        frame = next((frame for frame in frames if frame is not None), None)
+        if frame is None:
+            continue  # said row by row
+        hw = maps.hw(frame.hw)
+        if first is not None and hw != first[1]:
+            found = f"{recording.name} has pictures of {_size(frame.hw)} and maps of {_size(hw)}"
+            raise ValueError(
+                f"extract.dense: {found}, expected maps of {_size(first[1])} as of {first[0]}; extract them apart"
+            )
+        first = first or (recording.name, hw)
+    if first is None:
+        raise ValueError("extract.dense: found no frame that can be read, expected one that tells the size of maps")
+    return first[1]
+
+
+def _readable(recording: Recording, at: int) -> Frame | None:
+    """A frame, None where it cannot be read: said where that frame is the anchor."""
+    try:
+        return recording[at]
+    except MemoryError:
+        raise
+    except Exception:
+        return None
+
+
+def _check_shapes(added: Mapping[str, Tensor], wanted: Mapping[str, Column]) -> None:
+    """Raises SampleError for a map of another size than its column, the only thing that a picture's size decides."""
+    for name, column in wanted.items():
+        if name in added and tuple(added[name].shape) != column.shape:
+            found, expected = (_size(shape) for shape in (added[name].shape, column.shape))
+            raise SampleError(f"{name}: found {found}, expected {expected} as of the first frame; extract it apart")
+
+
+def _size(hw: Sequence[int]) -> str:
+    return f"{hw[0]}x{hw[1]}"
 
 
 def _sample(anchor: Frame, others: Sequence[Frame | None]) -> dict[str, Any]:

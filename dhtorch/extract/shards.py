@@ -22,8 +22,9 @@ from dhtorch.extract.plan import Shard
 #: Key of the metadata that all shards share, and of those of one shard.
 SHARED, OWN = b"dhtorch", b"dhtorch.shard"
 
-#: Rows that are decoded together: few, because a shuffled loader asks for one.
-GROUP_ROWS = 16
+#: Rows that are held and decoded together: few, because a shuffled loader asks for one, and so many bytes of them at
+#: most, because maps are large.
+GROUP_ROWS, GROUP_BYTES = 16, 1 << 24
 
 _PATTERN = "shard-*.parquet"
 _UNFINISHED = ".tmp"
@@ -52,7 +53,7 @@ def write(
     try:
         with unfinished.open("wb") as file:
             with parquet.ParquetWriter(file, layout, compression="zstd") as writer:
-                for group in _groups(rows):
+                for group in _groups(rows, group_rows(wanted)):
                     counts.update(problems[str(int(row["problem"]))].lower() for row in group)
                     writer.write_table(table(group, wanted, layout))
                 counts["skipped"] = len(shard.rows) - counts.total()
@@ -65,6 +66,11 @@ def write(
         unfinished.unlink(missing_ok=True)
         raise
     return counts
+
+
+def group_rows(wanted: Mapping[str, Column]) -> int:
+    """Rows of such columns that are held together, one at least."""
+    return max(1, min(GROUP_ROWS, GROUP_BYTES // sum(column.n_bytes for column in wanted.values())))
 
 
 def shard_files(folder: Path) -> list[Path]:
@@ -111,9 +117,9 @@ def described(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         raise FormatError(path, "metadata", f"{type(error).__name__}: {error}", "a shard of dhtorch extract") from None
 
 
-def _groups(rows: Iterable[Row]) -> Iterator[list[Row]]:
+def _groups(rows: Iterable[Row], size: int) -> Iterator[list[Row]]:
     rows = iter(rows)
-    while group := list(islice(rows, GROUP_ROWS)):
+    while group := list(islice(rows, size)):
         yield group
 
 

@@ -15,6 +15,7 @@ from dhtorch.transform.adapters import (
 )
 from dhtorch.transform.extend_depth import ExtendDepth
 from dhtorch.transform.leaves import SampleError
+from dhtorch.transform.maps import Maps
 from dhtorch.transform.problems import SampleProblem
 from dhtorch.transform.tokens import CHANNELS, grid, patch_tokens
 from dhtorch.transform.views import Views
@@ -25,6 +26,7 @@ __all__ = [
     "ExtendDepth",
     "ExtendedDataset",
     "ExtendedStream",
+    "Maps",
     "NumpyTransform",
     "RldsBatchTransform",
     "SampleError",

@@ -15,7 +15,8 @@ from dhtorch.geometry import camera as cam
 from dhtorch.method import Method, networks
 from dhtorch.methods import METHODS
 from dhtorch.pair import merge
-from dhtorch.records import NO_HINT, Estimate, PoseFit, TrackHint
+from dhtorch.records import NO_HINT, DepthMap, Estimate, PoseFit, Samples, TrackHint
+from dhtorch.transform import maps
 from dhtorch.transform.leaves import SampleError, find, to_tensor
 from dhtorch.transform.problems import SampleProblem, Tally
 from dhtorch.transform.tokens import CHANNELS, FITS, grid, patch_tokens
@@ -37,6 +38,9 @@ class ExtendDepth(torch.nn.Module):
         hint: what is known of the motion between the views, for the tracker.
         seed: of the pose search. With ``index_key`` each sample has the seed ``seed + sample[index_key]``.
         index_key: key of a whole number that tells samples apart; None = the same draws for all.
+        dense: True = a map of every pixel as well, with the defaults of :func:`dhtorch.dense.complete`; a mapping =
+            options for it: ``partners``, ``planes``, ``size``, ``refinements``, ``min_correlation``,
+            ``max_sigma_rel``. Sigma and score of swept pixels are calibrated by what travels with the package.
         patch, tokens_hw, fit: the network's patches, see :func:`dhtorch.transform.patch_tokens`.
         on_error: what to do with a sample that cannot be read, or whose values contradict what was stated. ``raise``;
             ``skip`` = return None, see :func:`dhtorch.transform.collate_kept`; ``flag`` = add zeros, and ``problem``
@@ -53,14 +57,22 @@ class ExtendDepth(torch.nn.Module):
         (4, 4) and its ``pose_cov`` (6, 6), ``pose_ok``, ``pose_code``; ``tokens`` (P, 10) of
         :data:`dhtorch.transform.CHANNELS` and ``tokens_valid`` (P,); ``problem``. What is not valid is 0.
 
+        With ``dense`` also ``depth_map``, ``sigma_map`` (h, w) m, ``score_map`` (h, w) in [0, 1], ``source_map`` and
+        ``gate_map`` (h, w) codes, over the field of the picture and of its size unless that is longer than ``size``.
+        A silent pixel, NaN in a :class:`dhtorch.records.DepthMap`, is 0 here; where there is no second view the map
+        is the sensor's. Tokens are then pooled from all pixels of the map, no longer from the samples; every other key
+        is what it is without maps.
+
     Raises:
         ValueError: options that cannot be.
         SampleError: a bad sample, where ``on_error`` says so.
 
-    Gradient: points, tokens and pose to images, depth and intrinsics, as ``dhtorch.extend``; none in a worker, whose
-    samples cannot carry a graph.
-    Cost: as the method. In workers use one thread (``worker_init_fn=one_thread``). A process that has used several
-    threads should not be forked: set one thread before, or spawn the workers.
+    Gradient: points, maps, tokens and pose to images, depth and intrinsics, as ``dhtorch.extend`` and
+    ``dhtorch.dense.complete``; none in a worker, whose samples cannot carry a graph.
+    Memory: with ``dense`` that of ``complete``, about a third as much again for tokens.
+    Cost: as the method; with ``dense`` most of it is the sweep's. In workers use one thread
+    (``worker_init_fn=one_thread``). A process that has used several threads should not be forked: set one thread
+    before, or spawn the workers.
     """
 
     def __init__(
@@ -71,6 +83,7 @@ class ExtendDepth(torch.nn.Module):
         hint: TrackHint = NO_HINT,
         seed: int = 0,
         index_key: str | None = None,
+        dense: bool | Mapping[str, Any] = False,
         patch: int = 14,
         tokens_hw: tuple[int, int] | None = None,
         fit: str = "stretch",
@@ -89,6 +102,7 @@ class ExtendDepth(torch.nn.Module):
             raise ValueError(f"fit is {fit!r}, expected one of {', '.join(FITS)}")
         grid((max(patch, 1),) * 2, patch=patch, tokens_hw=tokens_hw)  # raises where no patch fits
         self.views = Views(**views)
+        self.maps = maps.Maps.asked(dense)
         method = METHODS[method] if isinstance(method, str) else method
         self.method, self.hint = method if n is None else method.replace(n=n), hint
         self.learned = torch.nn.ModuleList(networks(self.method))  # so that .to() and .parameters() find them
@@ -127,27 +141,20 @@ class ExtendDepth(torch.nn.Module):
         Raises:
             SampleError: it is to be flagged, and nothing tells the size of its image.
         """
-        hw = self.tokens_hw or self.views.image_hw(sample) or self._seen_hw
+        hw = (None if self.maps else self.tokens_hw) or self.views.image_hw(sample) or self._seen_hw
         if self.on_error == "flag" and hw is None:
-            raise SampleError(f"{error} (and no image tells the size of its tokens: give tokens_hw)") from error
+            missing = "maps" if self.maps else "tokens: give tokens_hw"
+            raise SampleError(f"{error} (and no image tells the size of its {missing})") from error
         warnings.warn(f"{'skipped' if self.on_error == 'skip' else 'flagged'}: {error}", stacklevel=3)
         self.tally.add(torch.tensor([SampleProblem.UNREADABLE]))
         return None if self.on_error == "skip" or hw is None else self._joined(sample, self._blank(hw))
 
     def _answer(self, read: Read, seed: int | Tensor) -> dict[str, Tensor]:
         frame, paired, bad = read.anchor, read.paired, read.bad
-        if read.other is not None and bool(paired.any()):
-            trace: dict[str, Any] = {}
-            estimate = self.method(frame, read.other, seed=seed, hint=self.hint, trace=trace)
-            samples, fit = trace["samples"], trace["fit"]
-            estimate = estimate.replace(gate=torch.where(paired[:, None], estimate.gate, Gate.NO_TRACK))
-        else:
-            samples = self.method.look(frame)
-            estimate, fit = Estimate.silent(samples, Gate.NO_TRACK, n_views=0), None
+        samples, estimate, fit, dense = self._asked(read, seed)
         found = merge(samples, estimate)
-        tokens, known = patch_tokens(
-            found, samples.hole, frame.hw, patch=self.patch, tokens_hw=self.tokens_hw, fit=self.fit
-        )
+        pooled = (found, samples.hole) if dense is None else maps.as_samples(dense, frame, self.method)
+        tokens, known = patch_tokens(*pooled, frame.hw, patch=self.patch, tokens_hw=self.tokens_hw, fit=self.fit)
         valid = found.source != Source.NONE
         xyz = cam.unproject(frame.camera, found.uv, found.depth)
         problem = (~paired).int() * SampleProblem.NO_SECOND_VIEW
@@ -166,11 +173,28 @@ class ExtendDepth(torch.nn.Module):
             **_pose(fit, paired, found.depth),
             "tokens": tokens,
             "tokens_valid": known,
+            **({} if dense is None else maps.as_keys(dense)),
         }
         if bool(bad.any()):
             added = {key: x.masked_fill(bad.view(-1, *[1] * (x.ndim - 1)), 0) for key, x in added.items()}
             problem = torch.where(bad, SampleProblem.UNREADABLE, problem)
         return {**added, "problem": problem}
+
+    def _asked(self, read: Read, seed: int | Tensor) -> tuple[Samples, Estimate, PoseFit | None, DepthMap | None]:
+        """What the method says, and the maps where they are wanted; the front end alone where nothing is paired."""
+        if read.other is None or not bool(read.paired.any()):
+            samples = self.method.look(read.anchor)
+            dense = None if self.maps is None else self.maps.sensed(read.anchor, self.method)
+            return samples, Estimate.silent(samples, Gate.NO_TRACK, n_views=0), None, dense
+        trace: dict[str, Any] = {}
+        if self.maps is None:
+            dense = None
+            estimate = self.method(read.anchor, read.other, seed=seed, hint=self.hint, trace=trace)
+        else:
+            dense = self.maps.swept(read, self.method, seed=seed, hint=self.hint, trace=trace)
+            estimate = trace["sparse"]
+        estimate = estimate.replace(gate=torch.where(read.paired[:, None], estimate.gate, Gate.NO_TRACK))
+        return trace["samples"], estimate, trace["fit"], dense
 
     def _seeds(self, sample: Mapping[str, Any], batch: int) -> int | Tensor:
         if self.index_key is None:
@@ -194,6 +218,10 @@ class ExtendDepth(torch.nn.Module):
             out[key] = torch.zeros(1, *size, dtype=torch.bool)
         for key, size in {"source": (n,), "flag": (n,), "hole": (n,), "gate": (n,), "pose_code": ()}.items():
             out[key] = torch.zeros(1, *size, dtype=torch.int32)
+        if self.maps is not None:
+            size = self.maps.hw(hw)
+            out |= {key: torch.zeros(1, *size) for key in maps.NUMBERS}
+            out |= {key: torch.zeros(1, *size, dtype=torch.int32) for key in maps.CODES}
         return {**out, "problem": torch.full((1,), SampleProblem.UNREADABLE, dtype=torch.int32)}
 
     def _joined(self, sample: Mapping[str, Any], added: Mapping[str, Tensor]) -> dict[str, Any]:
