@@ -515,7 +515,7 @@ ELSEWHERE = {
     *(f"dhtorch.evaluate.errors.{name}" for name in ("points", "select", "measure", "summarise", "unit")),
     *(
         f"dhtorch.evaluate.risk.{name}"
-        for name in ("curve", "risk_coverage", "measure", "capped", "realised", "surest")
+        for name in ("ause", "capped", "curve", "measure", "realised", "risk_coverage", "surest")
     ),
     *(
         f"dhtorch.evaluate.reliability.{n}"
@@ -529,7 +529,7 @@ ELSEWHERE = {
     ),
     *(
         f"dhtorch.evaluate.compare.{name}"
-        for name in ("method_ratios", "against", "completed", "ratio_over_seeds", "equal_coverage")
+        for name in ("against", "completed", "equal_coverage", "method_ratios", "promises", "ratio_over_seeds")
     ),
     "dhtorch.evaluate.curves.sampled",
     *(f"dhtorch.evaluate.correlation.{name}" for name in ("pearson", "spearman", "ranks")),

@@ -256,3 +256,27 @@ def test_what_a_cut_silences_is_silent_in_every_field():
         assert torch.equal(getattr(cut, name)[cut.keep], getattr(p, name)[cut.keep]), name
     assert torch.equal(cut.score[cut.keep], p.score[cut.keep]) and not (cut.keep & ~p.keep).any()
     assert risk.surest(p, 24 + 30) is p
+
+
+def test_sparsification_by_hand_and_its_ends():
+    g = torch.Generator().manual_seed(5)
+    error = torch.rand(400, generator=g, dtype=torch.float64)
+    one = torch.ones_like(error)
+
+    def scored(score):
+        return errors.points(1 + error, one, score)
+
+    assert risk.ause(scored(-error)) == pytest.approx(0, abs=1e-12), "the errors' own order"
+    assert risk.ause(scored(one)) == pytest.approx(1), "what cannot be told apart is left as chance leaves it"
+    assert risk.ause(scored(error)) > 1.5, "the worst order"
+    score = torch.rand(400, generator=g, dtype=torch.float64)
+    left, best = ([float(error[order][: round(4 * (100 - k))].mean()) for k in range(96)] for order in (
+        score.argsort(descending=True), error.argsort()
+    ))  # fmt: skip
+    area = statistics.mean(a - b for a, b in zip(left, best, strict=True))
+    chance = float(error.mean()) - statistics.mean(best)
+    assert risk.ause(scored(score)) == pytest.approx(area / chance)
+    assert (
+        risk.ause(errors.points(torch.full((3,), torch.nan), one[:3], one[:3], keep=torch.zeros(3, dtype=torch.bool)))
+        is None
+    )
