@@ -37,12 +37,16 @@ _CV: Any = cv2
 
 
 class Rectified(NamedTuple):
-    """Two pictures turned so that a point has the same row in both; tipped on their side where views lie so."""
+    """Two pictures turned so that a point has the same row in both, further left in the second.
+
+    They are tipped on their side where the other camera is above or below, and mirrored where it is on the left.
+    """
 
     pictures: tuple[np.ndarray, np.ndarray]  # uint8
-    place: np.ndarray  # (h, w, 2) where pixels of view 0 lie in the first
-    axis: np.ndarray  # (h, w) z in view 0 of that place's ray with z = 1 in the rectified view
-    reach: float  # px · m: disparity = reach / depth in the rectified view
+    R: np.ndarray  # (3, 3) from view 0 to the rectified view
+    K: np.ndarray  # (3, 3) of the rectified view, upright and not mirrored
+    upright: bool
+    reach: float  # px · m: disparity = reach / depth in the rectified view; negative where the pictures are mirrored
 
 
 def epipole_inside(views: tuple[tuple[Camera, tuple[int, int]], ...], T_1_from_0: Pose) -> Tensor:
@@ -85,7 +89,7 @@ def semi_global(
         pictures = [(255 * g[b, 0]).round().clamp(0, 255).to(torch.uint8).cpu().numpy() for g in (grey_0, grey_1)]
         views = (pictures[0], camera_0[one]), (pictures[1], camera_1[one])
         rectified = rectify(*views, T_1_from_0[one], nearest_m=float(nearest_m[b]))
-        found, spread = _depth(rectified)
+        found, spread = _depth(rectified, camera_0[one], hw)
         at = uv[one].cpu().double()
         depth[b] = nearest(torch.from_numpy(found)[None], at)[0][0].to(depth)
         noise[b] = nearest(torch.from_numpy(spread)[None], at)[0][0].to(depth)
@@ -118,19 +122,11 @@ def rectify(
         one = _CV.remap(picture, *maps, cv2.INTER_AREA if shrink < 1 else cv2.INTER_LINEAR)
         one = one if upright else one.T
         turned.append(np.ascontiguousarray(one if reach > 0 else one[:, ::-1]))
-    ray = cam.rays(camera_0, _grid(h, w).to(camera_0.f))[0].double().cpu().numpy()
-    local = ray @ R_0.T
-    place = (local / local[:, 2:]) @ (S @ N_0[:, :3]).T
-    place = place[:, :2] if upright else place[:, 1::-1]
-    if reach < 0:
-        place = np.stack([turned[0].shape[1] - 1 - place[:, 0], place[:, 1]], -1)
-    return Rectified(
-        (turned[0], turned[1]), place.reshape(h, w, 2), (1 / local[:, 2]).reshape(h, w), abs(reach) * shrink
-    )
+    return Rectified((turned[0], turned[1]), R_0, S @ N_0[:, :3], upright, reach * shrink)
 
 
-def _depth(rectified: Rectified) -> tuple[np.ndarray, np.ndarray]:
-    """Depth (h, w) in view 0, NaN where nothing is matched, and the relative noise that half a pixel makes."""
+def matched(pictures: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Disparity (h, w) px of the first of two rectified pictures, not positive where there is none."""
     matcher = _CV.StereoSGBM_create(
         0,
         DISPARITIES,
@@ -143,12 +139,26 @@ def _depth(rectified: Rectified) -> tuple[np.ndarray, np.ndarray]:
         speckleRange=2,
         mode=cv2.STEREO_SGBM_MODE_HH4,
     )
-    left, right = (cv2.copyMakeBorder(p, 0, 0, DISPARITIES, 0, cv2.BORDER_REPLICATE) for p in rectified.pictures)
-    disparity = matcher.compute(left, right)[:, DISPARITIES:].astype(np.float32) / 16
-    read = _CV.remap(disparity, rectified.place.astype(np.float32), None, cv2.INTER_NEAREST, borderValue=-1)
+    left, right = (cv2.copyMakeBorder(p, 0, 0, DISPARITIES, 0, cv2.BORDER_REPLICATE) for p in pictures)
+    disparity: np.ndarray = matcher.compute(left, right)[:, DISPARITIES:].astype(np.float32) / 16
+    return disparity
+
+
+def _depth(rectified: Rectified, camera_0: Camera, hw: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Depth (h, w) in view 0, NaN where nothing is matched, and the relative noise that half a pixel makes."""
+    h, w = hw
+    disparity = matched(rectified.pictures)
+    ray = cam.rays(camera_0, _grid(h, w).to(camera_0.f))[0].double().cpu().numpy() @ rectified.R.T
+    place = (ray / ray[:, 2:]) @ rectified.K.T
+    u, v = (place[:, 0], place[:, 1]) if rectified.upright else (place[:, 1], place[:, 0])
+    if rectified.reach < 0:
+        u = disparity.shape[1] - 1 - u
+    maps = (x.reshape(h, w).astype(np.float32) for x in (u, v))
+    read = _CV.remap(disparity, *maps, cv2.INTER_NEAREST, borderValue=-1)
     told = read > 0
-    z = rectified.reach / np.where(told, read, 1.0)
-    return np.where(told, z * rectified.axis, np.nan), NOISE_PX / np.where(told, read, 1.0)
+    known = np.where(told, read, 1.0)
+    # a ray with z = 1 in view 0 has z = ray[2] in the rectified one
+    return np.where(told, abs(rectified.reach) / (known * ray[:, 2].reshape(h, w)), np.nan), NOISE_PX / known
 
 
 def flow(anchor: Frame, other: Frame, T_1_from_0: Pose, samples: Samples, *, size: int = 640) -> Estimate:
