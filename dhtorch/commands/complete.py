@@ -59,6 +59,9 @@ KINDS = {"sensor": "sensor", "swept": "swept", "none": "silent"}
 #: Of which frames there are figures and points: of none, the first, or all.
 SHOWN = (False, True, "all")
 
+#: Modules that decide what is found beside those that the settings name.
+ROOTS = ("dhtorch.dense", "dhtorch.offers", "dhtorch.data.pairs", "dhtorch.export.frames")
+
 #: Folders of pictures and points, which are made of the files of a frame.
 EXTRAS = {"figures": (".png",), "points": (".ply", ".glb")}
 
@@ -161,7 +164,6 @@ def _shared(scene: Scene, layout: Layout, settings: Mapping[str, Any], digest: s
     """What all frames of a scene have in common, and their key."""
     config = {k: settings[k] for k in KEYED} | {"scene": scene.name, "format": layout.name, "unit": layout.unit}
     made = archive.meta(device="cpu", dtype=settings["dtype"], threads=1, seed=settings["seed"])
-    roots = [dense.__name__, export.frames.__name__]
     name = settings["choices"]["data"]
     found: Row = storage.strict(
         {
@@ -175,7 +177,7 @@ def _shared(scene: Scene, layout: Layout, settings: Mapping[str, Any], digest: s
             "git": made["git"],
             "method": settings["choices"]["method"],
             "calibration": None if dense.shipped() is None else CALIBRATION,
-            "key": archive.result_key({**config, "files": FORMAT}, digest, roots=roots),
+            "key": archive.result_key({**config, "files": FORMAT}, digest, roots=ROOTS),
             "config": archive.portable(config),
             "data": {"name": name, "digest": digest},
             "codes": {"source": names(Source), "gate": names(Gate)},

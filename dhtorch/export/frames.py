@@ -52,7 +52,8 @@ def in_steps(
     code = array(source)
     if not z.shape == s.shape == code.shape:
         raise ValueError(f"in_steps: found shapes {z.shape}, {s.shape}, {code.shape}, expected three alike")
-    z, s = np.round(z), np.maximum(np.round(s), 1)
+    z = z.round()
+    s = s.round().clip(1)
     wanted = code != Source.NONE
     fits = wanted & (z >= 1) & (z <= LAST) & (s <= LAST)
     return Steps(
