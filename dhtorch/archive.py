@@ -299,6 +299,19 @@ def data_digest(files: Mapping[str, str | Path]) -> str:
     return total.hexdigest()
 
 
+def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
+    """The first thing that differs between what two runs note of themselves (``config``, ``data``, ``git`` and
+    ``version``), in words."""
+    ours, theirs = _flat("", here["config"]), _flat("", there["config"])
+    for name in sorted(ours.keys() | theirs.keys()):
+        if ours.get(name) != theirs.get(name):
+            return f"{name} {theirs.get(name)} there, {ours.get(name)} here"
+    if there["data"]["digest"] != here["data"]["digest"]:
+        return "other data"
+    versions = [meta["git"] or meta["version"] for meta in (there, here)]
+    return "other code" + (f": {versions[0]} there, {versions[1]} here" if versions[0] != versions[1] else "")
+
+
 def meta(*, device: str, dtype: str, threads: int, seed: int) -> dict[str, Any]:
     """When, with which code and on what a job runs."""
     versions = {"python": platform.python_version(), **{name: _version(name) for name in _PACKAGES}}
@@ -412,6 +425,12 @@ def _keyed(config: Any) -> Any:
     if isinstance(config, Mapping):
         return {str(k): _keyed(v) for k, v in config.items() if str(k) not in UNKEYED}
     return [_keyed(v) for v in config] if isinstance(config, list | tuple) else config
+
+
+def _flat(name: str, value: Any) -> dict[str, Any]:
+    if not isinstance(value, Mapping):
+        return {name: value}
+    return {k: v for key, inner in value.items() for k, v in _flat(f"{name}.{key}".lstrip("."), inner).items()}
 
 
 def _paths(name: str, value: Any) -> Iterator[tuple[str, Path]]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import shutil
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -84,6 +85,23 @@ def replace_file(path: str | Path, content: bytes) -> Path:
         Path(name).unlink(missing_ok=True)
         raise
     _sync_folder(path.parent)
+    return path
+
+
+def copy_file(source: str | Path, path: str | Path) -> Path:
+    """Copy a file, however large, so that ``path`` never holds half of it; nothing is done where there is no source, or
+    a copy of its size already."""
+    source, path = Path(source), Path(path)
+    if not source.is_file() or (path.is_file() and path.stat().st_size == source.stat().st_size):
+        return path
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f".{path.name}.copy{_UNFINISHED}")
+    try:
+        shutil.copyfile(source, unfinished)
+        unfinished.replace(path)
+    except BaseException:
+        unfinished.unlink(missing_ok=True)
+        raise
     return path
 
 

@@ -197,7 +197,7 @@ def test_exit_codes_stand_in_every_help(command):
     text = " ".join(out.split())
     for code, words in EXIT_CODES.items():
         assert f"{code} {words}" in text
-    for word in ("inspect", "report", "extract", "integrate", "stream", "view"):
+    for word in ("inspect", "report", "complete", "extract", "integrate", "stream", "view"):
         out = " ".join(command(word, "--help")[1].split())
         assert "Exit code: 0 done, 2 bad option or bad data, 130 interrupted" in out, word
 
@@ -212,6 +212,7 @@ def test_exit_codes(command):
         ["report", "fine", "--colour"],
         ["view", "nowhere"],
         ["extract"],
+        ["complete", "nowhere", "out=x"],
         ["integrate", "voxel=-1"],
         ["stream", "nowhere"],
     ):

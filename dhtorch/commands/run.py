@@ -31,6 +31,7 @@ COMMANDS = {"inspect": "dhtorch.commands.inspect", "report": "dhtorch.studies.re
 #: Sub-command with settings of its own, ``conf/<word>.yaml`` → module with ``run(settings, parts, *, progress)``, which
 #: is given all options as plain values, and as objects those that name a function. It returns the exit code.
 CONFIGURED = {
+    "complete": "dhtorch.commands.complete",
     "extract": "dhtorch.extract",
     "integrate": "dhtorch.integrate.mapping",
     "stream": "dhtorch.commands.stream",
@@ -38,7 +39,7 @@ CONFIGURED = {
 }
 
 #: Sub-command → the option that a first word without a name sets.
-FIRST_WORD = {"stream": "data.root", "view": "result"}
+FIRST_WORD = {"complete": "data.root", "stream": "data.root", "view": "result"}
 
 DONE, SOME_FAILED, FAILED, INTERRUPTED, UNHEARD = 0, 1, 2, 130, 141
 

@@ -1,8 +1,8 @@
 """Everything that is drawn: figures of a job, of the report's page and of notebooks, and the project's colours.
 
 ``colours`` is the one page of colours; ``axis`` says where a number stands, ``canvas`` is a bare figure, ``panel`` one
-pair of axes, ``pictures`` shows what a pair found, ``svg`` puts a panel into a page. matplotlib is imported when
-something is drawn.
+pair of axes, ``pictures`` shows what a pair found, ``maps`` a completed view, ``svg`` puts a panel into a page.
+matplotlib is imported when something is drawn.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 from dhtorch.drawing.axis import Axis, spanning
 from dhtorch.drawing.canvas import Canvas, Key, Mark, save
 from dhtorch.drawing.colours import Stroke, series
+from dhtorch.drawing.maps import draw_completed
 from dhtorch.drawing.panel import Panel
 from dhtorch.drawing.pictures import FEWEST, Layer, Picture, draw_depth, draw_holes, draw_risk_coverage, draw_samples
 from dhtorch.drawing.svg import inline
@@ -24,6 +25,7 @@ __all__ = [
     "Panel",
     "Picture",
     "Stroke",
+    "draw_completed",
     "draw_depth",
     "draw_holes",
     "draw_risk_coverage",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 
 def array(x: Any) -> np.ndarray:
@@ -46,3 +47,13 @@ def finite(xyz: np.ndarray, face: np.ndarray | None) -> tuple[np.ndarray, np.nda
         raise ValueError(f"export: face names points {face.min()} to {face.max()}, expected 0 to {len(xyz) - 1}")
     renumbered = np.cumsum(good) - 1
     return good, renumbered[face[good[face].all(1)]] if face.size else face.reshape(0, 3)
+
+
+def quaternion(
+    R: Tensor,  # (3, 3)
+) -> list[float]:
+    """Quaternion w, x, y, z (kornia's) of a rotation, w >= 0."""
+    from kornia.geometry.conversions import rotation_matrix_to_quaternion  # noqa: PLC0415
+
+    q = rotation_matrix_to_quaternion(R[None])[0]
+    return (-q if q[0] < 0 else q).tolist()

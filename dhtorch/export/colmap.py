@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from dhtorch import storage
-from dhtorch.export.arrays import bytes_of_colour, rows
+from dhtorch.export.arrays import bytes_of_colour, quaternion, rows
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Pose
 
@@ -95,12 +95,9 @@ def _camera(shot: Shot) -> str:
 
 
 def _pose(shot: Shot) -> str:
-    """Quaternion w, x, y, z (kornia's) with w >= 0, and translation, of the camera from the world."""
-    from kornia.geometry.conversions import rotation_matrix_to_quaternion  # noqa: PLC0415
-
+    """Quaternion w, x, y, z and translation, of the camera from the world."""
     T = se3.invert(shot.T_world_from_cam.map(lambda v: v.double()))
-    q = rotation_matrix_to_quaternion(T.R)[0]
-    return " ".join(map(_text, [*(-q if q[0] < 0 else q).tolist(), *T.t[0].tolist()]))
+    return " ".join(map(_text, [*quaternion(T.R[0]), *T.t[0].tolist()]))
 
 
 def _text(value: float) -> str:

@@ -14,7 +14,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from dhtorch import storage
+from dhtorch import archive, storage
 from dhtorch.data.files import FormatError, need
 from dhtorch.extract.columns import Column, Row, schema, table
 from dhtorch.extract.plan import Shard
@@ -97,7 +97,7 @@ def finished(folder: Path, shared: Mapping[str, Any]) -> dict[str, Counter[str]]
         except FormatError:
             continue  # torn: it is written again
         if other["key"] != shared["key"]:
-            found_there = f"a shard of another extraction ({_difference(other, shared)})"
+            found_there = f"a shard of another extraction ({archive.difference(other, shared)})"
             raise FileExistsError(f"{path}: found {found_there}, expected one of this, or another folder for out")
         found[path.name] = Counter(own["counts"])
     return found
@@ -121,21 +121,3 @@ def _groups(rows: Iterable[Row], size: int) -> Iterator[list[Row]]:
     rows = iter(rows)
     while group := list(islice(rows, size)):
         yield group
-
-
-def _difference(a: Mapping[str, Any], b: Mapping[str, Any]) -> str:
-    """The first thing that differs between two extractions, in words."""
-    ours, theirs = _flat("", b["config"]), _flat("", a["config"])
-    for name in sorted(ours.keys() | theirs.keys()):
-        if ours.get(name) != theirs.get(name):
-            return f"{name} {theirs.get(name)} there, {ours.get(name)} here"
-    if a["data"]["digest"] != b["data"]["digest"]:
-        return "other data"
-    versions = [meta["git"] or meta["version"] for meta in (a, b)]
-    return "other code" + (f": {versions[0]} there, {versions[1]} here" if versions[0] != versions[1] else "")
-
-
-def _flat(name: str, value: Any) -> dict[str, Any]:
-    if not isinstance(value, Mapping):
-        return {name: value}
-    return {k: v for key, inner in value.items() for k, v in _flat(f"{name}.{key}".lstrip("."), inner).items()}

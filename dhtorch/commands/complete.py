@@ -1,0 +1,446 @@
+"""``dhtorch complete``: every frame of a recording with a depth for every pixel that the sensor or the views tell.
+
+A frame is a file in each of ``depth/``, ``sigma/``, ``source/`` and, written last, ``meta/``: one that has it is whole.
+``complete.json`` says what all frames of a folder share, and the folder is a recording again, in the capture's own
+format where that can hold what was found. Only whole frames count: the same command makes those that are missing.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from dhtorch import archive, dense, export, storage
+from dhtorch.codes import Gate, Source, names, words
+from dhtorch.commands.layouts import LAYOUTS, Layout, confident, layout_of, own_cameras
+from dhtorch.data import files as data_files
+from dhtorch.data.pairs import by_choice
+from dhtorch.data.recording import Recording
+from dhtorch.data.scene import Scene, scenes_of
+from dhtorch.drawing import draw_completed
+from dhtorch.evaluate.holdout import range_split
+from dhtorch.geometry import camera as cameras
+from dhtorch.geometry import se3
+from dhtorch.method import Method, Trace
+from dhtorch.offers import choosing, picked
+from dhtorch.records import DepthMap, Frame
+from dhtorch.tree import stack
+
+Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
+Row = dict[str, Any]
+
+#: Of the files: raised when a reader of older ones would be wrong.
+FORMAT = 1
+
+#: Name of the calibration that travels with the package.
+CALIBRATION = "dense"
+
+#: Options of the sweep.
+SWEEP = ("partners", "planes", "size", "refinements", "min_correlation", "max_sigma_rel")
+
+#: Options that decide what the files of a frame hold, beside format and unit as they came out.
+KEYED = ("data", "method", "seed", "dtype", "cutoff", "steps", "past", *SWEEP, "arrays")
+
+#: Numbers and what they must lie between, the upper end among it.
+RANGES = {"unit": (1e-6, 0.1), "cutoff": (0, math.inf), "min_correlation": (-1, 1), "max_sigma_rel": (0, math.inf)}
+
+#: Source in a meta file → in words.
+KINDS = {"sensor": "sensor", "swept": "swept", "none": "silent"}
+
+#: Of which frames there are figures and points: of none, the first, or all.
+SHOWN = (False, True, "all")
+
+#: Modules that decide what is found beside those that the settings name.
+ROOTS = ("dhtorch.dense", "dhtorch.offers", "dhtorch.data.pairs", "dhtorch.export.frames")
+
+#: Folders of pictures and points, which are made of the files of a frame.
+EXTRAS = {"figures": (".png",), "points": (".ply", ".glb")}
+
+
+@dataclass(frozen=True)
+class Task:
+    """One scene, and what is wanted of it."""
+
+    scene: Scene
+    folder: Path
+    layout: Layout
+    method: Method
+    settings: Mapping[str, Any]
+    frames: Sequence[int]  # positions
+    offers: Mapping[int, Sequence[int]]  # position → frames around it among which the method chooses
+    shared: Row  # complete.json
+    done: dict[str, Row] = field(default_factory=dict)  # name of a whole frame → its meta file
+
+    @property
+    def recording(self) -> Recording:
+        """Of the scene."""
+        return self.scene.recording
+
+    def name(self, i: int) -> str:
+        """Of the files of frame ``i``."""
+        return self.layout.stem(self.recording, i)
+
+    def extras(self, i: int) -> list[Path]:
+        """Figure and points that are wanted of frame ``i``: of all frames, or of the first that has another view."""
+        first = next((k for k in self.frames if k in self.offers), self.frames[0])
+        kinds = [kind for kind in EXTRAS if self.settings[kind] == "all" or (self.settings[kind] and i == first)]
+        return [self.folder / kind / f"{self.name(i)}{end}" for kind in kinds for end in EXTRAS[kind]]
+
+    def missing(self, i: int) -> bool:
+        """Whether a file of frame ``i`` is to be made."""
+        return self.name(i) not in self.done or not all(path.is_file() for path in self.extras(i))
+
+
+def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:
+    """``dhtorch complete``: write the frames of ``out`` that are not there yet; a folder for each of several scenes.
+
+    Args:
+        settings: the options of ``conf/complete.yaml``, resolved, with ``choices``.
+        parts: ``data`` and ``method``, as objects.
+        progress: wraps a loop: (items, text, number of items) → items.
+
+    Returns:
+        Exit code 0.
+
+    Raises:
+        ValueError, OSError, ImportError: bad options or data, a folder that holds something else.
+        KeyboardInterrupt: Ctrl-C; whole frames stay.
+    """
+    _check(settings)
+    if settings["threads"] is not None:
+        torch.set_num_threads(settings["threads"])
+        data_files.set_opencv_threads(settings["threads"])
+    scenes = scenes_of(parts["data"])
+    out = Path(str(settings["out"])).expanduser()
+    found: dict[Path, str] = {}
+    digests: dict[Path | None, str] = {}
+    for scene in scenes:
+        folder = out if len(scenes) == 1 else out / scene.name
+        if folder in found:
+            raise ValueError(f"data: found two scenes named {scene.name}, expected one (data.camera=KEY, or one root)")
+        if scene.root not in digests:
+            digests[scene.root] = _digest(scene, settings, out)
+        task = _task(scene, folder, parts["method"], settings, digests[scene.root])
+        _take_up(task)
+        before = sum(task.name(i) in task.done for i in task.frames)
+        _make(task, progress)
+        found[folder] = _said(task, before)
+    print("\n".join([*found.values(), "wrote", *(f"  {folder}" for folder in found)]))
+    return 0
+
+
+def _task(scene: Scene, folder: Path, method: Method, settings: Mapping[str, Any], digest: str) -> Task:
+    """What is wanted of a scene, and what is there already."""
+    frames = range(0, len(scene.recording), settings["every"])[: settings["most"]]
+    hw = scene.recording[0].hw
+    if 0 in hw:
+        raise ValueError(f"{scene.name}: found frames without pictures, expected pictures (data.images=true)")
+    same = dense.map_hw(hw, settings["size"]) == hw
+    asked = {"unit": settings["unit"], "arrays": settings["arrays"], "same": same}
+    layout = layout_of(scene.recording, settings["format"], **asked)
+    pairs = [] if len(scene.recording) < 2 else by_choice(scene, settings["steps"], stride=1, past=settings["past"])
+    return Task(
+        scene=scene,
+        folder=folder,
+        layout=layout,
+        method=method,
+        settings=settings,
+        frames=frames,
+        offers={pair.anchor: pair.offered for pair in pairs},
+        shared=_shared(scene, layout, settings, digest),
+    )
+
+
+def _shared(scene: Scene, layout: Layout, settings: Mapping[str, Any], digest: str) -> Row:
+    """What all frames of a scene have in common, and their key."""
+    config = {k: settings[k] for k in KEYED} | {"scene": scene.name, "format": layout.name, "unit": layout.unit}
+    made = archive.meta(device="cpu", dtype=settings["dtype"], threads=1, seed=settings["seed"])
+    name = settings["choices"]["data"]
+    found: Row = storage.strict(
+        {
+            "format": FORMAT,
+            "scene": scene.name,
+            "layout": layout.name,
+            "unit_m": layout.unit,
+            "sigma_unit_m": layout.sigma_unit,
+            "reach_m": layout.reach,
+            "version": made["versions"]["dhtorch"],
+            "git": made["git"],
+            "method": settings["choices"]["method"],
+            "calibration": None if dense.shipped() is None else CALIBRATION,
+            "key": archive.result_key({**config, "files": FORMAT}, digest, roots=ROOTS),
+            "config": archive.portable(config),
+            "data": {"name": name, "digest": digest},
+            "codes": {"source": names(Source), "gate": names(Gate)},
+        }
+    )
+    return found
+
+
+def _digest(scene: Scene, settings: Mapping[str, Any], out: Path) -> str:
+    """Of all data files; what is written here may lie beside them."""
+    files = {**archive.files_below([scene.root]), **archive.files_named({k: settings[k] for k in ("data", "method")})}
+    place = out.resolve()
+    return archive.data_digest({k: p for k, p in files.items() if not p.resolve().is_relative_to(place)})
+
+
+# ------------------------------------------------------------------------------------------------------ what is there
+
+
+def _take_up(task: Task) -> None:
+    """Note the frames of a folder that are whole; what a killed run left of others is removed.
+
+    Raises:
+        FileExistsError: the folder holds something else; the message says what differs.
+        NotADirectoryError: it is a file.
+    """
+    folder, about = task.folder, task.folder / "complete.json"
+    if folder.exists() and not folder.is_dir():
+        raise NotADirectoryError(f"out: {folder} is a file, expected a folder, or a place for one")
+    storage.clear(about)
+    if not folder.is_dir() or not any(folder.iterdir()):
+        return
+    if not about.is_file():
+        raise FileExistsError(f"out: {folder} holds other files, expected an empty folder, or one that this word made")
+    try:
+        there = storage.loads(about.read_text(encoding="utf-8"))
+        same = there["key"] == task.shared["key"]
+        found = "" if same else archive.difference(there, task.shared)
+    except (ValueError, KeyError, TypeError) as error:
+        raise FileExistsError(f"{about}: found {error}, expected what dhtorch complete writes") from None
+    if not same:
+        raise FileExistsError(f"{about}: found other frames ({found}), expected these, or another folder for out")
+    task.done.update(_found(task))
+    for kind in (*task.layout.folders, *EXTRAS):
+        for file in (folder / kind).glob("*"):
+            if file.stem not in task.done:
+                file.unlink()
+
+
+def _found(task: Task) -> dict[str, Row]:
+    """The frames that are whole, by name."""
+    metas = sorted((task.folder / "meta").glob("*.json"))
+    return {path.stem: row for path in metas if (row := _row(task, path))}
+
+
+def _row(task: Task, path: Path) -> Row | None:
+    """The meta file of a frame that is whole."""
+    if any(not task.layout.file(task.folder, kind, path.stem).is_file() for kind in task.layout.folders):
+        return None
+    try:
+        row: Row = storage.loads(path.read_text(encoding="utf-8"))
+        return row if row["key"] == task.shared["key"] else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+# ------------------------------------------------------------------------------------------------------ what is made
+
+
+def _make(task: Task, progress: Progress) -> None:
+    """Make what is missing, frame by frame; the folder is a recording at every end but a kill."""
+    todo = [i for i in task.frames if task.missing(i)]
+    try:
+        for i in progress(todo, f"{task.scene.name}: frames", len(todo)):
+            if task.name(i) not in task.done:
+                _write(task, i, *_completed(task, i))
+            _write_extras(task, i)
+    except KeyboardInterrupt:
+        _close(task)
+        n = sum(task.name(i) in task.done for i in task.frames)
+        stay = f"{n} of {len(task.frames)} frames in {task.folder} are whole and stay"
+        raise KeyboardInterrupt(f"{stay}; the same command does the rest") from None
+    except Exception:
+        _close(task)
+        raise
+    _close(task)
+
+
+def _close(task: Task) -> None:
+    """Note what is whole now, and make a recording of it."""
+    task.done.update(_found(task))
+    known = [i for i in range(len(task.recording)) if task.name(i) in task.done]
+    if known:
+        task.layout.close(task.folder, task.recording, known, [task.done[task.name(i)] for i in known])
+
+
+def _completed(task: Task, i: int) -> tuple[Frame, DepthMap, Row]:
+    """The map of one frame, on the CPU, and which views were asked for it."""
+    s, offered = task.settings, task.offers.get(i, ())
+    anchor = _shown(task, i)
+    if not offered:
+        found = dense.sensed(anchor, method=task.method, size=s["size"])
+        return anchor, found.to("cpu"), {"views": [], "n_offered": 0}
+    others = stack([_shown(task, k) for k in offered])
+    options: dict[str, Any] = {k: s[k] for k in (*SWEEP, "seed")}
+    options |= {"method": choosing(task.method), "calibration": dense.shipped(), "hint": task.scene.hint}
+    trace: Trace = {}
+    with torch.no_grad():
+        found = dense.complete(anchor, others, **options, trace=trace)
+    choice = picked(i, offered, trace)
+    number = task.recording.number
+    return anchor, found.to("cpu"), {"views": [int(number[k]) for k in choice.views], **choice.row()["why"]}
+
+
+def _shown(task: Task, i: int) -> Frame:
+    """A frame as the method may see it."""
+    s = task.settings
+    frame = task.recording[i].to(getattr(torch, s["dtype"])).to(s["device"])
+    return range_split(frame, s["cutoff"])
+
+
+def _write(task: Task, i: int, anchor: Frame, found: DepthMap, asked: Row) -> None:
+    """The files of one frame; the one that makes it whole comes last."""
+    name, layout, one = task.name(i), task.layout, found[0]
+    steps = export.in_steps(one.depth, one.sigma, one.source, layout.unit)
+    pictures = {"depth": steps.depth, "sigma": steps.sigma, "source": steps.source}
+    if layout.pictures:
+        pictures[layout.pictures] = _picture(anchor, steps.depth.shape)
+    if layout.confidence:
+        pictures["confidence"] = confident(steps.source)
+    if not (about := task.folder / "complete.json").is_file():
+        storage.write_json(about, task.shared)
+    for kind, pixels in pictures.items():
+        storage.replace_file(layout.file(task.folder, kind, name), export.png(pixels))
+    if layout.arrays:
+        storage.replace_file(layout.file(task.folder, "arrays", name), _arrays(one))
+    row = storage.strict(_about(task, i, anchor, steps) | asked | _counts(steps, one))
+    storage.write_json(layout.file(task.folder, "meta", name), row)
+
+
+def _about(task: Task, i: int, anchor: Frame, steps: export.Steps) -> Row:
+    """What a reader of one frame has to know."""
+    camera = cameras.resize(anchor.camera, anchor.hw, steps.depth.shape).to("cpu")
+    poses = task.recording.poses
+    same = ("key", "version", "method", "calibration", "unit_m", "sigma_unit_m")
+    return {
+        **{k: task.shared[k] for k in same},
+        "cutoff_m": task.settings["cutoff"],
+        "frame": int(task.recording.number[i]),
+        "time": None if anchor.time is None else float(anchor.time[0]),
+        "hw": list(steps.depth.shape),
+        "K": cameras.to_matrix(camera)[0],
+        "distortion": None if camera.distortion is None else camera.distortion[0],
+        "T_world_from_cam": None if poses is None else se3.to_matrix(poses[i : i + 1])[0],
+    }
+
+
+def _counts(steps: export.Steps, one: DepthMap) -> Row:
+    """Pixels by source, and the shares of all pixels that are silent, by reason."""
+    kinds = {code: name.lower() for code, name in names(Source).items() if code != Source.RECOVERED}
+    pixels = {name: int((steps.source == code).sum()) for code, name in kinds.items()}
+    gates = {name.lower(): float((one.gate == code).double().mean()) for code, name in names(Gate).items()}
+    silent = {name: share for name, share in gates.items() if share and name != "answer"}
+    return {"pixels": pixels, "silent": {**silent, "unfit": float(steps.unfit.mean())}}
+
+
+def _picture(frame: Frame, hw: tuple[int, ...]) -> np.ndarray:
+    """The picture at the size of the map, (h, w, 3) or (h, w) uint8; each pixel the mean of what it covers."""
+    image = frame.image[0].cpu()
+    if image.is_floating_point():
+        image = (image.clamp(0, 1) * 255).round().to(torch.uint8)
+    if image.shape[-2:] != hw:
+        image = F.interpolate(image[None].float(), hw, mode="area")[0].round().to(torch.uint8)
+    return image[0].numpy() if len(image) == 1 else image.permute(1, 2, 0).numpy()
+
+
+def _arrays(one: DepthMap) -> bytes:
+    """The map as it was found, as NPZ."""
+    out = io.BytesIO()
+    codes = {k: getattr(one, k).to(torch.uint8).numpy() for k in ("source", "gate")}
+    np.savez_compressed(out, **{k: getattr(one, k).numpy() for k in ("depth", "sigma", "score")}, **codes)
+    return out.getvalue()
+
+
+# ------------------------------------------------------------------------------------------------- what is shown of it
+
+
+def _write_extras(task: Task, i: int) -> None:
+    """Figure and points of a frame, as its files have it."""
+    wanted = [path for path in task.extras(i) if not path.is_file()]
+    if not wanted:
+        return
+    name, layout = task.name(i), task.layout
+    maps = {
+        kind: data_files.read_depth_png(layout.file(task.folder, kind, name), 1 / unit)
+        for kind, unit in (("depth", layout.unit), ("sigma", layout.sigma_unit))
+    }
+    source = data_files.read_image(layout.file(task.folder, "source", name))[0]
+    frame = task.recording[i]
+    picture = _picture(frame, source.shape)
+    for path in wanted:
+        if path.suffix == ".png":
+            out = io.BytesIO()
+            draw_completed(out, frame.image[0], **maps, source=source, title=f"{task.scene.name} {name}")
+            storage.replace_file(path, out.getvalue())
+        else:
+            _write_points(path, frame, picture, **maps, source=source)
+
+
+def _write_points(
+    path: Path, frame: Frame, picture: np.ndarray, *, depth: np.ndarray, sigma: np.ndarray, source: np.ndarray
+) -> None:
+    """A frame in its camera's axes: points as PLY, a mesh of what lies on one surface as GLB."""
+    hw = depth.shape[0], depth.shape[1]
+    z = torch.from_numpy(np.where(depth > 0, depth, np.nan)).reshape(1, -1)
+    xyz = cameras.unproject(frame.camera, dense.pixels(frame, hw)[None], z)[0]
+    rgb = np.broadcast_to(picture if picture.ndim == 3 else picture[..., None], (*hw, 3)).reshape(-1, 3)
+    if path.suffix == ".ply":
+        export.write_ply(path, xyz, rgb, sigma=sigma.reshape(-1), source=source.reshape(-1))
+    else:
+        export.write_glb(path, [export.Shape("view", xyz, rgb, face=export.faces(depth))])
+
+
+def _said(task: Task, before: int) -> str:
+    """One scene in words."""
+    rows = [task.done[task.name(i)] for i in task.frames]
+    pixels: Counter[str] = Counter()
+    silent: Counter[str] = Counter()
+    for row in rows:
+        pixels.update(row["pixels"])
+        silent.update({k: share / len(rows) for k, share in row["silent"].items()})
+    sensor, swept, none = (f"{kind} {pixels[k] / pixels.total():.1%}" for k, kind in KINDS.items())
+    unfit = silent.pop("unfit")
+    reasons = ", ".join(f"{words(name.upper())} {share:.1%}" for name, share in silent.most_common())
+    layout, (h, w) = task.layout, rows[0]["hw"]
+    lines = [
+        f"{task.scene.name}: {len(rows)} frame{'s' * (len(rows) != 1)}{f' ({before} left untouched)' * (before > 0)}"
+        f" of {w}x{h}: {sensor}, {swept}, {none}{f' ({reasons})' * bool(reasons)}",
+        f"  steps of {1e3 * layout.unit:g} mm reach {layout.reach:.1f} m"
+        + (f": {unfit:.2%} of the pixels do not fit and are silent (unit=, arrays=true)" if unfit else ""),
+    ]
+    if layout.name == "png" != task.settings["format"]:
+        lines.append("  maps alone, no recording: not every frame has a pose")
+    if layout.pictures and own_cameras(rows):
+        lines.append("  the camera changes: K beside the maps is that of the first frame, meta/ has each frame's own")
+    return "\n".join(lines)
+
+
+def _check(settings: Mapping[str, Any]) -> None:
+    """Options that would only fail after minutes."""
+    for name in ("most", "every"):
+        value = settings[name]
+        if not (isinstance(value, int) and value >= 1) and not (name == "most" and value is None):
+            raise ValueError(f"{name}: found {value!r}, expected a whole number of at least 1")
+    words_of = {"format": ("auto", *LAYOUTS), "dtype": ("float32", "float64"), **dict.fromkeys(EXTRAS, SHOWN)}
+    for name, known in words_of.items():
+        if settings[name] not in known:
+            shown = ", ".join(str(word).lower() for word in known)
+            raise ValueError(f"{name}: found {settings[name]!r}, expected one of {shown}")
+    for name, (low, high) in RANGES.items():
+        value = settings[name]
+        if value is not None and not (isinstance(value, int | float) and low < value <= high):
+            raise ValueError(f"{name}: found {value!r}, expected a number above {low:g}, at most {high:g}")
+    try:
+        torch.empty(0, device=settings["device"])
+    except (RuntimeError, AssertionError) as error:
+        raise ValueError(f"device: found {settings['device']!r}, expected one that torch can use here") from error

@@ -1,0 +1,118 @@
+"""A completed view: the picture, what the sensor says of it, what is known of it now, and how well.
+
+Arrays may be torch tensors or numpy arrays, on any device, of one view (no batch dimension).
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from dhtorch.codes import Source
+from dhtorch.drawing import colours
+from dhtorch.drawing.axis import Axis
+from dhtorch.drawing.canvas import SMALL, Canvas, save
+from dhtorch.drawing.colours import INK, Stroke
+
+#: Width of a picture, between two of them, and the heights of a title and of a scale with its numbers, points.
+WIDTH, GAP, TITLE, SCALE = 340.0, 12.0, 20.0, 46.0
+#: Shares of the depths that the scale leaves out at its ends.
+NEAREST, FARTHEST = 0.01, 0.99
+#: Scale of sigma / depth.
+SIGMA_REL = (0.005, 0.2)
+#: From this ratio of its ends on, round numbers on a scale are those of decades.
+DECADES = 8.0
+
+
+def draw_completed(
+    path: str | Path | IO[bytes],
+    image: Any,  # (C, h, w) or (C, H, W) uint8, or float in [0, 1]
+    depth: Any,  # (h, w) m, 0 or NaN where nothing is known
+    sigma: Any,  # (h, w) m
+    source: Any,  # (h, w) codes.Source
+    *,
+    title: str = "",
+) -> None:
+    """Draw the picture, the sensor's depth, the completed one on the same scale, and its sigma / depth.
+
+    Depth is drawn by its logarithm, the nearest blue, the farthest red; what lies beyond the ends of a scale, of the
+    depths a hundredth on each side, has the colour of that end. Silence is left blank.
+    """
+    z, s, code = (_array(x) for x in (depth, sigma, source))
+    known = np.isfinite(z) & (z > 0) & (code != Source.NONE)
+    metres, share = _depths(z[known]), Axis(*SIGMA_REL, "sigma / depth, %", log=True, percent=True)
+    sensed = known & (code == Source.SENSOR)
+    height = WIDTH * z.shape[0] / z.shape[1]
+    canvas = Canvas(2 * WIDTH + GAP, 2 * (height + TITLE) + SCALE, dpi=160)
+    rows = SCALE, SCALE + height + TITLE
+    ratio = np.where(known, s / np.where(known, z, 1), 1)
+    shown = [
+        (_title("Picture", title), rows[1], _rgb(image)),
+        (f"Sensor: {_percent(sensed)}", rows[1], _coloured(z, sensed, metres, colours.DEPTH)),
+        (f"Completed: {_percent(known)}, the rest is silent", rows[0], _coloured(z, known, metres, colours.DEPTH)),
+        ("Sigma / depth", rows[0], _coloured(ratio, known, share, colours.ERROR)),
+    ]
+    for k, (words, bottom, pixels) in enumerate(shown):
+        left = (k % 2) * (WIDTH + GAP)
+        canvas.title(words, WIDTH, bottom + height + TITLE, left)
+        canvas.picture(pixels, (left, bottom, WIDTH, height))
+    _scale(canvas, metres, colours.DEPTH, 0.0)
+    _scale(canvas, share, colours.ERROR, WIDTH + GAP)
+    save(canvas.figure, path)
+
+
+def _depths(depth: np.ndarray) -> Axis:
+    """The scale of all depths."""
+    low, high = np.quantile(depth, (NEAREST, FARTHEST)).tolist() if depth.size else (0.5, 5.0)
+    high = max(high, 1.25 * low)
+    return Axis(low, high, "depth, m", log=True)
+
+
+def _coloured(values: np.ndarray, there: np.ndarray, axis: Axis, kind: str) -> np.ndarray:
+    """(h, w, 3) in [0, 1]: values by a colour map along a logarithmic axis, the ground where there is none."""
+    low, high = math.log(axis.low), math.log(axis.high)
+    places = (np.log(np.where(there, values, axis.low).clip(1e-9)) - low) / (high - low)
+    ground = np.array(colours.rgb(colours.PICTURE)) / 255
+    return np.where(there[..., None], _mapped(places.clip(0, 1), kind), ground)
+
+
+def _mapped(places: np.ndarray, kind: str) -> np.ndarray:
+    """Colours (…, 3) of places in [0, 1]."""
+    from matplotlib import colormaps  # noqa: PLC0415
+
+    return colormaps[kind](places)[..., :3]
+
+
+def _scale(canvas: Canvas, axis: Axis, kind: str, left: float) -> None:
+    """A colour map from end to end under a picture, with round numbers and what they mean."""
+    base, height = SCALE - 18.0, 9.0
+    canvas.picture(_mapped(np.linspace(0, 1, 256)[None].repeat(2, 0), kind), (left, base, WIDTH, height))
+    ticks = axis.ticks(8) if axis.high > DECADES * axis.low else Axis(axis.low, axis.high).ticks(8)
+    for tick in ticks:
+        u = left + WIDTH * axis.place(tick)
+        canvas.lines([((u, base), (u, base - 3))], Stroke(INK, 0.7))
+        canvas.text(axis.write(tick), min(max(u, left + 6), left + WIDTH - 6), base - 13, size=SMALL - 1, ha="center")
+    canvas.text(axis.label, left + WIDTH / 2, 1, ha="center")
+
+
+def _percent(mask: np.ndarray) -> str:
+    return f"{100 * mask.mean():.0f} %"
+
+
+def _title(word: str, title: str) -> str:
+    return f"{title}: {word.lower()}" if title else word
+
+
+def _rgb(image: Any) -> np.ndarray:
+    """(H, W) or (H, W, 3) in [0, 1]."""
+    pixels = _array(image)
+    pixels = pixels / 255.0 if pixels.dtype == np.uint8 else pixels
+    pixels = np.clip(pixels, 0, 1)
+    return pixels[0] if len(pixels) == 1 else pixels.transpose(1, 2, 0)
+
+
+def _array(x: Any) -> np.ndarray:
+    return x.detach().cpu().numpy() if hasattr(x, "detach") else np.asarray(x)
