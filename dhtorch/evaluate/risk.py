@@ -96,7 +96,8 @@ def ause(pooled: Points) -> float | None:
     Source: E. Ilg et al., "Uncertainty estimates and multi-hypotheses networks for optical flow", 2018.
     """
     answered = pooled.answered()
-    loss, n = capped(answered.error), answered.keep.numel()
+    loss = capped(answered.error)
+    n = answered.keep.numel()
     if not n:
         return None
     left = torch.tensor([max(round(n * (100 - k) / 100), 1) - 1 for k in range(96)], device=loss.device)

@@ -184,7 +184,7 @@ def run(
         parts.append(protocol.run(asked, whole, some, settings, progress=progress))
     outcome = protocol.join(parts)
     outcome.summary |= _summary(outcome, {scene.name: scene.place for scene in every}, indoor, peers)
-    outcome.summary["dense.rotation_answered"] = _turned(outcome)
+    outcome.summary["dense.rotation_answered"] = turned(outcome)
     if rooms:
         outcome.summary |= within_one(rooms, sparse, options)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, peers))
@@ -362,7 +362,7 @@ def _points(outcome: Outcome, variant: str, cohort: str = FULL) -> dict[str, Poi
     }
 
 
-def _turned(outcome: Outcome) -> Row:
+def turned(outcome: Outcome) -> Row:
     """Share of the pixels without a return that are answered where the camera only turns, pooled over its scenes."""
     turning = {row["scene"] for row in outcome.rows if row.get("role") == "rotation"}
     asked = [
