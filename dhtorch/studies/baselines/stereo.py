@@ -110,7 +110,7 @@ def rectify(
     K_0, d_0 = _opencv(camera_0)
     K_1, d_1 = _opencv(camera_1)
     R, t = (x[0].double().cpu().numpy() for x in (T_1_from_0.R, T_1_from_0.t))
-    R_0, R_1, N_0, N_1 = _CV.stereoRectify(K_0, d_0, K_1, d_1, (w, h), R, t.reshape(3, 1))[:4]
+    R_0, R_1, N_0, N_1 = _CV.stereoRectify(K_0, d_0, K_1, d_1, imageSize=(w, h), R=R, T=t.reshape(3, 1))[:4]
     upright = abs(N_1[0, 3]) >= abs(N_1[1, 3])
     reach = float(-N_1[0, 3] if upright else -N_1[1, 3])
     shrink = min(1.0, DISPARITIES / max(abs(reach) / nearest_m, 1e-9))

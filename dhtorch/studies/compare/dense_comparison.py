@@ -121,8 +121,16 @@ class Looking:
         lost = ~fit.ok
         R = torch.where(lost[:, None, None], torch.nan, fit.T_1_from_0.R)
         t = torch.where(lost[:, None], torch.nan, fit.T_1_from_0.t)
-        trace = {**trace, "sparse": joined}
-        return Looked(anchor, trace, asked, maps, grid, asked.frames[at], Pose(R, t), ms)
+        return Looked(
+            anchor=anchor,
+            trace={**trace, "sparse": joined},
+            asked=asked,
+            maps=maps,
+            grid=grid,
+            other=asked.frames[at],
+            T_1_from_0=Pose(R, t),
+            ms=ms,
+        )
 
 
 def run(

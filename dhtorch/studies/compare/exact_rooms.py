@@ -77,7 +77,16 @@ def exact_pose(anchor: Frame, other: Frame, n: int) -> PoseFit:
     inlier = torch.ones(len(one), n, dtype=torch.bool, device=one.device)
     code = torch.full_like(one, PoseCode.OK, dtype=torch.int32)
     cov = 1e-8 * torch.eye(6).to(T.t).expand(len(one), 6, 6)
-    return PoseFit(T, cov, inlier, inlier.sum(-1), one, 0.1 * one, 1e3 * one, code)
+    return PoseFit(
+        T_1_from_0=T,
+        cov=cov,
+        inlier=inlier,
+        n_inlier=inlier.sum(-1),
+        rms_px=one,
+        sigma_px=0.1 * one,
+        t_snr=1e3 * one,
+        code=code,
+    )
 
 
 def judged(anchor: Frame, other: Frame, odd: Tensor) -> Tensor:
