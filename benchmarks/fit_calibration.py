@@ -3,6 +3,8 @@
 python benchmarks/fit_calibration.py      on the shared scenes, five seeds; writes dhtorch/calibration/map.json
 python benchmarks/fit_calibration.py --method auto --seeds 2          the same of methods of several views, whose
 python benchmarks/fit_calibration.py --method window_1 --seeds 2      thresholds nine scenes in ten keep, one by one
+python benchmarks/fit_calibration.py --dense                          of swept pixels under the motions of auto, four
+                                      anchors a scene, one seed; writes dhtorch/calibration/dense.json
 
 Scenes with a role are left out; every scene has the same weight, its seeds are pooled. What the same recipe is worth in
 rooms it was not fitted on is measured by ``dhtorch experiment=method_comparison`` (rows ``ece``, ``realised_risk_…``).
@@ -26,7 +28,12 @@ from dhtorch.commands.run import config_dir
 from dhtorch.data.pairs import around, by_gap
 from dhtorch.evaluate import control, score_calibration
 from dhtorch.evaluate.compare import MIN_ABOVE as FEW
+from dhtorch.evaluate.errors import Points
 from dhtorch.studies import protocol
+from dhtorch.studies.compare import dense_comparison
+
+#: Anchors of every scene whose maps a calibration of swept pixels is fitted on.
+ANCHORS = 4
 
 HERE = Path(__file__).resolve().parent
 
@@ -38,28 +45,52 @@ def settings(method: str) -> tuple[protocol.Method, list[Any]]:
     return instantiate(cfg.method, _convert_="all"), instantiate(cfg.data, _convert_="all")
 
 
+def _sparse(method: protocol.Method, chosen: list[Any], seeds: int) -> dict[str, list[Points]]:
+    """Scene → candidates of every seed."""
+    offers = None if method.choose is None else around
+    variants = {f"{k}": protocol.Variant(method, seed=k, offers=offers) for k in range(seeds)}
+    return _by_scene(protocol.run(chosen, protocol.Protocol(variants), by_gap, protocol.Settings()).points)
+
+
+def _dense(method: protocol.Method, chosen: list[Any]) -> dict[str, list[Points]]:
+    """Scene → hidden pixels of the maps of some anchors."""
+    study = dense_comparison.run(
+        chosen, {"auto": method}, by_gap, protocol.Settings(), anchors=ANCHORS, peers=False, rooms=()
+    )
+    wanted = (dense_comparison.DENSE, dense_comparison.FULL)
+    return _by_scene({k: p for k, p in study.points.items() if k[1:] == wanted and p.keep.numel()})
+
+
+def _by_scene(found: dict[tuple[str, str, str], Points]) -> dict[str, list[Points]]:
+    scenes: dict[str, list[Points]] = {}
+    for (scene, _, _), points in found.items():
+        scenes.setdefault(scene, []).append(points)
+    return scenes
+
+
 def main() -> int:
     """Run the method on the scenes, fit, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--method", default="map")
     parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--dense", action="store_true")
     parser.add_argument("--output", type=Path, default=None)
     options = parser.parse_args()
     torch.set_num_threads(1)
+    if options.dense:
+        options.method, options.seeds = "auto", 1
     method, chosen = settings(options.method)
-    offers = None if method.choose is None else around
-    variants = {f"{k}": protocol.Variant(method, seed=k, offers=offers) for k in range(options.seeds)}
-    outcome = protocol.run(chosen, protocol.Protocol(variants), by_gap, protocol.Settings())
+    found = _dense(method, chosen) if options.dense else _sparse(method, chosen, options.seeds)
     scenes = [scene.name for scene in chosen if scene.role is None]
-    found = {s: [p for (name, _, _), p in outcome.points.items() if name == s] for s in scenes}
-    pooled = {s: tree.collate(points) for s, points in found.items() if points}
+    pooled = {s: tree.collate(found[s]) for s in scenes if found.get(s)}
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], cwd=HERE, capture_output=True, text=True, check=False
     ).stdout.strip()
-    origin = {"method": options.method, "scenes": [*pooled], "truth": "full", "seeds": options.seeds, "git": commit}
+    name = "dense" if options.dense else options.method
+    origin = {"method": name, "scenes": [*pooled], "truth": "full", "seeds": options.seeds, "git": commit}
     choose = control.plug_in if method.views == 1 else partial(control.most_scenes, few=FEW * options.seeds)
     fitted = score_calibration.fit(list(pooled.values()), choose=choose, provenance=origin)
-    target = options.output or HERE.parent / "dhtorch" / "calibration" / f"{options.method}.json"
+    target = options.output or HERE.parent / "dhtorch" / "calibration" / f"{name}.json"
     print(calibration.save(fitted, target))
     return 0
 
