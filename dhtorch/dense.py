@@ -48,6 +48,11 @@ GREY_NOISE, INDEPENDENT = 0.002, 5.0
 #: signs fit less well, windows show something else as well, and where they fit better, less noise.
 MISFIT = 40.0
 
+#: Cost (of one view) by which the best place along the line must beat every other that is further away in the pictures
+#: than so many pixels. What surrounds a pixel weighs by the price of jumps (18 from each side): a rival within more than
+#: one may be the better one, as where a texture repeats.
+RIVAL, ELSEWHERE_PX = 30, 3.0
+
 #: A pixel whose window of so many pixels to each side holds a step of the surface may belong to the other side of it:
 #: standard deviation as a share of the step.
 WINDOW, EDGE = 4, 0.17
@@ -185,7 +190,8 @@ def swept(
     start = _best_planes(base, partner, q)
     found = _fitted(base, partner, start, q, refinements)
     beyond = start.q >= q[:, -1, None, None] * (1 - 1e-6)
-    told = _gated(base, found, beyond, _silent_pairs(asked, wanted), min_correlation, max_sigma_rel)
+    silent = _silent_pairs(asked, wanted)
+    told = _gated(base, found, (beyond, start.alone), silent, min_correlation, max_sigma_rel)
     told = told if calibration is None else calibration.apply(told)
     return _with_sensor(told, anchor, method, asked.samples)
 
@@ -286,6 +292,7 @@ class Found(NamedTuple):
 
     q: Tensor  # 1/m, between the planes by a parabola
     misfit: Tensor  # cost of the surface there for each view, see sweep.aggregate
+    alone: Tensor  # bool, no other place along the line costs nearly as little
 
 
 @torch.no_grad()
@@ -296,9 +303,23 @@ def _best_planes(base: sweep.Base, partners: list[Partner], q: Tensor) -> Found:
         if is_static(use) or bool(use.any()):
             sweep.add_costs(C, base, view, q, use)
     views = torch.stack([partner.use for partner in partners]).sum(0).clamp_min(1)
-    best = sweep.winner(sweep.aggregate(C.movedim(1, -1).contiguous(), views))
-    step = (q[:, 1] - q[:, 0])[:, None, None]
-    return Found((best.plane + best.shift) * step, best.cost / views[:, None, None].to(q))
+    S = sweep.aggregate(C.movedim(1, -1).contiguous(), views)
+    best, step = sweep.winner(S), q[:, 1] - q[:, 0]
+    place = (best.plane + best.shift) * step[:, None, None]
+    each = views[:, None, None]
+    alone = sweep.rivals(S, best, _elsewhere(base, partners, place, step)) >= RIVAL * each
+    return Found(place, best.cost / each.to(q), alone)
+
+
+def _elsewhere(base: sweep.Base, partners: list[Partner], q: Tensor, step: Tensor) -> Tensor:
+    """Planes (B,) beyond which a pixel has moved by more than a few in the view that moves most."""
+    moved = []
+    for view, _, _, use in partners:
+        go = sweep.travel(base, view)
+        here, there = (go.at(q.flatten(1) + k * step[:, None]) for k in (0, 1))
+        length = (torch.stack(there) - torch.stack(here)).norm(dim=0).median(-1).values
+        moved.append(torch.where(use, length, 0.0))
+    return (ELSEWHERE_PX / torch.stack(moved).amax(0).clamp_min(1e-3)).ceil().clamp(2, 1e4)
 
 
 def _fitted(base: sweep.Base, partners: list[Partner], start: Found, q: Tensor, steps: int) -> Fitted:
@@ -375,16 +396,18 @@ def _silent_pairs(asked: Asked, wanted: Tensor) -> Tensor:
 def _gated(
     base: sweep.Base,
     found: Fitted,
-    beyond: Tensor,  # (B, h, w) bool, nearer than the nearest plane
+    place: tuple[Tensor, Tensor],  # (B, h, w) bool each: nearer than the nearest plane, found in one place only
     silent: Tensor,  # (B,)
     min_correlation: float,
     max_sigma_rel: float,
 ) -> DepthMap:
     """The swept map: depths, and what speaks against them."""
+    beyond, alone = place
     depth = 1 / found.q.clamp_min(1e-9)
     sigma_rel = (found.own + found.shared).sqrt() * depth.detach()
     lost = ~base.known.unflatten(-1, base.hw) | ~found.seen | beyond | (found.correlation < min_correlation)
-    gate = first_reason((lost, Gate.NO_TRACK), (~(sigma_rel <= max_sigma_rel), Gate.UNCERTAIN))
+    unsure = ~(sigma_rel <= max_sigma_rel) | ~alone
+    gate = first_reason((lost, Gate.NO_TRACK), (unsure, Gate.UNCERTAIN))
     pair = silent[:, None, None].expand_as(gate)
     gate = torch.where(pair != Gate.ANSWER, pair, gate)
     keep = gate == Gate.ANSWER

@@ -275,6 +275,20 @@ def _winner(S: Tensor) -> tuple[Tensor, ...]:
     return index, shift, cost.to(S.dtype)
 
 
+def rivals(S: Tensor, best: Winner, reach: Tensor) -> Tensor:
+    """How much more the best plane costs (B, h, w) that lies further than ``reach`` (B,) planes from the winner.
+
+    Asked at every other pixel, both ways; its neighbours have its answer. Gradient: none.
+    """
+    cost, plane = (x[:, ::2, ::2, None] for x in (best.cost, best.plane.to(torch.int16)))
+    apart = (torch.arange(S.shape[-1], dtype=torch.int16, device=S.device) - plane).abs()
+    near = apart <= reach.to(torch.int16)[:, None, None, None]
+    most = torch.iinfo(S.dtype).max
+    more = S[:, ::2, ::2].masked_fill(near, most).amin(-1, keepdim=True) - cost
+    more = more[..., 0].repeat_interleave(2, 1).repeat_interleave(2, 2)
+    return more[:, : S.shape[1], : S.shape[2]]
+
+
 class Fit(NamedTuple):
     """How the grey values around every pixel fit one view at the depths given; (B, h, w) each."""
 

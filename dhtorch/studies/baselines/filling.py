@@ -17,10 +17,10 @@ from dhtorch.records import Estimate, Frame, Samples
 from dhtorch.studies.baselines.stereo import answer
 
 #: Longer side of the pictures, px; window and its spreads in space (px) and grey value.
-SIZE, WINDOW, SPACE, GREY = 160, 9, 3.0, 0.1
+SIZE, WINDOW, SPACE, GREY = 96, 9, 3.0, 0.1
 
 #: Times that returns are carried on: windows reach across the picture.
-ROUNDS = 40
+ROUNDS = 30
 
 #: Least weight of returns in a window that fills its middle.
 LEAST = 1e-3
