@@ -49,8 +49,8 @@ GREY_NOISE, INDEPENDENT = 0.002, 5.0
 MISFIT = 40.0
 
 #: Cost (of one view) by which the best place along the line must beat every other that is further away in the pictures
-#: than so many pixels. What surrounds a pixel weighs by the price of jumps (18 from each side): a rival within more than
-#: one may be the better one, as where a texture repeats.
+#: than so many pixels. What surrounds a pixel weighs by the price of jumps (18 from each side): a rival within more
+#: than one may be the better one, as where a texture repeats.
 RIVAL, ELSEWHERE_PX = 30, 3.0
 
 #: A pixel whose window of so many pixels to each side holds a step of the surface may belong to the other side of it:
@@ -192,8 +192,9 @@ def swept(
     beyond = start.q >= q[:, -1, None, None] * (1 - 1e-6)
     silent = _silent_pairs(asked, wanted)
     told = _gated(base, found, (beyond, start.alone), silent, min_correlation, max_sigma_rel)
-    told = told if calibration is None else calibration.apply(told)
-    return _with_sensor(told, anchor, method, asked.samples)
+    returns = _returns(anchor, method, base.hw)
+    told = _judged(told, returns, asked.samples)
+    return _joined_with(told if calibration is None else calibration.apply(told), returns)
 
 
 def sensed(anchor: Frame, *, method: Method = AUTO, size: int = 640) -> DepthMap:
@@ -427,10 +428,8 @@ def _returns(anchor: Frame, method: Method, hw: tuple[int, int]) -> Samples:
     return samples.map(lambda x: x.unflatten(1, hw))
 
 
-def _with_sensor(told: DepthMap, anchor: Frame, method: Method, near: Samples) -> DepthMap:
-    """The sensor where it answers, else the sweep; which is silent where the sensor refutes it."""
-    h, w = told.depth.shape[-2:]
-    returns = _returns(anchor, method, (h, w))
+def _judged(told: DepthMap, returns: Samples, near: Samples) -> DepthMap:
+    """The sweep, silent where the sensor refutes it, and as unsure as the sensor is that the motions' metre is from."""
     usable, depth, sigma = returns.usable, returns.depth.detach(), returns.sigma.detach()
     sigma_told = told.sigma.detach()
     both = usable & told.keep
@@ -444,7 +443,7 @@ def _with_sensor(told: DepthMap, anchor: Frame, method: Method, near: Samples) -
     share = median(near.sigma / torch.where(noise, near.depth, torch.ones_like(near.depth)), noise)
     share = torch.where(noise.any(-1, keepdim=True), share, 0.0)[..., None].detach()  # a wrong scale passes whole
     sigma_told = (sigma_told.square() + (share * told.depth.detach()).square()).sqrt()
-    return _joined_with(told.replace(sigma=sigma_told, gate=gate), returns)
+    return told.replace(sigma=sigma_told, gate=gate)
 
 
 def _joined_with(told: DepthMap, returns: Samples) -> DepthMap:

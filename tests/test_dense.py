@@ -2,13 +2,15 @@
 
 import pytest
 import torch
+from worlds import Board, look
 
 from dhtorch import MAP
 from dhtorch.codes import Gate, Source
-from dhtorch.dense import complete, resized
+from dhtorch.dense import complete, resized, sensed
 from dhtorch.evaluate.holdout import range_split
-from dhtorch.geometry import se3
-from dhtorch.records import PoseFit
+from dhtorch.evaluate.monotone import Sigmoid, Table
+from dhtorch.evaluate.score_calibration import Calibration, SigmaModel
+from dhtorch.studies.compare.exact_rooms import exact_pose
 from dhtorch.synthetic import SyntheticRoom
 from dhtorch.tree import collate, stack
 
@@ -35,12 +37,8 @@ def found(views):
 
 
 def exact(room, i, j, n=1):
-    """The pose from the room itself, as a fit that is known to a tenth of a millimetre."""
-    T = se3.compose(se3.invert(room[j].T_world_from_cam), room[i].T_world_from_cam)
-    T = T.map(lambda x: x.float())
-    one, cov = torch.ones(1), 1e-8 * torch.eye(6)[None]
-    inlier = torch.ones(1, n, dtype=torch.bool)
-    return PoseFit(T, cov, inlier, inlier.sum(-1), one, 0.1 * one, 1e3 * one, torch.zeros(1, dtype=torch.int32))
+    """The pose from the room itself."""
+    return exact_pose(room[i], room[j], n)
 
 
 def test_far_pixels_of_the_room_are_found_and_know_how_well(views, found):
@@ -100,6 +98,28 @@ def test_a_camera_that_only_turns_gets_the_sensor_alone():
         got = complete(range_split(room[0], NEAR), range_split(room[4], NEAR), **FAST)
     assert bool((got.source != Source.SWEPT).all()) and bool((got.source == Source.SENSOR).any())
     assert bool((got.gate[got.source == Source.NONE] == Gate.NO_BASELINE).all())
+
+
+def test_without_another_view_the_map_is_the_sensors(views):
+    anchor = views[0]
+    got = sensed(anchor, method=FAST["method"])
+    seen = anchor.depth > 0
+    assert torch.equal(got.depth[seen], anchor.depth[seen]) and bool((got.source[seen] == Source.SENSOR).all())
+    assert bool((got.gate[~seen] == Gate.NO_TRACK).all()) and bool(got.depth[~seen].isnan().all())
+
+
+def test_a_calibration_changes_swept_pixels_alone(views, found):
+    model = SigmaModel(2.0, 0.0)
+    table = Table(torch.tensor([0.0, 1.0]), torch.tensor([0.0, 0.5]))
+    sigmoid = Sigmoid(torch.tensor(1.0), torch.tensor(0.0))
+    with torch.no_grad():
+        got = complete(views[0], views[1], calibration=Calibration(table, table, sigmoid, model, {}), **FAST)
+    swept = found.source == Source.SWEPT
+    torch.testing.assert_close(got.sigma[swept], 2 * found.sigma[swept])
+    torch.testing.assert_close(got.score[swept], 0.5 * found.score[swept])
+    for name in ("depth", "source", "gate"):
+        torch.testing.assert_close(getattr(got, name), getattr(found, name), equal_nan=True)
+    assert torch.equal(got.score[~swept], found.score[~swept])
 
 
 def test_a_motion_that_the_sensor_refutes_is_not_believed(room, views):
@@ -184,3 +204,63 @@ def test_a_large_picture_is_swept_at_the_size_asked(views):
 def test_options_out_of_range_raise(views, wrong):
     with pytest.raises(ValueError, match=f"complete: {next(iter(wrong))} is .*, expected at least"):
         complete(views[0], views[1], **{**FAST, **wrong})
+
+
+def boards(*far):
+    """What the map of two views says of boards beyond the sensor, and what is true: (map, depth, which board)."""
+    near = [Board(1.5, x=(-9, -0.35), seed=7), Board(1.5, y=(0.42, 9), seed=8)]
+    anchor, which = look([*near, *far], (0.0, 0.0, 0.0))
+    other, _ = look([*near, *far], (0.15, 0.02, 0.01), angle=(0.01, -0.02, 0.01))
+    fit = exact_pose(anchor, other, 512)
+    with torch.no_grad():
+        got = complete(range_split(anchor, NEAR), range_split(other, NEAR), fit=fit, method=FAST["method"], planes=64)
+    return got, anchor.depth, torch.where(anchor.depth > NEAR, which - len(near), -1)
+
+
+def judged(got, depth, where):
+    """Share answered of the pixels asked for, relative errors of these answers, and errors in sigmas."""
+    told = where & (got.source == Source.SWEPT)
+    off = (got.depth - depth).abs()[told]
+    return float(told.sum() / where.sum()), off / depth[told], off / got.sigma[told]
+
+
+def test_a_slanted_wall_has_no_steps():
+    got, depth, which = boards(Board(3.0, slope=0.8))
+    share, error, sigmas = judged(got, depth, which == 0)
+    assert share > 0.8 and float(error.median()) < 0.006 and float((error > 0.05).float().mean()) < 0.03
+    assert float((sigmas < 2).float().mean()) > 0.9
+
+
+def test_thin_things_are_right_or_unsaid_and_do_not_bleed():
+    got, depth, which = boards(Board(4.0, seed=1), Board(2.5, x=(0.0, 0.04)), Board(2.5, x=(0.5, 0.58)))
+    for post in (1, 2):
+        share, error, _ = judged(got, depth, which == post)
+        assert share < 1 and float((error > 0.2).float().sum()) < 0.15 * (which == post).sum()
+    share, error, _ = judged(got, depth, which == 0)
+    assert share > 0.7 and float((error > 0.1).float().mean()) < 0.02, "the wall behind keeps its depth"
+
+
+def test_texture_that_repeats_along_the_line_is_left_unsaid():
+    got, depth, which = boards(Board(3.4, stripes=0.1))
+    assert judged(got, depth, which == 0)[0] < 0.02
+    assert bool((got.gate[(which == 0) & ~got.keep] == Gate.UNCERTAIN).float().mean() > 0.8)
+    got, depth, which = boards(Board(3.0, x=(0, 0.8), y=(-0.5, 0.3), stripes=0.15), Board(3.01, seed=2))
+    share, error, _ = judged(got, depth, which == 0)
+    assert share > 0.5 and float((error > 0.05).float().mean()) < 0.02, "its surroundings tell which"
+
+
+def test_where_one_surface_ends_before_another_both_keep_their_depth():
+    got, depth, which = boards(Board(2.2, x=(0.2, 0.6), y=(-0.4, 0.3), seed=5), Board(4.5, seed=6))
+    for board, least in ((0, 0.75), (1, 0.7)):
+        share, error, sigmas = judged(got, depth, which == board)
+        assert share > least and float((error > 0.1).float().mean()) < 0.02
+        assert float((sigmas < 2).float().mean()) > 0.9
+
+
+def test_a_mirror_shows_what_stands_behind_it():
+    """What no two views can tell: the picture in a plane mirror moves as a room behind it would."""
+    got, depth, which = boards(Board(2.5, x=(0, 0.6), mirrored=5.0, seed=3), Board(2.6, seed=4))
+    share, error, _ = judged(got, depth, which == 1)
+    assert share > 0.8 and float((error > 0.05).float().mean()) < 0.03, "the wall beside it is not drawn along"
+    told = (which == 0) & (got.source == Source.SWEPT)
+    assert float((got.depth[told] / 5.0 - 1).abs().median()) < 0.02
