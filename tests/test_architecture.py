@@ -18,7 +18,9 @@ LEVELS = [
     {"stages", "data", "evaluate", "export", "synthetic", "testing", "calibration"},
     {"method"},
     {"pair", "window", "methods", "first_release", "views", "offers"},
-    {"transform", "integrate", "extract", "viewer", "stream", "dense"},
+    {"stream", "dense"},
+    {"transform", "integrate", "viewer"},
+    {"extract"},
     {"studies"},
     {"commands", "__main__"},
 ]
@@ -37,7 +39,6 @@ SIDEWAYS = {
     ("window", "views"),
     ("offers", "views"),
     ("methods", "views"),
-    ("extract", "transform"),
     ("__main__", "commands"),
 }
 FILES = sorted(ROOT.rglob("*.py"))

@@ -193,13 +193,17 @@ def test_the_volume_that_was_fused_into_is_unchanged():
         assert torch.equal(getattr(before, name), getattr(kept, name))
 
 
-def test_sources_keep_their_own_weights_and_the_larger_one_names_a_point():
-    volume = fuse(fuse(empty(0.02, channels=1), wall(2.0)), wall(2.01, sigma=0.03), source=Source.RECOVERED)
+def test_sources_keep_their_own_weights_and_the_largest_names_a_point():
+    sigmas = {Source.SENSOR: 0.01, Source.RECOVERED: 0.03, Source.SWEPT: 0.02}
+    volume = empty(0.02, channels=1)
+    for code, sigma in sigmas.items():
+        volume = fuse(volume, wall(2.0, sigma=sigma), source=code)
     assert set(points(volume).source.tolist()) == {Source.SENSOR}
-    assert bool((volume.weight.amax((0, 1)) > 0).all())
-    volume = fuse(empty(0.02, channels=1), wall(2.0, sigma=0.02), source=Source.RECOVERED)
-    assert set(points(volume).source.tolist()) == {Source.RECOVERED}
-    assert height(points(volume)) == pytest.approx(2.0, abs=1e-3)
+    assert volume.weight.amax((0, 1)).tolist() == pytest.approx([sigma**-2 for sigma in sigmas.values()], rel=1e-4)
+    for code in sigmas:
+        alone = fuse(empty(0.02, channels=1), wall(2.0, sigma=0.02), source=code)
+        assert set(points(alone).source.tolist()) == {code}
+        assert height(points(alone)) == pytest.approx(2.0, abs=1e-3)
 
 
 def test_what_is_unsure_is_spread_as_far_as_it_is_unsure():
@@ -472,5 +476,5 @@ def test_recovered_points_widen_the_map_beyond_the_sensor(walked):
 
 def test_memory_is_that_of_the_blocks(room):
     _, volume, _ = room
-    assert volume.bytes == len(volume.key) * (8 + 512 * (4 + 2 * 4 + (1 + 3) * 2))
+    assert volume.bytes == len(volume.key) * (8 + 512 * (4 + 3 * 4 + 1 + (1 + 3) * 2))
     assert volume.bytes < 10 * 2**20, "a side of the room at 3 cm"

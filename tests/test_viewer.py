@@ -97,7 +97,7 @@ def test_what_was_held_back_is_apart(scene):
     for shot in scene.shots:
         assert 0 < len(shot.seen.xyz) <= DENSE and 0 < shot.seen.xyz[:, 2].max() <= CUTOFF
         assert 0 < len(shot.held.xyz) <= DENSE and shot.held.xyz[:, 2].min() > CUTOFF
-        assert shot.depth_map.depth.max() <= CUTOFF and shot.seen.rgb.std() > 10
+        assert shot.depth_image.depth.max() <= CUTOFF and shot.seen.rgb.std() > 10
 
 
 def test_without_a_trajectory_every_pair_stands_alone():

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dhtorch.codes import Gate, Source, names, words
-from dhtorch.drawing.colours import DEPTH, GATES, RECOVERED, SENSOR, SILENT, rgb
+from dhtorch.drawing.colours import DEPTH, GATES, RECOVERED, SENSOR, SILENT, SWEPT, rgb
 from dhtorch.viewer.exhibit import Cloud, Exhibit, Picture, Shot
 
 ENDINGS = (".rrd",)
@@ -20,8 +20,8 @@ ENDINGS = (".rrd",)
 #: Radii of points, m: a recovered point is as large as its sigma, within these limits.
 SMALLEST, LARGEST = 0.004, 0.15
 
-#: Class of samples with a return of the sensor; the others have the code of their gate.
-SENSED = 100
+#: Classes of samples with a return of the sensor, and of swept pixels; other samples have the code of their gate.
+SENSED, BY_SWEEP = 100, 101
 
 
 def save(path: Path, scene: Exhibit) -> Path:
@@ -82,6 +82,7 @@ def _blueprint() -> Any:
 
 def _log(rr: Any, stream: Any, scene: Exhibit) -> None:
     classes = [(SENSED, "sensor", rgb(SENSOR)), (Gate.ANSWER, "recovered", rgb(RECOVERED))]
+    classes.append((BY_SWEEP, "swept", rgb(SWEPT)))
     classes += [(code, words(names(Gate)[code]), rgb(colour)) for code, colour in GATES.items()]
     stream.log("/", rr.AnnotationContext(classes), static=True)
     stream.log("world", rr.ViewCoordinates.RDF, static=True)
@@ -132,13 +133,17 @@ def _log_points(rr: Any, stream: Any, shot: Shot) -> None:
     seen = shot.seen if len(shot.seen.xyz) else Cloud(s["xyz"][sensed], s["rgb"][sensed])
     for name, cloud in (("sensor", seen), ("held_back", shot.held)):
         stream.log(f"world/map/{name}", rr.Points3D(_moved(T, cloud.xyz), colors=cloud.rgb, radii=SMALLEST))
+    swept, kept = shot.swept, {"score": shot.swept.score, "sigma": shot.swept.sigma}
+    classes = np.full(len(swept.xyz), BY_SWEEP, np.uint16)
+    dots = rr.Points3D(_moved(T, swept.xyz), radii=SMALLEST, class_ids=classes)
+    stream.log("world/map/swept", dots, rr.AnyValues(**kept))
 
 
 def _log_views(rr: Any, stream: Any, shot: Shot, view_0: Picture, view_1: Picture) -> None:
     s = shot.samples
     _log_camera(rr, stream, "anchor", shot.T_world_from_0, view_0)
-    if shot.depth_map is not None:
-        (h, w), m = shot.depth_map.depth.shape, shot.depth_map
+    if shot.depth_image is not None:
+        (h, w), m = shot.depth_image.depth.shape, shot.depth_image
         c = [m.c[0] + 0.5, m.c[1] + 0.5]
         stream.log("world/anchor/depth", rr.Pinhole(focal_length=m.f, principal_point=c, width=w, height=h))
         stream.log("world/anchor/depth", rr.DepthImage(m.depth, meter=1.0, colormap=DEPTH))
