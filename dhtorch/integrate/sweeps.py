@@ -111,7 +111,7 @@ class Shelf:
                 self._folder.mkdir(parents=True, exist_ok=True)
             self._file = tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115  (it lives as long as the shelf)
         depth = torch.where(found.keep, found.depth, 0.0)
-        keep = (found.source == Source.SWEPT) & (edges(depth) <= edge_rel)
+        keep = found.keep & (found.source == Source.SWEPT) & (edges(depth) <= edge_rel)
         values = torch.cat((depth, found.sigma, found.score))
         stored = torch.where(keep, values, 0.0).cpu().numpy().astype(np.float16)
         offset = self._file.seek(0, 2)
