@@ -486,7 +486,7 @@ ELSEWHERE = {
     *(f"dhtorch.integrate.mapping.{name}" for name in ("make", "run", "write")),
     *(
         f"dhtorch.integrate.recording.{name}"
-        for name in ("ask", "place", "chain", "build", "coverage", "sensed", "recovered", "roomy", "swept")
+        for name in ("ask", "place", "chain", "build", "coverage", "sensed", "recovered", "swept")
     ),
     "dhtorch.geometry.filters.gaussian_taps",
     "dhtorch.window.ask_window",

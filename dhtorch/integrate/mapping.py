@@ -130,13 +130,15 @@ def _fused(
     """The volume, and what it showed after each source: of the ``sensor``, also ``sparse``, and with what was swept."""
     stages = {Source.SENSOR: "sensor", Source.RECOVERED: "sparse"}
     stages |= {Source.SWEPT: "dense"} if any(a.swept is not None for a in answers) else {}
+    points: dict[str, integrate.Surface] = {}
+
+    def after(source: int, volume: integrate.Volume) -> None:
+        points[stages[source]] = integrate.points(volume, min_weight=settings["min_weight"])
+
     options = {k: settings[k] for k in ("cutoff", "min_conf", "min_maps")} | {"progress": progress}
     options |= {"sigma_m": settings["sensor_sigma_m"], "sigma_rel": settings["sensor_sigma_rel"]}
     volume = integrate.empty(settings["voxel"], truncation=settings["truncation"])
-    volume, points = recordings.roomy(recording, volume, answers, places), {}
-    for source, name in stages.items():
-        volume = recordings.build(recording, volume, answers, places, sources=[source], **options)
-        points[name] = integrate.points(volume, min_weight=settings["min_weight"])
+    volume = recordings.build(recording, volume, answers, places, sources=list(stages), after=after, **options)
     return volume, points
 
 
@@ -268,7 +270,7 @@ def _result(settings: Mapping[str, Any], sources: Sequence[Scene], rows: list[Ro
     summary = {}
     for metric in metrics:
         values = sorted(row[metric] for row in scenes if row[metric] is not None and row["role"] is None)
-        middle = float(torch.tensor(values).double().quantile(0.5)) if values else None
+        middle = float(torch.tensor(values, dtype=torch.float64).quantile(0.5)) if values else None
         summary[f"{_name(settings)}.{metric}"] = bootstrap.single(middle, len(values), "")
     threads = torch.get_num_threads()
     return archive.build(

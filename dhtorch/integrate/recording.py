@@ -210,14 +210,15 @@ def build(
     sigma_rel: float = 0.01,
     min_conf: int = 1,
     min_maps: int = 2,
+    after: Callable[[int, Volume], None] = lambda _source, _volume: None,
     progress: Callable[[Iterable[Any], str, int], Iterable[Any]] = lambda items, _text, _total: items,
 ) -> Volume:
     """The volume after all placed frames: first what the sensor says, frame by frame, then what was recovered, and then
     what was swept.
 
     Of a swept map whole patches may be wrong together, and float where other frames see through. So room is made for
-    all maps first (:func:`roomy`): whatever the order, every ray that passes a place speaks of it. What remains and no
-    second map has found is left out (:func:`dhtorch.integrate.confirmed`).
+    all maps first (:func:`dhtorch.integrate.reserve`): whatever the order, every ray that passes a place speaks of it.
+    What remains and no second map has found is left out (:func:`dhtorch.integrate.confirmed`).
 
     Args:
         recording: read once more, frame by frame.
@@ -227,41 +228,34 @@ def build(
         cutoff: m; returns beyond it are hidden.
         sigma_m, sigma_rel, min_conf: the sensor's noise and least confidence, as in stage 2.
         min_maps: swept maps that must agree on a surface of which nothing else speaks; of fewer maps all.
+        after: is told the volume after each source: (codes.Source, volume).
         progress: wraps the loop over frames: (items, text, number of items) → items.
 
     Returns:
         Volume; recovered points are splats of 1.5 voxels, added where the sensor has no usable return.
     """
-    if Source.SWEPT in sources:
-        volume = roomy(recording, volume, answers, places)
+    maps = [a for a in answers if a.pair[0] in places.poses and a.swept is not None and a.swept.n]
+    for answer in progress(maps, f"{recording.name}: room", len(maps)) if Source.SWEPT in sources else ():
+        volume = reserve(volume, swept(recording, answer, places))
     if Source.SENSOR in sources:
         for k in progress(list(places.poses), f"{recording.name}: sensor", len(places.poses)):
             frame = range_split(recording[k].to(volume.distance.dtype), cutoff)
             options: dict[str, Any] = {"sigma_m": sigma_m, "sigma_rel": sigma_rel, "min_conf": min_conf}
             one = sensed(frame, places.poses[k], radius=PATCH * volume.voxel if recording.sparse else None, **options)
             volume = fuse(volume, one)
+        after(Source.SENSOR, volume)
     if Source.RECOVERED in sources:
         placed = [a for a in answers if a.pair[0] in places.poses and bool(a.recovered.any())]
         for answer in progress(placed, f"{recording.name}: recovered", len(placed)):
             one = recovered(answer, places.poses[answer.pair[0]], radius=PATCH * volume.voxel)
             volume = fuse(volume, one, source=Source.RECOVERED)
+        after(Source.RECOVERED, volume)
     if Source.SWEPT in sources:
-        some = _with_maps(answers, places)
-        for answer in progress(some, f"{recording.name}: swept", len(some)):
+        for answer in progress(maps, f"{recording.name}: swept", len(maps)):
             volume = fuse(volume, swept(recording, answer, places), source=Source.SWEPT)
-        volume = confirmed(volume, max(1, min(min_maps, len(some))))
+        volume = confirmed(volume, max(1, min(min_maps, len(maps))))
+        after(Source.SWEPT, volume)
     return volume
-
-
-def roomy(recording: Recording, volume: Volume, answers: Sequence[PairEstimate], places: Places) -> Volume:
-    """The volume with room for all swept surfaces, of which nothing is said yet; see :func:`reserve`."""
-    for answer in _with_maps(answers, places):
-        volume = reserve(volume, swept(recording, answer, places))
-    return volume
-
-
-def _with_maps(answers: Sequence[PairEstimate], places: Places) -> list[PairEstimate]:
-    return [a for a in answers if a.pair[0] in places.poses and a.swept is not None and a.swept.n]
 
 
 def coverage(xyz: Tensor, cell: float) -> dict[str, Any]:

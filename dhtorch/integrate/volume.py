@@ -87,7 +87,8 @@ def empty(
     features = torch.zeros(0, INSIDE, 1 + channels, dtype=torch.float16, device=device)
     weight = values[..., None].expand(-1, -1, len(SOURCES))
     n_swept = values.to(torch.uint8)
-    return Volume(key, values, weight, n_swept, features, float(voxel), float(truncation))
+    sides = {"voxel": float(voxel), "truncation": float(truncation)}
+    return Volume(key, values, weight, n_swept, features, **sides)
 
 
 def fuse(
