@@ -92,12 +92,15 @@ def _log(rr: Any, stream: Any, scene: Exhibit) -> None:
         stream.log("world/path", rr.LineStrips3D([scene.path], colors=rgb(SILENT)), static=True)
     for name, (said, colour) in _outcomes().items():
         stream.log(f"gates/{name.lower()}", rr.SeriesLines(names=said, colors=colour), static=True)
+    swept = any(len(shot.swept.xyz) for shot in scene.shots)
     for k, shot in enumerate(scene.shots):
         stream.set_time("pair", sequence=k)
         if shot.view_0 is not None and (time := scene.views[shot.view_0].time) is not None:
             stream.set_time("time", duration=time)
         _log_words(rr, stream, shot)
         _log_points(rr, stream, shot)
+        if swept:
+            _log_swept(rr, stream, shot)
         if shot.view_0 is not None and shot.view_1 is not None:
             _log_views(rr, stream, shot, scene.views[shot.view_0], scene.views[shot.view_1])
 
@@ -133,10 +136,13 @@ def _log_points(rr: Any, stream: Any, shot: Shot) -> None:
     seen = shot.seen if len(shot.seen.xyz) else Cloud(s["xyz"][sensed], s["rgb"][sensed])
     for name, cloud in (("sensor", seen), ("held_back", shot.held)):
         stream.log(f"world/map/{name}", rr.Points3D(_moved(T, cloud.xyz), colors=cloud.rgb, radii=SMALLEST))
-    swept, kept = shot.swept, {"score": shot.swept.score, "sigma": shot.swept.sigma}
-    classes = np.full(len(swept.xyz), BY_SWEEP, np.uint16)
-    dots = rr.Points3D(_moved(T, swept.xyz), radii=SMALLEST, class_ids=classes)
-    stream.log("world/map/swept", dots, rr.AnyValues(**kept))
+
+
+def _log_swept(rr: Any, stream: Any, shot: Shot) -> None:
+    cloud = shot.swept
+    classes = np.full(len(cloud.xyz), BY_SWEEP, np.uint16)
+    dots = rr.Points3D(_moved(shot.T_world_from_0, cloud.xyz), radii=SMALLEST, class_ids=classes)
+    stream.log("world/map/swept", dots, rr.AnyValues(score=cloud.score, sigma=cloud.sigma))
 
 
 def _log_views(rr: Any, stream: Any, shot: Shot, view_0: Picture, view_1: Picture) -> None:
