@@ -12,8 +12,9 @@ search: where both speak, they judge it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -69,6 +70,18 @@ SURFACE = 1.5
 #: Pixels where sensor and sweep both speak by which a motion may be refuted; a difference counts beyond so many sigmas
 #: and such a share of the depth.
 WITNESSES, SIGMAS, APART = 200, 3.0, 0.1
+
+
+#: What the options of a sweep may be.
+RANGES: dict[str, tuple[float, float]] = {
+    "partners": (1, sweep.VIEWS),
+    "planes": (3, 1024),
+    "size": (16, math.inf),
+    "refinements": (0, math.inf),
+    "min_correlation": (-1, 1),
+    "max_sigma_rel": (0, math.inf),
+}
+OPTIONS = tuple(RANGES)
 
 
 class Asked(NamedTuple):
@@ -182,7 +195,8 @@ def swept(
 
     Arguments, result, errors, gradient, memory and cost as there; of ``method`` the reading of the sensor counts.
     """
-    _check_options(partners=partners, planes=planes, size=size, refinements=refinements)
+    given = (partners, planes, size, refinements, min_correlation, max_sigma_rel)
+    _check_options("complete", dict(zip(OPTIONS, given, strict=True)))
     index, wanted = worthiest(asked, partners)
     base = sweep.base(*resized(anchor, size))
     partner = [_partner(asked, k, size, use, base.image) for k, use in zip(index, wanted, strict=True)]
@@ -202,7 +216,7 @@ def sensed(anchor: Frame, *, method: Method = AUTO, size: int = 640) -> DepthMap
 
     Arguments, result, errors and gradient as of :func:`complete`.
     """
-    _check_options(size=size)
+    _check_options("sensed", {"size": size})
     nan = torch.full((len(anchor.camera.f), *map_hw(anchor.hw, size)), torch.nan).to(anchor.camera.f)
     code = torch.zeros_like(nan, dtype=torch.int32)
     silent = DepthMap(nan, nan, torch.zeros_like(nan), code, torch.full_like(code, Gate.NO_TRACK))
@@ -234,13 +248,35 @@ def resized(frame: Frame, size: int) -> tuple[Tensor, Camera]:
     return F.interpolate(picture, hw, mode="area"), cam.resize(frame.camera, frame.hw, hw)
 
 
-def _check_options(**options: int) -> None:
-    low = {"partners": 1, "planes": 3, "size": 16, "refinements": 0}
-    high = {"partners": sweep.VIEWS}
-    for name, value in options.items():
-        if not low[name] <= value <= high.get(name, value):
-            upper = f" to {high[name]}" if name in high else ""
-            raise ValueError(f"complete: {name} is {value}, expected at least {low[name]}{upper}")
+def options(given: bool | Mapping[str, Any] | None, name: str = "dense") -> dict[str, Any] | None:
+    """What settings ask for as keywords of :func:`complete`: true = its own, a mapping = some others, false = no maps.
+
+    Raises:
+        ValueError: something else, an unknown option, no number, or one out of range.
+    """
+    if given is None or given is False:
+        return None
+    if not isinstance(given, bool | Mapping):
+        raise ValueError(f"{name}: found {given!r}, expected true, false or options among {', '.join(OPTIONS)}")
+    standard = complete.__kwdefaults__ or {}
+    found: dict[str, Any] = {option: standard[option] for option in OPTIONS}
+    for option, value in (given if isinstance(given, Mapping) else {}).items():
+        if option not in found:
+            raise ValueError(f"{name}: found {option!r}, expected some of {', '.join(OPTIONS)}")
+        whole = isinstance(found[option], int)
+        if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)):
+            raise ValueError(f"{name}.{option}: found {value!r}, expected a {'whole ' * whole}number")
+        found[option] = value
+    _check_options(name, found)
+    return found
+
+
+def _check_options(name: str, given: Mapping[str, float]) -> None:
+    for option, value in given.items():
+        low, high = RANGES[option]
+        if not low <= value <= high:
+            upper = f" to {high:g}" if high < math.inf else ""
+            raise ValueError(f"{name}: {option} is {value}, expected at least {low:g}{upper}")
 
 
 def views_asked(joined: Estimate, others: Frame | Sequence[Frame], trace: Trace) -> Asked:

@@ -481,13 +481,14 @@ ELSEWHERE = {
         for name in ("register", "register_step", "composed", "believed", "nearest_inside")
     ),
     *(f"dhtorch.geometry.sparse_grid.{name}" for name in ("occupied", "components")),
-    *(f"dhtorch.integrate.volume.{name}" for name in ("empty", "fuse", "splat")),
+    *(f"dhtorch.integrate.volume.{name}" for name in ("empty", "fuse", "reserve", "confirmed", "splat")),
+    "dhtorch.integrate.sweeps.edges",
     *(f"dhtorch.integrate.surface.{name}" for name in ("points", "mesh")),
     "dhtorch.integrate.picture.draw_map",
     *(f"dhtorch.integrate.mapping.{name}" for name in ("make", "run", "write")),
     *(
         f"dhtorch.integrate.recording.{name}"
-        for name in ("ask", "place", "chain", "build", "coverage", "sensed", "recovered")
+        for name in ("ask", "place", "chain", "build", "coverage", "sensed", "recovered", "swept")
     ),
     "dhtorch.geometry.filters.gaussian_taps",
     "dhtorch.window.ask_window",

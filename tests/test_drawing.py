@@ -113,12 +113,14 @@ def test_figures_leave_nothing_behind(tmp_path):
 # ---------------------------------------------------------------------------------------------------- colours
 
 
-def test_blue_is_the_sensor_orange_what_was_recovered_and_nothing_else():
-    own = {colours.SENSOR, colours.RECOVERED}
+def test_blue_is_the_sensor_orange_what_was_recovered_purple_what_was_swept_and_nothing_else():
+    own = {colours.SENSOR, colours.RECOVERED, colours.SWEPT}
     others = [*colours.METHODS.values(), *colours.OTHERS, *colours.GATES.values(), *colours.HOLES.values()]
     others += [c for pair in colours.PAGE.values() for c in pair] + [colours.PALE, colours.HELD]
     assert not own & {c.upper() for c in others}
     assert colours.SOURCES[Source.SENSOR] == colours.SENSOR and colours.SOURCES[Source.RECOVERED] == colours.RECOVERED
+    assert colours.SOURCES[Source.SWEPT] == colours.SWEPT and set(colours.SOURCES) == set(names(Source))
+    assert colours.of_source(np.array([1, 2, 3]))[:, 0].tolist() == [0x00, 0xE6, 0xC6]
 
 
 def test_every_code_and_every_method_has_a_colour_of_its_own():
@@ -155,7 +157,7 @@ def test_what_is_drawn_on_a_page_is_seen_by_day_and_in_the_dark():
 
 def test_the_viewer_draws_in_these_colours():
     script = "".join((REPO / "dhtorch/viewer" / name).read_text() for name in pages._SCRIPTS)
-    for name in ("sensor", "recovered", "silent", "pale", "held", "white", "black"):
+    for name in ("sensor", "recovered", "swept", "silent", "pale", "held", "white", "black"):
         assert f"DATA.colours.{name}" in script and name.upper() in pages._COLOURS
     assert (
         set(re.findall(r'new Scale\([^;]*?, "(\w+)", \{', script)) == set(pages._RAMPS) == {"depth", "score", "error"}

@@ -1,6 +1,7 @@
 """Global integration: on scenes that are known exactly, against Open3D, and by what must never happen."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,12 +9,14 @@ import torch
 from box import BOX, HW, off_wall, walk
 from room_truth import room_distance
 
-from dhtorch import extend
-from dhtorch.codes import Source
+from dhtorch import MAP, extend
+from dhtorch.codes import Gate, Source
+from dhtorch.data.recording import Recording
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3, sparse_grid
-from dhtorch.integrate import View, empty, fuse, mesh, points, recording, splat
-from dhtorch.records import Camera, Estimate, Pose, Samples, Tracks
+from dhtorch.integrate import View, confirmed, empty, fuse, mesh, points, recording, splat, sweeps
+from dhtorch.records import Camera, DepthMap, Estimate, Pose, Samples, Tracks
+from dhtorch.stages.holes import classify
 from dhtorch.studies.baselines.device_pose import given_pose
 from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.tree import collate
@@ -193,13 +196,17 @@ def test_the_volume_that_was_fused_into_is_unchanged():
         assert torch.equal(getattr(before, name), getattr(kept, name))
 
 
-def test_sources_keep_their_own_weights_and_the_larger_one_names_a_point():
-    volume = fuse(fuse(empty(0.02, channels=1), wall(2.0)), wall(2.01, sigma=0.03), source=Source.RECOVERED)
+def test_sources_keep_their_own_weights_and_the_largest_names_a_point():
+    sigmas = {Source.SENSOR: 0.01, Source.RECOVERED: 0.03, Source.SWEPT: 0.02}
+    volume = empty(0.02, channels=1)
+    for code, sigma in sigmas.items():
+        volume = fuse(volume, wall(2.0, sigma=sigma), source=code)
     assert set(points(volume).source.tolist()) == {Source.SENSOR}
-    assert bool((volume.weight.amax((0, 1)) > 0).all())
-    volume = fuse(empty(0.02, channels=1), wall(2.0, sigma=0.02), source=Source.RECOVERED)
-    assert set(points(volume).source.tolist()) == {Source.RECOVERED}
-    assert height(points(volume)) == pytest.approx(2.0, abs=1e-3)
+    assert volume.weight.amax((0, 1)).tolist() == pytest.approx([sigma**-2 for sigma in sigmas.values()], rel=1e-4)
+    for code in sigmas:
+        alone = fuse(empty(0.02, channels=1), wall(2.0, sigma=0.02), source=code)
+        assert set(points(alone).source.tolist()) == {code}
+        assert height(points(alone)) == pytest.approx(2.0, abs=1e-3)
 
 
 def test_what_is_unsure_is_spread_as_far_as_it_is_unsure():
@@ -472,5 +479,148 @@ def test_recovered_points_widen_the_map_beyond_the_sensor(walked):
 
 def test_memory_is_that_of_the_blocks(room):
     _, volume, _ = room
-    assert volume.bytes == len(volume.key) * (8 + 512 * (4 + 2 * 4 + (1 + 3) * 2))
+    assert volume.bytes == len(volume.key) * (8 + 512 * (4 + 3 * 4 + 1 + (1 + 3) * 2))
     assert volume.bytes < 10 * 2**20, "a side of the room at 3 cm"
+
+
+# --------------------------------------------------------------------------------------------------------- swept maps
+
+WIDE = {"hw": (96, 128), "camera": Camera(torch.tensor([[123.0, 116.5]]), torch.tensor([[67.5, 44.0]]))}
+
+
+def box_map(frame, sigma=0.02):
+    """An exact map of every pixel of a frame in the box."""
+    same = torch.ones_like(frame.depth)
+    code = same.to(torch.int32)
+    return DepthMap(frame.depth, sigma * same, 0.5 * same, code * Source.SWEPT, code * Gate.ANSWER)
+
+
+def looked_around(frames, maps):
+    """Frames as a recording, answers that hold their maps, and their places."""
+    shelf = sweeps.Shelf()
+    answers = [replace(answered(k, k, relative(0, 0)), swept=shelf.put(found)) for k, found in enumerate(maps)]
+    walked = Recording(name="box", format="made", load=frames.__getitem__, number=torch.arange(len(frames)))
+    return walked, answers, recording.Places({k: f.T_world_from_cam for k, f in enumerate(frames)}, 1, 0)
+
+
+def test_swept_pixels_enter_with_their_source_and_weight_and_without_edges():
+    (frame,) = walk(1, **WIDE)
+    found = box_map(frame)
+    depth, source, gate = found.depth.clone(), found.source.clone(), found.gate.clone()
+    depth[0, 40, 60] *= 0.8
+    source[0, :10], gate[..., :5] = Source.SENSOR, Gate.UNCERTAIN
+    walked, (answer,), places = looked_around([frame], [found.replace(depth=depth, source=source, gate=gate)])
+    one = recording.swept(walked, answer, places)
+    there = torch.ones_like(depth, dtype=torch.bool)
+    there[0, 39:42, 59:62], there[0, :10], there[..., :5] = False, False, False
+    assert torch.equal(one.depth > 0, there) and answer.swept.n == int(there.sum())
+    torch.testing.assert_close(one.depth[there], frame.depth[there], rtol=1e-3, atol=0)
+    torch.testing.assert_close(one.sigma[there], torch.full_like(one.sigma[there], 0.02), rtol=1e-3, atol=0)
+    assert torch.equal(one.features[..., :3], frame.image.permute(0, 2, 3, 1) / 255)
+    volume = recording.build(walked, empty(VOXEL), [answer], places, sources=[Source.SWEPT])
+    assert float(volume.weight[..., :2].max()) == 0 and float(volume.weight[..., 2].max()) == pytest.approx(2500, 1e-2)
+    surface = points(volume)
+    assert set(surface.source.tolist()) == {Source.SWEPT} and len(surface.xyz) > 1000
+    assert float((off_wall(surface.xyz) * BOX.min()).quantile(0.99)) < VOXEL / 2, "a map alone is believed"
+    assert float((surface.features[:, 3] - 0.5).abs().max()) < 0.01
+
+
+def test_a_map_of_half_the_size_is_of_the_same_walls():
+    (frame,) = walk(1, **WIDE)
+    (small,) = walk(1, hw=(48, 64), camera=cameras.resize(frame.camera, (96, 128), (48, 64)))
+    walked, answers, places = looked_around([frame], [box_map(small)])
+    surface = points(recording.build(walked, empty(VOXEL), answers, places, sources=[Source.SWEPT]))
+    assert len(surface.xyz) > 1000 and float((off_wall(surface.xyz) * BOX.min()).quantile(0.95)) < VOXEL / 2
+
+
+@pytest.mark.parametrize("bad", [0, 3])
+def test_a_wrong_patch_that_others_see_through_is_gone(bad):
+    """Whether it comes first or last; and, where it is too sure of itself to be outweighed, as no other map has it."""
+    frames = walk(4, **WIDE)
+    maps = [box_map(frame) for frame in frames]
+    patch = torch.zeros_like(maps[bad].keep)
+    patch[:, 30:60, 40:90] = True
+
+    def off(sigma, least):
+        wrong = maps[bad].replace(
+            depth=torch.where(patch, 0.6 * maps[bad].depth, maps[bad].depth),
+            sigma=torch.where(patch, sigma, maps[bad].sigma),
+        )
+        walked, answers, places = looked_around(frames, [*maps[:bad], wrong, *maps[bad + 1 :]])
+        volume = recording.build(walked, empty(VOXEL), answers, places, sources=[Source.SWEPT], min_maps=least)
+        return int((off_wall(points(volume).xyz) * BOX.min() > 0.2).sum())
+
+    assert off(0.02, 1) == 0, "outweighed by those who see through"
+    assert off(0.002, 1) > 100 and off(0.002, 2) == 0, "not found by a second one"
+
+
+def test_a_surface_that_one_map_alone_has_is_kept_where_others_speak():
+    (frame,) = walk(1, **WIDE)
+    volume = fuse(empty(VOXEL, channels=3), view(frame), source=Source.SWEPT)
+    assert len(points(confirmed(volume)).xyz) == 0 and len(points(confirmed(volume, 1)).xyz) > 1000
+    both = fuse(volume, view(frame, sigma=0.5 * VOXEL), source=Source.RECOVERED)
+    assert len(points(confirmed(both)).xyz) == len(points(both).xyz)
+    assert int(fuse(volume, view(frame), source=Source.SWEPT).n_swept.max()) == 2
+    with pytest.raises(ValueError, match="least is 0, expected at least 1"):
+        confirmed(volume, 0)
+
+
+def test_a_shelf_holds_maps_of_all_sizes_and_leaves_nothing_behind(tmp_path):
+    frames = walk(2, **WIDE)
+    small = walk(1)[0]
+    shelf = sweeps.Shelf(tmp_path / "out")
+    assert not (tmp_path / "out").exists(), "no folder for maps that nobody made"
+    kept = [shelf.put(box_map(frame)) for frame in (frames[0], small, frames[1])]
+    assert list((tmp_path / "out").iterdir()) == []
+    for k, frame in ((2, frames[1]), (0, frames[0]), (1, small)):
+        depth, sigma, score = kept[k].read()
+        there = sweeps.edges(frame.depth) <= 0.1
+        assert kept[k].hw == frame.hw and kept[k].n == int(there.sum()) > 0.9 * there.numel()
+        torch.testing.assert_close(depth, torch.where(there, frame.depth, 0.0), rtol=1e-3, atol=0)
+        assert torch.equal(score, 0.5 * there) and float((sigma - 0.02 * there).abs().max()) < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("yes", "dense: found 'yes', expected true, false or options among partners, planes"),
+        ({"planse": 3}, "dense: found 'planse', expected some of partners, planes"),
+        ({"planes": 3.5}, r"dense\.planes: found 3\.5, expected a whole number"),
+        ({"min_correlation": "high"}, r"dense\.min_correlation: found 'high', expected a number"),
+        ({"size": True}, r"dense\.size: found True, expected a whole number"),
+    ],
+)
+def test_what_no_sweep_can_be_asked_for_is_refused(given, words):
+    with pytest.raises(ValueError, match=words):
+        sweeps.Sweep.asked(given)
+
+
+def test_a_sweep_is_asked_for_by_true_or_by_options():
+    assert sweeps.Sweep.asked(False) is None is sweeps.Sweep.asked(None)
+    assert sweeps.Sweep.asked(True).options == {}
+    assert sweeps.Sweep.asked({"min_correlation": 1, "size": 320}).options == {"min_correlation": 1, "size": 320}
+
+
+def test_a_sweep_finds_more_of_the_far_walls_than_samples_and_the_method_runs_once():
+    room = SyntheticRoom(hw=(150, 200), n_frames=8, supersample=1, step_m=0.03)
+    calls = []
+    method = MAP.replace(n=512, classify=lambda *args: calls.append(1) or classify(*args))
+    answers = list(recording.ask(room, method, [(0, 5), (2, 7)], cutoff=2.0, sweep=sweeps.Sweep({"planes": 40})))
+    assert len(calls) == 2
+    places = recording.place(room, answers)
+    sparse = recording.build(room, empty(0.04), [replace(a, swept=None) for a in answers], places, cutoff=2.0)
+    dense = recording.build(room, empty(0.04), answers, places, cutoff=2.0)
+    near = [(far_of(room, 0, points(volume).xyz) < 0.08).double().mean() for volume in (sparse, dense)]
+    assert near[1] > 1.4 * near[0] > 0.2
+    surface = points(dense)
+    off = room_distance(surface.xyz[surface.source == Source.SWEPT])
+    assert len(off) > 1000 and float(off.median()) < 0.04 and float((off > 0.2).double().mean()) < 0.1
+
+
+def far_of(room, k, xyz):
+    """Distance of what frame ``k`` truly shows beyond the cutoff from the nearest of some points."""
+    frame = room[k]
+    depth = room.truth(k)["depth"][0]
+    v, u = (depth > 2.2).nonzero()[::7].T
+    true = cameras.unproject(frame.camera, torch.stack((u, v), -1)[None].float(), depth[None, v, u].float())
+    return torch.cdist(se3.apply(frame.T_world_from_cam, true.double())[0], xyz.double()).amin(1)

@@ -15,6 +15,7 @@ from dhtorch.commands.run import main
 from dhtorch.integrate import mapping
 from dhtorch.studies import report
 from dhtorch.synthetic.recording import SyntheticRoom
+from dhtorch.viewer import points
 
 TINY = [
     "data.hw=[240,320]",
@@ -119,6 +120,10 @@ def command(tmp_path, monkeypatch, capsys):
         ("cutoff=-1", "cutoff: found -1, expected a positive number of metres, or null"),
         ("pairs.gap=99", "pairs.gap: found 99"),
         ("voxle=1", "voxle"),
+        ("dense=often", "dense: found 'often', expected true, false or options among partners"),
+        ("dense={planse: 32}", "dense: found 'planse', expected some of partners"),
+        ("dense={planes: few}", "dense.planes: found 'few', expected a whole number"),
+        ("min_maps=0", "min_maps: found 0, expected a whole number of at least 1"),
     ],
 )
 def test_wrong_options_end_in_one_line_and_no_file(command, tmp_path, option, words):
@@ -153,7 +158,7 @@ def test_ctrl_c_keeps_the_scenes_that_are_whole(tmp_path, monkeypatch):
     monkeypatch.setattr(mapping, "make", make)
     monkeypatch.setattr(mapping, "write", lambda *_: [])
     settings = {"output": str(tmp_path), "dtype": "float32", "poses": "device", "mesh": None, "threads": None}
-    settings |= {"voxel": 0.1, "truncation": None, "min_weight": 0.0, "cutoff": None}
+    settings |= {"voxel": 0.1, "truncation": None, "min_weight": 0.0, "cutoff": None, "dense": False, "min_maps": 2}
     rooms = [SyntheticRoom(n_frames=2), SyntheticRoom(n_frames=2)]
     with pytest.raises(KeyboardInterrupt, match=f"1 of 2 scenes in {tmp_path} are whole and stay"):
         mapping.run(settings, {"data": rooms, "method": None, "pairs": None}, progress=lambda items, _text, _n: items)
@@ -163,8 +168,40 @@ def test_ctrl_c_keeps_the_scenes_that_are_whole(tmp_path, monkeypatch):
 def test_help_shows_every_option(command):
     code, out, _ = command("--help")
     assert code == 0
-    for word in ("poses", "voxel", "truncation", "sensor_sigma_rel", "min_weight", "mesh", "anchored", "Exit code"):
+    for word in (
+        "poses",
+        "voxel",
+        "truncation",
+        "sensor_sigma_rel",
+        "min_weight",
+        "mesh",
+        "anchored",
+        "dense",
+        "min_maps",
+        "Exit code",
+    ):
         assert word in out
+
+
+def test_a_dense_map_says_what_the_sweep_added(command, tmp_path):
+    code, out, err = command(*TINY, "cutoff=2.0", "dense={planes: 32, size: 160}", "mesh=false", "output=here")
+    assert code == 0, err
+    assert "times those without a sweep" in out
+    here = tmp_path / "here"
+    assert {p.name for p in here.rglob("*") if p.is_file()} == {*FILES, "result.json"}, "the maps' file is gone"
+    result = archive.read(here)
+    pair, scene = result["rows"]
+    assert pair["map_hw"] == [120, 160] and pair["n_swept"] == scene["n_swept"] > 1000
+    assert scene["n_voxels"] > scene["n_voxels_sparse"] > scene["n_voxels_sensor"]
+    assert scene["voxels_vs_sparse"] == scene["n_voxels"] / scene["n_voxels_sparse"]
+    assert result["summary"]["map.voxels_vs_sparse"]["value"] == scene["voxels_vs_sparse"]
+    assert result["config"]["dense"] == {"planes": 32, "size": 160}
+    words = (here / "synthetic_room" / "map.ply").read_bytes()[:400]
+    assert b"source: 0 none, 1 sensor, 2 recovered, 3 swept" in words
+    (shot,) = points.read(here / "synthetic_room" / "map.ply").shots
+    assert len(shot.swept.xyz) > 200 and len(shot.swept.xyz) + len(shot.samples["xyz"]) == scene["n_points"]
+    glb = (here / "synthetic_room" / "map.glb").read_bytes()
+    assert b'"name":"swept"' in glb and b'"_SOURCE"' in glb
 
 
 @pytest.mark.data

@@ -4,6 +4,7 @@ import base64
 import copy
 import html.parser
 import importlib.util
+import io
 import json
 import math
 import re
@@ -15,19 +16,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from omegaconf import OmegaConf
 from PIL import Image
+from room_truth import room_distance
 from rooms import Changed, noted
 from rooms import room as rendered
 
 from dhtorch import archive, closure, data, export, viewer
 from dhtorch.codes import Gate, Source, names
 from dhtorch.commands import run
-from dhtorch.data.pairs import by_gap
+from dhtorch.data.pairs import by_choice, by_gap
+from dhtorch.integrate.sweeps import Sweep
 from dhtorch.method import Method
 from dhtorch.methods import METHODS
 from dhtorch.stages.fuse import inverse_variance
-from dhtorch.studies.exhibits import DENSE, look
+from dhtorch.studies.exhibits import DENSE, SWEPT, look
 from dhtorch.studies.protocol import Settings
 from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.viewer import again, points, rrd
@@ -43,7 +47,8 @@ browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
 @pytest.fixture(scope="module")
 def scene():
     room = rendered(hw=(180, 240), n_frames=6)
-    return look(room, METHODS["map"].replace(n=N), lambda r: by_gap(r, 4), Settings(cutoff=CUTOFF))
+    method, sweep = METHODS["map"].replace(n=N), Sweep({"planes": 32})
+    return look(room, method, lambda r: by_gap(r, 4), Settings(cutoff=CUTOFF), sweep=sweep)
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +102,35 @@ def test_what_was_held_back_is_apart(scene):
     for shot in scene.shots:
         assert 0 < len(shot.seen.xyz) <= DENSE and 0 < shot.seen.xyz[:, 2].max() <= CUTOFF
         assert 0 < len(shot.held.xyz) <= DENSE and shot.held.xyz[:, 2].min() > CUTOFF
-        assert shot.depth_map.depth.max() <= CUTOFF and shot.seen.rgb.std() > 10
+        assert shot.depth_image.depth.max() <= CUTOFF and shot.seen.rgb.std() > 10
+
+
+def test_swept_pixels_are_a_cloud_of_their_own(scene):
+    for shot in scene.shots:
+        view, swept = scene.views[shot.view_0], shot.swept
+        assert (
+            1000 < len(swept.xyz) <= SWEPT and swept.sigma.min() > 0 and 0 < swept.score.min() < swept.score.max() < 1
+        )
+        uv = swept.xyz[:, :2] / swept.xyz[:, 2:] * view.f + view.c
+        assert np.abs(uv - np.round(uv)).max() < 0.01, "pixels of the picture"
+        assert len(np.unique(np.round(uv), axis=0)) == len(uv), "each once"
+        colour = np.asarray(Image.open(io.BytesIO(view.jpeg)))[tuple(np.round(uv).astype(int).T[::-1])]
+        assert np.abs(colour.astype(float) - swept.rgb).mean() < 12, "in its colour, but for the JPEG's"
+        off = room_distance(torch.from_numpy(swept.xyz @ shot.T_world_from_0[:3, :3].T + shot.T_world_from_0[:3, 3]))
+        assert float(off.median()) < 0.15 and float((off < 2 * torch.from_numpy(swept.sigma)).double().mean()) > 0.7
+
+
+def test_without_a_sweep_there_are_no_swept_pixels():
+    found = look(noted(SyntheticRoom(hw=(40, 60), n_frames=2)), METHODS["paper"], lambda r: by_gap(r, 1), Settings())
+    data = data_of(pages.page(found))
+    assert len(found.shots[0].swept.xyz) == 0 and "swept" not in data["about"]
+
+
+def test_a_method_that_chooses_sweeps_what_it_chose():
+    room = noted(rendered(hw=(180, 240), n_frames=6))
+    method = METHODS["window"].replace(n=256, views=2)
+    found = look(room, method, lambda r: by_choice(r, stride=9), Settings(cutoff=CUTOFF), sweep=Sweep({"planes": 16}))
+    assert len(found.shots) == 1 and found.shots[0].facts["views"] and len(found.shots[0].swept.xyz) > 500
 
 
 def test_without_a_trajectory_every_pair_stands_alone():
@@ -168,9 +201,12 @@ def test_the_page_holds_what_was_computed(scene):
             assert (unpacked(sent["samples"][name]) == shot.samples[name]).all(), name
         uv = unpacked(sent["samples"]["uv_1"]).reshape(-1, 2) / data["per_pixel"] - data["margin_px"]
         assert np.abs(uv - shot.samples["uv_1"])[shot.samples["tracked"]].max() <= 0.5 / data["per_pixel"] + 1e-4
-        packed = sent["seen"]
-        xyz = unpacked(packed["xyz"]).reshape(-1, 3) * packed["step"] + packed["low"]
-        assert np.abs(xyz - shot.seen.xyz).max() < 1e-3
+        for name in ("seen", "swept"):
+            packed, cloud = sent[name], getattr(shot, name)
+            xyz = unpacked(packed["xyz"]).reshape(-1, 3) * packed["step"] + packed["low"]
+            assert np.abs(xyz - cloud.xyz).max() < 1e-3 and (unpacked(packed["rgb"]) == cloud.rgb.ravel()).all()
+        assert (unpacked(sent["swept"]["sigma"]) == shot.swept.sigma).all()
+        assert np.abs(unpacked(sent["swept"]["score"]) / 65535 - shot.swept.score).max() < 1e-4
         jpeg = base64.b64decode(data["views"][sent["view_0"]]["jpeg"])
         assert jpeg[:2] == b"\xff\xd8"
 
@@ -216,6 +252,7 @@ def test_a_browser_draws_the_points(scene, tmp_path, dark):
     red, green, blue = stage[..., 0], stage[..., 1], stage[..., 2]
     assert ((blue > red + 40) & (blue > 60)).sum() > 300, "returns of the sensor"
     assert ((red > blue + 90) & (green > blue + 40)).sum() > 300, "recovered points"
+    assert ((red > green + 50) & (blue > green + 25)).sum() > 300, "swept pixels"
     empty = (np.abs(stage - stage[0, -1]).max(-1) < 12).mean()
     assert 0.3 < empty < 0.99 and (stage[0, -1].mean() < 60) == dark
 
@@ -280,18 +317,21 @@ def test_a_recording_holds_everything(recorded):
     for name in ("path", "anchor/picture", "anchor/depth", "anchor/picture/samples/silent", "other/picture/tracks"):
         assert f"/world/{name}" in paths, name
     assert {"/pair", "/about", "/world/map/sensor", "/world/map/held_back", "/world/map/sigma"} <= paths
+    assert "/world/map/swept" in paths
 
 
 def test_a_recording_is_read_back_as_computed(recorded, scene):
     where = column(recorded, "/world/map/recovered", "positions")
     radii = column(recorded, "/world/map/recovered", "radii")
     counts = column(recorded, "/gates/answer", "scalars")
+    swept = column(recorded, "/world/map/swept", "positions")
     for k, shot in enumerate(scene.shots):
         s, T = shot.samples, shot.T_world_from_0
         here = s["source"] == Source.RECOVERED
         assert np.allclose(where[k], s["xyz"][here] @ T[:3, :3].T + T[:3, 3], atol=1e-5)
         assert np.allclose(radii[k], s["sigma"][here].clip(rrd.SMALLEST, rrd.LARGEST), atol=1e-6)
         assert counts[k] == [shot.gates()["ANSWER"]]
+        assert np.allclose(swept[k], shot.swept.xyz @ T[:3, :3].T + T[:3, 3], atol=1e-5)
 
 
 # --------------------------------------------------------------------------------------------------------- the command
@@ -334,6 +374,7 @@ def test_a_recording_of_ones_own(command, tmp_path):
     [
         (["nowhere"], ["nowhere"]),
         ([*TINY, "most=0"], ["most", "0"]),
+        ([*TINY, "dense={sise: 3}"], ["dense", "sise", "partners"]),
         ([*TINY, "scene=hall", "html=x.html"], ["scene", "hall", "synthetic_room"]),
         (["html=x.txt"], ["x.txt", ".html"]),
         (["save=view.rerun"], ["view.rerun", ".rrd"]),
@@ -441,11 +482,14 @@ def test_null_stands_for_what_strict_json_cannot_hold(job):
 def test_points_of_a_file(tmp_path):
     rng = np.random.default_rng(0)
     xyz, sigma, score = rng.normal(size=(50, 3)), rng.random(50), rng.random(50)
-    source = rng.integers(1, 3, 50)
+    source = rng.integers(1, 4, 50)
     export.write_ply(tmp_path / "p.ply", xyz, sigma=sigma, score=score, source=source)
-    found = points.read(tmp_path / "p.ply").shots[0].samples
+    (shot,) = points.read(tmp_path / "p.ply").shots
+    dense = source == Source.SWEPT
     for name, value in {"xyz": xyz, "sigma": sigma, "score": score, "source": source}.items():
-        assert np.allclose(found[name], value, atol=1e-6), name
+        assert np.allclose(shot.samples[name], value[~dense], atol=1e-6), name
+    for name, value in {"xyz": xyz, "sigma": sigma, "score": score}.items():
+        assert np.allclose(getattr(shot.swept, name), value[dense], atol=1e-6), name
     assert "points" in data_of(pages.page(points.read(tmp_path / "p.ply")))["about"]
 
 

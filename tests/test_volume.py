@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from dhtorch.codes import Source
 from dhtorch.geometry import se3, sparse_grid
 from dhtorch.integrate import View, empty, fuse, points, recording, splat
-from dhtorch.integrate.volume import Volume
+from dhtorch.integrate.volume import SOURCES, Volume
 from dhtorch.records import Camera, Frame
 
 CAMERA = Camera(torch.tensor([[22.0, 18.0]]), torch.tensor([[10.5, 6.25]]))
@@ -34,11 +33,11 @@ def voxels(volume):
 
 
 def loop_fuse(volume, looks, max_reach=3.0, carve=True):
-    """What ``looks`` (view, source) leave at every voxel, one by one: distance, weights, share with colour, colour, and
+    """What ``looks`` (view, source) leave at every voxel: distance, weights, swept surfaces, share with colour, colour,
     whether it is sure which pixel it reads: not on a border of two, nor beyond the middle of the outermost."""
     place = voxels(volume).reshape(-1, 3).double().numpy() * volume.voxel
     n, tau = len(place), volume.truncation
-    distance, weight = np.zeros(n), np.zeros((n, 2))
+    distance, weight, swept = np.zeros(n), np.zeros((n, 3)), np.zeros(n, int)
     colour, coloured, sure = np.zeros((n, 2)), np.zeros(n), np.ones(n, bool)
     for view, source in looks:
         R, t = view.T_world_from_cam.R[0].numpy(), view.T_world_from_cam.t[0].numpy()
@@ -68,24 +67,28 @@ def loop_fuse(volume, looks, max_reach=3.0, carve=True):
                 colour[k] += share * (view.features[0, v, u].numpy() - colour[k])
                 coloured[k] += share * (1 - coloured[k])
             weight[k, source] += w
-    return distance, weight, coloured, colour, sure
+            swept[k] += source == 2 and -0.75 * reach <= ahead <= reach
+    return distance, weight, swept, coloured, colour, sure
 
 
 @pytest.mark.parametrize(("carve", "max_reach", "sigma"), [(True, 3.0, 0.02), (False, 3.0, 0.15), (True, 1.2, 0.15)])
 def test_every_voxel_learns_what_its_pixel_says(carve, max_reach, sigma):
     volume = empty(0.1, truncation=0.25, channels=2)
-    looks = [(looked(0), 0), (looked(1, sigma, far=1.7), 1), (looked(2, sigma), 0)]
+    looks = [(looked(0), 0), (looked(1, sigma, far=1.7), 1), (looked(2, sigma), 2), (looked(3), 2)]
     for view, source in looks:
-        which = (Source.SENSOR, Source.RECOVERED)[source]
+        which = SOURCES[source]
         volume = fuse(volume, view, source=which, carve=carve, max_reach=max_reach)
     # what was said before a block was there is not known to it: ask again, now that all blocks are
-    blank = volume.replace(**{k: torch.zeros_like(getattr(volume, k)) for k in ("distance", "weight", "features")})
+    blank = volume.replace(
+        **{k: torch.zeros_like(getattr(volume, k)) for k in ("distance", "weight", "n_swept", "features")}
+    )
     for view, source in looks:
-        which = (Source.SENSOR, Source.RECOVERED)[source]
+        which = SOURCES[source]
         blank = fuse(blank, view, source=which, carve=carve, max_reach=max_reach)
-    distance, weight, coloured, colour, sure = loop_fuse(blank, looks, max_reach, carve)
+    distance, weight, swept, coloured, colour, sure = loop_fuse(blank, looks, max_reach, carve)
     assert sure.mean() > 0.8 and (weight[sure] > 0).any(0).all() and (weight[sure].sum(-1) == 0).any()
     features = blank.features.flatten(0, 1).numpy()[sure]
+    assert (blank.n_swept.flatten().numpy()[sure] == swept[sure]).mean() > 0.999 and set(swept[sure]) == {0, 1, 2}
     np.testing.assert_allclose(blank.weight.flatten(0, 1).numpy()[sure], weight[sure], rtol=2e-3, atol=0.05)
     np.testing.assert_allclose(blank.distance.flatten().numpy()[sure], distance[sure], atol=1e-4)
     np.testing.assert_allclose(features[:, 0], coloured[sure], atol=4e-3)
@@ -110,10 +113,11 @@ def scattered(seed=0):
     g = torch.Generator().manual_seed(seed)
     key = sparse_grid.pack(torch.tensor([[0, 0, 0], [1, 0, 0], [3, -2, 1]])).sort().values
     distance = 0.3 * (torch.rand(3, 512, generator=g) - 0.5)
-    weight = torch.rand(3, 512, 2, generator=g) * 100
+    weight = torch.rand(3, 512, 3, generator=g) * 100
     weight[torch.rand(3, 512, generator=g) < 0.3] = 0
     features = torch.rand(3, 512, 3, generator=g).half()
-    return Volume(key, distance, weight, features, 0.1, 0.15)
+    n_swept = torch.zeros(3, 512, dtype=torch.uint8)
+    return Volume(key, distance, weight, n_swept, features, 0.1, 0.15)
 
 
 @pytest.mark.parametrize("min_weight", [0.0, 60.0])
@@ -162,7 +166,7 @@ def test_points_are_the_crossings_of_all_grid_edges(min_weight):
         xyz = tuple(round(0.1 * (p + t * (k == axis)), 4) for k, p in enumerate(place))
         expected[xyz] = (
             weight.sum() ** -0.5,
-            Source.SENSOR if weight[0] >= weight[1] else Source.RECOVERED,
+            SOURCES[int(weight.argmax())],
             feature[1:] / feature[0],
             normal / np.linalg.norm(normal),
         )

@@ -44,11 +44,9 @@ FORMAT = 1
 #: Name of the calibration that travels with the package.
 CALIBRATION = "dense"
 
-#: Options of the sweep.
-SWEEP = ("partners", "planes", "size", "refinements", "min_correlation", "max_sigma_rel")
 
 #: Options that decide what the files of a frame hold, beside format and unit as they came out.
-KEYED = ("data", "method", "seed", "dtype", "cutoff", "steps", "past", *SWEEP, "arrays")
+KEYED = ("data", "method", "seed", "dtype", "cutoff", "steps", "past", *dense.OPTIONS, "arrays")
 
 #: Numbers and what they must lie between, the upper end among it.
 RANGES = {"unit": (1e-6, 0.1), "cutoff": (0, math.inf), "min_correlation": (-1, 1), "max_sigma_rel": (0, math.inf)}
@@ -281,7 +279,7 @@ def _completed(task: Task, i: int) -> tuple[Frame, DepthMap, Row]:
         found = dense.sensed(anchor, method=task.method, size=s["size"])
         return anchor, found.to("cpu"), {"views": [], "n_offered": 0}
     others = stack([_shown(task, k) for k in offered])
-    options: dict[str, Any] = {k: s[k] for k in (*SWEEP, "seed")}
+    options: dict[str, Any] = {k: s[k] for k in (*dense.OPTIONS, "seed")}
     options |= {"method": choosing(task.method), "calibration": dense.shipped(), "hint": task.scene.hint}
     trace: Trace = {}
     with torch.no_grad():

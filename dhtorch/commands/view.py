@@ -16,6 +16,7 @@ import torch
 from dhtorch import archive
 from dhtorch.data import FormatError
 from dhtorch.data.scene import scenes_of
+from dhtorch.integrate.sweeps import Sweep
 from dhtorch.studies.exhibits import look
 from dhtorch.studies.protocol import Progress, Settings
 from dhtorch.viewer import again, html, points, rrd
@@ -83,7 +84,8 @@ def _looked(
     if not isinstance(settings["most"], int) or settings["most"] < 1:
         raise ValueError(f"most: found {settings['most']!r}, expected a whole number of at least 1")
     common = Settings(cutoff=cutoff(chosen.name), seed=settings["seed"], device=settings["device"], dtype=dtype)
-    shown = look(chosen, parts["method"], parts["pairs"], common, most=settings["most"], progress=progress)
+    options: dict[str, Any] = {"most": settings["most"], "sweep": Sweep.asked(settings["dense"]), "progress": progress}
+    shown = look(chosen, parts["method"], parts["pairs"], common, **options)
     limit = common.cutoff_of(chosen)
     hidden = limit is not None and limit != float("inf")
     facts = {"samples": f"{parts['method'].n} in each pair"}

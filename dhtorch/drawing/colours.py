@@ -1,7 +1,8 @@
 """Every colour of the project, in figures, pages, viewers and notebooks: the only place where one is written down.
 
-Blue is the sensor and orange is what was recovered, and nothing else is drawn in them. A method has one colour in every
-figure. Depth has one colour map, blue near and red far, also where a viewer brings its own (Rerun's has the same name).
+Blue is the sensor, orange is what was recovered, purple is what was swept, and nothing else is drawn in them. A method
+has one colour in every figure. Depth has one colour map, blue near and red far, also where a viewer brings its own
+(Rerun's has the same name).
 Colours stay apart for the colour-blind where they can (Okabe and Ito, Tol); those of methods and series are seen on
 light and on dark ground alike. Only what belongs to a page, as its ink and its ground, has a counterpart in the dark.
 """
@@ -16,7 +17,7 @@ import numpy as np
 from dhtorch.codes import Gate, Hole, Source
 
 #: What a depth comes from; what is silent is paler than what was answered.
-SENSOR, RECOVERED, SILENT = "#0072B2", "#E69F00", "#B4B4B4"
+SENSOR, RECOVERED, SWEPT, SILENT = "#0072B2", "#E69F00", "#C653A6", "#B4B4B4"
 
 #: Variable of the pages → its colour by day and in the dark. Figures are drawn in those of the day.
 PAGE = {
@@ -78,7 +79,7 @@ HOLES = {
     Hole.HIGHLIGHT: "#CC79A7",
     Hole.AT_BORDER: "#009E73",
 }
-SOURCES = {Source.NONE: SILENT, Source.SENSOR: SENSOR, Source.RECOVERED: RECOVERED}
+SOURCES = {Source.NONE: SILENT, Source.SENSOR: SENSOR, Source.RECOVERED: RECOVERED, Source.SWEPT: SWEPT}
 
 #: Quantity → matplotlib's name of its colour map.
 DEPTH, SCORE, ERROR, SIGNED, GREY = "turbo", "viridis", "Spectral_r", "RdBu_r", "gray"
@@ -112,9 +113,9 @@ def rgb(colour: str) -> tuple[int, int, int]:
 
 
 def of_source(source: Any) -> np.ndarray:
-    """Colours (P, 3) uint8 of points by codes.Source (P,): sensor blue, recovered orange."""
-    sensed = np.asarray(source.detach().cpu() if hasattr(source, "detach") else source)[:, None] == Source.SENSOR
-    return np.where(sensed, rgb(SENSOR), rgb(RECOVERED)).astype(np.uint8)
+    """Colours (P, 3) uint8 of points by codes.Source (P,): sensor blue, recovered orange, swept purple."""
+    code = np.asarray(source.detach().cpu() if hasattr(source, "detach") else source).astype(np.int64)
+    return np.array([rgb(SOURCES[k]) for k in sorted(SOURCES)], np.uint8)[code]
 
 
 def ramp(name: str, n: int = 17) -> list[str]:
@@ -132,7 +133,7 @@ def variable(colour: str) -> str:
 
 def style_sheet() -> str:
     """The variables of a page by day and in the dark, and those of the colours that are the same in both."""
-    fixed = {"sensor": SENSOR, "recovered": RECOVERED, "silent": SILENT, "white": WHITE, "black": BLACK}
+    fixed = {"sensor": SENSOR, "recovered": RECOVERED, "swept": SWEPT, "silent": SILENT, "white": WHITE, "black": BLACK}
     day, night = ({name: pair[k] for name, pair in PAGE.items()} for k in (0, 1))
     dark = f"@media (prefers-color-scheme: dark) {{ {_root(night)} }}"
     return f"{_root({**day, **fixed})}\n{dark}\n"

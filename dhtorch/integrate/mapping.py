@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from dhtorch import archive, export, integrate
-from dhtorch.codes import Source
+from dhtorch.codes import Source, names, words
 from dhtorch.data import files as data_files
 from dhtorch.data.pairs import Pair
 from dhtorch.data.recording import Recording
@@ -24,6 +24,7 @@ from dhtorch.geometry import se3
 from dhtorch.integrate import recording as recordings
 from dhtorch.integrate.picture import draw_map
 from dhtorch.integrate.recording import PairEstimate, Places
+from dhtorch.integrate.sweeps import Shelf, Sweep
 from dhtorch.method import Method
 from dhtorch.pair import merge
 from dhtorch.records import Camera, Frame
@@ -96,33 +97,61 @@ def make(scene: Scene, method: Method, pairs: Pairs, settings: Mapping[str, Any]
         ValueError: as the readers, the method and the volume raise it; no frame that could be placed.
     """
     recording, chosen = scene.recording, list(pairs(scene))
-    anchored = settings["poses"] == "anchored"
+    sweep = Sweep.asked(settings["dense"])
     options = {k: settings[k] for k in ("cutoff", "seed", "device")} | {"dtype": getattr(torch, settings["dtype"])}
-    asked = recordings.ask(scene, method, chosen, **options)
+    asked = recordings.ask(scene, method, chosen, sweep=sweep, shelf=Shelf(Path(settings["output"])), **options)
     answers = list(progress(asked, f"{recording.name}: pairs", len(chosen)))
-    links = _links(answers) if anchored else []
+    links = _links(answers) if settings["poses"] == "anchored" else []
     linked = recordings.ask(scene, method, links, **options)
     found = [*answers, *progress(linked, f"{recording.name}: links", len(links))]
     places = recordings.place(recording, found, poses=settings["poses"])
     if not places.poses:
         raise ValueError(f"{recording.name}: found no frame with a finite pose, expected one at least")
-    volume = integrate.empty(settings["voxel"], truncation=settings["truncation"])
-    fuse = {"cutoff": settings["cutoff"], "min_conf": settings["min_conf"], "progress": progress}
-    fuse |= {"sigma_m": settings["sensor_sigma_m"], "sigma_rel": settings["sensor_sigma_rel"]}
-    sensor = recordings.build(recording, volume, answers, places, sources=[Source.SENSOR], **fuse)
-    volume = recordings.build(recording, sensor, answers, places, sources=[Source.RECOVERED], **fuse)
-    least = settings["min_weight"]
-    alone, both = (integrate.points(v, min_weight=least) for v in (sensor, volume))
-    surface = integrate.mesh(volume, min_weight=least) if _meshed(settings["mesh"]) else both
+    volume, points = _fused(recording, answers, places, settings, progress)
+    *_, last = points.values()
+    surface = integrate.mesh(volume, min_weight=settings["min_weight"]) if _meshed(settings["mesh"]) else last
     row: Row = {"scene": recording.name, "pair": None, "method": _name(settings), "truth": settings["poses"]}
     row |= {"role": scene.role, "n_pairs": len(chosen), "n_frames": len(places.poses)}
     row |= {"n_fragments": places.n_fragments, "n_unplaced": places.n_unplaced, "n_recovered": _n_recovered(answers)}
-    row |= recordings.coverage(both.xyz, settings["voxel"])
-    row |= {f"{k}_sensor": v for k, v in recordings.coverage(alone.xyz, settings["voxel"]).items()}
-    row["voxels_vs_sensor"] = row["n_voxels"] / row["n_voxels_sensor"] if row["n_voxels_sensor"] else None
+    row |= {} if sweep is None else {"n_swept": sum(a.swept.n for a in answers if a.swept is not None)}
+    row |= _covered(points, settings["voxel"])
     row |= {"n_points": len(surface.xyz), "n_triangles": None if surface.face is None else len(surface.face)}
     row |= {"volume_mib": volume.bytes / 2**20}
     return MappedScene(recording, answers, places, volume, surface, row)
+
+
+def _fused(
+    recording: Recording,
+    answers: Sequence[PairEstimate],
+    places: Places,
+    settings: Mapping[str, Any],
+    progress: Progress,
+) -> tuple[integrate.Volume, dict[str, integrate.Surface]]:
+    """The volume, and what it showed after each source: of the ``sensor``, also ``sparse``, and with what was swept."""
+    stages = {Source.SENSOR: "sensor", Source.RECOVERED: "sparse"}
+    stages |= {Source.SWEPT: "dense"} if any(a.swept is not None for a in answers) else {}
+    points: dict[str, integrate.Surface] = {}
+
+    def after(source: int, volume: integrate.Volume) -> None:
+        points[stages[source]] = integrate.points(volume, min_weight=settings["min_weight"])
+
+    options = {k: settings[k] for k in ("cutoff", "min_conf", "min_maps")} | {"progress": progress}
+    options |= {"sigma_m": settings["sensor_sigma_m"], "sigma_rel": settings["sensor_sigma_rel"]}
+    volume = integrate.empty(settings["voxel"], truncation=settings["truncation"])
+    volume = recordings.build(recording, volume, answers, places, sources=list(stages), after=after, **options)
+    return volume, points
+
+
+def _covered(points: Mapping[str, integrate.Surface], voxel: float) -> Row:
+    """Columns of the last of these surfaces, of those before it with their names, and how much wider it is."""
+    found = {name: recordings.coverage(surface.xyz, voxel) for name, surface in points.items()}
+    *before, last = found
+    row: Row = found[last]
+    for name in before:
+        row |= {f"{k}_{name}": v for k, v in found[name].items()}
+        n = row[f"n_voxels_{name}"]
+        row[f"voxels_vs_{name}"] = row["n_voxels"] / n if n else None
+    return row
 
 
 def write(folder: Path, scene: MappedScene, settings: Mapping[str, Any]) -> list[Path]:
@@ -130,23 +159,27 @@ def write(folder: Path, scene: MappedScene, settings: Mapping[str, Any]) -> list
     surface, voxel = scene.surface, settings["voxel"]
     rgb, score = surface.features[:, :3], surface.features[:, 3]
     about = {"sigma": surface.sigma, "score": score, "source": surface.source}
-    world = f"metres; axes of {scene.recording.name}'s world"
+    codes = ", ".join(f"{code} {words(name)}" for code, name in names(Source).items())
+    said = [f"metres; axes of {scene.recording.name}'s world", f"source: {codes}"]
     export.write_ply(
-        folder / "map.ply", surface.xyz, rgb, normal=surface.normal, face=surface.face, comments=[world], **about
+        folder / "map.ply", surface.xyz, rgb, normal=surface.normal, face=surface.face, comments=said, **about
     )
     cloud = _cloud(scene)
     recovered = cloud["source"] == Source.RECOVERED
-    shapes = [export.Shape("surface", surface.xyz, rgb, surface.normal, surface.face, values={"sigma": surface.sigma})]
+    named = {"sigma": surface.sigma, "source": surface.source}
+    shapes = [export.Shape("surface", surface.xyz, rgb, surface.normal, surface.face, values=named)]
     points = cloud["xyz"][recovered], cloud["rgb"][recovered]
     shapes.append(export.Shape("recovered", *points, values={"sigma": cloud["sigma"][recovered]}))
+    swept = surface.source == Source.SWEPT
+    shapes.append(export.Shape("swept", surface.xyz[swept], rgb[swept], values={"sigma": surface.sigma[swept]}))
     export.write_glb(folder / "map.glb", shapes, up=scene.places.up)
     columns = {k: cloud[k] for k in ("sigma", "score", "hole", "source")}
-    export.write_ply(folder / "points.ply", cloud["xyz"], cloud["rgb"], comments=[world], **columns)
+    export.write_ply(folder / "points.ply", cloud["xyz"], cloud["rgb"], comments=said, **columns)
     _write_colmap(folder / "colmap", scene)
     draw_map(folder / "map.png", surface, list(scene.places.poses.values()), scene.places.up, voxel=voxel)
-    names = ["map.ply", "map.glb", "points.ply", "map.png"]
-    names += [f"colmap/{name}" for name in ("cameras.txt", "images.txt", "points3D.txt")]
-    return [folder / name for name in names]
+    files = ["map.ply", "map.glb", "points.ply", "map.png"]
+    files += [f"colmap/{name}" for name in ("cameras.txt", "images.txt", "points3D.txt")]
+    return [folder / name for name in files]
 
 
 def _cloud(scene: MappedScene) -> dict[str, Tensor]:
@@ -201,6 +234,7 @@ def _pair_rows(scene: MappedScene) -> list[Row]:
     return [
         {**common, "pair": list(a.pair), "pnp_ok": int(a.fit.ok[0]), "n_kept": int(a.estimate.keep.sum())}
         | {"n_recovered": int(a.recovered.sum()), "placed": int(a.pair[0] in scene.places.poses)}
+        | ({} if a.swept is None else {"n_swept": a.swept.n, "map_hw": list(a.swept.hw)})
         | ({} if a.picked is None else a.picked.row())
         for a in scene.answers
     ]
@@ -213,6 +247,7 @@ def _said(row: Row, voxel: float) -> str:
     if not row["n_voxels"]:
         return f"{row['scene']}: {placed}, {fragments}; no surface"
     wider = f", {row['voxels_vs_sensor']:.3g} times the sensor's" if row["voxels_vs_sensor"] else ""
+    wider += f" and {row['voxels_vs_sparse']:.3g} times those without a sweep" if row.get("voxels_vs_sparse") else ""
     islands = f"{row['n_islands']} islands, the largest {row['largest_island']:.0%}"
     size = f"{row['n_points']} points" + (f", {row['n_triangles']} triangles" if row["n_triangles"] else "")
     return (
@@ -230,12 +265,13 @@ def _result(settings: Mapping[str, Any], sources: Sequence[Scene], rows: list[Ro
     config = {k: v for k, v in settings.items() if k != "choices"}
     named = archive.files_named({k: config[k] for k in GROUPS})
     digest = archive.data_digest({**archive.files_below(r.root for r in sources), **named})
-    units = {"n_voxels": "", "n_voxels_sensor": "", "voxels_vs_sensor": "", "n_fragments": "", "n_islands": ""}
+    metrics = ["n_voxels", "n_voxels_sensor", "voxels_vs_sensor", "n_fragments", "n_islands"]
+    metrics += ["n_voxels_sparse", "voxels_vs_sparse"] if Sweep.asked(settings["dense"]) is not None else []
     summary = {}
-    for metric, unit in units.items():
+    for metric in metrics:
         values = sorted(row[metric] for row in scenes if row[metric] is not None and row["role"] is None)
-        middle = float(torch.tensor(values).double().quantile(0.5)) if values else None
-        summary[f"{_name(settings)}.{metric}"] = bootstrap.single(middle, len(values), unit)
+        middle = float(torch.tensor(values, dtype=torch.float64).quantile(0.5)) if values else None
+        summary[f"{_name(settings)}.{metric}"] = bootstrap.single(middle, len(values), "")
     threads = torch.get_num_threads()
     return archive.build(
         experiment="integrate",
@@ -269,6 +305,9 @@ def _check(settings: Mapping[str, Any]) -> None:
         raise ValueError(f"poses: found {settings['poses']!r}, expected one of {', '.join(recordings.POSES)}")
     if settings["cutoff"] is not None and not settings["cutoff"] > 0:
         raise ValueError(f"cutoff: found {settings['cutoff']}, expected a positive number of metres, or null for none")
+    if not isinstance(settings["min_maps"], int) or settings["min_maps"] < 1:
+        raise ValueError(f"min_maps: found {settings['min_maps']!r}, expected a whole number of at least 1")
+    Sweep.asked(settings["dense"])
     if settings["mesh"] and not _meshed(None):
         raise ImportError("mesh: found no scikit-image, expected the extra: pip install 'dhtorch[mesh]'")
     integrate.points(

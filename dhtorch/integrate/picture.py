@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dhtorch.codes import Source
-from dhtorch.drawing import Canvas, Key, Stroke, save
-from dhtorch.drawing.colours import INK, RECOVERED, SENSOR, of_source
+from dhtorch.codes import Source, names, words
+from dhtorch.drawing import Canvas, Key, Stroke, colours, save
+from dhtorch.drawing.colours import INK, of_source
 from dhtorch.geometry import se3
 from dhtorch.geometry.camera import project
 from dhtorch.integrate.surface import Surface
-from dhtorch.integrate.volume import splat
+from dhtorch.integrate.volume import SOURCES, splat
 from dhtorch.records import Camera, Pose
 
 
@@ -40,14 +40,16 @@ def draw_map(
     lens = _fitted(torch.cat((xyz[ahead], way[way[..., 2] > voxel])), hw)
     uv = project(lens, xyz)
     depth = torch.where(ahead, xyz[..., 2], 0.0)
-    colours = torch.cat((surface.features[:, :3].double(), by_source), -1)[None]
-    seen = splat(lens, hw, uv, depth, torch.ones_like(depth), colours, T_world_from_cam=T, radius=0.8 * voxel)
+    both = torch.cat((surface.features[:, :3].double(), by_source), -1)[None]
+    seen = splat(lens, hw, uv, depth, torch.ones_like(depth), both, T_world_from_cam=T, radius=0.8 * voxel)
     picture = torch.where(seen.depth[0, ..., None] > 0, seen.features[0], 1.0).clamp(0, 1).numpy()
     dots = project(lens, way)[way[..., 2] > voxel].numpy()
-    counts = {code: int((surface.source == code).sum()) for code in (Source.SENSOR, Source.RECOVERED)}
-    _side_by_side(
-        path, {f"Map of {len(cameras)} views": picture[..., :3], "Sensor and recovered": picture[..., 3:]}, dots, counts
-    )
+    counts = {code: int((surface.source == code).sum()) for code in SOURCES}
+    shown = {code: n for code, n in counts.items() if n or code != Source.SWEPT}
+    *first, last = (words(names(Source)[code]) for code in shown)
+    title = f"{', '.join(first)} and {last}".capitalize()
+    pictures = {f"Map of {len(cameras)} views": picture[..., :3], title: picture[..., 3:]}
+    _side_by_side(path, pictures, dots, shown)
 
 
 def _side_by_side(
@@ -70,8 +72,8 @@ def _side_by_side(
         inside = [(u, v) for u, v in places if left <= u <= left + width and 0 <= v <= height]
         canvas.lines([inside] if inside else [], Stroke(INK, 0.8))
         canvas.dots(inside, Stroke(INK, 1.5))
-    kinds = ((Source.SENSOR, "sensor", SENSOR), (Source.RECOVERED, "recovered", RECOVERED))
-    save(canvas.finished([Key(f"{name}  {counts[code]}", colour, "box") for code, name, colour in kinds]), path)
+    keys = [Key(f"{words(names(Source)[code])}  {n}", colours.SOURCES[code], "box") for code, n in counts.items()]
+    save(canvas.finished(keys), path)
 
 
 def _viewpoint(surface: Surface, cameras: Sequence[Pose], up: Sequence[float]) -> Pose:

@@ -11,6 +11,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import torch
@@ -20,11 +21,13 @@ from dhtorch.codes import Source
 from dhtorch.data.pairs import Pair, between
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Given, Scene
+from dhtorch.dense import pixels
 from dhtorch.evaluate.holdout import range_split
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3, sparse_grid
 from dhtorch.geometry.lookup import nearest
-from dhtorch.integrate.volume import View, Volume, fuse, splat
+from dhtorch.integrate.sweeps import Shelf, Sweep, Swept, edges
+from dhtorch.integrate.volume import SOURCES, View, Volume, confirmed, fuse, reserve, splat
 from dhtorch.method import Method
 from dhtorch.offers import Picked, choosing, picked
 from dhtorch.records import Camera, Estimate, Frame, Pose, PoseFit, Samples, Tracks
@@ -50,6 +53,7 @@ class PairEstimate:
     hw: tuple[int, int]
     picked: Picked | None = None  # where the method chose among several
     others: Mapping[int, PoseFit] = field(default_factory=dict)  # the poses of all views that it chose
+    swept: Swept | None = None  # pixels of the anchor's map, where one was asked for
 
     @property
     def links(self) -> dict[int, PoseFit]:
@@ -86,6 +90,8 @@ def ask(
     seed: int = 0,
     device: str = "cpu",
     dtype: torch.dtype = torch.float32,
+    sweep: Sweep | None = None,
+    shelf: Shelf | None = None,
 ) -> Iterator[PairEstimate]:
     """The method's answer to each pair, one after the other.
 
@@ -94,12 +100,15 @@ def ask(
         method: of one view or several; the others lie between the two of the pair, or are chosen among those offered.
         cutoff: m; returns beyond it are hidden from the method. None hides nothing.
         seed, device, dtype: of the method's run; answers come back on the CPU.
+        sweep: also make a map of every pixel of the anchors; the method runs once all the same.
+        shelf: where the maps wait; None = one of this call.
 
     Raises:
         ValueError: as the method, the readers and the hold-out raise it.
     """
     scene = Scene.of(scene)
     hint, recording = scene.hint, scene.recording
+    shelf = Shelf() if shelf is None else shelf
     for i, j in pairs:
         offered = () if isinstance(j, int) else j
         seen = between(i, j, min(method.views, j - i)) if isinstance(j, int) else offered
@@ -108,7 +117,8 @@ def ask(
         trace: dict[str, Any] = {}
         with torch.no_grad():
             others = stack(shown[1:]) if len(seen) > 1 else shown[-1]
-            estimate = asked(shown[0], others, seed=seed, hint=hint, trace=trace)
+            ask_one = asked if sweep is None else partial(sweep, asked)
+            estimate = ask_one(shown[0], others, seed=seed, hint=hint, trace=trace)
             samples = trace["samples"].to("cpu")
             rgb = _colour(shown[0], trace["samples"].uv)
         tracks, fit = (trace[k].to("cpu") for k in ("tracks", "fit"))
@@ -126,6 +136,7 @@ def ask(
             hw=shown[0].hw,
             picked=choice,
             others={} if choice is None else dict(zip(choice.views, fits or [fit], strict=True)),
+            swept=shelf.put(trace["dense"]) if sweep is not None else None,
         )
 
 
@@ -193,38 +204,57 @@ def build(
     answers: Sequence[PairEstimate],
     places: Places,
     *,
-    sources: Sequence[int] = (Source.SENSOR, Source.RECOVERED),
+    sources: Sequence[int] = SOURCES,
     cutoff: float | None = None,
     sigma_m: float = 0.0,
     sigma_rel: float = 0.01,
     min_conf: int = 1,
+    min_maps: int = 2,
+    after: Callable[[int, Volume], None] = lambda _source, _volume: None,
     progress: Callable[[Iterable[Any], str, int], Iterable[Any]] = lambda items, _text, _total: items,
 ) -> Volume:
-    """The volume after all placed frames: first what the sensor says, frame by frame, then what was recovered.
+    """The volume after all placed frames: first what the sensor says, frame by frame, then what was recovered, and then
+    what was swept.
+
+    Of a swept map whole patches may be wrong together, and float where other frames see through. So room is made for
+    all maps first (:func:`dhtorch.integrate.reserve`): whatever the order, every ray that passes a place speaks of it.
+    What remains and no second map has found is left out (:func:`dhtorch.integrate.confirmed`).
 
     Args:
         recording: read once more, frame by frame.
         volume: with four feature channels: red, green, blue and score.
         answers, places: from :func:`ask` and :func:`place`.
-        sources: which of the two to fuse.
+        sources: which of the three to fuse.
         cutoff: m; returns beyond it are hidden.
         sigma_m, sigma_rel, min_conf: the sensor's noise and least confidence, as in stage 2.
+        min_maps: swept maps that must agree on a surface of which nothing else speaks; of fewer maps all.
+        after: is told the volume after each source: (codes.Source, volume).
         progress: wraps the loop over frames: (items, text, number of items) → items.
 
     Returns:
         Volume; recovered points are splats of 1.5 voxels, added where the sensor has no usable return.
     """
+    maps = [a for a in answers if a.pair[0] in places.poses and a.swept is not None and a.swept.n]
+    for answer in progress(maps, f"{recording.name}: room", len(maps)) if Source.SWEPT in sources else ():
+        volume = reserve(volume, swept(recording, answer, places))
     if Source.SENSOR in sources:
         for k in progress(list(places.poses), f"{recording.name}: sensor", len(places.poses)):
             frame = range_split(recording[k].to(volume.distance.dtype), cutoff)
             options: dict[str, Any] = {"sigma_m": sigma_m, "sigma_rel": sigma_rel, "min_conf": min_conf}
             one = sensed(frame, places.poses[k], radius=PATCH * volume.voxel if recording.sparse else None, **options)
             volume = fuse(volume, one)
+        after(Source.SENSOR, volume)
     if Source.RECOVERED in sources:
         placed = [a for a in answers if a.pair[0] in places.poses and bool(a.recovered.any())]
         for answer in progress(placed, f"{recording.name}: recovered", len(placed)):
             one = recovered(answer, places.poses[answer.pair[0]], radius=PATCH * volume.voxel)
             volume = fuse(volume, one, source=Source.RECOVERED)
+        after(Source.RECOVERED, volume)
+    if Source.SWEPT in sources:
+        for answer in progress(maps, f"{recording.name}: swept", len(maps)):
+            volume = fuse(volume, swept(recording, answer, places), source=Source.SWEPT)
+        volume = confirmed(volume, max(1, min(min_maps, len(maps))))
+        after(Source.SWEPT, volume)
     return volume
 
 
@@ -262,7 +292,7 @@ def sensed(
     if frame.conf is not None:
         depth = torch.where(frame.conf >= min_conf, depth, 0.0)
     if radius is None:
-        depth = torch.where(_edges(depth) > edge_rel, 0.0, depth)
+        depth = torch.where(edges(depth) > edge_rel, 0.0, depth)
     sigma = (sigma_m**2 + (sigma_rel * depth).square()).sqrt()
     v, u = torch.meshgrid(*(torch.arange(n, device=depth.device) for n in hw), indexing="ij")
     uv = torch.stack((u, v), -1).view(1, -1, 2).to(depth)
@@ -292,6 +322,16 @@ def recovered(answer: PairEstimate, T_world_from_cam: Pose, *, radius: float) ->
     )
 
 
+def swept(recording: Recording, answer: PairEstimate, places: Places) -> View:
+    """The swept pixels of an anchor's map, with colours from its picture."""
+    assert answer.swept is not None
+    frame, hw = recording[answer.pair[0]], answer.swept.hw
+    depth, sigma, score = answer.swept.read()
+    features = torch.cat((_colour(frame, pixels(frame, hw)[None]), score.view(1, -1, 1)), -1)
+    camera = cameras.resize(frame.camera, frame.hw, hw)
+    return View(depth, sigma, features.view(1, *hw, 4), camera, places.poses[answer.pair[0]])
+
+
 def _own(recording: Recording, k: int) -> Pose:
     assert recording.poses is not None
     return recording.poses[k : k + 1].to(torch.float64)
@@ -319,11 +359,3 @@ def _colour(frame: Frame, uv: Tensor) -> Tensor:
 def _in_picture(frame: Frame, camera: Camera, uv: Tensor) -> Tensor:
     """Pixels of the picture (1, N, 2) that see what pixels of the depth map see."""
     return cameras.project(frame.camera, cameras.rays(camera, uv).nan_to_num())
-
-
-def _edges(depth: Tensor) -> Tensor:
-    """Farthest over nearest return in 3×3 pixels, minus one; what has no return does not count."""
-    far = torch.nn.functional.max_pool2d(depth[:, None], 3, 1, 1)[:, 0]
-    inverse = torch.where(depth > 0, 1 / torch.where(depth > 0, depth, 1.0), 0.0)
-    near = torch.nn.functional.max_pool2d(inverse[:, None], 3, 1, 1)[:, 0]
-    return far * near - 1

@@ -32,7 +32,7 @@ class Surface(Record):
     normal: Tensor  # (P, 3) unit, towards the open side; NaN where unknown
     features: Tensor  # (P, C) weighted means
     sigma: Tensor  # (P,) m, of the mean of all views, as if each erred for itself
-    source: Tensor  # (P,) int32 codes.Source, the one with the larger weight
+    source: Tensor  # (P,) int32 codes.Source, the one with the largest weight
     face: Tensor | None = None  # (F, 3) int64, counter-clockwise seen from the open side
 
 
@@ -131,13 +131,13 @@ def _described(volume: Volume, a: Tensor, b: Tensor, t: Tensor, xyz: Tensor) -> 
     mixed = (volume.features.flatten(0, 1)[index].to(t.dtype) * share).sum(0)
     slope = (_slope(volume, torch.stack((a, b))) * share).sum(0)
     length = slope.norm(dim=-1, keepdim=True)
-    sensed = weight[:, 0] >= weight[:, 1]
+    codes = torch.tensor(SOURCES, dtype=torch.int32, device=weight.device)
     return Surface(
         xyz=xyz.to(t.dtype),
         normal=torch.where(length > 0, slope / length, torch.nan),
         features=mixed[:, 1:] / mixed[:, :1].clamp_min(1e-6),
         sigma=weight.sum(-1).rsqrt(),
-        source=torch.where(sensed, SOURCES[0], SOURCES[1]).to(torch.int32),
+        source=codes[weight.argmax(-1)],  # of equals the first
     )
 
 

@@ -28,7 +28,7 @@ INSIDE = SIDE**3
 #: Blocks that are updated at a time: bounds the memory of intermediates.
 _CHUNK = 1024
 #: Sources with a weight of their own, in the order in which a voxel keeps them.
-SOURCES = (Source.SENSOR, Source.RECOVERED)
+SOURCES = (Source.SENSOR, Source.RECOVERED, Source.SWEPT)
 
 
 @record
@@ -37,7 +37,8 @@ class Volume(Record):
 
     key: Tensor  # (K,) int64, rising: numbers of the blocks, see geometry.sparse_grid
     distance: Tensor  # (K, 512) m, positive in front of the surface
-    weight: Tensor  # (K, 512, 2) 1/m², of the sensor and of recovered depth; 0 = nothing known
+    weight: Tensor  # (K, 512, 3) 1/m², of depth from the sensor, recovered and swept; 0 = nothing known
+    n_swept: Tensor  # (K, 512) uint8: swept views with a surface within reach; 255 = so many or more
     features: Tensor  # (K, 512, 1 + C) float16: how much of the weight came with features, and that times their mean
     voxel: float  # m
     truncation: float  # m
@@ -45,7 +46,7 @@ class Volume(Record):
     @property
     def bytes(self) -> int:
         """Memory of the blocks."""
-        parts = (self.key, self.distance, self.weight, self.features)
+        parts = (self.key, self.distance, self.weight, self.n_swept, self.features)
         return sum(x.numel() * x.element_size() for x in parts)
 
 
@@ -84,7 +85,10 @@ def empty(
     key = torch.zeros(0, dtype=torch.int64, device=device)
     values = torch.zeros(0, INSIDE, device=device)
     features = torch.zeros(0, INSIDE, 1 + channels, dtype=torch.float16, device=device)
-    return Volume(key, values, values[..., None].expand(-1, -1, 2), features, float(voxel), float(truncation))
+    weight = values[..., None].expand(-1, -1, len(SOURCES))
+    n_swept = values.to(torch.uint8)
+    sides = {"voxel": float(voxel), "truncation": float(truncation)}
+    return Volume(key, values, weight, n_swept, features, **sides)
 
 
 def fuse(
@@ -106,7 +110,7 @@ def fuse(
     Args:
         volume: what is known so far.
         view: B views, fused in their order.
-        source: of their depth, Source.SENSOR or Source.RECOVERED; decides which weight grows.
+        source: of their depth, Source.SENSOR, RECOVERED or SWEPT; decides which weight grows.
         max_reach: in truncations; a depth whose twofold sigma exceeds it says nothing.
         carve: False leaves voxels alone that lie in front of the surface by more than the reach.
 
@@ -123,13 +127,42 @@ def fuse(
     """
     _check(volume, view)
     if source not in SOURCES:
-        raise ValueError(f"integrate.fuse: source is {source}, expected SENSOR ({SOURCES[0]}) or RECOVERED")
+        raise ValueError(f"integrate.fuse: source is {source}, expected SENSOR, RECOVERED or SWEPT {SOURCES}")
     with torch.no_grad():
         views = [_Sight(volume, view[b : b + 1], max_reach) for b in range(len(view.depth))]
         volume = _grown(volume, [s.blocks() for s in views])
         for sight in views:
             sight.add_to(volume, SOURCES.index(source), carve)
     return volume
+
+
+def reserve(volume: Volume, view: View, *, max_reach: float = 3.0) -> Volume:
+    """The volume with room for the surfaces of B views, of which nothing is said yet.
+
+    A voxel learns nothing from views that were fused before its block was there: rays that passed through it are
+    forgotten. Where that matters, because what comes later may be wrong, room is made for all views first.
+
+    Arguments and errors as of :func:`fuse`.
+    """
+    _check(volume, view)
+    with torch.no_grad():
+        sights = [_Sight(volume, view[b : b + 1], max_reach) for b in range(len(view.depth))]
+        return _grown(volume, [sight.blocks() for sight in sights])
+
+
+def confirmed(volume: Volume, least: int = 2) -> Volume:
+    """The volume without what swept depth alone says and fewer than ``least`` swept views agree on; asked at the end.
+
+    A view whose motion is wrong is wrong in all its pixels, and its neighbours in a patch err alike; what another view
+    found as well, with other partners, is seldom wrong in the same way.
+
+    Raises:
+        ValueError: ``least`` is not positive.
+    """
+    if least < 1:
+        raise ValueError(f"integrate.confirmed: least is {least}, expected at least 1")
+    keep = (volume.n_swept >= least) | (volume.weight[..., : SOURCES.index(Source.SWEPT)] > 0).any(-1)
+    return volume.replace(weight=torch.where(keep[..., None], volume.weight, 0.0))
 
 
 def splat(
@@ -270,6 +303,8 @@ class _Sight:
         colour = volume.features[part].to(share.dtype)
         volume.features[part] = (colour + close * (self.features[pixel] - colour)).to(volume.features.dtype)
         volume.weight[part, :, source] += weight
+        if SOURCES[source] == Source.SWEPT:
+            volume.n_swept[part] += (told & (along <= reach) & (fade >= 0.5) & (volume.n_swept[part] < 255)).byte()
 
 
 def _grown(volume: Volume, keys: list[Tensor]) -> Volume:
@@ -280,9 +315,8 @@ def _grown(volume: Volume, keys: list[Tensor]) -> Volume:
     def wider(x: Tensor) -> Tensor:
         return x.new_zeros(len(key), *x.shape[1:]).index_copy_(0, at, x)
 
-    return volume.replace(
-        key=key, distance=wider(volume.distance), weight=wider(volume.weight), features=wider(volume.features)
-    )
+    fields = ("distance", "weight", "n_swept", "features")
+    return volume.replace(key=key, **{name: wider(getattr(volume, name)) for name in fields})
 
 
 def _nearest_first(pixel: Tensor, depth: Tensor, owner: Tensor, n_pixels: int) -> Tensor:

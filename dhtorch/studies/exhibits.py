@@ -12,18 +12,23 @@ import torch
 from dhtorch.codes import Source
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Given, Scene
+from dhtorch.dense import pixels
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.lookup import nearest
+from dhtorch.integrate.sweeps import Sweep
 from dhtorch.offers import picked
 from dhtorch.pair import merge
-from dhtorch.records import Camera, Frame, Pose
+from dhtorch.records import Camera, DepthMap, Frame, Pose
 from dhtorch.studies import protocol
 from dhtorch.studies.protocol import Answer, Method, Pairs, Progress, Protocol, Settings, Variant
-from dhtorch.viewer.exhibit import NO_POINTS, Cloud, DepthMap, Exhibit, Picture, Shot
+from dhtorch.viewer.exhibit import NO_POINTS, NO_SWEPT, Cloud, DepthImage, Exhibit, Picture, Shot, SweptCloud
 
 #: Points of a depth map that are shown, drawn at random: enough to know the place, few enough for a page.
 DENSE = 12_000
+
+#: Swept pixels that are shown of one view, drawn at random.
+SWEPT = 24_000
 
 #: Longer side of the pictures, px, and quality of their JPEG.
 LONGEST, QUALITY = 800, 82
@@ -36,6 +41,7 @@ def look(
     settings: Settings,
     *,
     most: int = 12,
+    sweep: Sweep | None = None,
     progress: Progress = protocol.quiet,
 ) -> Exhibit:
     """Run the method on pairs of the recording, as the main job does, and keep what there is to see.
@@ -46,6 +52,7 @@ def look(
         pairs: scene → list of :class:`dhtorch.data.pairs.Pair`, or plain (anchor, other).
         settings: cutoff, seed, device, batch, workers.
         most: pairs that are shown; of more, as many spread evenly.
+        sweep: also make a map of every pixel of the anchors.
         progress: wraps the loop over the pairs.
 
     Raises:
@@ -64,7 +71,7 @@ def look(
         shots.append(_shot(answer, list(views)))
         return {}
 
-    seen = Protocol({"view": Variant(method)}, columns=keep, min_candidates=0)
+    seen = Protocol({"view": Variant(method, ask=sweep, chooses=True)}, columns=keep, min_candidates=0)
     protocol.run([shown], seen, lambda scene: _spread(pairs(scene), most), settings, progress=progress)
     path = None if recording.poses is None else recording.poses.t.detach().cpu().numpy()
     return Exhibit(recording.name, shots, list(views.values()), path)
@@ -110,7 +117,8 @@ def _shot(answer: Answer, shown: Sequence[int]) -> Shot:
         view_1=shown.index(j),
         seen=_cloud(anchor, (anchor.depth > 0) & (anchor.depth <= cutoff)),
         held=_cloud(held, held.depth > cutoff),
-        depth_map=_depth_map(anchor, cutoff),
+        swept=_swept(anchor, answer.trace["dense"]) if "dense" in answer.trace else NO_SWEPT,
+        depth_image=_depth_image(anchor, cutoff),
         facts=facts,
     )
 
@@ -120,9 +128,9 @@ def _view(recording: Recording, k: int, frame: Frame) -> Picture:
     return Picture(int(recording.number[k]), time, *_jpeg(_pixels(frame)), frame.hw, *_intrinsics(frame.camera))
 
 
-def _depth_map(frame: Frame, cutoff: float) -> DepthMap:
+def _depth_image(frame: Frame, cutoff: float) -> DepthImage:
     depth = frame.depth[0].cpu()
-    return DepthMap(torch.where(depth <= cutoff, depth, 0.0).float().numpy(), *_intrinsics(_depth_camera(frame)))
+    return DepthImage(torch.where(depth <= cutoff, depth, 0.0).float().numpy(), *_intrinsics(_depth_camera(frame)))
 
 
 def _depth_camera(frame: Frame) -> Camera:
@@ -140,13 +148,28 @@ def _cloud(frame: Frame, wanted: torch.Tensor) -> Cloud:
     places = wanted[0].cpu().nonzero()
     if not len(places):
         return NO_POINTS
-    some = torch.randperm(len(places), generator=torch.Generator().manual_seed(0))[:DENSE]
-    v, u = places[some].unbind(-1)
+    v, u = _some(places, DENSE).unbind(-1)
     camera = _depth_camera(frame)
     xyz = cam.unproject(camera, torch.stack((u, v), -1)[None].to(camera.f), frame.depth[:, v, u].cpu())
     rgb = _colours(frame, cam.project(frame.camera.to("cpu"), xyz).nan_to_num())
     fine = xyz[0].isfinite().all(-1)
     return Cloud(xyz[0, fine].float().numpy(), rgb[0, fine].numpy())
+
+
+def _swept(frame: Frame, found: DepthMap) -> SweptCloud:
+    """Some of the swept pixels of a map (B = 1)."""
+    found = found.to("cpu")
+    hw = found.depth.shape[-2], found.depth.shape[-1]
+    some = _some((found.source == Source.SWEPT).flatten(1)[0].nonzero()[:, 0], SWEPT)
+    uv = pixels(frame, hw)[some].cpu()[None]
+    depth, sigma, score = (x.flatten(1)[:, some].float() for x in (found.depth, found.sigma, found.score))
+    xyz = cam.unproject(frame.camera.to("cpu"), uv, depth)
+    return SweptCloud(*(x[0].numpy() for x in (xyz.float(), _colours(frame, uv), sigma, score)))
+
+
+def _some(places: torch.Tensor, most: int) -> torch.Tensor:
+    """At most so many rows of these, drawn at random."""
+    return places[torch.randperm(len(places), generator=torch.Generator().manual_seed(0))[:most]]
 
 
 def _colours(frame: Frame, uv: torch.Tensor) -> torch.Tensor:

@@ -114,6 +114,7 @@ class Variant:
     given: Callable[[Batch], Mapping[str, Any]] = lambda _batch: {}  # further options: an oracle may see it all
     offers: Offers | None = None  # other views in the place of the pair's own; silent where it is offered none
     needs: Callable[[Scene], str | None] = lambda _scene: None  # scene → why it cannot run there, None = it can
+    chooses: bool = False  # ``ask`` chooses among several views, as the method does
     two_frames: bool = False  # cannot choose: what it is judged by would take part in the choice
 
 
@@ -213,8 +214,9 @@ class Protocol:
         Raises:
             ValueError: such a variant and such pairs.
         """
-        if any(v.two_frames or v.fit is not None or v.ask is not None for v in self.variants.values()):
-            fixed(pairs)
+        for v in self.variants.values():
+            if v.two_frames or v.fit is not None or (v.ask is not None and not v.chooses):
+                fixed(pairs)
 
 
 @dataclass(frozen=True)

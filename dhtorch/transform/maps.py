@@ -15,9 +15,6 @@ from dhtorch.method import Method
 from dhtorch.records import DepthMap, Frame, Map
 from dhtorch.transform.views import Read
 
-#: Options of :func:`dhtorch.dense.complete` that may be asked for.
-OPTIONS = ("partners", "planes", "size", "refinements", "min_correlation", "max_sigma_rel")
-
 #: Keys of a map: numbers, and codes.
 NUMBERS, CODES = ("depth_map", "sigma_map", "score_map"), ("source_map", "gate_map")
 
@@ -31,26 +28,9 @@ class Maps:
 
     @classmethod
     def asked(cls, given: bool | Mapping[str, Any], name: str = "dense") -> Maps | None:
-        """What ``dense=`` asks for: True = as ``complete`` has it, a mapping = options that differ, False = None.
-
-        Raises:
-            ValueError: something else, an unknown option, or one that is no number.
-        """
-        if not isinstance(given, bool | Mapping):
-            raise ValueError(f"{name}: found {given!r}, expected true, false or options among {', '.join(OPTIONS)}")
-        if given is False:
-            return None
-        standard = dict(dense.complete.__kwdefaults__ or {})
-        options = {option: standard[option] for option in OPTIONS}
-        for option, value in {} if given is True else given.items():
-            if option not in options:
-                raise ValueError(f"{name}: found {option!r}, expected some of {', '.join(OPTIONS)}")
-            kinds = (int,) if isinstance(options[option], int) else (int, float)
-            if not isinstance(value, kinds) or isinstance(value, bool):
-                expected = "a whole number" if kinds == (int,) else "a number"
-                raise ValueError(f"{name}.{option}: found {value!r}, expected {expected}")
-            options[option] = value
-        return cls(options)
+        """What ``dense=`` asks for, see :func:`dhtorch.dense.options`."""
+        options = dense.options(given, name)
+        return None if options is None else cls(options)
 
     def hw(self, hw: tuple[int, int]) -> tuple[int, int]:
         """Height and width of the map of a picture."""

@@ -5,6 +5,6 @@
 is to be seen of a recording is computed by ``dhtorch.studies.exhibits``.
 """
 
-from dhtorch.viewer.exhibit import Cloud, DepthMap, Exhibit, Picture, Shot
+from dhtorch.viewer.exhibit import Cloud, DepthImage, Exhibit, Picture, Shot, SweptCloud
 
-__all__ = ["Cloud", "DepthMap", "Exhibit", "Picture", "Shot"]
+__all__ = ["Cloud", "DepthImage", "Exhibit", "Picture", "Shot", "SweptCloud"]

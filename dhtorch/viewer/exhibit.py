@@ -36,8 +36,16 @@ class Cloud:
 
 
 @dataclass(frozen=True)
-class DepthMap:
-    """A depth map and its intrinsics."""
+class SweptCloud(Cloud):
+    """Points of swept pixels."""
+
+    sigma: np.ndarray  # (P,) m, float32
+    score: np.ndarray  # (P,) in [0, 1], float32
+
+
+@dataclass(frozen=True)
+class DepthImage:
+    """The sensor's depth of a view as a picture, and its intrinsics."""
 
     depth: np.ndarray  # (h, w) m float32, 0 = no return
     f: tuple[float, float]  # px of the depth map
@@ -45,6 +53,7 @@ class DepthMap:
 
 
 NO_POINTS = Cloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
+NO_SWEPT = SweptCloud(NO_POINTS.xyz, NO_POINTS.rgb, np.zeros(0, np.float32), np.zeros(0, np.float32))
 
 
 @dataclass(frozen=True)
@@ -65,7 +74,8 @@ class Shot:
     view_1: int | None = None
     seen: Cloud = NO_POINTS  # returns that the method saw
     held: Cloud = NO_POINTS  # returns that it did not see, or the exact depth there
-    depth_map: DepthMap | None = None  # that the method saw
+    swept: SweptCloud = NO_SWEPT  # swept pixels of view 0, where a map of every pixel was asked for
+    depth_image: DepthImage | None = None  # that the method saw
     facts: Mapping[str, str] = field(default_factory=dict)
 
     def gates(self) -> dict[str, int]:

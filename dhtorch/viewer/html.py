@@ -18,7 +18,7 @@ from dhtorch import storage
 from dhtorch.codes import Gate, Hole, names, words
 from dhtorch.drawing import colours
 from dhtorch.drawing.colours import GATES, HOLES, RECOVERED, SENSOR
-from dhtorch.viewer.exhibit import Cloud, Exhibit, Picture, Shot
+from dhtorch.viewer.exhibit import Cloud, Exhibit, Picture, Shot, SweptCloud
 
 ENDINGS = (".html", ".htm")
 
@@ -26,7 +26,7 @@ _HERE = Path(__file__).parent
 _SCRIPTS = ("space.js", "pictures.js", "layers.js", "page.js")
 
 #: Colours that the scripts ask for by name, and their colour maps.
-_COLOURS = ("SENSOR", "RECOVERED", "SILENT", "PALE", "HELD", "WHITE", "BLACK")
+_COLOURS = ("SENSOR", "RECOVERED", "SWEPT", "SILENT", "PALE", "HELD", "WHITE", "BLACK")
 _RAMPS = {"depth": colours.DEPTH, "score": colours.SCORE, "error": colours.ERROR}
 
 #: Pixels travel in 16 bits: this many steps a pixel, from this far outside the picture.
@@ -79,9 +79,12 @@ def _data(scene: Exhibit) -> dict[str, Any]:
     outcomes = [("SENSOR", "sensor", SENSOR), ("ANSWER", "recovered", RECOVERED)]
     outcomes += [(name, words(name), GATES[code]) for code, name in names(Gate).items() if code != Gate.ANSWER]
     n = sum(len(shot.samples["depth"]) for shot in scene.shots)
+    swept = sum(len(shot.swept.xyz) for shot in scene.shots)
+    said = f"{_many(len(scene.shots), 'pair')}, {n} samples" if scene.views else f"{n + swept} points"
+    said += f", {swept} swept pixels" if scene.views and swept else ""
     return {
         "title": scene.name,
-        "about": f"{_many(len(scene.shots), 'pair')}, {n} samples" if scene.views else f"{n} points",
+        "about": said,
         "facts": dict(scene.facts),
         "placed": scene.placed,
         "per_pixel": PER_PIXEL,
@@ -99,13 +102,14 @@ def _data(scene: Exhibit) -> dict[str, Any]:
 
 
 def _shot(shot: Shot) -> dict[str, Any]:
-    columns = {**shot.samples, "score": np.round(65535 * np.nan_to_num(shot.samples["score"]).clip(0, 1))}
+    columns = {**shot.samples, "score": _shares(shot.samples["score"])}
     for name in ("uv_0", "uv_1"):
         steps = np.round((np.nan_to_num(columns[name]) + MARGIN_PX) * PER_PIXEL)
         columns[name] = steps.clip(0, 65535)
     made: dict[str, Any] = {"samples": {name: _packed(columns[name], kind) for name, kind in _TYPES.items()}}
     made |= {"label": shot.label, "counts": shot.gates(), "facts": dict(shot.facts)}
     made |= {"view_0": shot.view_0, "view_1": shot.view_1, "seen": _cloud(shot.seen), "held": _cloud(shot.held)}
+    made["swept"] = _cloud(shot.swept) | _surely(shot.swept)
     poses = {"T_world_from_0": shot.T_world_from_0, "T_world_from_1": shot.T_world_from_1}
     return made | {k: None if T is None else [float(x) for x in T[:3].ravel()] for k, T in poses.items()}
 
@@ -127,6 +131,15 @@ def _cloud(cloud: Cloud) -> dict[str, Any]:
         "xyz": _packed(steps, "u2"),
         "rgb": _packed(cloud.rgb, "u1"),
     }
+
+
+def _surely(cloud: SweptCloud) -> dict[str, Any]:
+    return {"sigma": _packed(cloud.sigma, "f4"), "score": _packed(_shares(cloud.score), "u2")}
+
+
+def _shares(score: np.ndarray) -> np.ndarray:
+    """Scores in 16 bits."""
+    return np.round(65535 * np.nan_to_num(score).clip(0, 1))
 
 
 def _packed(values: np.ndarray, kind: str) -> dict[str, str]:

@@ -19,19 +19,22 @@ const shots = DATA.shots.map((s) => {
   const columns = Object.fromEntries(Object.entries(s.samples).map(([name, packed]) => [name, unpack(packed)]));
   for (const name of ["uv_0", "uv_1"]) columns[name] = Float32Array.from(columns[name], (v) => v / DATA.per_pixel - DATA.margin_px);
   columns.score = Float32Array.from(columns.score, (v) => v / 65535);
-  return { ...s, ...columns, n: columns.depth.length, seen: cloud(s.seen), held: cloud(s.held) };
+  const swept = { ...cloud(s.swept), sigma: unpack(s.swept.sigma), score: Float32Array.from(unpack(s.swept.score), (v) => v / 65535) };
+  swept.depth = Float32Array.from({ length: swept.n }, (_, k) => DATA.views.length ? swept.xyz[3 * k + 2] : Math.hypot(...swept.xyz.subarray(3 * k, 3 * k + 3))); // a map's origin is no camera
+  return { ...s, ...columns, n: columns.depth.length, seen: cloud(s.seen), held: cloud(s.held), swept };
 });
 const outcomes = DATA.outcomes, gateOf = Object.fromEntries(DATA.gates.map((g) => [g.code, g])), holeOf = Object.fromEntries(DATA.holes.map((h) => [h.code, h]));
-const SENSOR = hex(DATA.colours.sensor), RECOVERED = hex(DATA.colours.recovered), SILENT = hex(DATA.colours.silent);
+const SENSOR = hex(DATA.colours.sensor), RECOVERED = hex(DATA.colours.recovered), SWEPT = hex(DATA.colours.swept), SILENT = hex(DATA.colours.silent);
 const PALE = hex(DATA.colours.pale), HELD = hex(DATA.colours.held), [BY_DAY, BY_NIGHT] = [0, 1].map((k) => ({ stage: hex(DATA.page.stage[k]), rim: hex(DATA.page.rim[k]) }));
 const everything = (name, wanted = () => true) => shots.flatMap((s) => Array.from(s[name]).filter((_, k) => wanted(s, k)));
 const answered = (s, k) => s.source[k] === 2;
 const hasErrors = shots.some((s) => s.error.some(Number.isFinite));
-const hasViews = DATA.views.length > 0;
+const hasViews = DATA.views.length > 0, hasSwept = shots.some((s) => s.swept.n);
+const depths = () => [...everything("depth", (s, k) => s.source[k] > 0), ...shots.flatMap((s) => Array.from(s.swept.depth))];
 
 const scales = {
-  depth: new Scale(everything("depth", (s, k) => s.source[k] > 0), "depth", { unit: "m" }),
-  sigma: new Scale(shots.flatMap((s) => Array.from(s.sigma).map((v, k) => v / s.depth[k]).filter((_, k) => answered(s, k))), "error", { unit: "%" }),
+  depth: new Scale(depths(), "depth", { unit: "m" }),
+  sigma: new Scale(shots.flatMap((s) => [...Array.from(s.sigma).map((v, k) => v / s.depth[k]).filter((_, k) => answered(s, k)), ...Array.from(s.swept.sigma, (v, k) => v / s.swept.depth[k])]), "error", { unit: "%" }),
   score: new Scale([], "score", { log: false, range: [0, 1] }),
   error: new Scale(everything("error"), "error", { unit: "%", range: [0.003, 0.3] }),
 };
@@ -59,6 +62,16 @@ function returnColour(cloud, k, held) {
   if (scales[state.mode]) return PALE.map((v) => 0.67 * v + 0.45 * grey);
   if (held) return HELD.map((v) => v * (0.5 + grey));
   return SENSOR.map((v, c) => 0.75 * v * (0.35 + 1.3 * grey) + 0.25 * rgb[c]);
+}
+
+// The colour of a swept pixel: the number's on scales, else the picture's in the tint of its source.
+function sweptColour(cloud, k) {
+  const rgb = [0, 1, 2].map((c) => cloud.rgb[3 * k + c] / 255), grey = luma(rgb), mode = state.mode;
+  if (mode === "picture") return rgb;
+  const value = { depth: cloud.depth[k], sigma: cloud.sigma[k] / cloud.depth[k], score: cloud.score[k] }[mode];
+  if (value !== undefined) return scales[mode].colour(value).map((v) => v * (0.5 + 0.6 * grey));
+  if (scales[mode]) return PALE.map((v) => 0.67 * v + 0.45 * grey);
+  return SWEPT.map((v, c) => 0.75 * v * (0.35 + 1.3 * grey) + 0.25 * rgb[c]);
 }
 
 function colours(n, colour) {
@@ -97,6 +110,7 @@ function buildShot(s) {
     rays: space.layer({ position: Float32Array.from(rays), colour: colours(rays.length / 3, () => RECOVERED), score: twice(some, 2 * ends.length) }),
     seen: space.layer({ position: transformed(T, s.seen.xyz), colour: tone(s.seen.n) }),
     held: space.layer({ position: transformed(T, s.held.xyz), colour: tone(s.held.n) }),
+    swept: space.layer({ position: transformed(T, s.swept.xyz), colour: tone(s.swept.n), score: s.swept.score }),
     frustums: frustums(s),
   };
 }
@@ -118,7 +132,7 @@ function frustums(s) {
   return made;
 }
 
-const size = { depth: quantile(everything("depth", (s, k) => s.source[k] > 0), 0.5) || 1 };
+const size = { depth: quantile(depths(), 0.5) || 1 };
 const layers = space.gl ? shots.map(buildShot) : [];
 const path = space.gl && DATA.path ? (() => {
   const p = unpack(DATA.path), rows = [];
@@ -134,6 +148,7 @@ function recolour() {
     for (const name of ["sensor", "recovered"]) space.recolour(l[name], colours(l.groups[name].length, (k) => own(l.groups[name][k])));
     space.recolour(l.bars, colours(2 * l.groups.recovered.length, (k) => own(l.groups.recovered[k >> 1])));
     for (const name of ["seen", "held"]) space.recolour(l[name], colours(s[name].n, (k) => returnColour(s[name], k, name === "held")));
+    space.recolour(l.swept, colours(s.swept.n, (k) => sweptColour(s.swept, k)));
     s.css = Array.from({ length: s.n }, (_, k) => css(sampleColour(s, k)));
   });
   if (!layers.length) shots.forEach((s) => { s.css = Array.from({ length: s.n }, (_, k) => css(sampleColour(s, k))); });
@@ -157,6 +172,7 @@ function drawSpace() {
       space.points(l.sensor, { size: 1.3 * grain, smallest: l.seen ? 1.6 : 2.5 });
     }
     if (show.held) space.points(l.held, { size: grain, smallest: 1.4 });
+    if (show.swept) space.points(l.swept, { size: grain, smallest: 1.4, threshold });
     if (show.recovered && l.recovered) {
       const large = 1 + 1.8 * Math.min(1, 3000 / l.recovered.n); // few points are drawn large, a dense cloud is not
       space.points(l.recovered, { size: large * grain, smallest: 1.4 * large, threshold, rim: (dark ? BY_NIGHT : BY_DAY).rim, rimmed: 0.75 });

@@ -94,7 +94,7 @@ function tellColours() {
     const list = mode === "hole" ? [[DATA.colours.sensor, "sensor"], ...DATA.holes.filter((h) => seen("hole", h.code, (x) => x !== 1)).map((h) => [h.colour, h.name])]
       : mode === "gate" ? outcomes.filter((o) => shots.some((s) => s.counts[o.key])).map((o) => [o.colour, o.name])
       : mode === "picture" ? []
-      : [[DATA.colours.sensor, "sensor"], [DATA.colours.recovered, "recovered"], ...(hasViews ? [[DATA.colours.silent, "silent (on the pictures)"]] : [])];
+      : [[DATA.colours.sensor, "sensor"], [DATA.colours.recovered, "recovered"], ...(hasSwept ? [[DATA.colours.swept, "swept"]] : []), ...(hasViews ? [[DATA.colours.silent, "silent (on the pictures)"]] : [])];
     rows.push(element("ul", { class: "keys" }, ...list.map(([colour, name]) => key(colour, name))));
   }
   box.replaceChildren(element("h2", {}, MODES.find(([k]) => k === mode)[1]), ...rows);
@@ -153,6 +153,7 @@ function lookFrom(name) {
   }
   eye.turn(...{ over: [-0.55, 0.45], above: [0, 1.5 - eye.pitch], side: [-1.3, 0.15], camera: [0, 0] }[name]);
   const points = [...Array(s.n).keys()].filter((k) => s.source[k]).map((k) => l.world.subarray(3 * k, 3 * k + 3));
+  if (!points.length) for (let k = 0; k < s.swept.n; k += 20) points.push(place(s.T_world_from_0, ...s.swept.xyz.subarray(3 * k, 3 * k + 3)));
   eye.fit([...points, o], space.canvas.clientWidth / Math.max(space.canvas.clientHeight, 1), 0.12 * size.depth);
   redraw();
 }
@@ -213,7 +214,7 @@ const KEYS = {
   c: () => chooseColour(MODES[(MODES.findIndex(([k]) => k === state.mode) + 1) % MODES.length][0]),
   "+": () => { eye.zoom(0.9); redraw(); }, "=": () => { eye.zoom(0.9); redraw(); }, "-": () => { eye.zoom(1 / 0.9); redraw(); },
   o: () => lookFrom("over"), v: () => lookFrom("camera"), a: () => lookFrom("above"), d: () => lookFrom("side"),
-  s: () => toggle("sensor"), r: () => toggle("recovered"), h: () => toggle("held"), u: () => toggle("sigma"), f: () => toggle("frustums"), t: () => toggle("tracks"),
+  s: () => toggle("sensor"), r: () => toggle("recovered"), h: () => toggle("held"), w: () => toggle("swept"), u: () => toggle("sigma"), f: () => toggle("frustums"), t: () => toggle("tracks"),
 };
 
 function listen() {
@@ -250,7 +251,7 @@ function begin() {
   document.querySelector('[data-place="camera"]').toggleAttribute("hidden", !hasViews);
   $("no-gl").toggleAttribute("hidden", Boolean(space.gl));
   $("space").setAttribute("aria-label", `Points of ${DATA.title} in space: arrow keys turn, plus and minus zoom`);
-  for (const [name, has] of [["held", shots.some((s) => s.held.n)], ["silent", hasViews], ["tracks", hasViews], ["depth", hasViews], ["frustums", hasViews]]) {
+  for (const [name, has] of [["held", shots.some((s) => s.held.n)], ["swept", hasSwept], ["silent", hasViews], ["tracks", hasViews], ["depth", hasViews], ["frustums", hasViews]]) {
     document.querySelector(`[data-show="${name}"]`).closest("label").toggleAttribute("hidden", !has);
   }
   listen();

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from dhtorch.codes import Gate, Hole, Source
-from dhtorch.viewer.exhibit import Exhibit, Shot
+from dhtorch.viewer.exhibit import NO_SWEPT, Exhibit, Shot, SweptCloud
 
 #: Points of a file that are shown; of more, as many drawn at random.
 MOST_POINTS = 100_000
@@ -20,7 +20,8 @@ _NUMPY |= {"int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4"}
 def read(path: Path) -> Exhibit:
     """The points of a PLY file, as :func:`dhtorch.export.write_ply` writes it: no pictures, no tracks.
 
-    Properties that are not there are taken to be recovered points without sigma and score.
+    Properties that are not there are taken to be recovered points without sigma and score. Swept points become a cloud
+    of their own.
 
     Raises:
         ValueError: no binary little-endian PLY with x, y and z, or a file shorter than it says.
@@ -39,6 +40,8 @@ def read(path: Path) -> Exhibit:
     xyz = np.stack([vertex[a] for a in "xyz"], -1).astype(np.float32)
     grey = np.full(n, 128, np.uint8)
     rgb = np.stack([vertex[c] if c in known else grey for c in ("red", "green", "blue")], -1)
+    dense = source == Source.SWEPT
+    swept = SweptCloud(xyz[dense], rgb[dense].astype(np.uint8), *(column[name][dense] for name in ("sigma", "score")))
     absent = np.full(n, np.nan, np.float32)
     zero = np.zeros((n, 2), np.float32)
     depth = xyz[:, 2] if (xyz[:, 2] > 0).all() else np.linalg.norm(xyz, axis=1)  # a map's origin is no camera
@@ -46,7 +49,8 @@ def read(path: Path) -> Exhibit:
     samples |= {"uv_0": zero, "uv_1": zero, "tracked": np.zeros(n, bool), "candidate": np.zeros(n, bool)}
     samples |= {"gate": np.full(n, Gate.ANSWER, np.int32), "hole": hole.astype(np.int32)}
     samples |= dict.fromkeys(("parallax_deg", "residual_px", "error"), absent)
-    return Exhibit(path.name, [Shot(path.name, samples, np.eye(4))])
+    rest = {name: values[~dense] for name, values in samples.items()}
+    return Exhibit(path.name, [Shot(path.name, rest, np.eye(4), swept=swept if dense.any() else NO_SWEPT)])
 
 
 def _read_ply(path: Path) -> np.ndarray:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dhtorch.codes import Gate, Source, names, words
-from dhtorch.drawing.colours import DEPTH, GATES, RECOVERED, SENSOR, SILENT, rgb
+from dhtorch.drawing.colours import DEPTH, GATES, RECOVERED, SENSOR, SILENT, SWEPT, rgb
 from dhtorch.viewer.exhibit import Cloud, Exhibit, Picture, Shot
 
 ENDINGS = (".rrd",)
@@ -20,8 +20,8 @@ ENDINGS = (".rrd",)
 #: Radii of points, m: a recovered point is as large as its sigma, within these limits.
 SMALLEST, LARGEST = 0.004, 0.15
 
-#: Class of samples with a return of the sensor; the others have the code of their gate.
-SENSED = 100
+#: Classes of samples with a return of the sensor, and of swept pixels; other samples have the code of their gate.
+SENSED, BY_SWEEP = 100, 101
 
 
 def save(path: Path, scene: Exhibit) -> Path:
@@ -82,6 +82,7 @@ def _blueprint() -> Any:
 
 def _log(rr: Any, stream: Any, scene: Exhibit) -> None:
     classes = [(SENSED, "sensor", rgb(SENSOR)), (Gate.ANSWER, "recovered", rgb(RECOVERED))]
+    classes.append((BY_SWEEP, "swept", rgb(SWEPT)))
     classes += [(code, words(names(Gate)[code]), rgb(colour)) for code, colour in GATES.items()]
     stream.log("/", rr.AnnotationContext(classes), static=True)
     stream.log("world", rr.ViewCoordinates.RDF, static=True)
@@ -91,12 +92,15 @@ def _log(rr: Any, stream: Any, scene: Exhibit) -> None:
         stream.log("world/path", rr.LineStrips3D([scene.path], colors=rgb(SILENT)), static=True)
     for name, (said, colour) in _outcomes().items():
         stream.log(f"gates/{name.lower()}", rr.SeriesLines(names=said, colors=colour), static=True)
+    swept = any(len(shot.swept.xyz) for shot in scene.shots)
     for k, shot in enumerate(scene.shots):
         stream.set_time("pair", sequence=k)
         if shot.view_0 is not None and (time := scene.views[shot.view_0].time) is not None:
             stream.set_time("time", duration=time)
         _log_words(rr, stream, shot)
         _log_points(rr, stream, shot)
+        if swept:
+            _log_swept(rr, stream, shot)
         if shot.view_0 is not None and shot.view_1 is not None:
             _log_views(rr, stream, shot, scene.views[shot.view_0], scene.views[shot.view_1])
 
@@ -134,11 +138,18 @@ def _log_points(rr: Any, stream: Any, shot: Shot) -> None:
         stream.log(f"world/map/{name}", rr.Points3D(_moved(T, cloud.xyz), colors=cloud.rgb, radii=SMALLEST))
 
 
+def _log_swept(rr: Any, stream: Any, shot: Shot) -> None:
+    cloud = shot.swept
+    classes = np.full(len(cloud.xyz), BY_SWEEP, np.uint16)
+    dots = rr.Points3D(_moved(shot.T_world_from_0, cloud.xyz), radii=SMALLEST, class_ids=classes)
+    stream.log("world/map/swept", dots, rr.AnyValues(score=cloud.score, sigma=cloud.sigma))
+
+
 def _log_views(rr: Any, stream: Any, shot: Shot, view_0: Picture, view_1: Picture) -> None:
     s = shot.samples
     _log_camera(rr, stream, "anchor", shot.T_world_from_0, view_0)
-    if shot.depth_map is not None:
-        (h, w), m = shot.depth_map.depth.shape, shot.depth_map
+    if shot.depth_image is not None:
+        (h, w), m = shot.depth_image.depth.shape, shot.depth_image
         c = [m.c[0] + 0.5, m.c[1] + 0.5]
         stream.log("world/anchor/depth", rr.Pinhole(focal_length=m.f, principal_point=c, width=w, height=h))
         stream.log("world/anchor/depth", rr.DepthImage(m.depth, meter=1.0, colormap=DEPTH))

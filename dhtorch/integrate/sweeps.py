@@ -1,0 +1,111 @@
+"""Maps of every pixel for the frames of a recording: asked for as the settings say, and put aside in a file.
+
+A map is made where its frame is asked for and needed once the frame has a place, which may be when all the others have
+been asked. Until then it lies in a file without a name, of half precision, and memory holds none of it.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dhtorch import dense
+from dhtorch.codes import Source
+from dhtorch.evaluate.score_calibration import Calibration
+from dhtorch.method import Method, Trace
+from dhtorch.records import DepthMap, Estimate, Frame
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """How maps are made: options of ``complete`` that differ from its own, and the calibration of their sigma."""
+
+    options: Mapping[str, Any] = field(default_factory=dict)
+    calibration: Calibration | None = field(default_factory=dense.shipped)
+
+    @classmethod
+    def asked(cls, given: bool | Mapping[str, Any] | None, name: str = "dense") -> Sweep | None:
+        """What settings ask for, see :func:`dhtorch.dense.options`."""
+        options = dense.options(given, name)
+        return None if options is None else cls(options)
+
+    def __call__(
+        self, method: Method, anchor: Frame, others: Frame, *, trace: Trace, track: Any = None, **told: Any
+    ) -> Estimate:
+        """The sparse answers, as ``method(anchor, others)`` gives them; ``trace`` also has ``dense``, the maps.
+
+        Args:
+            method, anchor, others: as :func:`dhtorch.dense.complete` takes them.
+            trace: receives what the method tells.
+            track: another function in the method's seat 4; None = its own.
+            told: ``seed``, ``fit`` and ``hint``.
+        """
+        method = method if track is None else method.replace(track=track)
+        own: dict[str, Any] = {**self.options, "calibration": self.calibration, **told}
+        trace["dense"] = dense.complete(anchor, others, method=method, trace=trace, **own)
+        sparse: Estimate = trace["sparse"]
+        return sparse
+
+
+@dataclass(frozen=True, eq=False)
+class Swept:
+    """The swept pixels of one frame's map (B = 1), which lie in a file."""
+
+    file: IO[bytes]
+    offset: int
+    hw: tuple[int, int]
+    n: int  # pixels that were swept and are kept
+
+    def read(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Depth and sigma in m, and score, (1, h, w) each, float32; 0 in other pixels."""
+        self.file.seek(self.offset)
+        h, w = self.hw
+        stored = np.frombuffer(self.file.read(3 * h * w * 2), np.float16).reshape(3, 1, h, w)
+        depth, sigma, score = torch.from_numpy(stored.astype(np.float32))
+        return depth, sigma, score
+
+
+class Shelf:
+    """Where the maps of a recording wait until its frames are placed: a file that goes when nobody holds it.
+
+    Disk: six bytes a pixel. A kill leaves nothing behind.
+    """
+
+    def __init__(self, folder: Path | None = None) -> None:
+        """Args: folder: of the file, made with the first map; None = the system's for temporary files."""
+        self._folder = folder
+        self._file: IO[bytes] | None = None
+
+    def put(self, found: DepthMap, *, edge_rel: float = 0.1) -> Swept:
+        """Put the swept pixels of a map (B = 1) aside, but for those beside a step of more than ``edge_rel``.
+
+        What has no return there was fitted in a window that reaches over the step, and may belong to either side.
+        """
+        if self._file is None:
+            if self._folder is not None:
+                self._folder.mkdir(parents=True, exist_ok=True)
+            self._file = tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115  (it lives as long as the shelf)
+        depth = torch.where(found.keep, found.depth, 0.0)
+        keep = found.keep & (found.source == Source.SWEPT) & (edges(depth) <= edge_rel)
+        values = torch.cat((depth, found.sigma, found.score))
+        stored = torch.where(keep, values, 0.0).cpu().numpy().astype(np.float16)
+        offset = self._file.seek(0, 2)
+        self._file.write(stored.tobytes())
+        return Swept(self._file, offset, (depth.shape[-2], depth.shape[-1]), int(keep.sum()))
+
+
+def edges(
+    depth: Tensor,  # (B, h, w) m, 0 = none
+) -> Tensor:
+    """Farthest over nearest depth in 3×3 pixels, minus one; what has none does not count."""
+    far = torch.nn.functional.max_pool2d(depth[:, None], 3, 1, 1)[:, 0]
+    inverse = torch.where(depth > 0, 1 / torch.where(depth > 0, depth, 1.0), 0.0)
+    near = torch.nn.functional.max_pool2d(inverse[:, None], 3, 1, 1)[:, 0]
+    return far * near - 1
