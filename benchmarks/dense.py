@@ -1,6 +1,6 @@
 """Time of a dense map's sweep, beside rectification and semi-global matching by OpenCV.
 
-    python benchmarks/dense.py --json benchmarks/results/dense.json
+    python benchmarks/dense.py --json benchmarks/results/dense_speed.json --clock cpu --repeats 5
 
 Ours is ``dense.swept`` with one other view and 96 planes, motions known, from the frames to the map; the peer is
 ``cv2.stereoRectify``, both maps and pictures, and ``cv2.StereoSGBM`` with 96 disparities in MODE_HH4, from grey

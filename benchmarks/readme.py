@@ -160,6 +160,36 @@ def beside_chosen() -> str:
 BESIDE = ("fixed_gap_ratio_worst", "rotation_answered", "convoy_wrong")
 
 
+def every_pixel(*results: str) -> str:
+    """The numbers that decide the dense comparison, in each of some results, beside their bars; and what it costs."""
+    summaries = [json.loads((RESULTS / f"{name}.json").read_text())["summary"] for name in results]
+    timed = [r for r in json.loads((RESULTS / "dense_speed.json").read_text()) if r["threads"] == 1]
+    rows = []
+    for name, (words, bar) in PIXELS.items():
+        found = [s.get(name, {}).get("value") for s in summaries]
+        rows.append([words, *("" if value is None else f"{value:.3f}" for value in found), bar])
+    for row in timed:
+        size = row["name"].removeprefix("sweep_").replace("x", "×")
+        rows.append([f"time of a sweep, {size}, ratio to rectification + SGBM", number(row["ratio"]), "", "≤ 3"])
+    return table(["number", *(f"`dense`, {name}" for name in ("shared scenes", "streams")), "bar"], rows)
+
+
+def pixels_by_scene(comparison: str) -> str:
+    """What the dense map of every scene answers, how well, and how its peers do under the same motion."""
+    rows = []
+    for scene, methods in scenes(comparison, "full").items():
+        found = methods["dense"]
+        if found["role"] or not found.get("n_candidates"):
+            continue
+        own = found["dense"]
+        cells = [scene, percent(found["coverage"]), percent(found["median_rel"]), percent(found["wrong_share"])]
+        cells += [number(own.get("ause_ratio")), number(own.get("error_ratio_to_sparse"))]
+        peers = (own.get(f"error_ratio_to_{peer}") for peer in ("sgbm", "dis_flow", "bilateral"))
+        rows.append([*cells, " / ".join("–" if ratio is None else number(ratio) for ratio in peers)])
+    head = ["scene", "answered", "median error", "off by a fifth", "AUSE", "error to sparse"]
+    return table([*head, "to SGBM / DIS / bilateral"], rows)
+
+
 def by_scene(comparison: str) -> str:
     """Coverage and median error of every method on every scene of a comparison, and the ratio at equal coverage."""
     rows = []
@@ -240,6 +270,8 @@ def caught() -> str:
 TABLES = {"room": room, "room seeds": room_by_seed, "shared": shared, "truths": truths, "comparison": comparison}
 TABLES |= {"comparison scenes": partial(by_scene, "method_comparison"), "stress": partial(by_scene, "stress")}
 TABLES |= {"chosen views": partial(chosen_views, "method_comparison", "streams"), "beside chosen": beside_chosen}
+TABLES |= {"every pixel": partial(every_pixel, "dense", "dense_streams")}
+TABLES |= {"pixels by scene": partial(pixels_by_scene, "dense")}
 TABLES |= {"bars": speed_tables.bars, "speed": speed_tables.stages}
 
 #: Numbers of the method comparison in words, and on which side of its bar each belongs.
@@ -266,6 +298,26 @@ GAINS = {
     "ece_scenes": ("calibration error beyond chance, mean over scenes", "≤ 0.05"),
     "within_target_5": ("scenes that keep the threshold for 5 %", "≥ 0.9"),
     "coverage_within_5": ("coverage above that threshold, mean over scenes", "≥ 0.8 of that at 5 %"),
+}
+
+#: What a dense map is to be, in words, and its bars.
+PIXELS = {
+    "dense.answered": ("hidden pixels answered, textured or not, median over scenes", "≥ 0.50"),
+    "dense.error_ratio_to_sparse": ("median error where `auto` answers as well, ratio to it", "≤ 1.15"),
+    "dense.coverage_at_5_indoor": ("coverage at 5 % mean risk indoors, on the samples of `auto`", "≥ that of `auto`"),
+    "sparse.coverage_at_5_indoor": ("the same of `auto`", ""),
+    "dense.pixels_at_5_indoor": ("the same of all hidden pixels", ""),
+    "dense.ause_ratio": ("area between sparsification and the errors' own order, over that of chance", "≤ 0.5"),
+    "dense.within_sigma": ("errors within one sigma, calibrated in other rooms", "0.68 ± 0.07"),
+    "dense.within_2sigma": ("errors within two", "≥ 0.90"),
+    "dense.wrong_share": ("answered pixels off by a fifth, mean over scenes", "≤ 0.05"),
+    "dense.error_ratio_to_sgbm": ("error at equal coverage with one other view, ratio to rectified SGBM", "≤ 1.0"),
+    "dense.error_ratio_to_sgbm_own_calibration": ("the same, SGBM under the data set's own calibration", ""),
+    "dense.error_ratio_to_dis_flow": ("the same, DIS flow triangulated", ""),
+    "dense.error_ratio_to_bilateral": ("the same, the sensor filled by a joint bilateral filter", ""),
+    "dense.rotation_answered": ("pixels answered where the camera only turns", "≤ 0.005"),
+    "dense.room_within_1": ("built-in rooms, exact motion: answered pixels within 1 %", "≥ 0.90"),
+    "dense.room_within_1_of_all": ("the same of all that was asked, silence counted as a miss", ""),
 }
 
 BOUND = dict.fromkeys(NUMBER, "≤") | {"coverage_at_5": "≥", "within_2sigma": "≥", "within_sigma": "±0.07 of"}

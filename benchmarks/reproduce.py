@@ -35,6 +35,8 @@ EXPERIMENTS = {
     "part_ablation_auto": "experiment=part_ablation data=shared_scenes experiment.groups=[auto] experiment.seeds=1",
     "stress": "experiment=method_comparison data=synthetic_stress experiment.seeds=2",
     "views_study": "experiment=views_study data=shared_scenes experiment.anchors=3",
+    "dense": "experiment=dense_comparison data=shared_scenes experiment.anchors=6",
+    "dense_streams": "experiment=dense_comparison data=streams experiment.anchors=6 experiment.rooms=[]",
     "shared_scenes": "experiment=opencv_twin data=shared_scenes",
     "room_exact": "experiment=opencv_twin data=synthetic_seeds data.lidar=exact data.image_noise=0",
     "room_phone": "experiment=opencv_twin data=synthetic_seeds",
@@ -71,6 +73,7 @@ EXPERIMENTS = {
 SCRIPTS = dict.fromkeys(("frontend", "lk", "pnp", "triangulate", "pair", "loader", "scaling", "readers"), "")
 SCRIPTS |= {
     "stream": "--clock cpu --repeats 5",
+    "dense_speed": "--clock cpu --repeats 5",
     "degenerate": "",
     "mutants": "--quiet",
     "kornia": "--clock cpu",
@@ -78,7 +81,7 @@ SCRIPTS |= {
 }
 
 #: Scripts of another name than their result: ``kornia.py`` would be imported instead of the library.
-NAMED = {"kornia": "beside_kornia"}
+NAMED = {"kornia": "beside_kornia", "dense_speed": "dense"}
 
 #: Options that change no number, and which a file may hold otherwise.
 ASIDE = {"figures", "traceback", "root"}

@@ -337,6 +337,10 @@ SMALLER = {
     "defocus": ["data=synthetic_views"],
     "defocus_fusion": ["data=synthetic_views"],
     "focus_stack": ["data=synthetic_views", "experiment.slices=5"],
+    "dense_comparison": [
+        *("experiment.anchors=1", "experiment.sweep.planes=16", "experiment.sweep.size=128", "experiment.rooms=[]"),
+        *("experiment.rotations.hw=[96,128]", "experiment.rotations.n_frames=4", "experiment.rotations.gap=2"),
+    ],
     "icp": ["experiment.n=256", "experiment.links=2"],
     "latency": [
         *("experiment.sizes=[[96,128]]", "experiment.n=128", "experiment.rounds=1", "experiment.peak=false"),

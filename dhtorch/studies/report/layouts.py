@@ -207,6 +207,11 @@ def _views_study(result: Result) -> list[Table]:
     ]
 
 
+def _dense(result: Result) -> list[Table]:
+    columns = ("n_scenes", "n_kept", "coverage", "median_rel", "wrong_share", "coverage_at_5", "aurc")
+    return [by_variant(result, "Every pixel beside the samples, and peers under the same motion", columns)]
+
+
 def _learned_score(result: Result) -> list[Table]:
     columns = ("n_scenes", "n_kept", "aurc", "aurc_excess", "aurc_ratio", "aurc_ratio_by_error", "coverage_at_5")
     return [by_variant(result, "The same answers in the order of each score, over scenes", columns)]
@@ -228,6 +233,7 @@ LAYOUTS: dict[str, Callable[[Result], list[Table]]] = {
     "learned_score": _learned_score,
     "part_ablation": _part_ablation,
     "views_study": _views_study,
+    "dense_comparison": _dense,
     "helix_correlation": negatives.helix,
     "icp": negatives.icp,
     "hole_attention": negatives.attention,
