@@ -84,7 +84,7 @@ def test_imports_go_down_only(path):
 @pytest.mark.parametrize(
     ("library", "homes"),
     [
-        ("cv2", {"data/files.py", "studies/baselines/opencv.py"}),
+        ("cv2", {"data/files.py", "studies/baselines/opencv.py", "studies/baselines/stereo.py"}),
         ("hydra", {"commands/run.py"}),
         ("omegaconf", {"commands/run.py"}),
     ],

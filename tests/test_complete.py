@@ -404,7 +404,7 @@ def test_sparse_depth_has_longer_steps_and_pictures_are_asked_for(room):
 def test_the_sweeps_options_have_the_functions_defaults():
     defaults = {k: p.default for k, p in inspect.signature(dense.complete).parameters.items()}
     settings = composed()
-    assert {k: settings[k] for k in complete.SWEEP} == {k: defaults[k] for k in complete.SWEEP}
+    assert {k: settings[k] for k in dense.OPTIONS} == {k: defaults[k] for k in dense.OPTIONS}
 
 
 def test_a_figure_of_silence_is_a_figure(tmp_path):

@@ -162,7 +162,7 @@ def test_maps_and_tokens_learn_from_pictures_and_depth(items):
         ({"planes": 12.5}, "dense.planes: found 12.5, expected a whole number"),
         ({"size": True}, "dense.size: found True, expected a whole number"),
         ({"max_sigma_rel": "little"}, "dense.max_sigma_rel: found 'little', expected a number"),
-        (None, "dense: found None, expected true, false or options among"),
+        ("yes", "dense: found 'yes', expected true, false or options among"),
     ],
 )
 def test_options_that_cannot_be_raise_when_it_is_made(wrong, said):

@@ -9,7 +9,7 @@ import torch
 from box import BOX, HW, off_wall, walk
 from room_truth import room_distance
 
-from dhtorch import MAP, extend
+from dhtorch import MAP, dense, extend
 from dhtorch.codes import Gate, Source
 from dhtorch.data.recording import Recording
 from dhtorch.geometry import camera as cameras
@@ -597,8 +597,10 @@ def test_what_no_sweep_can_be_asked_for_is_refused(given, words):
 
 def test_a_sweep_is_asked_for_by_true_or_by_options():
     assert sweeps.Sweep.asked(False) is None is sweeps.Sweep.asked(None)
-    assert sweeps.Sweep.asked(True).options == {}
-    assert sweeps.Sweep.asked({"min_correlation": 1, "size": 320}).options == {"min_correlation": 1, "size": 320}
+    standard = dense.options(True)
+    assert standard is not None and sweeps.Sweep.asked(True).options == standard
+    asked = {"min_correlation": 1, "size": 320}
+    assert sweeps.Sweep.asked(asked).options == standard | asked
 
 
 def test_a_sweep_finds_more_of_the_far_walls_than_samples_and_the_method_runs_once():
