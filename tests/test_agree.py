@@ -181,6 +181,7 @@ def room():
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_small_pictures_choose_views_as_large_ones_do(room):
     frames = [room[k] for k in (0, 1, 2, 4, 6, 9)]
     anchor = frames[0]

@@ -202,6 +202,7 @@ def test_kill_9_in_the_middle_loses_and_doubles_nothing(tmp_path, many, command)
     assert contents("whole") == contents("features"), "the same as without the kill"
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_whole_shards_and_says_how_to_go_on(robot, command, monkeypatch):
     real, calls = shards.write, []
 

@@ -109,7 +109,8 @@ def test_it_runs_in_a_transform_and_in_rows_for_a_data_set(room):
     answers = [ExtendDepth(method=m, depth_unit="m", other_at=0)(sample_of) for m in (PLAIN, USUAL)]
     for key in ("depth", "gate", "score"):
         assert torch.equal(*(a[f"dhtorch.{key}"] for a in answers))
-    columns = {"depth": SimpleNamespace(kind="float32"), "gate": SimpleNamespace(kind="int32")}
+    kinds = {"depth": "float32", "gate": "int32"}
+    columns = {name: SimpleNamespace(kind=kind, shape=(PLAIN.n,)) for name, kind in kinds.items()}
     rows = [
         Rows([Scene(room)], plan.make([Scene(room)], 3, 1), columns, method=m, gap=3)[4].features
         for m in (PLAIN, USUAL)

@@ -277,6 +277,7 @@ def test_the_tables_quote_the_paper_and_name_random_weights():
 # ------------------------------------------------------------------------------------------------------ visual odometry
 
 
+@pytest.mark.slow
 def test_blocks_share_no_frame_and_pairs_keep_their_distance():
     room = SyntheticRoom(hw=(60, 80), n_frames=31)
     scene = Scene(room, gap=9)

@@ -138,6 +138,7 @@ def test_nulls_everywhere_are_shown_as_nothing(result):
     parse(page.page([{**nothing, "rows": []}]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("some", [slice(0, None, 6), pytest.param(slice(None), marks=pytest.mark.slow)])
 def test_committed_results_make_a_page(some):
     paths = [p for p in sorted((REPO / "benchmarks/results").glob("*.json")) if p.read_text().startswith("{")][some]

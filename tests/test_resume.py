@@ -62,6 +62,7 @@ def command(tmp_path, monkeypatch, capsys):
     return call
 
 
+@pytest.mark.slow
 def test_kill_9_in_the_middle_of_a_sweep_loses_and_doubles_nothing(tmp_path):
     sweep = ["-m", "resume=true", "output=sweep", *SIX]
     code = stop(start(tmp_path, *sweep), partial(results, tmp_path), 2, signal.SIGKILL)
