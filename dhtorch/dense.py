@@ -159,7 +159,7 @@ def complete(
 
     Gradient: swept depth to all images, to intrinsics and through the motions to the near depth, by one step of the
     last fit; planes, partners, sigma and gates carry none.
-    Memory: three bytes for every pixel and plane, whatever the number of views, and pictures.
+    Memory: less than four bytes for every pixel and plane, whatever the number of views, and pictures.
     Cost: linear in planes, pixels and partners.
     """
     trace = {} if trace is None else trace
@@ -335,17 +335,22 @@ class Found(NamedTuple):
 @torch.no_grad()
 def _best_planes(base: sweep.Base, partners: list[Partner], q: Tensor) -> Found:
     """The best surface through the planes q (B, D)."""
-    C = torch.zeros(len(q), q.shape[1], *base.hw, dtype=torch.uint8, device=q.device)
-    for view, _, _, use in partners:
-        if is_static(use) or bool(use.any()):
-            sweep.add_costs(C, base, view, q, use)
     views = torch.stack([partner.use for partner in partners]).sum(0).clamp_min(1)
-    S = sweep.aggregate(C.movedim(1, -1).contiguous(), views)
+    S = sweep.aggregate(_costs(base, partners, q), views)
     best, step = sweep.winner(S), q[:, 1] - q[:, 0]
     place = (best.plane + best.shift) * step[:, None, None]
     each = views[:, None, None]
     alone = sweep.rivals(S, best, _elsewhere(base, partners, place, step)) >= RIVAL * each
     return Found(place, best.cost / each.to(q), alone)
+
+
+def _costs(base: sweep.Base, partners: list[Partner], q: Tensor) -> Tensor:
+    """How badly every pixel fits all views at every plane, (B, h, w, D) uint8."""
+    C = torch.zeros(len(q), q.shape[1], *base.hw, dtype=torch.uint8, device=q.device)
+    for view, _, _, use in partners:
+        if is_static(use) or bool(use.any()):
+            sweep.add_costs(C, base, view, q, use)
+    return C.movedim(1, -1).contiguous()
 
 
 def _elsewhere(base: sweep.Base, partners: list[Partner], q: Tensor, step: Tensor) -> Tensor:

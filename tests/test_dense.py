@@ -6,7 +6,7 @@ from worlds import Board, look
 
 from dhtorch import MAP
 from dhtorch.codes import Gate, Source
-from dhtorch.dense import complete, resized, sensed
+from dhtorch.dense import complete, resized, sensed, swept, views_asked
 from dhtorch.evaluate.holdout import range_split
 from dhtorch.evaluate.monotone import Sigmoid, Table
 from dhtorch.evaluate.score_calibration import Calibration, SigmaModel
@@ -264,3 +264,21 @@ def test_a_mirror_shows_what_stands_behind_it():
     assert share > 0.8 and float((error > 0.05).float().mean()) < 0.03, "the wall beside it is not drawn along"
     told = (which == 0) & (got.source == Source.SWEPT)
     assert float((got.depth[told] / 5.0 - 1).abs().median()) < 0.02
+
+
+@pytest.mark.slow
+def test_a_sweep_is_captured_as_one_graph():
+    room = SyntheticRoom(n_frames=12, hw=(60, 80), depth_hw=(60, 80))
+    anchor, other = (range_split(room[k], NEAR) for k in (1, 9))
+    method, trace = MAP.replace(n=256), {}
+    with torch.no_grad():
+        joined = method(anchor, other, trace=trace)
+        asked = views_asked(joined, other, trace)
+
+        def sweep(anchor, asked):
+            return swept(anchor, asked, method=method, planes=16, partners=1)
+
+        plain = sweep(anchor, asked)
+        captured = torch.compile(sweep, fullgraph=True, backend="eager")(anchor, asked)
+    for name in ("depth", "sigma", "score", "source", "gate"):
+        torch.testing.assert_close(getattr(captured, name), getattr(plain, name), rtol=0, atol=0, equal_nan=True)
