@@ -280,12 +280,15 @@ def rivals(S: Tensor, best: Winner, reach: Tensor) -> Tensor:
 
     Asked at every other pixel, both ways; its neighbours have its answer. Gradient: none.
     """
-    cost, plane = (x[:, ::2, ::2, None] for x in (best.cost, best.plane.to(torch.int16)))
-    apart = (torch.arange(S.shape[-1], dtype=torch.int16, device=S.device) - plane).abs()
-    near = apart <= reach.to(torch.int16)[:, None, None, None]
-    most = torch.iinfo(S.dtype).max
-    more = S[:, ::2, ::2].masked_fill(near, most).amin(-1, keepdim=True) - cost
-    more = more[..., 0].repeat_interleave(2, 1).repeat_interleave(2, 2)
+    places = torch.arange(S.shape[-1], dtype=torch.int16, device=S.device)
+    reach, found = reach.to(torch.int16)[:, None, None, None], []
+    for first in range(0, S.shape[1], ROWS):  # some rows at once, as the winner is read
+        rows = slice(first, first + ROWS, 2)
+        cost, plane = (x[:, rows, ::2, None] for x in (best.cost, best.plane.to(torch.int16)))
+        near = (places - plane).abs() <= reach
+        others = S[:, rows, ::2].masked_fill(near, torch.iinfo(S.dtype).max)
+        found.append((others.amin(-1, keepdim=True) - cost)[..., 0])
+    more = torch.cat(found, 1).repeat_interleave(2, 1).repeat_interleave(2, 2)
     return more[:, : S.shape[1], : S.shape[2]]
 
 
