@@ -151,7 +151,7 @@ def test_a_map_is_read_at_the_nearest_pixel_and_the_sensor_is_no_answer(pair):
     source = torch.full((1, h, w), Source.SWEPT, dtype=torch.int32)
     source[:, :, :20] = Source.SENSOR
     found = DepthMap(depth, 0.1 * depth, torch.full_like(depth, 0.5), source, torch.zeros_like(source))
-    got = dense_comparison.read(found, grid, near.hw)
+    got = dense_comparison.read(found, grid, near)
     u, v = ((grid.uv[0, :, k] + 0.5) / 4 - 0.5 for k in (0, 1))
     right = u > 19.6
     expected = (v.round().clamp(0, h - 1) * w + u.round().clamp(0, w - 1) + 1)[right]

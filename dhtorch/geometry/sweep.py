@@ -87,6 +87,15 @@ class Travel(NamedTuple):
         u, v = ((self.a[:, k] + q * self.b[:, k]) * scale for k in (0, 1))
         return u, v
 
+    def cell(self, q: Tensor, hw: tuple[int, int], margin: int) -> Tensor:
+        """Index (B, N) of the nearest pixel of a picture of size ``hw`` in which view 0 begins ``margin`` px inside; of
+        its border where that lies outside."""
+        column, row = (
+            x.add_(margin + 0.5).clamp_(0, size - 1).to(torch.int32)  # cut off, which is floor
+            for x, size in zip(self.at(q), hw[::-1], strict=True)
+        )
+        return row.mul_(hw[1]).add_(column).long()
+
 
 class Level(NamedTuple):
     """View 1 as it would be seen without its turn, around the place of view 0's picture."""
@@ -164,16 +173,14 @@ def count_bits(x: Tensor) -> Tensor:
     return x.mul_(0x01010101).bitwise_right_shift_(24)  # the sum of the bytes stands in the highest
 
 
-def level(base: Base, view: View, wanted: Tensor | None = None) -> Level:
+def level(base: Base, view: View, wanted: Tensor) -> Level:
     """View 1 turned as view 0 is; showing nothing to pairs that are not ``wanted`` (B,). Gradient: none."""
     margin = max(base.hw) // MARGIN
     hw = base.hw[0] + 2 * margin, base.hw[1] + 2 * margin
     ray = pixel_rays(cam.ideal(base.camera), base.hw, margin)
     uv, front = seen_at(view, ray, ray.new_zeros(ray.shape[:2]))
     grey, inside = bilinear(view.image, uv)
-    seen = (inside & front).unflatten(-1, hw)
-    if wanted is not None:
-        seen = seen & wanted[:, None, None]
+    seen = (inside & front).unflatten(-1, hw) & wanted[:, None, None]
     seen = F.pad(seen[:, 1:-1, 1:-1], (1, 1, 1, 1))
     code = census(grey.detach().unflatten(-1, hw)[:, 0, None])
     return Level(torch.where(seen, code, -1).flatten(1), hw, margin)
@@ -182,12 +189,7 @@ def level(base: Base, view: View, wanted: Tensor | None = None) -> Level:
 def misfit(base: Base, seen: Level, go: Travel, q: Tensor) -> Tensor:
     """How badly pixels fit at inverse depths q (B, N) or (B, 1): signs that differ, (B, N) int32; UNSEEN where view 1
     does not show them. Gradient: none."""
-    u, v = go.at(q)
-    column, row = (
-        x.add_(seen.margin + 0.5).clamp_(0, size - 1).to(torch.int32)  # cut off, which is floor
-        for x, size in ((u, seen.hw[1]), (v, seen.hw[0]))
-    )
-    code = seen.code.gather(1, row.mul_(seen.hw[1]).add_(column).long())
+    code = seen.code.gather(1, go.cell(q, seen.hw, seen.margin))
     count = count_bits(code ^ base.code.flatten(1))
     return count.masked_fill_(code < 0, UNSEEN)
 
@@ -410,11 +412,7 @@ def hidden(go: Travel, q: Tensor, tolerance: Tensor) -> Tensor:
     ``tolerance`` (B,) 1/m. Gradient: none."""
     B, h, w = q.shape
     edge = max(h, w) // MARGIN
-    u, v = (
-        (x + (edge + 0.5)).clamp(0, n + 2 * edge - 1).to(torch.int32).long()
-        for x, n in zip(go.at(q.flatten(1)), (w, h), strict=True)
-    )
-    index = v * (w + 2 * edge) + u
+    index = go.cell(q.flatten(1), (h + 2 * edge, w + 2 * edge), edge)
     front = q.new_full((B, (h + 2 * edge) * (w + 2 * edge)), -1.0)
     front = front.scatter_reduce(1, index, q.flatten(1), "amax")
     return (front.gather(1, index) > q.flatten(1) + tolerance[:, None]).unflatten(1, (h, w))

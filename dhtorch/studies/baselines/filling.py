@@ -12,6 +12,7 @@ from torch import Tensor
 
 from dhtorch.codes import Gate
 from dhtorch.dense import resized
+from dhtorch.geometry import camera as cam
 from dhtorch.geometry.lookup import nearest
 from dhtorch.records import Estimate, Frame, Samples
 from dhtorch.studies.baselines.stereo import answer
@@ -45,7 +46,7 @@ def bilateral(anchor: Frame, samples: Samples) -> Estimate:
         depth = torch.where(new, total / mass.clamp_min(LEAST), depth)
         age = torch.where(new, 1.0 + k, age)
         told = told | new
-    uv = (samples.uv + 0.5) * samples.uv.new_tensor([w / anchor.hw[1], h / anchor.hw[0]]) - 0.5
+    uv = cam.depth_pixels(anchor.camera, anchor.hw, None, (h, w), samples.uv)
     found = nearest(torch.where(told, depth, torch.nan)[:, 0], uv)[0]
     noise = 0.01 * (1 + nearest(age[:, 0], uv)[0])
     return answer(samples, found, noise, torch.where(found > 0, Gate.ANSWER, Gate.NO_TRACK))

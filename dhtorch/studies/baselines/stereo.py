@@ -81,8 +81,7 @@ def semi_global(
     inside = epipole_inside(((camera_0, hw), (camera_1, _hw(grey_1))), T_1_from_0)
     depth = torch.full_like(samples.depth, torch.nan)
     noise = torch.ones_like(depth)
-    scale = samples.uv.new_tensor([hw[1] / anchor.hw[1], hw[0] / anchor.hw[0]])
-    uv = (samples.uv + 0.5) * scale - 0.5
+    uv = cam.depth_pixels(anchor.camera, anchor.hw, None, hw, samples.uv)
     known = T_1_from_0.t.isfinite().all(-1)
     for b in (known & ~inside).nonzero()[:, 0].tolist():
         one = slice(b, b + 1)
@@ -169,7 +168,7 @@ def flow(anchor: Frame, other: Frame, T_1_from_0: Pose, samples: Samples, *, siz
     (grey_0, camera_0), (grey_1, camera_1) = (resized(frame, size) for frame in (anchor, other))
     hw = _hw(grey_0)
     engine = _CV.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    uv = (samples.uv + 0.5) * samples.uv.new_tensor([hw[1] / anchor.hw[1], hw[0] / anchor.hw[0]]) - 0.5
+    uv = cam.depth_pixels(anchor.camera, anchor.hw, None, hw, samples.uv)
     moved = torch.full_like(uv, torch.nan)
     for b in range(len(uv) if _hw(grey_1) == hw else 0):
         there, back = _flows(engine, *((255 * g[b, 0]).to(torch.uint8).cpu().numpy() for g in (grey_0, grey_1)))

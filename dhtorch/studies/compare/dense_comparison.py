@@ -25,6 +25,7 @@ from dhtorch.data.pairs import around
 from dhtorch.data.scene import Given, scenes_of
 from dhtorch.evaluate import bootstrap, compare, errors, holdout, risk
 from dhtorch.evaluate.errors import Points
+from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.lookup import nearest
 from dhtorch.method import Method, Trace
@@ -227,10 +228,10 @@ def rectifiable(looked: Looked) -> Tensor:
     return ~inside & looked.T_1_from_0.t.isfinite().all(-1)
 
 
-def read(found: DepthMap, samples: Samples, hw: tuple[int, int]) -> Estimate:
-    """A map at samples of a picture of size ``hw``: swept depths of the nearest pixel, else its reason for silence."""
+def read(found: DepthMap, samples: Samples, frame: Frame) -> Estimate:
+    """The map of a frame at samples of it: swept depths of the nearest pixel, else its reason for silence."""
     h, w = found.depth.shape[-2:]
-    place = (samples.uv + 0.5) * samples.uv.new_tensor([w / hw[1], h / hw[0]]) - 0.5
+    place = cam.depth_pixels(frame.camera, frame.hw, None, (h, w), samples.uv)
     depth, sigma, score, source, gate = (
         nearest(x.to(found.depth), place)[0] for x in (found.depth, found.sigma, found.score, found.source, found.gate)
     )
@@ -248,11 +249,11 @@ def _variants(method: Method, looking: Looking, seed: int, peers: bool) -> dict[
     most = looking.options.get("partners", 3)
 
     def at(k: int) -> Callable[[Looked], tuple[Samples, Estimate]]:
-        return lambda x: (x.grid, read(x.maps[k], x.grid, x.anchor.hw))
+        return lambda x: (x.grid, read(x.maps[k], x.grid, x.anchor))
 
     says: dict[str, Callable[[Looked], tuple[Samples, Estimate]]] = {
         "sparse": lambda x: (x.trace["samples"], x.trace["sparse"]),
-        AT_SAMPLES: lambda x: (x.trace["samples"], read(x.maps[most], x.trace["samples"], x.anchor.hw)),
+        AT_SAMPLES: lambda x: (x.trace["samples"], read(x.maps[most], x.trace["samples"], x.anchor)),
         ONE_VIEW: at(1),
         DENSE: at(most),
     }
