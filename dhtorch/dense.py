@@ -52,7 +52,7 @@ MISFIT = 40.0
 #: Cost (of one view) by which the best place along the line must beat every other that is further away in the pictures
 #: than so many pixels. What surrounds a pixel weighs by the price of jumps (18 from each side): a rival within more
 #: than one may be the better one, as where a texture repeats.
-RIVAL, ELSEWHERE_PX = 30, 3.0
+RIVAL, ELSEWHERE_PX = 5, 3.0
 
 #: A pixel whose window of so many pixels to each side holds a step of the surface may belong to the other side of it:
 #: standard deviation as a share of the step.
@@ -63,6 +63,9 @@ SAY = 0.5
 
 #: Planes that a fit may move a pixel in one step and in all, and by which one surface must be nearer to hide another.
 STEP, ALL_STEPS, NEARER = 1.0, 1.5, 1.5
+
+#: Planes by which the derivative of a step is found, and the least that it is believed to be.
+LITTLE, SLOPE = 0.1, 0.25
 
 #: Planes by which neighbours differ at most that lie on one surface.
 SURFACE = 1.5
@@ -157,8 +160,8 @@ def complete(
     Raises:
         ValueError: wrong shapes, no other view, or an option out of range.
 
-    Gradient: swept depth to all images, to intrinsics and through the motions to the near depth, by one step of the
-    last fit; planes, partners, sigma and gates carry none.
+    Gradient: swept depth to all images, to intrinsics and through the motions to the near depth, by the implicit
+    function theorem where the last fit ends; planes, partners, sigma and gates carry none.
     Memory: less than four bytes for every pixel and plane, whatever the number of views, and pictures.
     Cost: linear in planes, pixels and partners.
     """
@@ -241,7 +244,7 @@ def resized(frame: Frame, size: int) -> tuple[Tensor, Camera]:
     """Grey picture (B, 1, h, w) with a longer side of at most ``size``, each pixel the mean of what it covers, and its
     camera. Gradient: to the image and the intrinsics."""
     picture = grey(frame.image)
-    picture = picture.to(torch.promote_types(picture.dtype, torch.float32))
+    picture = picture.to(torch.promote_types(picture.dtype, frame.camera.f.dtype))
     hw = map_hw(frame.hw, size)
     if hw == frame.hw:
         return picture, frame.camera
@@ -375,9 +378,20 @@ def _fitted(base: sweep.Base, partners: list[Partner], start: Found, q: Tensor, 
             at = torch.minimum(torch.maximum(moved, start.q - near), start.q + near).clamp_min(0)
             at = sweep.smooth(at, SURFACE * plane)
     step, found = _joined(base, partners, at, plane, last=True)
+    if step.requires_grad:
+        step = step / _slope(base, partners, at, plane)
     edge = EDGE * sweep.spread(at, WINDOW)
     own = found.own * (start.misfit / MISFIT).square() + edge.square()
     return found._replace(q=at + (step - step.detach()), own=own)
+
+
+@torch.no_grad()
+def _slope(base: sweep.Base, partners: list[Partner], at: Tensor, plane: Tensor) -> Tensor:
+    """How much smaller a step gets (B, h, w) as a surface comes nearer to where it fits best: 1 where grey values are
+    straight between pixels. By it the gradient of the step becomes that of the place where it ends."""
+    little = LITTLE * plane[:, None, None]
+    before, after = (_joined(base, partners, at + sign * little, plane)[0] for sign in (-1, 1))
+    return ((before - after) / (2 * little)).clamp_min(SLOPE)
 
 
 def _joined(

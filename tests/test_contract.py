@@ -411,6 +411,8 @@ ROWS = [
     Row(least_squares.move, lambda b, n, d: (poses(b, d), uniform(b, 6, dtype=d, low=-0.2, high=0.2)), POINTLESS + " raises", grad=(0, 1), bad=wrong_last_axis(1)),
     Row(least_squares.choose, lambda b, n, d: (uniform(b, dtype=d) > 0.5, poses(b, d), poses(b, d, seed=1)), POINTLESS, grad=(1, 2)),
     Row(least_squares.weight_slope, lambda b, n, d: (uniform(b, n, dtype=d), "geman_mcclure", 0.5), "dtype batch vmap capture gradcheck empty shuffle padding nan", (0,), (0,)),
+    Row(least_squares.implicit, lambda b, n, d: (torch.sin, uniform(b, 6, dtype=d, low=-0.2, high=0.2)), "dtype batch capture"),
+    Row(near_far.moved, lambda b, n, d: (nine(b, n, d)[0], uniform(b, 9, dtype=d, low=-0.2, high=0.2)), "dtype batch vmap capture raises", bad=wrong_last_axis(1)),
     Row(near_far.step, nine, "dtype batch vmap capture raises", bad=wrong_last_axis(2)),
     Row(near_far.trial_step, nine, "dtype batch vmap capture raises", bad=wrong_last_axis(2)),
     Row(near_far.straighten, lambda b, n, d: (pixels(b, n, d).mT, cameras(b, d).f, cameras(b, d).c, uniform(b, n, dtype=d, low=-0.5, high=0.5), uniform(b, 3, dtype=d, high=0.02)), "dtype batch vmap capture gradcheck empty raises", grad=(0, 1, 2, 3, 4), bad=wrong_last_axis(3)),

@@ -172,7 +172,15 @@ def test_depth_carries_gradients_to_pictures_near_depth_and_intrinsics(views):
         assert bool(x.grad.isfinite().all()) and bool((x.grad != 0).any())
     # all near depths longer by a hundredth: a longer motion, and every depth longer by as much
     longer = float((depth.grad * depth.detach()).sum() / got.depth[swept].detach().sum())
-    assert longer == pytest.approx(1.0, abs=0.25)
+    assert longer == pytest.approx(1.0, abs=0.03)
+
+
+def test_double_precision_goes_in_beside_pictures_of_bytes():
+    room = SyntheticRoom(n_frames=8, hw=(60, 80), depth_hw=(60, 80), lidar="exact")
+    anchor, other = (range_split(room[i], NEAR).to(torch.float64) for i in (1, 6))
+    for as_given in (lambda x: (255 * x).byte(), lambda x: x.float()):
+        asked, view = (frame.replace(image=as_given(frame.image)) for frame in (anchor, other))
+        assert complete(asked, view, **FAST).depth.dtype == torch.float64
 
 
 def test_half_precision_goes_in_and_single_comes_out(views, found):

@@ -11,7 +11,7 @@ from test_contract import shifted, tracked
 from torch.func import jacfwd, jacrev, vmap
 from torch.utils import _pytree as pytree
 
-from dhtorch import PAPER, extend, tree
+from dhtorch import MAP, PAPER, extend, tree
 from dhtorch.evaluate import holdout
 from dhtorch.geometry.lookup import nearest
 from dhtorch.methods import METHODS
@@ -489,3 +489,29 @@ def test_a_wrong_scale_of_near_depth_is_recovered_pixel_by_pixel(task):
     theta = fit(residual, start, prior=1.0)
     assert left(start) > 0.04
     assert left(theta) < 0.015
+
+
+@pytest.mark.parametrize("method", [PAPER, MAP], ids=["paper", "map"])
+def test_the_whole_line_has_the_derivative_of_its_answers(method):
+    """Far depth is as long as the near ruler, and moves with the intrinsics as it does between two runs."""
+    room = SyntheticRoom(n_frames=12, hw=(120, 160), depth_hw=(120, 160), lidar="exact", image_noise=0.0)
+    views = [holdout.range_split(room[i], 2.0).to(torch.float64) for i in (3, 11)]
+    method = method.replace(n=384)
+
+    def ask(near, focal):
+        asked = (v.replace(depth=near * v.depth, camera=v.camera.replace(f=focal * v.camera.f)) for v in views)
+        return method(*asked, trace=trace)
+
+    trace = {}
+    near, focal = (torch.ones((), dtype=torch.float64, requires_grad=True) for _ in range(2))
+    found = ask(near, focal)
+    t, keep = trace["fit"].T_1_from_0.t[0], found.keep[0].nonzero()[:, 0]
+    length = (t.detach() @ t) / t.detach().square().sum()
+    assert float(torch.autograd.grad(length, near, retain_graph=True)[0]) == pytest.approx(1, abs=0.02)
+    slopes = [torch.autograd.grad(found.depth[0, i].log(), near, retain_graph=True)[0] for i in keep[::20]]
+    torch.testing.assert_close(torch.stack(slopes), torch.ones(len(slopes), dtype=torch.float64), rtol=0, atol=0.05)
+    if method.pose is MAP.pose:  # where the set of inliers does not jump
+        ask(torch.ones(()), torch.tensor(1 + 1e-5, dtype=torch.float64))
+        moved = (trace["fit"].T_1_from_0.t[0] - t).detach() / 1e-5
+        slope = torch.stack([torch.autograd.grad(x, focal, retain_graph=True)[0] for x in t])
+        torch.testing.assert_close(slope, moved, rtol=0, atol=0.02 * float(moved.norm()))

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.special import huber
 
-from dhtorch.geometry import se3
+from dhtorch.geometry import least_squares, se3
 from dhtorch.geometry.least_squares import (
     MIN_DEPTH,
     MIN_PIVOT,
@@ -297,3 +297,18 @@ def test_choose_takes_whole_elements_of_trees():
     mixed = choose(torch.tensor([True, False, True]), (new, torch.zeros(3)), (old, torch.ones(3)))
     assert mixed[0].R[:, 1, 1].tolist() == [1, 2, 1] and mixed[0].t[:, 2].tolist() == [1, 2, 1]
     assert mixed[1].tolist() == [0, 1, 0]
+
+
+def test_implicit_is_the_derivative_of_where_equations_end():
+    """x with x + x³ = a, both numbers of one element for themselves; singular ones stay where they are."""
+    a = torch.tensor([[0.5, 2.0], [1.0, -1.0]], dtype=torch.float64, requires_grad=True)
+    root = a.detach().clone()
+    for _ in range(50):
+        root = root - (root + root**3 - a.detach()) / (1 + 3 * root**2)
+    found = root + least_squares.implicit(lambda xi: (root + xi) + (root + xi) ** 3 - a.detach(), root + root**3 - a)
+    assert torch.equal(found, root)
+    slope = torch.autograd.grad(found.sum(), a)[0]
+    torch.testing.assert_close(slope, 1 / (1 + 3 * root**2), rtol=1e-5, atol=0)
+    flat = least_squares.implicit(lambda xi: 0 * xi, 2 * a)
+    assert not flat.any() and not torch.autograd.grad(flat.sum(), a)[0].any()
+    assert not least_squares.implicit(lambda xi: xi, a.detach()).requires_grad

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, TypeVar
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.autograd.forward_ad import unpack_dual
 from torch.utils import _pytree as pytree
 
 from dhtorch.geometry.se3 import Pose
@@ -26,6 +27,9 @@ MIN_DEPTH = 1e-6
 #: A matrix whose scaled Cholesky factor has a smaller pivot than this is called singular.
 MIN_PIVOT = 1e-6
 
+
+#: Displacement, rad or m, by which the derivative of equations in float64 is found.
+DIFFERENCE = 1e-7
 
 #: A pose, or another tree of unknowns with a leading batch dimension.
 S = TypeVar("S")
@@ -193,12 +197,37 @@ def solve_spd(
     return (x * s)[:, :n].to(b.dtype), ok
 
 
+def implicit(equations: Callable[[Tensor], Tensor], g: Tensor) -> Tensor:
+    """The zero displacement (B, n) of an optimum, with the gradient of where the optimum lies.
+
+    The implicit function theorem with the whole derivative of the equations: what Gauss–Newton leaves out (residuals
+    times their curvature, weights that change) is a fifth of the derivative of a pose from real tracks.
+
+    Args:
+        equations: g (B, n) after a displacement (B, n) of the unknowns; called without a graph.
+        g: what they are at the optimum, (B, n), with the graph of all that they depend on.
+
+    Gradient: to what g depends on, first order; zero where the equations are singular or g has no graph.
+    Raises ValueError for wrong shapes.
+    """
+    n = check("implicit", g=(g, "B n"))["n"]
+    if not (g.requires_grad or unpack_dual(g).tangent is not None):
+        return torch.zeros_like(g)
+    with torch.no_grad():
+        steps = DIFFERENCE * torch.eye(n, dtype=g.dtype, device=g.device)[:, None].expand(n, *g.shape)
+        slope = (torch.stack([equations(step) for step in steps], -1) - g.detach()[..., None]) / DIFFERENCE
+        inverse, info = torch.linalg.inv_ex(slope)
+        known = (info == 0) & inverse.isfinite().flatten(1).all(1)
+        inverse = torch.where(known[:, None, None], inverse, 0.0)
+    return -(inverse * (g - g.detach())[:, None]).sum(-1)
+
+
 def gauss_newton_step(T: Pose, H: Tensor, g: Tensor) -> tuple[Pose, Tensor]:
     """The pose after one Gauss–Newton step on its normal equations, and ``ok`` (B,); unchanged where H is singular.
 
     From a detached optimum this step is the implicit derivative of the optimum up to terms of the size of the
-    residuals. The step moves the pose by Cayley's map, a rotation that agrees with exp to second order and needs
-    no transcendental function.
+    residuals, which :func:`implicit` has as well. The step moves the pose by Cayley's map, a rotation that agrees with
+    exp to second order and needs no transcendental function.
 
     Gradient: to T, H and g. Raises ValueError for wrong shapes.
     """

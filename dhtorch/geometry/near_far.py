@@ -59,6 +59,12 @@ class Unknowns(NamedTuple):
     turn: Tensor  # (B, 3) rad per unit of y
 
 
+def moved(at: Unknowns, xi: Tensor) -> Unknowns:
+    """The unknowns displaced by xi (B, 9): a tangent vector of the pose, then the turn. Gradient: to both."""
+    check("moved", turn=(at.turn, "B 3"), xi=(xi, "B 9"))
+    return Unknowns(move(at.T, xi[:, :6]), at.turn + xi[:, 6:])
+
+
 def step(at: Unknowns, H: Tensor, g: Tensor) -> tuple[Unknowns, Tensor]:
     """The unknowns after one Gauss–Newton step, H (B, 9, 9) and g (B, 9), and ``ok`` (B,); unmoved where H is singular.
 
@@ -66,7 +72,7 @@ def step(at: Unknowns, H: Tensor, g: Tensor) -> tuple[Unknowns, Tensor]:
     """
     check("step", turn=(at.turn, "B 3"), H=(H, "B 9 9"), g=(g, "B 9"))
     xi, ok = solve_spd(H, -g[..., None])
-    return Unknowns(move(at.T, xi[:, :6, 0]), at.turn + xi[:, 6:, 0]), ok
+    return moved(at, xi[..., 0]), ok
 
 
 def trial_step(at: Unknowns, H: Tensor, g: Tensor) -> tuple[Unknowns, Tensor]:
@@ -77,8 +83,7 @@ def trial_step(at: Unknowns, H: Tensor, g: Tensor) -> tuple[Unknowns, Tensor]:
     check("trial_step", turn=(at.turn, "B 3"), H=(H, "B 9 9"), g=(g, "B 9"))
     with torch.no_grad():
         xi, info = torch.linalg.solve_ex(H.double(), -g.double())
-        xi = xi.to(g.dtype)
-        return Unknowns(move(at.T, xi[:, :6]), at.turn + xi[:, 6:]), info == 0
+        return moved(at, xi.to(g.dtype)), info == 0
 
 
 def straighten(

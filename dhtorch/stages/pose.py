@@ -18,6 +18,7 @@ from dhtorch.geometry.least_squares import (
     MIN_DEPTH,
     Normal,
     choose,
+    implicit,
     linearise,
     minimise,
     move,
@@ -91,8 +92,8 @@ def pnp_ransac(
     Raises:
         ValueError: wrong shapes, no hypothesis, an unknown kernel.
 
-    Gradient: R and t to near ``xyz``, ``uv_1`` and camera 1, exact to first order for small residuals, zero for
-    outliers; cov, rms_px, sigma_px and t_snr are detached.
+    Gradient: R and t to near ``xyz``, ``uv_1`` and camera 1, exact to first order, zero for outliers; cov,
+    rms_px, sigma_px and t_snr are detached.
     Cost: linear in B, H and N. Float64 in the minimal solver and the last step, the inputs' dtype elsewhere.
     Source: paper, "LiDAR-anchored relative pose", with P3P in place of EPnP. Checked against
     ``cv2.solvePnPRansac`` and ``poselib.estimate_absolute_pose`` (``tests/test_pose.py``).
@@ -160,18 +161,20 @@ def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, camera: Came
         start, found = _robust_pose(points, usable, f, c, draws, options)
     start = start.detach()  # forward mode looks through no_grad, into a search that may stand beside a singular triple
     # The last step, in float64 and with the graph on.
+    f, c = f.double(), c.double()
     xyz, uv = points.double().split((3, 2), 1)
-    rows, depth = linearise(start, f.double(), c.double(), xyz, uv)
-    with torch.no_grad():
-        square = (rows[:, 6] * rows[:, 6]).sum(1)
-        inlier = usable & found[:, None] & (depth > MIN_DEPTH) & (square < options.threshold_px**2)
-        _, weight = robust(square, options.kernel, options.kernel_px)
-        weight = torch.where(inlier, weight, 0.0).detach()
-    H, g = normal_equations(rows, weight)
+    rows, depth = linearise(start, f, c, xyz, uv)
+    square = (rows[:, 6] * rows[:, 6]).sum(1)
+    inlier = usable & found[:, None] & (depth > MIN_DEPTH) & (square < options.threshold_px**2)
+    H, g = _weighed(options, rows, inlier)
     eye = torch.eye(6, dtype=H.dtype, device=H.device).expand_as(H)
-    x, solved = solve_spd(H, torch.cat((-g[..., None], eye), -1))
-    T = move(start, x[..., 0])
-    inverse = x[..., 1:].detach()
+    x, solved = solve_spd(H.detach(), torch.cat((-g.detach()[..., None], eye), -1))
+
+    def equations(xi: Tensor) -> Tensor:
+        moved, _ = linearise(move(start, xi), f.detach(), c.detach(), xyz.detach(), uv.detach())
+        return _weighed(options, moved, inlier)[1]
+
+    T, inverse = move(move(start, x[..., 0]), implicit(equations, g)), x[..., 1:]
     with torch.no_grad():
         n_inlier = inlier.sum(-1)
         enough = n_inlier >= options.min_inlier
@@ -185,12 +188,12 @@ def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, camera: Came
             otherwise=PoseCode.OK,
         )
         ok, nan = code == PoseCode.OK, torch.full((), torch.nan, dtype=points.dtype, device=points.device)
-        total = torch.where(inlier, square, 0.0).sum(-1)
+        total = torch.where(inlier, square, 0.0).detach().sum(-1)
         rms_px = (total / n_inlier.clamp_min(1)).sqrt()
         sigma_px = (total / (2 * n_inlier - 6).clamp_min(1)).sqrt().clamp_min(MIN_SIGMA_PX)
         cov = (inverse + inverse.transpose(1, 2)) * (0.5 * sigma_px * sigma_px)[:, None, None]
         # With H = L Lᵀ, the lower end of L is the factor of the translation's information, the rotation eliminated.
-        lower = torch.linalg.cholesky_ex(H).L[:, 3:, 3:]
+        lower = torch.linalg.cholesky_ex(H.detach()).L[:, 3:, 3:]
         root = (lower * T.t[..., None]).sum(1)
         t_snr = (root * root).sum(-1).sqrt() / sigma_px
 
@@ -207,6 +210,12 @@ def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, camera: Came
         t_snr=answer(t_snr),
         code=code,
     )
+
+
+def _weighed(o: _Options, rows: Tensor, inlier: Tensor) -> tuple[Tensor, Tensor]:
+    """The normal equations of inliers, by the robust kernel."""
+    _, weight = robust((rows[:, 6] * rows[:, 6]).sum(1), o.kernel, o.kernel_px)
+    return normal_equations(rows, torch.where(inlier, weight, 0.0))
 
 
 def _planes(xyz: Tensor, uv: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
@@ -330,7 +339,7 @@ def map_pose(
         ValueError: wrong shapes, an unknown kernel; else as ``start``.
 
     Gradient: R, t and turn to near ``xyz``, ``uv_0``, ``uv_1`` and both cameras, through one last step from the
-    detached optimum: exact to first order for small residuals. Noise, weights, cov and codes are detached.
+    detached optimum: exact to first order. Noise and its scale, cov and codes are detached.
     Cost: linear in B and N. Float64 in the last step and the covariance, the inputs' dtype elsewhere.
     Source: see :mod:`dhtorch.geometry.near_far`.
 
@@ -383,9 +392,18 @@ def _fit_all(o: FitOptions, threshold_px: float, first: PoseFit, problem: Proble
     problem = problem.to(torch.float64)
     found = pytree.tree_map(lambda x: x.double() if x.is_floating_point() else x, found)
     found = found._replace(at=found.at._replace(T=Pose(_orthonormal(found.at.T.R), found.at.T.t)))
-    weights = (found.noise, found.far_weight, found.turn_precision)
-    _, H, g = near_far.normal(problem, found.at, *weights, kernel=o.kernel, bend=o.bend)
-    at, solved = near_far.step(found.at, H, g)
+    normal = partial(
+        near_far.normal,
+        noise=found.noise,
+        far_weight=found.far_weight,
+        turn_precision=found.turn_precision,
+        kernel=o.kernel,
+        bend=o.bend,
+    )
+    _, H, g = normal(problem, found.at)
+    at, solved = near_far.step(found.at, H.detach(), g.detach())
+    fixed = problem.detach()
+    at = near_far.moved(at, implicit(lambda xi: normal(fixed, near_far.moved(found.at, xi)).g, g))
     with torch.no_grad():
         cov, known = pose_covariance(problem, found, o)
         finite = at.T.R.isfinite().flatten(1).all(1) & at.T.t.isfinite().all(1)
