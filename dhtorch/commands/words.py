@@ -256,7 +256,8 @@ def _kind(usual: Any) -> Any:
     """What an option is by its default; one that may be nothing may be anything."""
     if isinstance(usual, list):
         return list[_kind(usual[0])] | None if usual else list | None  # type: ignore[misc]
-    return typing.Optional[type(usual)] if isinstance(usual, bool | int | float | str) else Any
+    kind = next((k for k in (bool, int, float, str) if isinstance(usual, k)), None)
+    return Any if kind is None else kind | None
 
 
 def _fits(value: Any, hint: Any) -> bool:

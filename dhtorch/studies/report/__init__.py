@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from dhtorch import archive
-from dhtorch.console import EPILOG, progress
+from dhtorch.console import EPILOG, progress, verbosity
 from dhtorch.studies.report import jobs, page, text
 from dhtorch.studies.report.advice import advice
 from dhtorch.studies.report.layouts import SHOWN, in_layout
@@ -59,15 +59,13 @@ def print_tables(result: Result, console: Any = None) -> None:
 
 
 def print_brief(result: Result) -> None:
-    """Print the first look at a result, of at most ten lines or so: its main table, of many scenes the summary alone."""
+    """Print the first look at a result: its main table, of many scenes the summary alone."""
     for table in (in_layout(result) or generic(result, SHOWN))[:1]:
         n_body = len(table.rows) - table.footer - table.quoted
-        many = n_body > MOST_ROWS and table.footer
-        one = n_body == 1 and table.footer  # the summary over one scene says it again
-        rows = (
-            table.rows[n_body:] if many else table.rows[:1] + table.rows[n_body + table.footer :] if one else table.rows
-        )
-        text.print_table(replace(table, rows=rows, footer=table.footer if many or not one else 0))
+        many, one = n_body > MOST_ROWS and table.footer > 0, n_body == 1 and table.footer > 0
+        start, end = (n_body, None) if many else (0, 1 if one else None)  # a summary of one scene says it again
+        footer, quoted = (0, 0) if one else (table.footer, table.quoted)
+        text.print_table(replace(table, rows=table.rows[start:end], footer=footer, quoted=quoted))
 
 
 def print_sweep(results: Sequence[Result], folder: Path, *, markdown: bool = False) -> None:
@@ -115,6 +113,9 @@ def main(argv: Sequence[str]) -> int:
     for folder in options.result:
         mine = [r for path, r in zip(paths, results, strict=True) if path != folder and path.is_relative_to(folder)]
         print_sweep(mine, folder, markdown=options.markdown)
+    apart = {r["experiment"] for r in results}
+    if len(options.result) == 1 and len(results) > 1 and len(apart) == 1 and verbosity() != "verbose":
+        return 0  # one table says it; -v shows every job
     for path, result in zip(paths, results, strict=True):
         if options.markdown:
             print(markdown(result))
