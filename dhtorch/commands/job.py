@@ -24,6 +24,9 @@ from dhtorch.studies.protocol import MIN_CANDIDATES, Outcome, Settings
 
 _LOG = logging.getLogger(__name__)
 
+#: File beside a result that says where its data lie.
+PLACE = "data_root.txt"
+
 #: The settings groups; their names enter the key of a result.
 GROUPS = ("method", "data", "pairs", "holdout", "experiment")
 
@@ -83,6 +86,7 @@ def run(
     scenes = [each.name for each in asked]
     data = {"name": names["data"], "scenes": scenes, "n_pairs": outcome.n_pairs, "digest": digest}
     result = _result(settings, names["experiment"], key, data, outcome)
+    _remember(folder, settings)
     archive.write(target, result)
     _show(result, [target, *drawn], swept=swept)
     return Ended(str(folder), "finished")
@@ -105,6 +109,14 @@ def _result(
         verdict=outcome.verdict,
         why=outcome.why,
     )
+
+
+def _remember(folder: Path, settings: Mapping[str, Any]) -> None:
+    """Where the data lie on this machine: beside the result, which names none."""
+    root = settings["data"].get("root") if isinstance(settings["data"], Mapping) else None
+    if root is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / PLACE).write_text(f"{Path(root).resolve()}\n", encoding="utf-8")
 
 
 def _show(result: Mapping[str, Any], written: Sequence[Path], *, swept: bool) -> None:

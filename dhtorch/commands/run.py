@@ -154,6 +154,9 @@ def _run_configured(word: str, argv: list[str]) -> int:
     _refuse_flags(argv, SHOW)
     if argv and word in FIRST_WORD and ("=" not in argv[0] or Path(argv[0]).exists()):
         argv = [f"{FIRST_WORD[word]}={quote(argv[0])}", *argv[1:]]
+    names = {a.partition("=")[0] for a in argv if a not in ("dense=false", "dense=null")}
+    if word in ("integrate", "view") and "dense" in names and not {"method", "result"} & names:
+        argv = [*argv, "method=auto"]  # others sweep one view alone
     words.refuse_words(argv, ())
     argv = words.quoted(argv)
     try:
