@@ -487,7 +487,9 @@ ELSEWHERE = {
     "dhtorch.integrate.sweeps.edges",
     *(f"dhtorch.integrate.surface.{name}" for name in ("points", "mesh")),
     "dhtorch.integrate.picture.draw_map",
-    *(f"dhtorch.integrate.mapping.{name}" for name in ("make", "run", "write")),
+    *(f"dhtorch.integrate.mapping.{name}" for name in ("make", "run", "voxel_of", "write")),
+    *(f"dhtorch.integrate.level.{name}" for name in ("upwards", "mean_upwards", "floor")),
+    "dhtorch.geometry.se3.turn_between",
     *(
         f"dhtorch.integrate.recording.{name}"
         for name in ("ask", "place", "chain", "build", "coverage", "sensed", "recovered", "swept")

@@ -14,7 +14,7 @@ from dhtorch.codes import Gate, Source
 from dhtorch.data.recording import Recording
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3, sparse_grid
-from dhtorch.integrate import View, confirmed, empty, fuse, mesh, points, recording, splat, sweeps
+from dhtorch.integrate import View, confirmed, empty, fuse, level, mesh, points, recording, splat, sweeps
 from dhtorch.records import Camera, DepthMap, Estimate, Pose, Samples, Tracks
 from dhtorch.stages.holes import classify
 from dhtorch.studies.baselines.device_pose import given_pose
@@ -411,9 +411,9 @@ def test_links_of_another_width_join_all_frames(pairs):
 
 def test_the_camera_knows_where_up_is():
     turned = se3.exp(torch.tensor([[math.pi / 2, 0, 0, 0, 0, 0]]).double())
-    assert recording.Places({0: se3.identity(1, TRUE.t)}, 1, 0).up == pytest.approx([0, -1, 0])
-    assert recording.Places({0: turned}, 1, 0).up == pytest.approx([0, 0, -1], abs=1e-6)
-    assert recording.Places({}, 0, 0).up == [0, -1, 0]
+    assert level.mean_upwards([se3.identity(1, TRUE.t)]).tolist() == pytest.approx([0, -1, 0])
+    assert level.mean_upwards([turned]).tolist() == pytest.approx([0, 0, -1], abs=1e-6)
+    assert level.mean_upwards([]).tolist() == [0, -1, 0]
 
 
 @pytest.mark.parametrize("own", [None, Camera(torch.tensor([[40.0, 38.0]]), torch.tensor([[17.0, 12.0]]))])
@@ -626,3 +626,15 @@ def far_of(room, k, xyz):
     v, u = (depth > 2.2).nonzero()[::7].T
     true = cameras.unproject(frame.camera, torch.stack((u, v), -1)[None].float(), depth[None, v, u].float())
     return torch.cdist(se3.apply(frame.T_world_from_cam, true.double())[0], xyz.double()).amin(1)
+
+
+def test_up_is_the_formats_axis_else_the_floors():
+    """A floor that lies askew of what the cameras hold upright; a format that knows better is believed."""
+    g = torch.Generator().manual_seed(0)
+    ground = torch.rand(800, 3, generator=g).double() * torch.tensor([4.0, 0.01, 4.0])
+    wall = torch.rand(300, 3, generator=g).double() * torch.tensor([0.01, 3.0, 4.0])
+    askew = se3.exp(torch.tensor([[0.3, 0.0, 0.1, 0.0, 0.0, 0.0]], dtype=torch.float64)).R[0]
+    found = level.floor(torch.cat((ground, wall)) @ askew.T, torch.tensor([0.0, -1.0, 0.0]).double(), 0.02)
+    assert (found - askew @ torch.tensor([0.0, -1.0, 0.0]).double()).norm() < 0.02
+    up = (askew @ torch.tensor([0.0, -1.0, 0.0]).double()).tolist()
+    assert (se3.turn_between(up) @ torch.tensor(up) - torch.tensor([0.0, -1.0, 0.0])).norm() < 1e-9

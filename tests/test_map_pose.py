@@ -410,3 +410,20 @@ def test_options_have_one_default():
     assert defaults == {k: v for k, v in written.items() if k[0] != "_" and k != "start"}
     for start in (written["start"], yaml.safe_load((conf / "paper.yaml").read_text())["pose"]):
         assert pnp_ransac.__kwdefaults__ == {k: v for k, v in start.items() if k[0] != "_"}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_returns_from_far_away_do_not_hide_a_baseline(seed):
+    """A pose that is fixed by the near returns alone is fixed with all returns, too."""
+    (samples, *others), _, _, z = pairs(1, 60, 300, noise=0.4, baseline=0.025, rotation=0.0, seed=seed)
+    cut = map_pose(samples, *others)
+    known = torch.where(samples.depth > 0, samples.depth, z)
+    ray = cam.rays(others[1], samples.uv)
+    everything = samples.replace(depth=known, xyz=torch.where(samples.xyz.isfinite(), samples.xyz, ray * z[..., None]))
+    whole = map_pose(everything, *others)
+    assert cut.ok.all() and whole.ok.all()
+
+
+def test_a_turn_alone_is_no_baseline_however_many_returns_there_are():
+    (samples, *others), *_ = pairs(4, 300, 60, noise=0.4, baseline=0.0, rotation=0.05)
+    assert (map_pose(samples, *others).code == PoseCode.NO_BASELINE).all()

@@ -147,7 +147,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ),
         ("_translates", "o.translation_gain * rotation + SLACK", "o.translation_gain * rotation"),
         ("_translates", "o.translation_gain * rotation + SLACK", "o.translation_gain * evaluate(at).cost + SLACK"),
-        ("_near_cost", "torch.where(problem.near, rho", "torch.where(problem.near | problem.far, rho"),
+        ("_near_cost", "torch.where(problem.near, _costs", "torch.where(problem.near | problem.far, _costs"),
         ("SLACK", "1.0", "2.0"),
         ("MIN_RISE", "0.1", "0.2"),
         ("PARAMETERS", "6", "9"),

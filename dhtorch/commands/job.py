@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from dhtorch import archive, storage
+from dhtorch import archive, console, storage
 from dhtorch.data import files as data_files
 from dhtorch.data import scenes_of
 from dhtorch.data.scene import Scene
@@ -23,6 +23,9 @@ from dhtorch.studies.pictures import draw_example
 from dhtorch.studies.protocol import MIN_CANDIDATES, Outcome, Settings
 
 _LOG = logging.getLogger(__name__)
+
+#: File beside a result that says where its data lie.
+PLACE = "data_root.txt"
 
 #: The settings groups; their names enter the key of a result.
 GROUPS = ("method", "data", "pairs", "holdout", "experiment")
@@ -44,6 +47,7 @@ def run(
     folder: Path,
     *,
     progress: Callable[[Iterable[Any], str, int], Iterable[Any]],
+    swept: bool = False,
 ) -> Ended:
     """Run the experiment and write ``folder/result.json``, unless resuming finds the same one there already.
 
@@ -53,6 +57,7 @@ def run(
         choices: settings group → name of the chosen settings.
         folder: of this job alone.
         progress: wraps a loop, see :func:`dhtorch.studies.protocol.run`.
+        swept: one job of several, whose results stand in one table at the end.
 
     Raises:
         ValueError, OSError, KeyError, ImportError: bad options or data; nothing is written.
@@ -81,8 +86,9 @@ def run(
     scenes = [each.name for each in asked]
     data = {"name": names["data"], "scenes": scenes, "n_pairs": outcome.n_pairs, "digest": digest}
     result = _result(settings, names["experiment"], key, data, outcome)
+    _remember(folder, settings)
     archive.write(target, result)
-    _show(result, [target, *drawn])
+    _show(result, [target, *drawn], swept=swept)
     return Ended(str(folder), "finished")
 
 
@@ -105,14 +111,33 @@ def _result(
     )
 
 
-def _show(result: Mapping[str, Any], written: Iterable[Path]) -> None:
-    report.print_tables(result)
+def _remember(folder: Path, settings: Mapping[str, Any]) -> None:
+    """Where the data lie on this machine: beside the result, which names none."""
+    root = settings["data"].get("root") if isinstance(settings["data"], Mapping) else None
+    if root is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / PLACE).write_text(f"{Path(root).resolve()}\n", encoding="utf-8")
+
+
+def _show(result: Mapping[str, Any], written: Sequence[Path], *, swept: bool) -> None:
+    """The first look; all tables where much is to be said, none of a job of a sweep, which has a table at its end."""
+    if console.verbosity() == "verbose":
+        report.print_tables(result)
+    elif not swept:
+        report.print_brief(result)
     few = {r["scene"]: r["n_few"] for r in result["rows"] if r["pair"] is None and r.get("n_few")}
-    for scene, n in few.items():
+    for scene, n in few.items() if not swept else ():
         print(f"{scene}: {n} pair{'s' * (n > 1)} dropped, fewer than {MIN_CANDIDATES} candidates each")
     if result["verdict"]:
         print(f"{result['verdict']}: {result['why']}")
-    print("\n".join(["wrote", *(f"  {path}" for path in written)]))
+    advice = report.advice(result)
+    print(
+        "\n".join(advice if len(advice) <= 2 else [f"{advice[0]} (and {len(advice) - 1} more)"]),
+        end="\n" * bool(advice),
+    )
+    beside = len(written) - 1
+    more = f" and {beside} picture{'s' * (beside > 1)} and points beside it" if beside else ""
+    print(f"wrote {written[0]}{more}")
 
 
 def _common(settings: Mapping[str, Any]) -> Settings:

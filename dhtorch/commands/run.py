@@ -12,6 +12,7 @@ import contextlib
 import hashlib
 import importlib
 import logging
+import math
 import os
 import re
 import shlex
@@ -24,6 +25,8 @@ from typing import Any
 
 import dhtorch
 from dhtorch import console
+from dhtorch.commands import together, words
+from dhtorch.commands.words import quote
 
 #: Sub-command → module with ``main(argv) -> int``.
 COMMANDS = {"inspect": "dhtorch.commands.inspect", "report": "dhtorch.studies.report"}
@@ -104,6 +107,7 @@ def _run(argv: list[str]) -> int:
     argv = _with_pairs(argv)
     if argv and argv[0] in CONFIGURED:
         return _run_configured(argv[0], argv[1:])
+    words.refuse_words(argv, [*COMMANDS, *CONFIGURED])
     return _run_hydra(argv)
 
 
@@ -149,15 +153,22 @@ def _run_configured(word: str, argv: list[str]) -> int:
         return _show(word, argv)
     _refuse_flags(argv, SHOW)
     if argv and word in FIRST_WORD and ("=" not in argv[0] or Path(argv[0]).exists()):
-        argv = [f"{FIRST_WORD[word]}={_quote(argv[0])}", *argv[1:]]
+        argv = [f"{FIRST_WORD[word]}={quote(argv[0])}", *argv[1:]]
+    names = {a.partition("=")[0] for a in argv if a not in ("dense=false", "dense=null")}
+    if word in ("integrate", "view") and "dense" in names and not {"method", "result"} & names:
+        argv = [*argv, "method=auto"]  # others sweep one view alone
+    words.refuse_words(argv, ())
+    argv = words.quoted(argv)
     try:
         with hydra.initialize_config_dir(str(config_dir()), version_base="1.3", job_name="dhtorch"):
+            usual = _refuse_names(word, argv)
             cfg = hydra.compose(word, argv, return_hydra_config=True)
             HydraConfig.instance().set_config(cfg)  # for what the settings take from Hydra, as the folder's name
             groups = {k: v for k, v in cfg.hydra.runtime.choices.items() if k.isidentifier()}
         OmegaConf.set_struct(cfg, False)
         del cfg["hydra"]
         settings: Any = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
+        words.refuse_values(settings, usual)
         named = [k for k, v in settings.items() if isinstance(v, dict) and "_target_" in v]
         parts = _parts(cfg, named)
     except (HydraException, OmegaConfBaseException) as error:
@@ -171,6 +182,29 @@ def _run_configured(word: str, argv: list[str]) -> int:
         return _fail(error, show=settings.get("traceback", False))
 
 
+def _refuse_names(name: str, argv: Sequence[str]) -> Any:
+    """Refuse choices and options that the settings ``name`` do not have; returns what the choices alone compose to."""
+    import hydra  # noqa: PLC0415
+    from omegaconf import OmegaConf  # noqa: PLC0415
+
+    folder = config_dir()
+    groups = [p.name for p in folder.iterdir() if p.is_dir()]
+    words.refuse_choices(argv, folder)
+    chosen = [a for a in argv if a.partition("=")[0] in groups]
+    first = [a.partition(",")[0] if "[" not in a else a for a in chosen]
+    composed: Any = OmegaConf.to_container(hydra.compose(name, first))
+    swept = [(group, choice) for group, _, some in (a.partition("=") for a in chosen) for choice in some.split(",")[1:]]
+    more = [f"{g}.{k}" for g, c in swept for k in words.names(_settings(folder / g / f"{c.strip()}.yaml"))]
+    words.refuse_keys(argv, composed, groups, more, IMPLIED)
+    return composed
+
+
+def _settings(path: Path) -> Any:
+    from omegaconf import OmegaConf  # noqa: PLC0415
+
+    return OmegaConf.to_container(OmegaConf.load(path)) if path.is_file() else {}
+
+
 def _show(name: str, argv: list[str]) -> int:
     """Hydra's own flags: help, the composed settings, shell completion."""
     import hydra  # noqa: PLC0415
@@ -182,7 +216,8 @@ def _show(name: str, argv: list[str]) -> int:
 
 def _refuse_flags(argv: Iterable[str], known: set[str]) -> None:
     for flag in (a for a in argv if a.startswith("-") and a not in known):
-        raise ValueError(f"{flag}: found an unknown flag, expected {', '.join(sorted(known))}")
+        near = words.suggestion(flag, {*known, *console.FLAGS, "--version"})
+        raise ValueError(f"{flag}: found an unknown flag{near}, expected {', '.join(sorted(known))}")
 
 
 def _run_hydra(argv: list[str]) -> int:
@@ -197,20 +232,25 @@ def _run_hydra(argv: list[str]) -> int:
     if SHOW & {a.split("=")[0] for a in argv}:
         return _show("run", argv)
     _refuse_flags(argv, SWEEP | SHOW)
-    overrides, sweep = [a for a in argv if a not in SWEEP], bool({*SWEEP, "hydra.mode=MULTIRUN"} & set(argv))
+    sweep = bool({*SWEEP, "hydra.mode=MULTIRUN"} & set(argv))
+    overrides = words.quoted([a for a in argv if a not in SWEEP], sweep)
     if console.verbosity() == "quiet":
         overrides.append("hydra/hydra_logging=disabled")  # what a launcher says of its jobs
     try:
         with hydra.initialize_config_dir(str(config_dir()), version_base="1.3", job_name="dhtorch"):
             engine: Any = GlobalHydra.instance().hydra
             mode = RunMode.MULTIRUN if sweep else RunMode.RUN
-            # A misspelt option fails here, in one line, before anything is imported or run.
+            # What is misspelt, or cannot be, fails here, in one line, before anything is run.
+            usual = _refuse_names("run", overrides)
             cfg = engine.compose_config("run", overrides, run_mode=mode, with_log_configuration=False)
+            own: Any = OmegaConf.masked_copy(cfg, [k for k in cfg if k not in ("hydra", "output")])
+            plain: Any = OmegaConf.to_container(own)
+            words.refuse_values(plain, usual)
             folder = _output(cfg, overrides, sweep)
-            overrides = [o for o in overrides if not o.startswith("output=")] + [f"output={_quote(str(folder))}"]
+            overrides = [o for o in overrides if not o.startswith("output=")] + [f"output={quote(str(folder))}"]
             again = _again(argv, folder)
             if sweep:
-                return _sweep(engine, overrides, again, show=cfg.traceback)
+                return _sweep(engine, overrides, folder, again, show=cfg.traceback)
             return _single(engine, overrides, again)
     except (HydraException, OmegaConfBaseException) as error:
         return _fail(error)
@@ -225,13 +265,14 @@ def _single(engine: Any, overrides: Sequence[str], again: str) -> int:
     return FAILED if ended.state == "failed" else DONE
 
 
-def _sweep(engine: Any, overrides: Sequence[str], again: str, show: bool) -> int:
+def _sweep(engine: Any, overrides: Sequence[str], folder: Path, again: str, show: bool) -> int:
     """Run all jobs, then say how they ended."""
     from hydra.errors import HydraException  # noqa: PLC0415
 
     go_on = f"What is finished stays. To do the rest:\n  {again}"
     try:
-        batches = engine.multirun("run", _job, list(overrides))
+        with together.watched(folder, _n_jobs(overrides)):
+            batches = engine.multirun("run", _job, list(overrides))
     except KeyboardInterrupt:
         print(f"\ndhtorch: interrupted. {go_on}", file=sys.stderr)
         return INTERRUPTED
@@ -245,6 +286,7 @@ def _sweep(engine: Any, overrides: Sequence[str], again: str, show: bool) -> int
     counts = Counter(job.return_value.state for job in jobs)
     shares = ", ".join(f"{counts[state]} {words}" for state, words in STATES.items())
     with console.unsaid():
+        _compare([Path(j.return_value.folder) for j in jobs if j.return_value.state != "failed"], folder)
         print(f"{len(jobs)} job{'s' * (len(jobs) != 1)}: {shares}", flush=True)
     if not counts["failed"]:
         return DONE
@@ -255,6 +297,22 @@ def _sweep(engine: Any, overrides: Sequence[str], again: str, show: bool) -> int
             print(f"failed: {name}: {job.return_value.error}", file=sys.stderr)
     print(go_on, file=sys.stderr)
     return SOME_FAILED
+
+
+def _n_jobs(overrides: Sequence[str]) -> int:
+    """Jobs of a sweep: every combination."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser  # noqa: PLC0415
+
+    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    return math.prod(len(list(o.sweep_string_iterator())) for o in parsed if o.is_sweep_override())
+
+
+def _compare(folders: Sequence[Path], sweep: Path) -> None:
+    """The table of a sweep's jobs, and its file."""
+    from dhtorch import archive  # noqa: PLC0415
+    from dhtorch.studies import report  # noqa: PLC0415
+
+    report.print_sweep([archive.read(each / "result.json") for each in folders], sweep)
 
 
 def _job(cfg: Any) -> Any:
@@ -269,14 +327,19 @@ def _job(cfg: Any) -> Any:
     from dhtorch.commands import job  # noqa: PLC0415
 
     runtime = HydraConfig.get().runtime
-    alone = runtime.choices["hydra/launcher"] == "basic"
+    swept = not OmegaConf.is_missing(HydraConfig.get().job, "num")  # only jobs of a sweep are numbered
+    sweep, name = Path(runtime.output_dir).parent, Path(runtime.output_dir).name
     try:
         settings: Any = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
+        words.refuse_values(settings)
         parts = _parts(cfg, ("data", "method", "pairs", "experiment"))
-        progress = console.progress if alone else lambda items, _text, _total: items
+        scenes = len(parts["data"]) if isinstance(parts["data"], Sequence) else 1
+        progress = together.noting(sweep, name, scenes) if swept else console.progress
         _LOG.debug("job in %s: %s", runtime.output_dir, HydraConfig.get().job.override_dirname or "defaults")
         with console.unsaid():
-            ended = job.run(settings, parts, dict(runtime.choices), Path(runtime.output_dir), progress=progress)
+            ended = job.run(
+                settings, parts, dict(runtime.choices), Path(runtime.output_dir), progress=progress, swept=swept
+            )
         if console.verbosity() == "quiet":
             print(Path(ended.folder) / "result.json", flush=True)
         return ended
@@ -287,6 +350,9 @@ def _job(cfg: Any) -> Any:
         with contextlib.suppress(OSError):
             Path(runtime.output_dir).rmdir()  # where nothing is in it
         return job.Ended(runtime.output_dir, "failed", _line(cause))
+    finally:
+        if swept:
+            together.finished(sweep, name)
 
 
 def _parts(cfg: Any, names: Iterable[str]) -> dict[str, Any]:
@@ -325,12 +391,7 @@ def _again(argv: Iterable[str], folder: Path) -> str:
     words = [a for a in argv if not a.startswith(("resume=", "output="))]
     own = any(a.startswith(("hydra.run.dir=", "hydra.sweep.dir=")) for a in words)
     place = folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
-    return shlex.join(["dhtorch", *words, "resume=true", *([] if own else [f"output={_quote(str(place))}"])])
-
-
-def _quote(text: str) -> str:
-    """A value as Hydra's grammar takes it."""
-    return text if re.fullmatch(r"[\w./-]+", text) else "'" + text.replace("'", r"\'") + "'"
+    return shlex.join(["dhtorch", *words, "resume=true", *([] if own else [f"output={quote(str(place))}"])])
 
 
 def _cause(error: BaseException) -> BaseException:
@@ -352,6 +413,17 @@ def _line(error: BaseException) -> str:
     if any("Original Traceback" in line for line in lines):  # a data-loader worker sends its whole traceback along
         lines = lines[-1:]
     message = " ".join(" ".join(lines).split())
+    if type(error).__name__ == "MissingMandatoryValue":
+        return f"{getattr(error, 'full_key', '')}: found no value, expected {getattr(error, 'full_key', '')}=VALUE"
     if "hydra/launcher/" in message:
         message += " (launchers come with the extras: pip install 'dhtorch[scale]', for Ray 'dhtorch[ray-launcher]')"
-    return f"{type(error).__name__}: {message}"
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        return f"{error.filename}: {error.strerror}"
+    if isinstance(error, KeyError) and len(error.args) == 1:
+        return str(error.args[0])
+    return message if isinstance(error, USER_ERRORS) or _from_settings(error) else f"{type(error).__name__}: {message}"
+
+
+def _from_settings(error: BaseException) -> bool:
+    """What Hydra says of settings names the option itself."""
+    return type(error).__module__.startswith(("hydra.", "omegaconf."))

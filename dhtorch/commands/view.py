@@ -14,6 +14,7 @@ from typing import Any
 import torch
 
 from dhtorch import archive
+from dhtorch.commands.job import PLACE
 from dhtorch.data import FormatError
 from dhtorch.data.scene import scenes_of
 from dhtorch.integrate.sweeps import Sweep
@@ -60,7 +61,7 @@ def _archived(target: Path, settings: Mapping[str, Any], progress: Progress) -> 
     config, name = result["config"], settings["scene"]
     own = {**settings, **{k: config[k] for k in ("seed", "dtype") if k in config}}
     try:
-        parts = again.parts(result, settings["root"])
+        parts = again.parts(result, settings["root"] or _remembered(folder))
         scene = _looked(parts, own, partial(again.cutoff, result), progress)
     except (OSError, FormatError) as error:
         scenes = result["data"]["scenes"]
@@ -71,6 +72,13 @@ def _archived(target: Path, settings: Mapping[str, Any], progress: Progress) -> 
         return replace(points.read(ply), name=str(_chosen(scenes, name, str)))
     facts = {"experiment": result["experiment"], "data": result["data"]["name"], "made": result["meta"]["utc"]}
     return replace(scene, facts={**facts, **scene.facts})
+
+
+def _remembered(folder: Path) -> str | None:
+    """Where the data of a result lay when it was made, if they are there still."""
+    note = folder / PLACE
+    root = note.read_text(encoding="utf-8", errors="replace").strip() if note.is_file() else ""
+    return root if root and Path(root).exists() else None
 
 
 def _looked(

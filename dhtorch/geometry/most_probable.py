@@ -51,6 +51,9 @@ PARAMETERS = 6
 #: Least believed ratio of mean psi′ to mean w: residuals all beyond the bend would make it negative.
 MIN_RISE = 0.1
 
+#: Nearest parts of the near tracks that alone may show a translation, and how many tracks make such a part.
+NEAREST, MIN_PART = (0.25, 0.5), 20
+
 #: Cost (in units of its variance) that may be gained or lost without being asked why.
 SLACK = 1.0
 
@@ -86,7 +89,9 @@ def most_probable(problem: Problem, start: Pose, o: FitOptions) -> Solution:
     *Far tracks* are believed unless the near tracks' robust cost rises by more than ``max_rise`` with them. A *turn* is
     believed where it takes away more than ``turn_gain`` of the whole cost, a *translation* where it takes away more
     than ``translation_gain`` of the cost of the best pure rotation. More parameters always fit better; by how much they
-    do without need is a matter of systematic errors, which no number of tracks averages out: hence shares.
+    do without need is a matter of systematic errors, which no number of tracks averages out: hence shares. Returns from
+    far away move little and lose little: their number dilutes the share. So a translation is also believed where the
+    nearest part of the near tracks shows it, the others counting as if they had no return.
 
     Raises:
         ValueError: wrong shapes, an unknown kernel.
@@ -159,8 +164,23 @@ def _translates(problem: Problem, at: Unknowns, noise: Tensor, far: Tensor, prec
         return Normal(cost, H * free * free[:, None] + torch.diag(1 - free), g * free)
 
     still = Unknowns(Pose(at.T.R, torch.zeros_like(at.T.t)), at.turn)
-    _, rotation = minimise(evaluate, still, o.steps, step=trial_step)
-    return rotation - evaluate(at).cost > o.translation_gain * rotation + SLACK
+    turned, rotation = minimise(evaluate, still, o.steps, step=trial_step)
+    shown = rotation - evaluate(at).cost > o.translation_gain * rotation + SLACK
+    costs = [_costs(problem, x, noise, o) for x in (turned, at)]
+    for part in NEAREST:
+        nearest = _nearest(problem, part)
+        share = torch.where(nearest, 1.0, torch.where(problem.near | problem.far, far[:, None], 0.0))
+        without, found = ((cost * share).sum(-1) for cost in costs)
+        better = without - found > o.translation_gain * without + SLACK
+        shown = shown | (better & (nearest.sum(-1) >= MIN_PART))
+    return shown
+
+
+def _nearest(problem: Problem, part: float) -> Tensor:
+    """The near tracks (B, N) of the shortest depth, ``part`` of all, and those just as deep."""
+    inverse = torch.where(problem.near, problem.inverse, 0.0)
+    last = (problem.near.sum(-1, keepdim=True) * part).ceil().long().sub(1).clamp_min(0)
+    return problem.near & (inverse >= inverse.sort(-1, descending=True).values.gather(-1, last))
 
 
 @torch.no_grad()
@@ -215,10 +235,15 @@ def pose_covariance(problem: Problem, solution: Solution, o: FitOptions) -> tupl
     return 0.5 * (whole + whole.transpose(1, 2)), ok
 
 
+def _costs(problem: Problem, at: Unknowns, noise: Tensor, o: FitOptions) -> Tensor:
+    """Robust cost (B, N) of every track, of weight 1."""
+    rho, _ = robust(squares(problem, linearise_tracks(problem, at), noise), o.kernel, o.bend)
+    return rho
+
+
 def _near_cost(problem: Problem, at: Unknowns, noise: Tensor, o: FitOptions) -> Tensor:
     """Robust cost (B,) of the near tracks alone."""
-    rho, _ = robust(squares(problem, linearise_tracks(problem, at), noise), o.kernel, o.bend)
-    return torch.where(problem.near, rho, 0.0).sum(-1)
+    return torch.where(problem.near, _costs(problem, at, noise, o), 0.0).sum(-1)
 
 
 def _rise_and_scatter(square: Tensor, weight: Tensor, used: Tensor, size: int, o: FitOptions) -> tuple[Tensor, Tensor]:

@@ -7,6 +7,7 @@ Alphabet: ``T_b_from_a`` maps points of frame a into frame b, ``x_b = R x_a + t`
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -148,3 +149,22 @@ def rotation_angle(R: Tensor) -> Tensor:
     axis = torch.stack((R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]), -1)
     trace = R.diagonal(dim1=-2, dim2=-1).sum(-1)
     return steady(torch.atan2, axis.norm(dim=-1), trace - 1)
+
+
+def turn_between(up: Sequence[float], to: Sequence[float] = (0.0, -1.0, 0.0)) -> Tensor:
+    """The smallest rotation (3, 3) that takes ``up`` to ``to``; half a turn goes about x.
+
+    Raises:
+        ValueError: a direction of no length.
+    """
+    a, b = (torch.tensor(list(v), dtype=torch.float64) for v in (up, to))
+    if not (float(a.norm()) > 0 and float(b.norm()) > 0):
+        raise ValueError(f"up: found {list(up)}, expected a direction of three numbers")
+    a, b = a / a.norm(), b / b.norm()
+    if float(a @ b) < -1 + 1e-9:
+        return torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+    v = torch.linalg.cross(a, b)
+    K = torch.zeros(3, 3, dtype=torch.float64)
+    K[0, 1], K[0, 2], K[1, 2] = -v[2], v[1], -v[0]
+    K = K - K.T
+    return torch.eye(3, dtype=torch.float64) + K + K @ K / (1 + a @ b)

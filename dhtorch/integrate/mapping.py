@@ -22,6 +22,7 @@ from dhtorch.evaluate import bootstrap
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.integrate import recording as recordings
+from dhtorch.integrate.level import upwards
 from dhtorch.integrate.picture import draw_map
 from dhtorch.integrate.recording import PairEstimate, Places
 from dhtorch.integrate.sweeps import Shelf, Sweep
@@ -47,6 +48,12 @@ class MappedScene:
     volume: integrate.Volume
     surface: integrate.Surface
     row: Row
+
+    @property
+    def up(self) -> list[float]:
+        """The upward direction of the map."""
+        poses = list(self.places.poses.values())
+        return upwards(self.recording, poses, self.surface.xyz, 2 * self.volume.voxel)
 
 
 def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:
@@ -85,7 +92,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         raise KeyboardInterrupt(f"{len(found)} of {len(sources)} scenes in {folder} are whole and stay") from None
     result = _result(settings, sources, rows, found)
     archive.write(folder / "result.json", result)
-    print("\n".join(_said(row, settings["voxel"]) for row in found))
+    print("\n".join(_said(row, row["voxel_m"]) for row in found))
     print("\n".join(["wrote", *(f"  {path}" for path in [folder / "result.json", *written])]))
     return 0
 
@@ -97,6 +104,9 @@ def make(scene: Scene, method: Method, pairs: Pairs, settings: Mapping[str, Any]
         ValueError: as the readers, the method and the volume raise it; no frame that could be placed.
     """
     recording, chosen = scene.recording, list(pairs(scene))
+    hidden = settings["cutoff"] is None and recording.root is None  # the built-in room shows what views add
+    settings = {**settings, "cutoff": scene.near if hidden else settings["cutoff"]}
+    settings["voxel"] = voxel_of(recording) if settings["voxel"] is None else settings["voxel"]
     sweep = Sweep.asked(settings["dense"])
     options = {k: settings[k] for k in ("cutoff", "seed", "device")} | {"dtype": getattr(torch, settings["dtype"])}
     asked = recordings.ask(scene, method, chosen, sweep=sweep, shelf=Shelf(Path(settings["output"])), **options)
@@ -116,8 +126,22 @@ def make(scene: Scene, method: Method, pairs: Pairs, settings: Mapping[str, Any]
     row |= {} if sweep is None else {"n_swept": sum(a.swept.n for a in answers if a.swept is not None)}
     row |= _covered(points, settings["voxel"])
     row |= {"n_points": len(surface.xyz), "n_triangles": None if surface.face is None else len(surface.face)}
-    row |= {"volume_mib": volume.bytes / 2**20}
+    row |= {"volume_mib": volume.bytes / 2**20, "voxel_m": settings["voxel"]}
     return MappedScene(recording, answers, places, volume, surface, row)
+
+
+def voxel_of(recording: Recording) -> float:
+    """Edge of a voxel, m: twice the size of a depth pixel at the median return, from 5 mm to 20 cm, to two digits."""
+    sizes = []
+    for k in sorted({0, len(recording) // 2, len(recording) - 1}):
+        frame: Frame = recording[k]
+        depth = frame.depth[frame.depth.isfinite() & (frame.depth > 0)]
+        if depth.numel():
+            own = frame.depth_camera.f if frame.depth_camera is not None else None
+            f = frame.camera.f * frame.depth.shape[-1] / frame.hw[1] if own is None else own
+            sizes.append(float(depth.median() / f.mean()))
+    middle = 2 * sorted(sizes)[len(sizes) // 2] if sizes else 0.02
+    return float(f"{min(max(middle, 0.005), 0.2):.2g}")
 
 
 def _fused(
@@ -156,11 +180,15 @@ def _covered(points: Mapping[str, integrate.Surface], voxel: float) -> Row:
 
 def write(folder: Path, scene: MappedScene, settings: Mapping[str, Any]) -> list[Path]:
     """The files of one scene; returns what was written."""
-    surface, voxel = scene.surface, settings["voxel"]
+    surface, voxel, up = scene.surface, scene.volume.voxel, scene.up
     rgb, score = surface.features[:, :3], surface.features[:, 3]
     about = {"sigma": surface.sigma, "score": score, "source": surface.source}
     codes = ", ".join(f"{code} {words(name)}" for code, name in names(Source).items())
-    said = [f"metres; axes of {scene.recording.name}'s world", f"source: {codes}"]
+    said = [
+        f"metres; axes of {scene.recording.name}'s world",
+        f"up {' '.join(f'{v:.6f}' for v in up)}",
+        f"source: {codes}",
+    ]
     export.write_ply(
         folder / "map.ply", surface.xyz, rgb, normal=surface.normal, face=surface.face, comments=said, **about
     )
@@ -172,11 +200,11 @@ def write(folder: Path, scene: MappedScene, settings: Mapping[str, Any]) -> list
     shapes.append(export.Shape("recovered", *points, values={"sigma": cloud["sigma"][recovered]}))
     swept = surface.source == Source.SWEPT
     shapes.append(export.Shape("swept", surface.xyz[swept], rgb[swept], values={"sigma": surface.sigma[swept]}))
-    export.write_glb(folder / "map.glb", shapes, up=scene.places.up)
+    export.write_glb(folder / "map.glb", shapes, up=up)
     columns = {k: cloud[k] for k in ("sigma", "score", "hole", "source")}
     export.write_ply(folder / "points.ply", cloud["xyz"], cloud["rgb"], comments=said, **columns)
     _write_colmap(folder / "colmap", scene)
-    draw_map(folder / "map.png", surface, list(scene.places.poses.values()), scene.places.up, voxel=voxel)
+    draw_map(folder / "map.png", surface, list(scene.places.poses.values()), up, voxel=voxel)
     files = ["map.ply", "map.glb", "points.ply", "map.png"]
     files += [f"colmap/{name}" for name in ("cameras.txt", "images.txt", "points3D.txt")]
     return [folder / name for name in files]

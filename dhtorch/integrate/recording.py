@@ -74,12 +74,6 @@ class Places:
     n_fragments: int  # into which the frames fall
     n_unplaced: int  # frames of other fragments, or without a finite pose
 
-    @property
-    def up(self) -> list[float]:
-        """The cameras' mean upward direction in the world; camera axes where they cancel out."""
-        mean = torch.stack([-T.R[0, :, 1] for T in self.poses.values()]).mean(0) if self.poses else torch.zeros(3)
-        return mean.tolist() if float(mean.norm()) > 1e-3 else [0.0, -1.0, 0.0]
-
 
 def ask(
     scene: Given,

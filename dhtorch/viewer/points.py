@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 
 from dhtorch.codes import Gate, Hole, Source
+from dhtorch.geometry.se3 import turn_between
 from dhtorch.viewer.exhibit import NO_SWEPT, Exhibit, Shot, SweptCloud
 
 #: Points of a file that are shown; of more, as many drawn at random.
@@ -38,6 +40,8 @@ def read(path: Path) -> Exhibit:
         vertex["class"] if "class" in known else np.where(source == Source.SENSOR, Hole.NONE, Hole.TRACKABLE_NO_LIDAR)
     )
     xyz = np.stack([vertex[a] for a in "xyz"], -1).astype(np.float32)
+    up = _up(path)
+    xyz = xyz if up is None else (xyz @ turn_between(up).T.numpy()).astype(np.float32)
     grey = np.full(n, 128, np.uint8)
     rgb = np.stack([vertex[c] if c in known else grey for c in ("red", "green", "blue")], -1)
     dense = source == Source.SWEPT
@@ -51,6 +55,17 @@ def read(path: Path) -> Exhibit:
     samples |= dict.fromkeys(("parallax_deg", "residual_px", "error"), absent)
     rest = {name: values[~dense] for name, values in samples.items()}
     return Exhibit(path.name, [Shot(path.name, rest, np.eye(4), swept=swept if dense.any() else NO_SWEPT)])
+
+
+def _up(path: Path) -> list[float] | None:
+    """The upward direction that a comment of the header tells; None where none does."""
+    head = path.read_bytes().partition(b"end_header\n")[0].decode("ascii", "replace")
+    found = re.search(r"^comment up (\S+) (\S+) (\S+)$", head, re.MULTILINE)
+    try:
+        up = [float(v) for v in found.groups()] if found else []
+    except ValueError:
+        return None
+    return up if np.isfinite(up).all() and np.linalg.norm(up) > 0 else None
 
 
 def _read_ply(path: Path) -> np.ndarray:

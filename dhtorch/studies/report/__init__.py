@@ -12,17 +12,34 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from dhtorch import archive
-from dhtorch.console import EPILOG, progress
-from dhtorch.studies.report import page, text
+from dhtorch.console import EPILOG, progress, verbosity
+from dhtorch.studies.report import jobs, page, text
+from dhtorch.studies.report.advice import advice
 from dhtorch.studies.report.layouts import SHOWN, in_layout
 from dhtorch.studies.report.reading import Result, describe
 from dhtorch.studies.report.tables import INTERVAL, Table, generic
 
-__all__ = ["INTERVAL", "Result", "Table", "describe", "main", "markdown", "print_tables", "tables"]
+#: Of more scenes a first look shows the summary alone.
+MOST_ROWS = 8
+
+__all__ = [
+    "INTERVAL",
+    "Result",
+    "Table",
+    "advice",
+    "describe",
+    "main",
+    "markdown",
+    "print_brief",
+    "print_sweep",
+    "print_tables",
+    "tables",
+]
 
 
 def tables(result: Result) -> list[Table]:
@@ -39,6 +56,33 @@ def print_tables(result: Result, console: Any = None) -> None:
     """
     for table in tables(result):
         text.print_table(table, console)
+
+
+def print_brief(result: Result) -> None:
+    """Print the first look at a result: its main table, of many scenes the summary alone."""
+    for table in (in_layout(result) or generic(result, SHOWN))[:1]:
+        n_body = len(table.rows) - table.footer - table.quoted
+        many, one = n_body > MOST_ROWS and table.footer > 0, n_body == 1 and table.footer > 0
+        start, end = (n_body, None) if many else (0, 1 if one else None)  # a summary of one scene says it again
+        footer, quoted = (0, 0) if one else (table.footer, table.quoted)
+        text.print_table(replace(table, rows=table.rows[start:end], footer=footer, quoted=quoted))
+
+
+def print_sweep(results: Sequence[Result], folder: Path, *, markdown: bool = False) -> None:
+    """Print the table of a sweep's jobs and write it beside them as ``sweep.csv``; nothing for fewer than two."""
+    table = jobs.table(results)
+    if table is None:
+        return
+    if markdown:
+        print(text.markdown([table]))
+    else:
+        text.print_table(table)
+    try:
+        said = f"wrote {jobs.write_csv(folder / 'sweep.csv', results)}"
+    except OSError as error:  # a folder that is only read
+        said = f"{folder}: no sweep.csv written ({error.strerror})"
+    if not markdown:
+        print(said)
 
 
 def markdown(result: Result) -> str:
@@ -66,6 +110,12 @@ def main(argv: Sequence[str]) -> int:
     if options.html:
         print(f"wrote {page.write(options.html, results)}: {len(results)} result{'s' * (len(results) != 1)}")
         return 0
+    for folder in options.result:
+        mine = [r for path, r in zip(paths, results, strict=True) if path != folder and path.is_relative_to(folder)]
+        print_sweep(mine, folder, markdown=options.markdown)
+    apart = {r["experiment"] for r in results}
+    if len(options.result) == 1 and len(results) > 1 and len(apart) == 1 and verbosity() != "verbose":
+        return 0  # one table says it; -v shows every job
     for path, result in zip(paths, results, strict=True):
         if options.markdown:
             print(markdown(result))

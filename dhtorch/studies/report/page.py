@@ -8,7 +8,7 @@ from pathlib import Path
 from dhtorch import storage
 from dhtorch.drawing import Key, inline
 from dhtorch.drawing.colours import style_sheet, variable
-from dhtorch.studies.report import published
+from dhtorch.studies.report import jobs, published
 from dhtorch.studies.report.figure import Figure
 from dhtorch.studies.report.layouts import SHOWN, in_layout
 from dhtorch.studies.report.markup import Markup, join, tag
@@ -37,9 +37,21 @@ def page(results: Sequence[Result]) -> str:
     names = _anchors(results)
     sections = [_section(result, name) for result, name in zip(results, names, strict=True)]
     skip = tag("a", "To the results", href=f"#{names[0]}" if names else "#", class_="skip")
-    top = tag("header", tag("h1", title), tag("p", _about(results), class_="lead"), _overview(results, names))
-    body = tag("body", skip, top, tag("main", *sections))
+    swept = jobs.table(results)
+    sweep = table_markup(swept) if swept and _one_sweep(results) else ""
+    overview = _overview(results, names)
+    if any(in_layout(result) for result in results):
+        top = tag("header", tag("h1", title), tag("p", _about(results), class_="lead"), sweep, overview)
+        body = tag("body", skip, top, tag("main", *sections))
+    else:  # no line of the paper stands here: the numbers begin
+        top = tag("header", tag("h1", title), sweep)
+        body = tag("body", skip, top, tag("main", *sections), tag("footer", overview))
     return "<!doctype html>\n" + tag("html", head, body, lang="en") + "\n"
+
+
+def _one_sweep(results: Sequence[Result]) -> bool:
+    """Whether the results are jobs of one kind, which one table can compare."""
+    return len({result["experiment"] for result in results}) == 1
 
 
 def write(path: Path, results: Sequence[Result]) -> Path:
@@ -110,11 +122,14 @@ def _section(result: Result, name: str) -> Markup:
     counts = f"{_many(len(data['scenes']), 'scene')}, {_many(data['n_pairs'], 'pair')}"
     facts = f"{counts} · {meta['utc']} · code {meta['git'] or 'unknown'} · {machine}"
     paper, drawn = in_layout(result), figures(result)
-    parts = [heading, tag("p", facts, class_="facts"), _question(result), *map(table_markup, paper)]
+    generics = generic(result, SHOWN)
+    first = [] if paper or result["verdict"] else generics[:1]  # one's own numbers, before anything is explained
+    parts = [heading, *map(table_markup, first), tag("p", facts, class_="facts"), _question(result)]
+    parts += map(table_markup, paper)
     parts += [figure_markup(figure) for figure in drawn if not figure.folded]
     folded = [figure_markup(figure) for figure in drawn if figure.folded]
     parts += [tag("details", tag("summary", "The same of the other variants"), *folded)] if folded else []
-    tables = [table_markup(table) for table in generic(result, SHOWN)]
+    tables = [table_markup(table) for table in generics[len(first) :]]
     everything = [table_markup(table) for table in every_number(result)]
     parts += [
         tag(
@@ -159,13 +174,14 @@ def table_markup(table: Table) -> Markup:
     theirs = {k for k, name in enumerate(table.head) if name == PUBLISHED}
     first = table.n_label
 
-    def cells(row: Sequence[str], kind: str) -> Markup:
+    def cells(at: int, row: Sequence[str], kind: str) -> Markup:
         made = []
-        for k, cell in enumerate(row):
+        for k, text in enumerate(row):
+            cell = tag("strong", text) if (at, k) in table.best else text
             if k == 0:
                 made.append(tag("th", cell, scope="row"))
                 continue
-            style = "" if k < first else "num " if _short(cell) else "word "
+            style = "" if k < first else "num " if _short(text) else "word "
             made.append(tag("td", cell, class_=(style + "theirs-cell" * (k in theirs)).strip() or None))
         return tag("tr", *made, class_=kind or None)
 
@@ -176,7 +192,8 @@ def table_markup(table: Table) -> Markup:
     bodies, at = [], 0
     for group in groups:
         if group:
-            bodies.append(tag("tbody", *(cells(row, kind) for row, kind in zip(group, kinds[at:], strict=False))))
+            numbered = zip(range(at, at + len(group)), group, kinds[at:], strict=False)
+            bodies.append(tag("tbody", *(cells(n, row, kind) for n, row, kind in numbered)))
         at += len(group)
     heads = [tag("tr", *_spanning(table.over))] if table.over else []
     heads.append(tag("tr", *(_heading(k, name, first, k in theirs) for k, name in enumerate(table.head))))

@@ -63,6 +63,7 @@ class Table:
     quoted: int = 0  # rows of the paper, after these
     over: tuple[tuple[str, int], ...] = ()  # headings over several columns: (text, columns)
     note: str = ""  # what must be known to read it
+    best: frozenset[tuple[int, int]] = frozenset()  # (row, column) of cells that stand out
 
     def flat_head(self) -> list[str]:
         """One heading per column, with what stands over it."""

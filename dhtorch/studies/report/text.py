@@ -28,7 +28,8 @@ def print_table(table: Table, console: Any = None) -> None:
         summed = n_body <= k < n_body + table.footer
         style = "bold" if summed and cells[0] != INTERVAL else "dim" if summed else "yellow" if k >= n_body else None
         last_of_part = k + 1 in (n_body, n_body + table.footer) and k + 1 < len(table.rows)
-        shown.add_row(*map(escape, cells), style=style, end_section=last_of_part)
+        texts = [f"[bold]{escape(c)}[/bold]" if (k, n) in table.best else escape(c) for n, c in enumerate(cells)]
+        shown.add_row(*texts, style=style, end_section=last_of_part)
     console.print(shown)
     if table.note:
         console.print(f"{escape(table.note)}\n", style="dim", highlight=False)
@@ -47,7 +48,11 @@ def markdown(tables: Iterable[Table]) -> str:
 def grid(table: Table) -> str:
     """A table's lines alone as Markdown."""
     align = [":--" if k < table.n_label else "--:" for k in range(len(table.head))]
-    rows = ([_plain(cell) for cell in cells] for cells in (table.flat_head(), align, *table.rows))
+    marked = [
+        [f"**{_plain(c)}**" if (k, n) in table.best else _plain(c) for n, c in enumerate(cells)]
+        for k, cells in enumerate(table.rows)
+    ]
+    rows = ([_plain(c) for c in table.flat_head()], align, *marked)
     return "\n".join(f"| {' | '.join(cells)} |" for cells in rows)
 
 

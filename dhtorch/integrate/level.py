@@ -1,0 +1,78 @@
+"""Which way is up: asked here, and nowhere else. The format's own gravity axis, else the floor, else the cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from dhtorch.data.recording import Recording
+from dhtorch.records import Pose
+
+#: Format → the direction of its world that points upwards: ARKit and the built-in room, motion capture.
+GRAVITY = {
+    "stray": (0.0, 1.0, 0.0),
+    "record3d": (0.0, 1.0, 0.0),
+    "synthetic": (0.0, -1.0, 0.0),
+    "tum": (0.0, 0.0, 1.0),
+    "arkitscenes": (0.0, 0.0, 1.0),
+}
+
+#: A direction farther from the cameras' own upward one is not believed, cosine of the angle.
+LEAST_COSINE = 0.5
+
+#: Planes that are tried, and the share of the points that the floor must hold.
+TRIALS, LEAST_SHARE = 300, 0.1
+
+
+def upwards(recording: Recording, poses: Sequence[Pose], xyz: Tensor, thickness: float) -> list[float]:
+    """The upward direction of a map, a unit vector in its world.
+
+    The format's gravity axis where it has one and the map stands in the recording's own world; else the normal of the
+    largest plane that cameras held upright could stand on; else the cameras' mean upward direction; camera axes where
+    that cancels out.
+
+    Args:
+        recording: that was mapped.
+        poses: T_world_from_cam (1) of its frames.
+        xyz: (P, 3) m, points of the map.
+        thickness: m, of the floor.
+    """
+    mean = mean_upwards(poses)
+    known = GRAVITY.get(recording.format)
+    if known is not None and recording.poses is not None:
+        axis = torch.tensor(known, dtype=torch.float64)
+        if float(axis @ mean) > LEAST_COSINE:
+            return axis.tolist()
+    found = floor(xyz.double(), mean, thickness)
+    return (mean if found is None else found).tolist()
+
+
+def mean_upwards(poses: Sequence[Pose]) -> Tensor:
+    """The cameras' mean upward direction (3,) in the world; that of camera axes where they cancel out."""
+    mean = torch.stack([-T.R[0, :, 1].double() for T in poses]).mean(0) if poses else torch.zeros(3).double()
+    length = mean.norm()
+    return mean / length if float(length) > 1e-3 else torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
+
+
+def floor(xyz: Tensor, guess: Tensor, thickness: float) -> Tensor | None:
+    """Unit normal (3,) of the largest plane within 40° of ``guess``; None where none holds a tenth of the points."""
+    xyz = xyz[xyz.isfinite().all(-1)]
+    if len(xyz) < 100:
+        return None
+    draw = torch.Generator().manual_seed(0)
+    some = xyz[torch.randint(len(xyz), (min(len(xyz), 5000),), generator=draw)]
+    three = some[torch.randint(len(some), (TRIALS, 3), generator=draw)]
+    normal = torch.linalg.cross(three[:, 1] - three[:, 0], three[:, 2] - three[:, 0])
+    normal = torch.nn.functional.normalize(normal, dim=-1)
+    normal = normal * torch.where(normal @ guess < 0, -1.0, 1.0)[:, None]
+    level = normal @ guess > 0.77
+    off = (some @ normal.T - (three[:, 0] * normal).sum(-1)).abs()
+    count = torch.where(level, (off < thickness).sum(0), 0)
+    best = int(count.argmax())
+    if int(count[best]) < LEAST_SHARE * len(some):
+        return None
+    held = some[off[:, best] < thickness]
+    axis = torch.linalg.eigh((held - held.mean(0)).T @ (held - held.mean(0))).eigenvectors[:, 0]
+    return axis if float(axis @ guess) > 0 else -axis

@@ -1,0 +1,106 @@
+"""What is typed is looked over before any work: words, names, values; and a sweep ends with one table."""
+
+import csv
+import re
+
+import pytest
+from test_manners import ROOM, command  # noqa: F401  (a fixture)
+
+from dhtorch import archive
+from dhtorch.commands import job, together, words
+from dhtorch.studies.report import advice, jobs
+
+TINY = [*ROOM, "method.n=256", "figures=false"]
+
+
+@pytest.mark.parametrize(
+    ("typed", "begins", "near"),
+    [
+        (["inspct", "x"], "inspct", "inspect"),
+        (["help"], "help", "--help"),
+        (["version"], "version", "--version"),
+        (["nonsense"], "nonsense", "complete"),
+        (["seed=x"], "seed", "whole number"),
+        (["seed=1.5"], "seed", "whole number"),
+        (["method.n=0"], "method.n", "at least 1"),
+        (["method.n=nan"], "method.n", "whole number"),
+        (["pairs.gap=abc"], "pairs.gap", "whole number"),
+        (["pair.gap=3"], "pair.gap", "pairs.gap"),
+        (["+pair.gap=3"], "pair.gap", "pairs.gap"),
+        (["++sede=3"], "sede", "seed"),
+        (["method=mop"], "method", "map"),
+        (["method.track.windw=3"], "method.track.windw", "method.track.window"),
+        (["method.pose.far_weight=a"], "method.pose.far_weight", "number"),
+        (["data.hw=60"], "data.hw", "list"),
+        (["holdout.cutoff=far"], "holdout.cutoff", "positive"),
+        (["figures=maybe"], "figures", "true"),
+        (["threads=0"], "threads", "at least 1"),
+        (["data=auto"], "data.root", "data.root=VALUE"),
+        (["--multrun"], "--multrun", "--multirun"),
+        (["integrate", "voxel=abc"], "voxel", "positive"),
+        (["integrate", "vxel=1"], "vxel", "voxel"),
+        (["complete", "nowhere"], "out", "out=VALUE"),
+        (["-m", "seed=0,1", "pairs.gp=3"], "pairs.gp", "pairs.gap"),
+    ],
+)
+def test_a_slip_is_said_in_one_line_before_any_work(command, monkeypatch, typed, begins, near):  # noqa: F811
+    monkeypatch.setattr(job, "run", lambda *_, **__: pytest.fail("work was begun"))
+    code, out, err = command(*typed)
+    assert code == 2 and out == ""
+    (line,) = err.strip().splitlines()
+    assert line.startswith(f"dhtorch: {begins}: ") and near in line, line
+
+
+def test_an_option_of_a_function_may_be_added_and_no_other(command):  # noqa: F811
+    assert command(*TINY, "+data.name=kitchen", "output=o")[0] == 0
+    assert command(*TINY, "+method.nothing=1")[0] == 2
+
+
+def test_names_of_places_are_one_text():
+    assert words.quoted(["output=a=b,c=1/x"]) == ["output='a=b,c=1/x'"]
+    assert words.quoted(["out=/tmp/a=b (1)/c"]) == ["out='/tmp/a=b (1)/c'"]
+    assert words.quoted(["seed=0,1", "extract.columns=[a,b]"], True) == ["seed=0,1", "extract.columns=[a,b]"]
+
+
+def test_a_sweep_ends_with_one_table_and_its_file(command, tmp_path):  # noqa: F811
+    data = ["data.hw=[60,80]", "data.n_frames=3", "data.supersample=1", "data.lidar=exact", "figures=false"]
+    code, out, _ = command("-m", *data, "pairs.gap=1,2", "method.n=256", "output=a=b")
+    assert code == 0
+    with (tmp_path / "a=b/sweep.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [r["pairs.gap"] for r in rows] == ["1", "2"]
+    assert list(rows[0]) == ["pairs.gap", *jobs.METRICS]
+    (at,) = [k for k, line in enumerate(out.splitlines()) if re.match(r"\s*pairs.gap\s+coverage\s+median\s+p90", line)]
+    assert len(out.splitlines()) - at < 12
+    assert not (tmp_path / "a=b" / together.NOTES).exists()
+    code, out, _ = command("report", "a=b")
+    assert code == 0 and "pairs.gap" in out and "truth dropped" not in out
+    assert command("report", "a=b", "--html", "p.html")[0] == 0 and "2 jobs" in (tmp_path / "p.html").read_text()
+    results = [archive.read(p) for p in sorted(tmp_path.rglob("result.json"))]
+    for k, (coverage, error) in enumerate(((0.5, 0.1), (0.4, 0.05))):
+        results[k]["summary"]["coverage"]["value"] = coverage
+        results[k]["summary"]["median_rel"]["value"] = error
+    assert {(0, 1), (1, 2)} <= jobs.table(results).best
+
+
+def test_a_job_says_little_and_all_of_it_when_asked(command):  # noqa: F811
+    code, out, _ = command(*TINY)
+    assert code == 0 and len(out.splitlines()) <= 15 and "what became of samples" not in out
+    assert "what became of samples" in command("-v", *TINY)[1]
+
+
+def test_jobs_note_how_far_they_are(tmp_path):
+    (tmp_path / together.NOTES).mkdir()
+    wrap = together.noting(tmp_path, "one", 2)
+    assert list(wrap(range(4), "first", 4)) == [0, 1, 2, 3]
+    assert together.read(tmp_path / together.NOTES) == (0.5, 0, ["first"])
+    together.finished(tmp_path, "one")
+    assert together.read(tmp_path / together.NOTES)[:2] == (1.0, 1)
+    assert list(together.noting(tmp_path / "unwatched", "one", 1)([7], "x", 1)) == [7]
+
+
+@pytest.mark.parametrize(("gate", "word"), [("no_track", "smaller pairs.gap"), ("no_baseline", "larger pairs.gap")])
+def test_silence_comes_with_advice(gate, word):
+    row = {"scene": "s", "pair": None, "method": "m", "gate_share": {"answer": 0.0, gate: 0.9, "residual": 0.1}}
+    assert word in advice({"rows": [row]})[0]
+    assert advice({"rows": [{**row, "gate_share": {"answer": 0.3, gate: 0.7}}]}) == []
