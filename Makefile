@@ -6,6 +6,12 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
+# Where torch's builds for the CPU are: on Linux pip's own choice brings CUDA, some gigabytes. `make TORCH_INDEX= run` leaves
+# the choice to pip; so does a machine that cannot reach the place, unless a build lies where pip is told to look.
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
+TORCH = test -z "$(TORCH_INDEX)" || $(PIP) --retries 0 --timeout 15 --index-url "$(TORCH_INDEX)" torch \
+	|| echo "== found no torch for the CPU at $(TORCH_INDEX): pip takes its own choice"
+
 .PHONY: run test test-all everything lint conf clean
 
 run: $(VENV)/.installed
@@ -39,12 +45,14 @@ conf: $(VENV)/.installed
 $(VENV)/.installed: pyproject.toml constraints.txt
 	@echo "== installing into $(VENV)"
 	$(PYTHON) -m venv $(VENV)
+	@$(TORCH)
 	$(PIP) -e .
 	@touch $@
 
 $(VENV)/.installed-dev: pyproject.toml constraints.txt
 	@echo "== installing into $(VENV), with what tests and benchmarks need"
 	$(PYTHON) -m venv $(VENV)
+	@$(TORCH)
 	$(PIP) -e ".[dev]"
 	@touch $@ $(VENV)/.installed
 

@@ -1,8 +1,11 @@
-"""The tables of README.md, benchmarks/README.md and docs/kornia.md, from committed result files; README's picture.
+"""README, and every page of docs/ that shows a figure or the code's own words: written from results and from the code.
 
-python benchmarks/readme.py            rewrite the tables between their markers
-python benchmarks/readme.py --check    exit 1 if they do not say what the result files say
-python benchmarks/readme.py --picture  also render benchmarks/results/room.png again
+python benchmarks/readme.py            rewrite what stands between markers
+python benchmarks/readme.py --check    exit 1 if a page does not say what result files and code say
+
+``<!-- name -->`` up to ``<!-- end -->`` holds a table of ``TABLES``, ``<!-- results name -->`` those of a result file
+in the paper's layout, ``<!-- make: name argument -->`` what a function of docs/hooks.py says. The pages are committed
+whole. Pictures: docs/pictures.py.
 """
 
 from __future__ import annotations
@@ -27,6 +30,10 @@ from dhtorch.studies.report import Table, layouts, text
 HERE = Path(__file__).resolve().parent
 README = HERE.parent / "README.md"
 RESULTS = HERE / "results"
+
+#: The beginning of a part that is written, and the whole of it.
+MARKER = re.compile(r"^<!-- (?!end -->)([^>]*?) -->$", re.M)
+BLOCK = re.compile(r"^<!-- (?!end -->)([^>]*?) -->\n.*?^<!-- end -->$", re.M | re.S)
 
 #: The room of conf/data/synthetic.yaml among those of synthetic_seeds.yaml.
 DEFAULT_ROOM = "synthetic_walk_2"
@@ -217,45 +224,107 @@ def verdicts(names: Sequence[str]) -> str:
     return text.grid(Table("", ["experiment", "verdict", "why"], rows, n_label=3))
 
 
-def picture(path: Path) -> None:
-    """The idea at a glance: what the sensor may say within 2 m, and what two views add."""
-    import torch
-    from matplotlib.figure import Figure
+def row_of(name: str, scene: str, method: str) -> dict[str, Any]:
+    """One scene's row of a comparison."""
+    return scenes(name, "full")[scene][method]
 
-    from dhtorch import extend, merge
-    from dhtorch.codes import Source
-    from dhtorch.drawing.colours import DEPTH, GREY
-    from dhtorch.evaluate import holdout
-    from dhtorch.synthetic import SyntheticRoom
 
-    torch.set_num_threads(1)
-    recording = SyntheticRoom()
-    whole = recording[0]
-    near, other = holdout.range_split(whole, 2.0), holdout.range_split(recording[6], 2.0)
-    trace: dict[str, Any] = {}
-    estimate = extend(near, other, trace=trace)
-    merged = merge(trace["samples"], estimate)
-    figure = Figure((15, 4.1))
-    axes = figure.subplots(1, 3)
-    sensor, recovered = (merged.source[0] == s for s in (Source.SENSOR, Source.RECOVERED))
-    panels = (
-        ("one view of a room", None),
-        ("a sensor that reaches 2 m", sensor),
-        ("… and what two views add", sensor | recovered),
+def how_good() -> str:
+    """README's one table: what is answered, how well, and at what price, by method."""
+    sparse = json.loads((RESULTS / "method_comparison.json").read_text())["summary"]
+    pixels = json.loads((RESULTS / "dense.json").read_text())["summary"]
+    rows = []
+    for key, words in GOOD.items():
+        cells = [percent(sparse.get(f"{m}.{key}", {}).get("value")) for m in ("paper", "map", "auto")]
+        rows.append([words, *cells, percent(pixels.get(f"dense.{DENSE_KEY.get(key, key)}", {}).get("value"))])
+    turned = [percent(row_of("method_comparison", TURNED, m)["coverage"]) for m in ("paper", "map", "auto")]
+    rows.append(["answered where the camera only turns", *turned, percent(pixels["dense.rotation_answered"]["value"])])
+    timed = {name: milliseconds(*name) for name in TIMED}
+    rows.append(["ms an anchor of 640×480, one thread", *(f"{ms:,.0f}" for ms in timed.values())])
+    rows[-1][-1] = f"as `auto` + {rows[-1][-1]}"
+    return table(["median over eleven scenes", "`paper`", "`map`", "`auto`", "`dense`"], rows)
+
+
+def milliseconds(file: str, name: str) -> float:
+    """What a row of a timing script took on one thread."""
+    found = [r["ours_ms"] for r in speed_tables.timings(file) if (r["name"], r["threads"]) == (name, 1)]
+    return float(found[0])
+
+
+#: What README's table says, in words; what a dense map calls it; the scene without a baseline; what was timed.
+GOOD = {
+    "coverage": "answered",
+    "median_rel": "median error",
+    "p90_rel": "nine in ten are within",
+    "wrong_share": "off by more than a fifth",
+    "coverage_at_5": "answered at 5 % mean error",
+    "within_sigma": "errors within one stated sigma (68 % wanted)",
+}
+DENSE_KEY = {"coverage": "answered"}
+TURNED = "tum_fr1_rpy_a"
+TIMED = (
+    ("pair", "pair_paper_b1"),
+    ("pair", "pair_map_b1"),
+    ("stream", "auto_anchor"),
+    ("dense_speed", "sweep_640x480"),
+)
+
+
+def loader_times() -> str:
+    """What the transform costs in a loader, in one sentence."""
+    rows = {r["name"]: r for r in speed_tables.timings("loader") if r["peer"] == "plain_loader"}
+    said = []
+    for views, words in (("single", "one view"), ("pair", "two views")):
+        alone, batch = (rows[f"loader_{views}_640x480_workers0{kind}"] for kind in ("", "_by_batch"))
+        said.append(f"{alone['ours_ms']:.0f} ms with {words} ({batch['ours_ms']:.0f} by batch)")
+    plain = rows["loader_single_640x480_workers0"]
+    return (
+        f"A sample of 640×480 takes {' and '.join(said)}, {plain['peer_ms']:.0f} ms of which is decoding\n"
+        f"(`python benchmarks/loader.py`; one thread, {plain['processor']})."
     )
-    for axis, (title, mask) in zip(axes, panels, strict=True):
-        grey = whole.image[0].float().mean(0)
-        axis.imshow(
-            whole.image[0].permute(1, 2, 0) if mask is None else grey, cmap=GREY, alpha=1 if mask is None else 0.45
-        )
-        if mask is not None:
-            dots = axis.scatter(*merged.uv[0][mask].T, c=merged.depth[0][mask], s=5, cmap=DEPTH, vmin=1, vmax=5)
-        axis.set_title(title, fontsize=13)
-        axis.set(xlim=(0, 639), ylim=(479, 0))
-        axis.axis("off")
-    figure.tight_layout()
-    figure.colorbar(dots, ax=axes, label="depth, m", shrink=0.85, pad=0.01)
-    figure.savefig(path, dpi=80, bbox_inches="tight")
+
+
+def swept() -> str:
+    """The jobs of the sweep that README shows, a row each; the best of a column in bold."""
+    jobs = json.loads((RESULTS / "sweep.json").read_text())
+    shown = [[number_as(job[key], key) for key in SWEPT] for job in jobs]
+    for k, (key, better) in enumerate(SWEPT.items()):
+        if better:
+            best = better(job[key] for job in jobs)
+            for row, job in zip(shown, jobs, strict=True):
+                row[k] = f"**{row[k]}**" if job[key] == best else row[k]
+    names = [[f"`{value}`" for value in job["overrides"].values()] for job in jobs]
+    head = [*(f"`{key}`" for key in jobs[0]["overrides"]), *(HEAD[key] for key in SWEPT)]
+    rows = [a + b for a, b in zip(names, shown, strict=True)]
+    return text.grid(Table("", head, rows, n_label=len(names[0])))
+
+
+def number_as(value: float, key: str) -> str:
+    """A cell of a sweep's table."""
+    return f"{value:,.0f}" if key == "ms" else percent(value)
+
+
+#: Columns of a sweep's table, and which end of each is the better one.
+SWEPT: dict[str, Any] = {"coverage": max, "median_rel": min, "p90_rel": min, "coverage_at_5": max, "ms": min}
+HEAD = {"coverage": "answered", "median_rel": "median error", "p90_rel": "p90"}
+HEAD |= {"coverage_at_5": "answered at 5 % mean error", "ms": "ms"}
+
+
+def captures() -> str:
+    """Every capture that was given to ``dhtorch PATH``: what came of it, and how long it took."""
+    file = RESULTS / "captures.json"
+    if not file.is_file():
+        return "Not measured yet: `benchmarks/results/captures.json` is not there."
+    rows = []
+    for found in json.loads(file.read_text()):
+        rows.append([found["name"], f"{found['seconds']:.0f}", found.get("said") or found.get("why") or ""])
+    return text.grid(Table("", ["capture", "seconds", "what came out"], rows))
+
+
+def questions() -> str:
+    """Every archived answer, in alphabetical order."""
+    found = {path.stem: json.loads(path.read_text()) for path in sorted(RESULTS.glob("*.json"))}
+    return verdicts([name for name, result in found.items() if isinstance(result, dict) and result.get("verdict")])
 
 
 def caught() -> str:
@@ -272,7 +341,8 @@ TABLES |= {"comparison scenes": partial(by_scene, "method_comparison"), "stress"
 TABLES |= {"chosen views": partial(chosen_views, "method_comparison", "streams"), "beside chosen": beside_chosen}
 TABLES |= {"every pixel": partial(every_pixel, "dense", "dense_streams")}
 TABLES |= {"pixels by scene": partial(pixels_by_scene, "dense")}
-TABLES |= {"bars": speed_tables.bars, "speed": speed_tables.stages}
+TABLES |= {"speed": speed_tables.stages, "mutants": caught} | speed_tables.TABLES | kornia_tables.TABLES
+TABLES |= {"how good": how_good, "sweep": swept, "captures": captures, "loader": loader_times, "questions": questions}
 
 #: Numbers of the method comparison in words, and on which side of its bar each belongs.
 NUMBER = {
@@ -332,13 +402,6 @@ NEGATIVE = ("helix_correlation", "defocus", "focus_stack", "defocus_fusion", "ic
 TABLES |= {"verdicts": partial(verdicts, ASKED), "negative": partial(verdicts, NEGATIVE)}
 TABLES |= {"pipelines": partial(verdicts, PIPELINES), "map": partial(verdicts, ("global_map",))}
 
-#: Pages and their tables.
-PAGES = {
-    README: TABLES,
-    HERE / "README.md": speed_tables.TABLES | {"mutants": caught},
-    HERE.parent / "docs" / "kornia.md": kornia_tables.TABLES,
-}
-
 
 def in_layout(name: str) -> str:
     """The tables of ``results/<name>.json`` in the paper's layout, the paper's figures beside ours."""
@@ -348,35 +411,54 @@ def in_layout(name: str) -> str:
     return text.markdown(found).rstrip()
 
 
-def fill(page: Path, tables: dict[str, Callable[[], str]]) -> str:
-    """A page with the tables as the result files have them.
+def maker(name: str) -> Callable[[], str]:
+    """What writes the part of a page that a marker names.
 
-    ``<!-- name -->`` up to ``<!-- end -->`` is one of ``tables``; ``<!-- results name -->`` those of a result file.
+    Raises:
+        ValueError: a marker that nobody knows.
     """
-    whole = page.read_text()
-    known = {f"results {name}": partial(in_layout, name) for name in re.findall(r"<!-- results ([\w.-]+) -->", whole)}
-    for name, make in (tables | known).items():
-        pattern = rf"(<!-- {re.escape(name)} -->\n).*?(<!-- end -->)"
-        whole, count = re.subn(pattern, lambda m, make=make: f"{m[1]}{make()}\n{m[2]}", whole, flags=re.DOTALL)
-        if count != 1:
-            raise ValueError(f"{page}: marker <!-- {name} -->: found {count}, expected one")
-    return whole
+    if name.startswith("results "):
+        return partial(in_layout, name.removeprefix("results "))
+    if name.startswith("make: "):
+        sys.path.append(str(HERE.parent / "docs"))
+        import hooks
+
+        return partial(hooks.made, name.removeprefix("make: "))
+    if name not in TABLES:
+        raise ValueError(f"marker <!-- {name} -->: expected one of {', '.join(TABLES)}")
+    return TABLES[name]
+
+
+def fill(page: Path) -> str:
+    """A page with everything between its markers as result files and code have it.
+
+    Raises:
+        ValueError: a marker that nobody knows, or one without its end.
+    """
+    whole = page.read_text(encoding="utf-8")
+    names, ends = MARKER.findall(whole), whole.count("<!-- end -->")
+    if len(names) != ends:
+        raise ValueError(f"{page}: found {len(names)} markers and {ends} ends, expected as many of each")
+    return BLOCK.sub(lambda m: f"<!-- {m[1]} -->\n{maker(m[1])()}\n<!-- end -->", whole)
+
+
+def pages() -> list[Path]:
+    """README, that of the benchmarks, and all of docs/."""
+    return [README, HERE / "README.md", *sorted((HERE.parent / "docs").rglob("*.md"))]
 
 
 def main() -> int:
     """Rewrite or check the pages."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true")
-    parser.add_argument("--picture", action="store_true")
     options = parser.parse_args()
-    wanted = {page: fill(page, tables) for page, tables in PAGES.items()}
-    if options.check:
-        return int(any(page.read_text() != filled for page, filled in wanted.items()))
-    for page, filled in wanted.items():
-        page.write_text(filled)
-    if options.picture:
-        picture(RESULTS / "room.png")
-    return 0
+    wanted = {page: fill(page) for page in pages()}
+    stale = [page for page, filled in wanted.items() if page.read_text(encoding="utf-8") != filled]
+    for page in stale:
+        print(f"{page.relative_to(HERE.parent)}: {'not up to date' if options.check else 'written'}")
+        if not options.check:
+            page.write_text(wanted[page], encoding="utf-8")
+    return int(options.check and bool(stale))
 
 
 if __name__ == "__main__":

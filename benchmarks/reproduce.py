@@ -78,6 +78,7 @@ SCRIPTS |= {
     "mutants": "--quiet",
     "kornia": "--clock cpu",
     "xfeat_noise": "",
+    "sweep": "",
 }
 
 #: Scripts of another name than their result: ``kornia.py`` would be imported instead of the library.

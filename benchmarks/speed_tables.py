@@ -1,4 +1,4 @@
-"""Tables of the timing scripts' result files, for README.md and benchmarks/README.md; see readme.py."""
+"""Tables of the timing scripts' result files, for docs/results/speed.md; see readme.py."""
 
 from __future__ import annotations
 
@@ -113,6 +113,6 @@ def scaling() -> str:
     return on("scaling", text.grid(Table("", head, rows)))
 
 
-#: Tables of benchmarks/README.md.
+#: Tables by marker.
 TABLES: dict[str, Callable[[], str]] = {"bars": bars, "scaling": scaling}
 TABLES |= {f"rows {file}": partial(every_row, file) for file in SCRIPTS}

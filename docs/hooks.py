@@ -1,8 +1,8 @@
-"""What MkDocs calls while it builds: pages of the API, and marks in the others that are filled from the code.
+"""What MkDocs calls while it builds, and what the pages take from the code.
 
-``<!-- make: name argument -->`` on a line of its own is replaced by what the function of that name in ``MAKERS``
-returns. So nothing is said twice: README's words come from README, an experiment's from its docstring, a help text from
-the command, figures from the result files.
+Between ``<!-- make: name argument -->`` and ``<!-- end -->`` stands what the function of that name in ``MAKERS``
+returns; ``python benchmarks/readme.py`` writes it there, so that the pages are whole wherever they are read. Pages of
+the API and of the notebooks are made while the site is built.
 """
 
 from __future__ import annotations
@@ -20,10 +20,9 @@ from typing import Any
 
 REPO = Path(__file__).resolve().parents[1]
 PACKAGE = REPO / "dhtorch"
-sys.path += [str(REPO / "benchmarks"), str(REPO / "docs")]  # MkDocs forgets this after the import
+sys.path += [str(REPO / "docs")]  # MkDocs forgets this after the import
 
 import licences as terms  # noqa: E402
-import readme as tables  # noqa: E402
 from docstrings import markdown as as_markdown  # noqa: E402
 
 import dhtorch  # noqa: E402
@@ -34,7 +33,7 @@ from dhtorch.drawing import colours as palette  # noqa: E402
 #: Words of the command with a help text of their own.
 WORDS = ("", "inspect", "report", "complete", "extract", "integrate", "stream", "view")
 
-_MARK = re.compile(r"^<!-- make: (\w+) ?(.*?) -->$", re.M)
+_MARK = re.compile(r"^<!-- .*? -->\n", re.M)
 _ASKED = re.compile(
     r"Question: (?P<question>.*?\?)(?P<idea>.*?)(?P<when>Expectation[^:]*): (?P<expectation>.*)"
     r"What would refute it: (?P<refutation>.*)",
@@ -53,34 +52,29 @@ def on_config(config: Any) -> Any:
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """The API's pages, and README's pictures."""
+    """The API's pages."""
     from mkdocs.structure.files import File  # noqa: PLC0415
 
     for part in ("dhtorch", *parts()):
         files.append(File.generated(config, f"api/{part}.md", content=api_page(part)))
-    for target in pictures():
-        files.append(File.generated(config, f"readme/{target}", abs_src_path=str(REPO / target)))
     return files
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Fill the marks of a page."""
-    return filled(markdown)
+    """A page without the marks between which it is written."""
+    return _MARK.sub("", markdown)
 
 
-def filled(markdown: str) -> str:
-    """A page with its marks replaced.
+def made(mark: str) -> str:
+    """What stands under ``<!-- make: name argument -->``.
 
     Raises:
         ValueError: a mark that nobody makes, or that asks for something which is not there.
     """
-
-    def make(mark: re.Match[str]) -> str:
-        if mark[1] not in MAKERS:
-            raise ValueError(f"docs: found the mark {mark[1]!r}, expected one of {', '.join(MAKERS)}")
-        return MAKERS[mark[1]](*([mark[2]] if mark[2] else []))
-
-    return _MARK.sub(make, markdown)
+    name, _, argument = mark.partition(" ")
+    if name not in MAKERS:
+        raise ValueError(f"docs: found the mark {name!r}, expected one of {', '.join(MAKERS)}")
+    return MAKERS[name](*([argument] if argument else [])).strip("\n")
 
 
 # ----------------------------------------------------------------------------------------------------------- the API
@@ -146,60 +140,6 @@ def _doc(part: str) -> str:
 def _first(docstring: str | None) -> str:
     """The promise: the first paragraph of a docstring in one line, as Markdown."""
     return " ".join(as_markdown((docstring or "").strip().split("\n\n")[0]).split()).replace("|", "\\|")
-
-
-# ------------------------------------------------------------------------------------------------------------- README
-
-
-@cache
-def readme() -> str:
-    """README; its tables are those of the result files (``benchmarks/readme.py``, held by a test)."""
-    return (REPO / "README.md").read_text(encoding="utf-8")
-
-
-def pictures() -> list[str]:
-    """Files of the repository that README shows."""
-    return sorted(set(re.findall(r"!\[[^\]]*\]\(((?!https?:)[^)#]+)\)", readme())))
-
-
-def section(title: str) -> str:
-    """A section of README with its heading, without the markers of its tables."""
-    found = re.search(rf"^## ({re.escape(title)}.*?)(?=^## |\Z)", readme(), re.M | re.S)
-    if not found:
-        known = ", ".join(re.findall(r"^## (.*)$", readme(), re.M))
-        raise ValueError(f"README.md: found no section {title!r}, expected one of {known}")
-    return _adopted(re.sub(r"^#(#+ )", r"\1", f"## {found[1]}", flags=re.M))
-
-
-def readme_head(end: str = "The stages") -> str:
-    """README from its beginning up to a section."""
-    head, found, _ = readme().partition(f"\n## {end}")
-    if not found:
-        raise ValueError(f"README.md: found no section {end!r}, expected one")
-    return _adopted(head)
-
-
-def readme_table(title: str) -> str:
-    """The first table of a section of README."""
-    table = re.search(r"(?:^\|.*\n)+", section(title) + "\n", re.M)
-    if not table:
-        raise ValueError(f"README.md: found no table in section {title!r}, expected one")
-    return table[0]
-
-
-def speed() -> str:
-    """benchmarks/README.md, whose tables are those of the result files."""
-    return _adopted((REPO / "benchmarks" / "README.md").read_text(encoding="utf-8"))
-
-
-def _adopted(markdown: str) -> str:
-    """README's text on a page of the site: pictures where the site has them, links to other files as text."""
-    for target in pictures():
-        markdown = markdown.replace(f"]({target})", f"](readme/{target})")
-    for label, target in re.findall(r"(?<!!)\[([^\]]+)\]\(([^)#:]+)\)", markdown):
-        if (REPO / target).exists():
-            markdown = markdown.replace(f"[{label}]({target})", label)
-    return re.sub(r"<!--.*?-->\n?", "", markdown)
 
 
 # --------------------------------------------------------------------------------------------------- what code says
@@ -292,11 +232,6 @@ def archived() -> dict[str, dict[str, Any]]:
     return found
 
 
-def verdicts() -> str:
-    """Every archived answer, through README's own function."""
-    return str(tables.verdicts(list(archived())))
-
-
 def helps() -> str:
     """Every help text of the command, as a terminal shows it."""
     names = {word: f"dhtorch {word}".strip() for word in WORDS}
@@ -359,7 +294,5 @@ def licences() -> str:
 
 
 MAKERS: dict[str, Callable[..., str]] = {
-    "readme": section,
-    **{f.__name__: f for f in (readme_head, readme_table, speed, module, reader, choices, codes)},
-    **{f.__name__: f for f in (experiments, verdicts, helps, exit_codes, licences, colours)},
+    f.__name__: f for f in (module, reader, choices, codes, experiments, helps, exit_codes, licences, colours)
 }

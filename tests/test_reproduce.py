@@ -17,7 +17,7 @@ import speed_tables
 
 REPO = Path(__file__).resolve().parents[1]
 RESULTS = {path.stem for path in (REPO / "benchmarks/results").glob("*.json")}
-PAGES = ("README.md", "benchmarks/README.md", *sorted(str(p.relative_to(REPO)) for p in REPO.glob("docs/*.md")))
+PAGES = ("README.md", "benchmarks/README.md", *sorted(str(p.relative_to(REPO)) for p in REPO.glob("docs/**/*.md")))
 
 
 def test_every_result_has_a_command_and_every_command_its_result():

@@ -147,7 +147,9 @@ def test_statements_are_found():
     assert {"undistort", "project", "exp", "triangulate", "lucas_kanade", "pnp_ransac", "min_eigenvalue"} <= found
 
 
-@pytest.mark.parametrize("page", ["README.md", *sorted(f"docs/{p.name}" for p in (REPO / "docs").glob("*.md"))])
+@pytest.mark.parametrize(
+    "page", ["README.md", *sorted(p.relative_to(REPO).as_posix() for p in (REPO / "docs").rglob("*.md"))]
+)
 def test_what_a_page_says_was_tested_names_its_test(page):
     prose = re.sub(r"^```.*?^```", "", (REPO / page).read_text(encoding="utf-8"), flags=re.M | re.S)
     wrong = []

@@ -245,7 +245,8 @@ def chromium(folder, page, *flags, script=""):
 @pytest.mark.parametrize("dark", [False, True])
 def test_a_browser_draws_the_points(scene, tmp_path, dark):
     shot = tmp_path / "shot.png"
-    _, console = chromium(tmp_path, pages.page(scene), f"--screenshot={shot}", *["--force-dark-mode"] * dark)
+    flags = [f"--screenshot={shot}", *["--force-dark-mode"] * dark]
+    _, console = chromium(tmp_path, pages.page(scene), *flags, script='chooseColour("source")')
     assert console == []
     pixels = np.asarray(Image.open(shot).convert("RGB")).astype(int)
     stage = pixels[110:600, 30:700]
@@ -270,13 +271,14 @@ def test_a_browser_counts_and_obeys(scene, tmp_path):
       for (const [mode] of MODES) chooseColour(mode);
       $("all").click(); for (const place of ["camera", "above", "side"]) lookFrom(place);
       pick(shots[1].source.indexOf(2)); drawSpace(); drawPictures(); said.push($("sample-facts").textContent);
+      said.push($("read-out").hidden ? "" : $("read-out").textContent);
       said.push(String(before !== $("space").toDataURL()), document.querySelector("h1").textContent, document.title);
       document.body.dataset.said = JSON.stringify(said);
     """
     dom, console = chromium(tmp_path, pages.page(named), "--dump-dom", script=script)
     assert console == []
     attribute = re.search(r'data-said="([^"]*)"', dom)
-    first, second, sample, changed, heading, title = json.loads(html.unescape(attribute[1]))
+    first, second, sample, beside, changed, heading, title = json.loads(html.unescape(attribute[1]))
     for k, (said, least) in enumerate([(first, 0.5), (second, 0.0)]):
         s = scene.shots[k].samples
         answers = s["source"] == Source.RECOVERED
@@ -285,6 +287,7 @@ def test_a_browser_counts_and_obeys(scene, tmp_path):
         right = np.isfinite(s["error"]) & (s["score"] >= least)
         assert f"Of {s['candidate'].sum()} held-back returns" in said and right.any()
     assert "recovered" in sample and "parallax" in sample and changed == "true"
+    assert " m ± " in beside and "recovered, score" in beside
     assert heading == title == f"{HOSTILE} · dhtorch"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -27,7 +28,7 @@ from dhtorch.viewer.exhibit import NO_POINTS, NO_SWEPT, Cloud, DepthImage, Exhib
 #: Points of a depth map that are shown, drawn at random: enough to know the place, few enough for a page.
 DENSE = 12_000
 
-#: Swept pixels that are shown of one view, drawn at random.
+#: Swept pixels that are shown of one view, in rows and columns as far apart as that takes.
 SWEPT = 24_000
 
 #: Longer side of the pictures, px, and quality of their JPEG.
@@ -157,14 +158,18 @@ def _cloud(frame: Frame, wanted: torch.Tensor) -> Cloud:
 
 
 def _swept(frame: Frame, found: DepthMap) -> SweptCloud:
-    """Some of the swept pixels of a map (B = 1)."""
+    """The swept pixels of a map (B = 1), or those in every second, third … row and column."""
     found = found.to("cpu")
     hw = found.depth.shape[-2], found.depth.shape[-1]
-    some = _some((found.source == Source.SWEPT).flatten(1)[0].nonzero()[:, 0], SWEPT)
+    apart = math.ceil(math.sqrt(max(1, int((found.source == Source.SWEPT).sum())) / SWEPT))
+    lattice = torch.zeros(hw, dtype=torch.bool)
+    lattice[::apart, ::apart] = True
+    some = ((found.source == Source.SWEPT)[0] & lattice).flatten().nonzero()[:, 0][:SWEPT]
     uv = pixels(frame, hw)[some].cpu()[None]
     depth, sigma, score = (x.flatten(1)[:, some].float() for x in (found.depth, found.sigma, found.score))
     xyz = cam.unproject(frame.camera.to("cpu"), uv, depth)
-    return SweptCloud(*(x[0].numpy() for x in (xyz.float(), _colours(frame, uv), sigma, score)))
+    step = apart * frame.hw[1] / hw[1]
+    return SweptCloud(*(x[0].numpy() for x in (xyz.float(), _colours(frame, uv), sigma, score)), step)
 
 
 def _some(places: torch.Tensor, most: int) -> torch.Tensor:

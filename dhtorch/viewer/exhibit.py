@@ -41,6 +41,7 @@ class SweptCloud(Cloud):
 
     sigma: np.ndarray  # (P,) m, float32
     score: np.ndarray  # (P,) in [0, 1], float32
+    step_px: float = 0.0  # between neighbours in rows and columns of the picture, which make a surface; 0 = no order
 
 
 @dataclass(frozen=True)

@@ -134,7 +134,7 @@ def _cloud(cloud: Cloud) -> dict[str, Any]:
 
 
 def _surely(cloud: SweptCloud) -> dict[str, Any]:
-    return {"sigma": _packed(cloud.sigma, "f4"), "score": _packed(_shares(cloud.score), "u2")}
+    return {"sigma": _packed(cloud.sigma, "f4"), "score": _packed(_shares(cloud.score), "u2"), "step_px": cloud.step_px}
 
 
 def _shares(score: np.ndarray) -> np.ndarray:

@@ -40,7 +40,7 @@ const scales = {
 };
 const MODES = [["picture", "own colour"], ["source", "source"], ["hole", "class of hole"], ["gate", "gate"], ["depth", "depth"], ["sigma", "sigma / depth"], ["score", "score"], ["error", "error against held-back returns"]]
   .filter(([key]) => key !== "error" || hasErrors);
-const state = { now: 0, all: false, mode: "source", threshold: 0, picked: null, playing: null };
+const state = { now: 0, all: false, mode: "picture", threshold: 0, picked: null, playing: null };
 const show = Object.fromEntries([...document.querySelectorAll("[data-show]")].map((box) => [box.dataset.show, box.checked]));
 
 // The colour of sample k: in categories the code's, on scales the number's, silent ones pale.
@@ -110,10 +110,49 @@ function buildShot(s) {
     rays: space.layer({ position: Float32Array.from(rays), colour: colours(rays.length / 3, () => RECOVERED), score: twice(some, 2 * ends.length) }),
     seen: space.layer({ position: transformed(T, s.seen.xyz), colour: tone(s.seen.n) }),
     held: space.layer({ position: transformed(T, s.held.xyz), colour: tone(s.held.n) }),
-    swept: space.layer({ position: transformed(T, s.swept.xyz), colour: tone(s.swept.n), score: s.swept.score }),
+    ...sweptLayers(s, T),
     frustums: frustums(s),
   };
 }
+
+// Swept pixels: triangles between neighbours of one surface, the surer the more opaque, and points where there are none.
+const [SURE, UNSURE, FAINTEST, JUMP] = [0.02, 0.15, 0.25, 1.08];
+function sweptLayers(s, T) {
+  const cloud = s.swept, { n, depth, sigma, step_px: step } = cloud, made = { swept: space.layer({ position: transformed(T, cloud.xyz), colour: new Float32Array(3 * n), score: cloud.score }) };
+  const view = DATA.views[s.view_0];
+  if (!space.gl || !n || n > 65535 || !step || !view) return made;
+  const at = new Map(), place = [], wide = 1 + Math.ceil(view.hw[1] / step), used = new Uint8Array(n), index = [];
+  for (let k = 0; k < n; k++) {
+    const [u, v] = [0, 1].map((c) => Math.round(((cloud.xyz[3 * k + c] / depth[k]) * view.f[c] + view.c[c]) / step));
+    at.set(v * wide + u, k);
+    place.push(v * wide + u);
+  }
+  const joined = (...ks) => { const z = ks.map((k) => depth[k]); if (ks.includes(undefined) || Math.max(...z) > JUMP * Math.min(...z)) return; index.push(...ks); for (const k of ks) used[k] = 1; };
+  for (let k = 0; k < n; k++) {
+    const [a, b, c] = [1, wide, wide + 1].map((d) => at.get(place[k] + d));
+    joined(k, a, b);
+    joined(a, c, b);
+  }
+  const opacity = Float32Array.from({ length: n }, (_, k) => 1 - (1 - FAINTEST) * Math.max(0, Math.min(1, (sigma[k] / depth[k] - SURE) / (UNSURE - SURE))));
+  const loose = [...Array(n).keys()].filter((k) => !used[k]), rows = made.swept && transformed(T, cloud.xyz);
+  made.surface = index.length ? space.triangles(Uint16Array.from(index), opacity) : null;
+  made.loose = loose;
+  made.grains = space.layer({ position: Float32Array.from(loose.flatMap((k) => [...rows.subarray(3 * k, 3 * k + 3)])), colour: new Float32Array(3 * loose.length), score: Float32Array.from(loose, (k) => cloud.score[k]) });
+  return made;
+}
+
+// A grid of whole metres, of ten or a tenth where the scene asks for it, under nearly all points, level with the first camera.
+const ground = (() => {
+  const rows = shots.flatMap((s) => [s.xyz, s.swept.xyz].flatMap((xyz) => { const out = [], step = 3 * Math.max(1, Math.ceil(xyz.length / 6000)); for (let k = 0; k + 2 < xyz.length; k += step) if (Number.isFinite(xyz[k])) out.push(place(s.T_world_from_0, xyz[k], xyz[k + 1], xyz[k + 2])); return out; }));
+  if (!rows.length) return { metres: 1, layer: null };
+  const span = (a, low, high) => [low, high].map((q) => quantile(rows.map((p) => dot(p, a)), q));
+  const [across, along] = [eye.right, eye.ahead].map((a) => span(a, 0.02, 0.98)), floor = span(eye.down, 0.02, 0.98)[1];
+  const extent = Math.max(across[1] - across[0], along[1] - along[0]), metres = extent > 25 ? 10 : extent > 1.5 ? 1 : 0.1;
+  const whole = ([low, high]) => { const first = Math.floor(low / metres), last = Math.ceil(high / metres); return Array.from({ length: Math.min(last - first, 60) + 1 }, (_, k) => (first + k) * metres); };
+  const [us, vs] = [whole(across), whole(along)], at = (u, v) => add(add(add([0, 0, 0], eye.right, u), eye.ahead, v), eye.down, floor);
+  const lines = [...us.flatMap((u) => [at(u, vs[0]), at(u, vs.at(-1))]), ...vs.flatMap((v) => [at(us[0], v), at(us.at(-1), v)])].flat();
+  return { metres, layer: space.layer({ position: Float32Array.from(lines), colour: colours(lines.length / 3, () => SILENT) }) };
+})();
 
 // Cameras as pyramids, a tenth of the typical depth high.
 function frustums(s) {
@@ -149,6 +188,7 @@ function recolour() {
     space.recolour(l.bars, colours(2 * l.groups.recovered.length, (k) => own(l.groups.recovered[k >> 1])));
     for (const name of ["seen", "held"]) space.recolour(l[name], colours(s[name].n, (k) => returnColour(s[name], k, name === "held")));
     space.recolour(l.swept, colours(s.swept.n, (k) => sweptColour(s.swept, k)));
+    if (l.grains) space.recolour(l.grains, colours(l.loose.length, (k) => sweptColour(s.swept, l.loose[k])));
     s.css = Array.from({ length: s.n }, (_, k) => css(sampleColour(s, k)));
   });
   if (!layers.length) shots.forEach((s) => { s.css = Array.from({ length: s.n }, (_, k) => css(sampleColour(s, k))); });
@@ -172,7 +212,8 @@ function drawSpace() {
       space.points(l.sensor, { size: 1.3 * grain, smallest: l.seen ? 1.6 : 2.5 });
     }
     if (show.held) space.points(l.held, { size: grain, smallest: 1.4 });
-    if (show.swept) space.points(l.swept, { size: grain, smallest: 1.4, threshold });
+    if (show.swept && l.surface) space.surface(l.swept, l.surface, { threshold });
+    if (show.swept) space.points(l.surface ? l.grains : l.swept, { size: grain, smallest: 1.4, threshold });
     if (show.recovered && l.recovered) {
       const large = 1 + 1.8 * Math.min(1, 3000 / l.recovered.n); // few points are drawn large, a dense cloud is not
       space.points(l.recovered, { size: large * grain, smallest: 1.4 * large, threshold, rim: (dark ? BY_NIGHT : BY_DAY).rim, rimmed: 0.75 });
@@ -186,13 +227,19 @@ function drawSpace() {
     }
   });
   if (show.frustums && DATA.placed) space.lines(path);
+  if (show.grid) space.lines(ground.layer, { alpha: 0.45 });
   mark();
 }
 
-// A ring around the picked sample: an element over the canvas, so that nothing in space hides it.
+// A ring around the picked sample and its depth beside it: elements over the canvas, so that nothing in space hides them.
 function mark() {
-  const p = state.picked === null ? [NaN] : layers[state.now].world.subarray(3 * state.picked, 3 * state.picked + 3);
-  const at = Number.isFinite(p[0]) ? space.onScreen(p) : null;
-  $("mark").toggleAttribute("hidden", !at);
-  if (at) $("mark").style.transform = `translate(${at[0]}px, ${at[1]}px)`;
+  const k = state.picked, p = k === null ? [NaN] : layers[state.now].world.subarray(3 * k, 3 * k + 3);
+  const at = Number.isFinite(p[0]) ? space.onScreen(p) : null, box = space.canvas;
+  for (const id of ["mark", "read-out"]) $(id).toggleAttribute("hidden", !at);
+  if (!at) return;
+  $("mark").style.transform = `translate(${at[0]}px, ${at[1]}px)`;
+  const s = shots[state.now], name = s.source[k] === 1 ? "sensor" : "recovered";
+  $("read-out").replaceChildren(element("b", {}, `${short(s.depth[k])} m ± ${short(s.sigma[k])} m`), ` ${name}${s.source[k] === 2 ? `, score ${s.score[k].toFixed(2)}` : ""}`);
+  const left = Math.max(4, Math.min(at[0] + 14, box.clientWidth - $("read-out").offsetWidth - 4)), top = Math.max(4, Math.min(at[1] - 14, box.clientHeight - 34));
+  $("read-out").style.transform = `translate(${left}px, ${top}px)`;
 }

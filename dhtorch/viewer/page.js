@@ -97,6 +97,7 @@ function tellColours() {
       : [[DATA.colours.sensor, "sensor"], [DATA.colours.recovered, "recovered"], ...(hasSwept ? [[DATA.colours.swept, "swept"]] : []), ...(hasViews ? [[DATA.colours.silent, "silent (on the pictures)"]] : [])];
     rows.push(element("ul", { class: "keys" }, ...list.map(([colour, name]) => key(colour, name))));
   }
+  rows.push(element("p", { class: "grid-size" }, `grid: ${ground.metres} m`));
   box.replaceChildren(element("h2", {}, MODES.find(([k]) => k === mode)[1]), ...rows);
 }
 
@@ -153,8 +154,8 @@ function lookFrom(name) {
   }
   eye.turn(...{ over: [-0.55, 0.45], above: [0, 1.5 - eye.pitch], side: [-1.3, 0.15], camera: [0, 0] }[name]);
   const points = [...Array(s.n).keys()].filter((k) => s.source[k]).map((k) => l.world.subarray(3 * k, 3 * k + 3));
-  if (!points.length) for (let k = 0; k < s.swept.n; k += 20) points.push(place(s.T_world_from_0, ...s.swept.xyz.subarray(3 * k, 3 * k + 3)));
-  eye.fit([...points, o], space.canvas.clientWidth / Math.max(space.canvas.clientHeight, 1), 0.12 * size.depth);
+  for (let k = 0; k < s.swept.n; k += 20) points.push(place(s.T_world_from_0, ...s.swept.xyz.subarray(3 * k, 3 * k + 3)));
+  eye.fit([...points, o], space.canvas.clientWidth / Math.max(space.canvas.clientHeight, 1), 0.07 * size.depth);
   redraw();
 }
 
@@ -214,7 +215,7 @@ const KEYS = {
   c: () => chooseColour(MODES[(MODES.findIndex(([k]) => k === state.mode) + 1) % MODES.length][0]),
   "+": () => { eye.zoom(0.9); redraw(); }, "=": () => { eye.zoom(0.9); redraw(); }, "-": () => { eye.zoom(1 / 0.9); redraw(); },
   o: () => lookFrom("over"), v: () => lookFrom("camera"), a: () => lookFrom("above"), d: () => lookFrom("side"),
-  s: () => toggle("sensor"), r: () => toggle("recovered"), h: () => toggle("held"), w: () => toggle("swept"), u: () => toggle("sigma"), f: () => toggle("frustums"), t: () => toggle("tracks"),
+  s: () => toggle("sensor"), r: () => toggle("recovered"), h: () => toggle("held"), w: () => toggle("swept"), u: () => toggle("sigma"), f: () => toggle("frustums"), t: () => toggle("tracks"), g: () => toggle("grid"),
 };
 
 function listen() {
@@ -256,7 +257,7 @@ function begin() {
   }
   listen();
   choosePair(0);
-  chooseColour("source");
+  chooseColour(state.mode);
   lookFrom("over");
 }
 

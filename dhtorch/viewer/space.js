@@ -17,6 +17,23 @@ void main() {
   if (r > 1.0) discard;
   gl_FragColor = vec4(mix(tint, rim, rimmed * smoothstep(0.55, 0.95, r)), 1.0);
 }`;
+const SURFACE_VERTEX = `
+attribute vec3 position; attribute vec3 colour; attribute float score; attribute float opacity;
+uniform mat4 matrix; uniform float threshold; varying vec3 tint; varying float dense;
+void main() {
+  gl_Position = matrix * vec4(position, 1.0);
+  tint = colour;
+  dense = score < threshold ? -1.0 : opacity;
+}`;
+// Opacity as a share of the pixels that are drawn: no order of the triangles has to be kept.
+const SURFACE_FRAGMENT = `
+precision mediump float; varying vec3 tint; varying float dense;
+void main() {
+  vec2 p = mod(floor(gl_FragCoord.xy), 4.0);
+  float rank = mod(p.x + p.y, 2.0) * 0.5 + mod(floor(p.x / 2.0) + floor(p.y / 2.0), 2.0) * 0.25 + mod(p.y, 2.0) * 0.125;
+  if (dense <= rank) discard;
+  gl_FragColor = vec4(tint, 1.0);
+}`;
 const LINE_VERTEX = `
 attribute vec3 position; attribute vec3 colour; attribute float score;
 uniform mat4 matrix; uniform float threshold; varying vec3 tint;
@@ -89,17 +106,19 @@ class Eye {
 
   zoom(factor) { this.distance = Math.max(1e-3, Math.min(1e5, this.distance * factor)); }
 
-  // Moves target and distance until nearly all of the points lie in the picture, the last one with room around it.
+  // Moves target and distance until nearly all of the points fill the picture, the last one with room around it.
   fit(points, aspect, room) {
-    const d = this.direction, x = unit(cross(d, this.down.map((v) => -v))), y = cross(x, d), last = points[points.length - 1];
-    const middle = (a) => {
-      const at = points.map((p) => dot(p, a)), low = quantile(at, 0.01), high = quantile(at, 0.99), own = dot(last, a);
-      return (Math.min(low, own) + Math.max(high, own)) / 2;
-    };
-    const [cx, cy, cz] = [x, y, d].map(middle), t = Math.tan(this.fov / 2) * 0.86;
-    this.target = [0, 1, 2].map((k) => cx * x[k] + cy * y[k] + cz * d[k]);
-    const need = (p, r) => Math.max((Math.abs(dot(p, x) - cx) + r) / (t * aspect), (Math.abs(dot(p, y) - cy) + r) / t) - (dot(p, d) - cz);
-    this.distance = Math.max(1e-3, quantile(points.map((p) => need(p, 0)), 0.99), need(last, room));
+    const d = this.direction, x = unit(cross(d, this.down.map((v) => -v))), y = cross(x, d), t = Math.tan(this.fov / 2) * 0.92;
+    const own = points[points.length - 1], span = (at, mine, r) => [Math.min(quantile(at, 0.01), mine - r), Math.max(quantile(at, 0.99), mine + r)];
+    this.target = [0, 1, 2].map((k) => quantile(points.map((p) => p[k]), 0.5));
+    this.distance = quantile(points.map((p) => Math.hypot(...sub(p, this.target))), 0.98) / t;
+    for (let turn = 0; turn < 30; turn++) { // what lies near moves more on the screen than what lies far: step by step
+      const eye = this.position, seen = points.map((p) => sub(p, eye)).map((p) => [dot(p, x), dot(p, y), Math.max(dot(p, d), 0.05 * this.distance)]);
+      const [ox, oy, oz] = seen[seen.length - 1], margin = room / oz;
+      const [left, right] = span(seen.map(([a, , c]) => a / c), ox / oz, margin), [low, high] = span(seen.map(([, b, c]) => b / c), oy / oz, margin);
+      this.target = add(add(this.target, x, ((left + right) / 2) * this.distance), y, ((low + high) / 2) * this.distance);
+      this.distance = Math.max(1e-3, this.distance * Math.max((right - left) / (2 * t * aspect), (high - low) / (2 * t)) ** 0.6);
+    }
   }
 
   matrix(aspect) {
@@ -117,6 +136,7 @@ class Space {
     const gl = this.gl;
     this.programs = {
       points: this.program(POINT_VERTEX, POINT_FRAGMENT),
+      surface: this.program(SURFACE_VERTEX, SURFACE_FRAGMENT),
       lines: this.program(LINE_VERTEX, LINE_FRAGMENT),
       picture: this.program(PICTURE_VERTEX, PICTURE_FRAGMENT),
     };
@@ -146,6 +166,13 @@ class Space {
   }
 
   // {position, colour, score} → buffers; without scores nothing is hidden by a threshold.
+  triangles(index, opacity) {
+    const gl = this.gl, made = gl.createBuffer();
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, made);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, index, gl.STATIC_DRAW);
+    return { n: index.length, index: made, opacity: this.buffer(opacity) };
+  }
+
   layer({ position, colour, score }) {
     const n = position.length / 3;
     if (!this.gl || !n) return null;
@@ -205,6 +232,16 @@ class Space {
     this.use("points", { position: [position, 3], colour: [colour, 3], score: [score, 1] }, uniforms);
     gl.disable(gl.BLEND);
     gl.drawArrays(gl.POINTS, 0, n);
+  }
+
+  // Triangles between the points of a layer: {n, index, opacity}.
+  surface(layer, triangles, { threshold = 0 }) {
+    if (!layer || !triangles) return;
+    const { position, colour, score } = layer, gl = this.gl;
+    this.use("surface", { position: [position, 3], colour: [colour, 3], score: [score, 1], opacity: [triangles.opacity, 1] }, { threshold });
+    gl.disable(gl.BLEND);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, triangles.index);
+    gl.drawElements(gl.TRIANGLES, triangles.n, gl.UNSIGNED_SHORT, 0);
   }
 
   lines(layer, { alpha = 1, threshold = 0 } = {}) {

@@ -1,0 +1,190 @@
+"""README's pictures, of real frames and of result files.
+
+    python docs/pictures.py                    all of them, into docs/assets/
+    python docs/pictures.py triptych risk      some
+
+``triptych`` and ``viewer`` show holo_a below DHTORCH_DATA (HoloLens frames of ardaduz/deep-video-mvs, MIT), returns
+beyond 2.5 m hidden; ``viewer`` is the page of ``dhtorch view``, turned by a headless Chromium; ``risk`` is drawn from
+``benchmarks/results/method_comparison.json``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import io
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from PIL import Image
+
+from dhtorch import calibration, data, dense
+from dhtorch.codes import Source
+from dhtorch.data.pairs import by_choice
+from dhtorch.data.scene import Scene
+from dhtorch.drawing import Axis, Key, Panel, Stroke, colours, save
+from dhtorch.evaluate.holdout import range_split
+from dhtorch.integrate.sweeps import Sweep
+from dhtorch.methods import AUTO
+from dhtorch.studies.exhibits import look
+from dhtorch.studies.protocol import Settings
+from dhtorch.tree import stack
+from dhtorch.viewer import html
+
+REPO = Path(__file__).resolve().parents[1]
+ASSETS = REPO / "docs" / "assets"
+
+#: Metres beyond which returns are hidden, and the position of the frame that is shown.
+CUTOFF, FRAME = 2.5, 0
+
+#: Depths of one colour scale, m.
+DEPTHS = (1.0, 6.0)
+
+CHROMIUM = ("chromium", "chromium-browser", "chromium-headless-shell", "google-chrome")
+
+
+def kitchen() -> Scene:
+    """The scene that is shown.
+
+    Raises:
+        SystemExit: DHTORCH_DATA is not set.
+    """
+    root = os.environ.get("DHTORCH_DATA")
+    if not root:
+        raise SystemExit("DHTORCH_DATA is not set: expected the folder that holds holo_a")
+    return Scene(data.open(Path(root) / "holo_a"), near=CUTOFF)
+
+
+def triptych(path: Path) -> None:
+    """A picture, what the sensor may say of it, and what is known of it now, on one scale of depth."""
+    scene = kitchen()
+    recording = scene.recording
+    (pair,) = (p for p in by_choice(scene, stride=1) if p.anchor == FRAME)
+    whole = recording[FRAME]
+    near = range_split(whole, CUTOFF)
+    others = stack([range_split(recording[k], CUTOFF) for k in pair.offered])
+    found = dense.complete(near, others, calibration=calibration.load("dense"))
+    image = whole.image[0].permute(1, 2, 0)
+    depth, source = found.depth[0].numpy(), found.source[0].numpy()
+    sensed, known = source == Source.SENSOR, source != Source.NONE
+    figure = Figure((15, 3.9), facecolor=colours.PICTURE)
+    axes = figure.subplots(1, 3)
+    axes[0].imshow(image)
+    for axis, mask in zip(axes[1:], (sensed, known), strict=True):
+        shown = axis.imshow(np.where(mask, depth, np.nan), cmap=colours.DEPTH, vmin=DEPTHS[0], vmax=DEPTHS[1])
+    titles = (
+        f"holo_a, frame {int(recording.number[FRAME])}",
+        f"a sensor that reaches {CUTOFF:g} m: {100 * sensed.mean():.0f} %",
+        f"completed: {100 * known.mean():.0f} %, the rest is silent",
+    )
+    for axis, title in zip(axes, titles, strict=True):
+        axis.set_title(title, fontsize=13)
+        axis.axis("off")
+    figure.subplots_adjust(wspace=0.03)
+    figure.colorbar(shown, ax=axes, label="depth, m", shrink=0.78, pad=0.01)
+    figure.savefig(path, dpi=90, bbox_inches="tight", pil_kwargs={"quality": 88})
+
+
+def risk(path: Path) -> None:
+    """Mean error of the surest answers against the share answered, pooled over scenes, by method."""
+    rows = json.loads((REPO / "benchmarks/results/method_comparison.json").read_text())["rows"]
+    share = np.linspace(0.05, 1.0, 191)  # of fewer a mean says little
+    panel = Panel(
+        "Error of the surest answers, eleven real scenes",
+        Axis(0.0, 0.8, "held-back returns answered, %, mean over scenes", percent=True),
+        Axis(0.0, 0.15, "mean relative error (at most 1), %, mean over scenes", percent=True),
+        size=(560, 330),
+    )
+    keys = []
+    for name in ("paper", "map", "auto"):
+        curves = [
+            r["curves"]["risk_coverage"]
+            for r in rows
+            if r["pair"] is None and r["truth"] == "full" and r["method"] == name and r.get("curves") and not r["role"]
+        ]
+        curves = [c for c in curves if c["coverage"]]
+        parts = [_at(c, share) for c in curves]
+        coverage, error = (np.mean([p[k] for p in parts], 0).tolist() for k in (0, 1))
+        stroke = Stroke(colours.METHODS[name], 2.2)
+        panel.line(coverage, error, stroke)
+        panel.dot(coverage[-1], error[-1], stroke, width=7)
+        keys.append(Key(name, stroke.colour, stroke=stroke))
+    save(panel.figure(keys=keys), path)
+
+
+def _at(curve: dict[str, Any], share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Coverage and risk of a scene where so large a share of its own answers is kept."""
+    coverage, error = (np.array(curve[k], float) for k in ("coverage", "risk"))
+    at = share * coverage[-1]
+    return at, np.interp(at, coverage, error)
+
+
+def viewer(path: Path, frames: int = 40, height: int = 450) -> None:
+    """The page of ``dhtorch view``, turned from side to side.
+
+    Raises:
+        SystemExit: no Chromium is installed.
+    """
+    browser = next(filter(None, map(shutil.which, CHROMIUM)), None)
+    if browser is None:
+        raise SystemExit(f"found none of {', '.join(CHROMIUM)}: the page is drawn by a browser")
+    common = Settings(cutoff=CUTOFF)
+    shown = look(kitchen(), AUTO, by_choice, common, most=1, sweep=Sweep.asked(True))
+    script = f"""
+      const made = [];
+      setTimeout(() => {{
+        lookFrom("over");
+        const yaw = eye.yaw, pitch = eye.pitch;
+        for (let k = 0; k < {frames}; k++) {{
+          const turn = (2 * Math.PI * k) / {frames};
+          eye.yaw = yaw + 0.35 * Math.sin(turn);
+          eye.pitch = pitch - 0.12 * (1 - Math.cos(turn));
+          drawSpace();
+          made.push(space.canvas.toDataURL("image/png"));
+        }}
+        document.body.replaceChildren(...made.map((src) => Object.assign(new Image(), {{ src, className: "made" }})));
+      }}, 1500);
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        page = Path(folder) / "page.html"
+        page.write_text(html.page(shown).replace("</script>\n</body>", f"{script}</script>\n</body>"), encoding="utf-8")
+        options = ["--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        options += [f"--window-size=1180,{height + 330}", "--virtual-time-budget=60000", "--dump-dom"]
+        done = subprocess.run([browser, *options, page.as_uri()], capture_output=True, text=True, check=True)
+    found = re.findall(r'<img src="data:image/png;base64,([^"]+)"', done.stdout)
+    pictures = [Image.open(io.BytesIO(base64.b64decode(text))).convert("RGB") for text in found]
+    pictures[0].save(
+        path, save_all=True, append_images=pictures[1:], duration=90, loop=0, quality=60, method=4, minimize_size=True
+    )
+
+
+PICTURES = {"triptych": (triptych, "jpg"), "risk": (risk, "png"), "viewer": (viewer, "webp")}
+
+
+def main() -> int:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(PICTURES))
+    names = parser.parse_args().names or list(PICTURES)
+    for name in names:
+        if name not in PICTURES:
+            parser.error(f"found {name!r}, expected {', '.join(PICTURES)}")
+    torch.set_num_threads(1)
+    for name in names:
+        draw, ending = PICTURES[name]
+        draw(ASSETS / f"{name}.{ending}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
