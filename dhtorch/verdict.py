@@ -12,13 +12,13 @@ through everything that stands on it, and only a given trajectory (``T_world_fro
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from dhtorch import dense, evidence, tree
-from dhtorch.codes import State
+from dhtorch.codes import Gate, State
 from dhtorch.evidence import References, Said
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3, sweep
@@ -97,18 +97,53 @@ def judge(
     trace = {} if trace is None else trace
     with torch.no_grad():
         asked = None if others is None else _asked(method, anchor, others, seed, fit, hint, trace)
-        hw = dense.map_hw(anchor.hw, size)
-        returns = method.backproject(anchor, dense.pixels(anchor, hw)).map(lambda x: x.unflatten(1, hw))
-        own = depth_map is None
-        grid = _usable(returns.depth if depth_map is None else _on_grid(depth_map, anchor, hw))
-        samples = method.look(anchor) if asked is None else asked.samples
-        joined = Estimate.silent(samples, 0, n_views=0) if asked is None else asked.joined
-        found = evidence.references(samples, joined, near=not own)
-        answers = evidence.by_answers(grid, anchor.hw, found, tolerance, None if own else returns)
-        pictures = maps = evidence.silent(grid)
-        if asked is not None and views:
-            pictures, maps = _asked_views(grid, anchor, asked, other_maps, own, partners, tolerance, trace)
-        return _joined(grid, anchor, found, asked, own, answers, pictures, maps)
+        offered = trace["choice"].index if "choice" in trace else None
+        options: dict[str, Any] = {"views": views, "partners": partners, "size": size, "tolerance": tolerance}
+        return judged(depth_map, anchor, asked, offered, other_maps=other_maps, method=method, **options)
+
+
+@torch.no_grad()
+def judged(
+    depth_map: Tensor | None,  # (B, h, w) m, 0 or not finite = says nothing; None = the sensor's own
+    anchor: Frame,
+    asked: dense.Asked | None,
+    offered: Tensor | None = None,  # (views, B) which of those offered were asked; None = all
+    *,
+    other_maps: Tensor | None = None,  # (V, B, h', w') m
+    method: Method = AUTO,
+    views: bool = True,
+    partners: int = 2,
+    size: int = 320,
+    tolerance: float = 0.025,
+) -> Verdict:
+    """The second half of :func:`judge`: what was asked already says of a map; for several maps of one frame.
+
+    Arguments, result, errors and cost as there. Gradient: none.
+    """
+    hw = dense.map_hw(anchor.hw, size)
+    returns = method.backproject(anchor, dense.pixels(anchor, hw)).map(lambda x: x.unflatten(1, hw))
+    own = depth_map is None
+    grid = _usable(returns.depth if depth_map is None else _resized(depth_map.to(anchor.camera.f), hw))
+    samples = method.look(anchor) if asked is None else asked.samples
+    joined = Estimate.silent(samples, Gate.NO_TRACK, n_views=0) if asked is None else asked.joined
+    found = evidence.references(samples, joined, near=not own)
+    answers = evidence.by_answers(grid, anchor.hw, found, tolerance, None if own else returns)
+    pictures = maps = evidence.silent(grid)
+    if asked is not None and views:
+        number = offered if offered is not None else torch.arange(len(asked.fits.code))[:, None].expand(-1, len(grid))
+        source = None if own else other_maps
+        pictures, maps = _asked_views(_Judged(grid, anchor, asked, number.to(grid.device), own), source, partners, tolerance)
+    return _joined(grid, anchor, found, asked, own, answers, pictures, maps)
+
+
+class _Judged(NamedTuple):
+    """A map on its grid, and the views that may speak of it."""
+
+    grid: Tensor  # (B, h, w) m
+    anchor: Frame
+    asked: dense.Asked
+    number: Tensor  # (views, B) of those asked, among those offered
+    own: bool  # the sensor's own map
 
 
 def _asked(
@@ -127,35 +162,24 @@ def _asked(
     return dense.views_asked(joined, others, trace)
 
 
-def _asked_views(
-    grid: Tensor,
-    anchor: Frame,
-    asked: dense.Asked,
-    other_maps: Tensor | None,
-    own: bool,
-    partners: int,
-    tolerance: float,
-    trace: Trace,
-) -> tuple[Said, Said]:
+def _asked_views(of: _Judged, other_maps: Tensor | None, partners: int, tolerance: float) -> tuple[Said, Said]:
     """What pictures and maps of the views say that are worth most; a view's number is its place among those offered."""
-    size = max(grid.shape[-2:])
-    base = sweep.base(*dense.resized(anchor, size))
+    grid, asked = of.grid, of.asked
+    base = sweep.base(*dense.resized(of.anchor, max(grid.shape[-2:])))
     index, wanted = dense.worthiest(asked, partners)
     wanted = asked.fits.ok.gather(0, index) & (wanted | _moved(asked).gather(0, index))
-    chosen = [dense.partner_of(asked, k, size, use, base.image) for k, use in zip(index, wanted, strict=True)]
+    chosen = [dense.partner_of(asked, k, max(base.hw), use, base.image) for k, use in zip(index, wanted, strict=True)]
     pictures = evidence.by_views(grid, base, chosen, tolerance)
-    batch = torch.arange(grid.shape[0], device=grid.device)
-    choice = trace["choice"].index if "choice" in trace else torch.zeros_like(index)
-    number = torch.stack([choice[k, batch] for k in index])
+    batch = torch.arange(len(grid), device=grid.device)
+    number = of.number.gather(0, index)
     maps = evidence.silent(grid)
-    if own:
-        seen = [asked.frames[k, batch] for k in index]
-        depths = [_usable(_of_sensor(frame, base.hw)) for frame in seen]
-        maps = evidence.by_maps(grid, base, chosen, depths, tolerance)
-    elif other_maps is not None:
-        other_maps = other_maps.to(grid)
-        depths = [_usable(_resized(other_maps[n, batch], base.hw)) for n in number]
-        maps = evidence.by_maps(grid, base, chosen, depths, tolerance)
+    if of.own or other_maps is not None:
+        if of.own:
+            depths = [_of_sensor(asked.frames[k, batch], base.hw) for k in index]
+        else:
+            assert other_maps is not None
+            depths = [_resized(other_maps.to(grid)[n, batch], base.hw) for n in number]
+        maps = evidence.by_maps(grid, base, chosen, [_usable(depth) for depth in depths], tolerance)
     return _numbered(pictures, number), _numbered(maps, number)
 
 
@@ -177,11 +201,6 @@ def _numbered(said: Said, number: Tensor) -> Said:
 def _usable(depth: Tensor) -> Tensor:
     depth = depth.nan_to_num(0.0, 0.0, 0.0)
     return torch.where(depth > 0, depth, 0.0)
-
-
-def _on_grid(depth_map: Tensor, anchor: Frame, hw: tuple[int, int]) -> Tensor:
-    """The map at the pixels of a grid, read at the nearest of its own."""
-    return _resized(depth_map.to(anchor.camera.f), hw)
 
 
 def _resized(depth_map: Tensor, hw: tuple[int, int]) -> Tensor:
