@@ -23,12 +23,12 @@ from dhtorch import tree
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.lookup import nearest
+from dhtorch.geometry.start import coarse_flow
 from dhtorch.method import Method
 from dhtorch.pair import under_pose
 from dhtorch.records import Frame, Pose, Samples, Tracks
 from dhtorch.stages.pose import pnp_ransac
 from dhtorch.stages.track import lucas_kanade
-from dhtorch.geometry.start import coarse_flow
 
 #: How pairs of a window are tracked and placed.
 TRACKING = Method(
@@ -52,8 +52,9 @@ FOCALS = (0.8, 0.87, 0.93, 0.95, 1.05, 1.07, 1.15, 1.25)
 #: Factors that take a depth in another unit to metres.
 UNITS = {"mm read as m": 1e-3, "m read as mm": 1e3, "inch read as m": 0.0254, "m read as inch": 1 / 0.0254}
 
-#: Pairs of a window, fewest that may name a cause, and frames from one of a pair to the other.
-PAIRS, FEWEST, GAPS = 8, 4, (4, 8)
+#: Pairs of a window, fewest that may name a cause, frames from one of a pair to the other, the widest first in which
+#: such a share of the textured samples is found again.
+PAIRS, FEWEST, GAPS, FOUND = 8, 4, (8, 4, 2, 1), 0.4
 
 
 @dataclass(frozen=True)
@@ -106,6 +107,7 @@ class Named(NamedTuple):
     kind: str | None  # of the cause
     loss: Mapping[str, float]  # hypothesis → mean loss over the pairs, "none" among them
     n_pairs: int  # pairs that could tell
+    pairs: Sequence[tuple[int, int]] = ()  # that were looked at, as places in the window
 
 
 def name_cause(
@@ -114,6 +116,7 @@ def name_cause(
     *,
     method: Method = TRACKING,
     seed: int = 0,
+    watched: Watched | None = None,
 ) -> Named:
     """The known fault that the maps of a window of frames share, if one explains the pictures clearly best.
 
@@ -123,6 +126,7 @@ def name_cause(
             returns give; None = the sensor's own depth, whose hypotheses each give motions of their own.
         method: how pairs are tracked and placed; its seats 1 to 5 count.
         seed: of the pose search.
+        watched: what :func:`watch` found in the same pictures; None = it is asked.
 
     Where all frames carry a pose of their own (``T_world_from_cam``) misses under that motion count as well, so that a
     unit or a focal length, which motions fitted to the same depth swallow, shows. Without, a unit of the sensor's own
@@ -138,12 +142,22 @@ def name_cause(
         found = "none" if maps is None else len(maps)
         raise ValueError(f"name_cause: found {len(frames)} frames and {found} maps, expected two or more, as many maps")
     with torch.no_grad():
-        window = _window(frames, maps, method, seed)
-        if window is None:
+        watched = watch(frames, method) if watched is None else watched
+        if not watched.pairs:
             return Named(None, None, {}, 0)
-        able = window.hypotheses()
-        losses = {cause.name: window.loss(cause) for cause in able}
-    return decided(losses)
+        window = Window(
+            anchors=tree.collate([frames[i] for i, _ in watched.pairs]),
+            others=tree.collate([frames[j] for _, j in watched.pairs]),
+            samples=tree.collate(watched.samples),
+            tracks=tree.collate(watched.tracks),
+            maps=maps,
+            depths=[frame.depth for frame in frames],
+            pairs=watched.pairs,
+            method=method,
+            seed=seed,
+        )
+        losses = {cause.name: window.loss(cause) for cause in window.hypotheses()}
+    return decided(losses)._replace(pairs=watched.pairs)
 
 
 def decided(losses: Mapping[str, Tensor]) -> Named:
@@ -168,6 +182,14 @@ def decided(losses: Mapping[str, Tensor]) -> Named:
     return Named(best, kinds[best], known, n) if clear and alone else nothing
 
 
+class Watched(NamedTuple):
+    """Pairs of a window, and the samples of each first picture with where the second shows them."""
+
+    pairs: Sequence[tuple[int, int]]
+    samples: Sequence[Samples]
+    tracks: Sequence[Tracks]
+
+
 @dataclass(frozen=True, eq=False)
 class Window:
     """Pairs of a window, tracked: what stays the same whatever the depth."""
@@ -178,7 +200,7 @@ class Window:
     tracks: Tracks  # (P, N)
     maps: Sequence[Tensor] | None  # of all frames
     depths: Sequence[Tensor]  # of all frames, the sensor's own
-    first: Sequence[int]  # frame of each anchor
+    pairs: Sequence[tuple[int, int]]  # frames of each
     method: Method
     seed: int
 
@@ -191,7 +213,7 @@ class Window:
 
     def loss(self, cause: Cause) -> Tensor:
         """(P,) loss with that fault undone; NaN where a pair cannot tell."""
-        place = [i + cause.lag for i in self.first]
+        place = [i + cause.lag for i, _ in self.pairs]
         there = torch.tensor([0 <= i < len(self.depths) for i in place], device=self.samples.uv.device)
         place = [min(max(i, 0), len(self.depths) - 1) for i in place]
         scaled = (self._scaled(self.anchors, cause.focal), self._scaled(self.others, cause.focal))
@@ -252,38 +274,39 @@ class Window:
         return torch.where(n >= 12, mean, torch.nan)
 
 
-def _window(frames: Sequence[Frame], maps: Sequence[Tensor] | None, method: Method, seed: int) -> Window | None:
-    pairs = _pairs(len(frames))
-    anchors = tree.collate([frames[i] for i, _ in pairs])
-    others = tree.collate([frames[j] for _, j in pairs])
-    samples = method.look(anchors)
-    tracks = method.track(anchors.image, others.image, samples.uv)
-    tracks = tracks.replace(valid=tracks.valid & (samples.trackability >= method.min_trackability))
-    if not bool(tracks.valid.any()):
-        return None
-    return Window(
-        anchors=anchors,
-        others=others,
-        samples=samples,
-        tracks=tracks,
-        maps=maps,
-        depths=[frame.depth for frame in frames],
-        first=[i for i, _ in pairs],
-        method=method,
-        seed=seed,
-    )
+def watch(frames: Sequence[Frame], method: Method = TRACKING) -> Watched:
+    """How points move between the pictures of a window, in pairs as wide as tracks hold: what no depth changes.
+
+    Gradient: none.
+    """
+    found: dict[int, tuple[int, Samples, Tracks]] = {}
+    for gap in [gap for gap in GAPS if gap < len(frames)]:
+        firsts = [i for i in _firsts(len(frames)) if i not in found and i + gap < len(frames)]
+        if not firsts:
+            continue
+        with torch.no_grad():
+            samples, tracks = _tracked([frames[i] for i in firsts], [frames[i + gap] for i in firsts], method)
+        textured = (samples.trackability >= method.min_trackability).sum(-1).clamp_min(1)
+        holds = tracks.valid.sum(-1) >= FOUND * textured
+        for k, i in enumerate(firsts):
+            if bool(holds[k]):
+                found[i] = gap, samples[k : k + 1], tracks[k : k + 1]
+    order = sorted(found)
+    pairs = [(i, i + found[i][0]) for i in order]
+    return Watched(pairs, [found[i][1] for i in order], [found[i][2] for i in order])
 
 
-def _pairs(n: int) -> list[tuple[int, int]]:
-    """Pairs of frames of a window, spread evenly, not so near its ends that no earlier or later map is known."""
-    found = []
-    for gap in GAPS:
-        gap = min(gap, n - 1)
-        low, high = min(LAG, n - 1 - gap), max(min(n - 1 - LAG, n - 1 - gap), 0)
-        low = min(low, high)
-        k = max(PAIRS // len(GAPS), 1)
-        found += [(low + round((high - low) * m / max(k - 1, 1)), gap) for m in range(k)]
-    return list(dict.fromkeys((i, i + gap) for i, gap in found))
+def _tracked(anchors: Sequence[Frame], others: Sequence[Frame], method: Method) -> tuple[Samples, Tracks]:
+    """Samples of some frames found again in others."""
+    samples = method.look(tree.collate(anchors))
+    tracks = method.track(tree.collate(anchors).image, tree.collate(others).image, samples.uv)
+    return samples, tracks.replace(valid=tracks.valid & (samples.trackability >= method.min_trackability))
+
+
+def _firsts(n: int) -> list[int]:
+    """Anchors of a window, spread evenly, not so near its ends that no earlier or later map is known."""
+    low, high = (LAG, n - 1 - LAG) if n > 3 * LAG else (0, n - 2)
+    return sorted({low + round((high - low) * k / (PAIRS - 1)) for k in range(PAIRS)})
 
 
 def _place(uv: Tensor, hw: tuple[int, int], depth: Tensor) -> Tensor:
