@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from dhtorch.pair import merge
     from dhtorch.records import Camera, Estimate, Frame, Map, Pose, PoseFit, Samples, TrackHint, Tracks, Verdict
     from dhtorch.stream import Stream
-    from dhtorch.transform import ExtendDepth
+    from dhtorch.transform import ExtendDepth, JudgeDepth
     from dhtorch.tree import collate
     from dhtorch.verdict import judge
 
@@ -32,6 +32,7 @@ __all__ = [
     "Estimate",
     "ExtendDepth",
     "Frame",
+    "JudgeDepth",
     "Map",
     "Method",
     "Pose",
@@ -49,7 +50,14 @@ __all__ = [
 
 #: Where a public name lives, if not among the records.
 _HOMES = dict.fromkeys(("AUTO", "MAP", "PAPER", "WINDOW", "extend"), "methods") | {"Method": "method"}
-_HOMES |= {"ExtendDepth": "transform", "Stream": "stream", "collate": "tree", "judge": "verdict", "merge": "pair"}
+_HOMES |= {
+    "ExtendDepth": "transform",
+    "JudgeDepth": "transform",
+    "Stream": "stream",
+    "collate": "tree",
+    "judge": "verdict",
+    "merge": "pair",
+}
 
 
 def __getattr__(name: str) -> Any:

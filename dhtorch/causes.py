@@ -10,6 +10,7 @@ of a picture 640 wide; the *loss* of a pair is the mean of miss² / (miss² + c�
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -25,7 +26,7 @@ from dhtorch.geometry import se3
 from dhtorch.geometry.lookup import nearest
 from dhtorch.geometry.start import coarse_flow
 from dhtorch.method import Method
-from dhtorch.pair import under_pose
+from dhtorch.pair import Clock, under_pose
 from dhtorch.records import Frame, Pose, Samples, Tracks
 from dhtorch.stages.pose import pnp_ransac
 from dhtorch.stages.track import lucas_kanade
@@ -167,7 +168,7 @@ def decided(losses: Mapping[str, Tensor]) -> Named:
     able = base.isfinite()
     mean = {name: float(loss[able & loss.isfinite()].mean()) for name, loss in losses.items()}
     n = int(able.sum())
-    known = {name: value for name, value in mean.items() if value == value}
+    known = {name: value for name, value in mean.items() if math.isfinite(value)}
     nothing = Named(None, None, known, n)
     others = {name: value for name, value in known.items() if name != NONE.name}
     if n < FEWEST or not others:
@@ -205,7 +206,7 @@ class Window:
     seed: int
 
     def hypotheses(self) -> Sequence[Cause]:
-        """What could be known here: a motion fitted to near returns swallows a focal length, and the unit of its own."""
+        """What could be known: a motion fitted to near returns swallows a focal length, and the unit of its own."""
         if self.anchors.T_world_from_cam is not None and self.others.T_world_from_cam is not None:
             return (NONE, *CAUSES)
         swallowed = {"focal length", "unit"} if self.maps is None else {"focal length"}
@@ -245,7 +246,7 @@ class Window:
         """Under motions fitted to near returns; a pair without one misses everything, of the sensor's own depth."""
         cameras = views[0].camera, views[1].camera
         _, usable, fit = under_pose(
-            self.method, samples, self.tracks, *cameras, seed=self.seed, fit=None, clock=_no_clock
+            self.method, samples, self.tracks, *cameras, seed=self.seed, fit=None, clock=Clock(None)
         )
         still = fit.t_snr < 3
         loss = self._missed(depth, usable, fit.T_1_from_0, cameras)
@@ -312,7 +313,3 @@ def _firsts(n: int) -> list[int]:
 def _place(uv: Tensor, hw: tuple[int, int], depth: Tensor) -> Tensor:
     scale = torch.tensor([depth.shape[-1] / hw[1], depth.shape[-2] / hw[0]]).to(uv)
     return (uv + 0.5) * scale - 0.5
-
-
-def _no_clock(_name: str, value: object) -> object:
-    return value

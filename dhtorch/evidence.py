@@ -21,7 +21,6 @@ from torch import Tensor
 
 from dhtorch import dense
 from dhtorch.codes import Flag
-from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3, sweep
 from dhtorch.geometry.lookup import nearest, nearest_index, pixels
 from dhtorch.geometry.shapes import check

@@ -218,6 +218,7 @@ class Verdict(Record):
     Evidence is in sigmas, positive where the map is too far, NaN where a kind of evidence says nothing.
     """
 
+    depth: Tensor  # (B, h, w) m, the map on the grid that is judged; 0 = it says nothing
     state: Tensor  # (B, h, w) int32, codes.State
     evidence: Tensor  # (B, h, w) of the kind that decided
     view: Tensor  # (B, h, w) int32, the other view that decided, in the order asked; -1 = our own answers, -2 = none

@@ -28,7 +28,7 @@ from dhtorch.geometry.shapes import check
 from dhtorch.method import Method, Trace
 from dhtorch.methods import AUTO
 from dhtorch.offers import choosing
-from dhtorch.records import NO_HINT, Estimate, Frame, PoseFit, Samples, TrackHint, Verdict
+from dhtorch.records import NO_HINT, Estimate, Frame, PoseFit, TrackHint, Verdict
 
 #: Sigmas from which on evidence speaks against a pixel, and up to which it speaks for it.
 AGAINST, FOR = 3.0, 2.0
@@ -96,7 +96,7 @@ def judge(
     check("judge", depth=(anchor.depth, "B y x"), depth_map=(depth_map, "B h w"))
     trace = {} if trace is None else trace
     with torch.no_grad():
-        asked = None if others is None else _asked(method, anchor, others, seed, fit, hint, trace)
+        asked = None if others is None else _asked(method, anchor, others, trace, seed=seed, fit=fit, hint=hint)
         offered = trace["choice"].index if "choice" in trace else None
         options: dict[str, Any] = {"views": views, "partners": partners, "size": size, "tolerance": tolerance}
         return judged(depth_map, anchor, asked, offered, other_maps=other_maps, method=method, **options)
@@ -132,8 +132,11 @@ def judged(
     if asked is not None and views:
         number = offered if offered is not None else torch.arange(len(asked.fits.code))[:, None].expand(-1, len(grid))
         source = None if own else other_maps
-        pictures, maps = _asked_views(_Judged(grid, anchor, asked, number.to(grid.device), own), source, partners, tolerance)
-    return _joined(grid, anchor, found, asked, own, answers, pictures, maps)
+        of = _Judged(grid, anchor, asked, number.to(grid.device), own)
+        pictures, maps = _asked_views(of, source, partners, tolerance)
+    none = torch.full((len(grid), 3), torch.nan).to(grid)
+    ruler = none if asked is None else _ruler(anchor, asked)
+    return _joined(grid, (answers, pictures, maps), _of_frame(grid, anchor, found, own), ruler, own)
 
 
 class _Judged(NamedTuple):
@@ -146,19 +149,12 @@ class _Judged(NamedTuple):
     own: bool  # the sensor's own map
 
 
-def _asked(
-    method: Method,
-    anchor: Frame,
-    others: Frame | Sequence[Frame],
-    seed: int | Tensor,
-    fit: PoseFit | None,
-    hint: TrackHint,
-    trace: Trace,
-) -> dense.Asked:
+def _asked(method: Method, anchor: Frame, others: Frame | Sequence[Frame], trace: Trace, **told: Any) -> dense.Asked:
+    """What the method says of the anchor; it chooses where it is offered more than it looks at."""
     others = others if isinstance(others, Frame) else tree.stack(others)
     several = others.image.dim() == 5
     method = choosing(method) if several and len(others.image) > method.views else method
-    joined = method(anchor, others, seed=seed, fit=fit, hint=hint, trace=trace)
+    joined = method(anchor, others, trace=trace, **told)
     return dense.views_asked(joined, others, trace)
 
 
@@ -214,7 +210,8 @@ def _resized(depth_map: Tensor, hw: tuple[int, int]) -> Tensor:
 def _of_sensor(frame: Frame, hw: tuple[int, int]) -> Tensor:
     """A view's own depth at the pixels of a grid over its picture."""
     uv = dense.pixels(frame, hw).expand(len(frame.camera.f), -1, -1)
-    place = cam.depth_pixels(frame.camera, frame.hw, frame.depth_camera, tuple(frame.depth.shape[-2:]), uv)
+    own = frame.depth.shape[-2], frame.depth.shape[-1]
+    place = cam.depth_pixels(frame.camera, frame.hw, frame.depth_camera, own, uv)
     depth, inside = nearest(frame.depth.to(uv), place)
     return torch.where(inside, depth, 0.0).unflatten(1, hw)
 
@@ -222,22 +219,13 @@ def _of_sensor(frame: Frame, hw: tuple[int, int]) -> Tensor:
 # ------------------------------------------------------------------------------------------------------------ verdicts
 
 
-def _joined(
-    grid: Tensor,
-    anchor: Frame,
-    found: References,
-    asked: dense.Asked | None,
-    own: bool,
-    answers: Said,
-    pictures: Said,
-    maps: Said,
-) -> Verdict:
+def _joined(grid: Tensor, kinds: tuple[Said, Said, Said], numbers: Numbers, ruler: Tensor, own: bool) -> Verdict:
+    answers, pictures, maps = kinds
     state, said, view = decided(answers, pictures, maps)
-    numbers = _of_frame(grid, anchor, found, own)
-    none = torch.full((len(grid), 3), torch.nan).to(grid)
-    ruler = none if asked is None else _ruler(anchor, asked)
+    none = torch.full_like(ruler, torch.nan)
     n_wrong, n_known = ((m.sum((1, 2)) / WINDOW) for m in (state == State.WRONG, state != State.CANNOT_KNOW))
     return Verdict(
+        depth=grid,
         state=state,
         evidence=said,
         view=view,
@@ -353,9 +341,7 @@ def _as_factor(log: Tensor, sd: Tensor) -> Tensor:
     return torch.stack([log, log - 1.96 * sd, log + 1.96 * sd], -1).exp().where(log.isfinite()[:, None], torch.nan)
 
 
-def _shape(
-    ratio: Tensor, found: References, used: Tensor, sigma: Tensor, hw: tuple[int, int]
-) -> tuple[Tensor, Tensor]:
+def _shape(ratio: Tensor, found: References, used: Tensor, sigma: Tensor, hw: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Shift in m and tilt, (B, 3) each, of map / reference = scale + shift / reference + tilt · place."""
     size = torch.tensor([hw[1], hw[0]]).to(ratio)
     place = (found.uv + 0.5) / size - 0.5
@@ -393,9 +379,9 @@ def _ruler(anchor: Frame, asked: dense.Asked) -> Tensor:
         return none
     V = len(asked.fits.t_snr)
     here = anchor.T_world_from_cam.map(lambda x: x.expand(V, *x.shape))
-    way = torch.stack(
-        [se3.relative(here[k], asked.frames.T_world_from_cam[k]).t.norm(dim=-1) for k in range(V)]
-    ).to(none)
+    way = torch.stack([se3.relative(here[k], asked.frames.T_world_from_cam[k]).t.norm(dim=-1) for k in range(V)]).to(
+        none
+    )
     length = asked.fits.T_1_from_0.t.norm(dim=-1)
     used = asked.fits.ok & (asked.fits.t_snr > 10) & (way > 0.01) & length.isfinite()
     log = torch.where(used, length / way.clamp_min(1e-6), 1.0).clamp_min(1e-6).log().T

@@ -19,7 +19,7 @@ LEVELS = [
     {"method"},
     {"pair", "window", "methods", "first_release", "views", "offers"},
     {"stream", "dense"},
-    {"evidence"},
+    {"evidence", "causes"},
     {"verdict"},
     {"transform", "integrate", "viewer"},
     {"extract"},

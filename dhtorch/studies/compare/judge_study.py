@@ -10,6 +10,7 @@ What would refute it: any of these numbers missed.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -146,7 +147,9 @@ def run(
         for i in progress(_spread(len(scene.recording), anchors), f"{scene.name}: anchors", anchors):
             rows.append(_anchor_row(scene, i, look, ask, settings, size))
         firsts = _firsts(len(scene.recording), windows)
-        found = [r for k in progress(firsts, f"{scene.name}: windows", len(firsts)) for r in _window_rows(scene, k, look)]
+        found = [
+            r for k in progress(firsts, f"{scene.name}: windows", len(firsts)) for r in _window_rows(scene, k, look)
+        ]
         outcome.rows += [*rows, *found, _scene_row(scene, rows)]
         outcome.n_pairs += len(rows)
     outcome.summary = summary(outcome.rows)
@@ -177,7 +180,9 @@ def summary(rows: Sequence[Row]) -> Row:
         shares[kind] = sum(right) / len(right)
         found[f"judge.named.{kind.replace(' ', '_')}"] = bootstrap.single(shares[kind], len(right))
     found["judge.named_worst"] = bootstrap.single(min(shares.values(), default=None), len(counted))
-    clean = [float(row["named_kind"] is not None) for row in rows if row["method"] == "causes" and row["fault"] == "none"]
+    clean = [
+        float(row["named_kind"] is not None) for row in rows if row["method"] == "causes" and row["fault"] == "none"
+    ]
     found["judge.misnamed"] = bootstrap.single(mean(clean), len(clean))
     return found
 
@@ -188,14 +193,12 @@ def summary(rows: Sequence[Row]) -> Row:
 def alarm(scale: Tensor) -> bool | None:
     """Whether a scale (3,) with its interval is said to be wrong; None where nothing is known of it."""
     value, low, high = (float(x) for x in scale)
-    if value != value:
+    if math.isnan(value):
         return None
-    return abs(torch.tensor(value).log().item()) > ALARM and not low <= 1 <= high
+    return abs(math.log(value)) > ALARM and not low <= 1 <= high
 
 
-def _anchor_row(
-    scene: Scene, i: int, look: Callable[[int], Frame], ask: Method, settings: Settings, size: int
-) -> Row:
+def _anchor_row(scene: Scene, i: int, look: Callable[[int], Frame], ask: Method, settings: Settings, size: int) -> Row:
     """All that is planted in one frame's map."""
     full, cutoff = look(i), settings.cutoff_of(scene)
     near = range_split(full, cutoff)
@@ -206,7 +209,12 @@ def _anchor_row(
         joined = ask(near, others, seed=settings.seed, hint=scene.hint, trace=trace)
     asked = dense.views_asked(joined, others, trace)
     say = partial(
-        judged, anchor=near, asked=asked, offered=trace["choice"].index if "choice" in trace else None, method=ask, size=size
+        judged,
+        anchor=near,
+        asked=asked,
+        offered=trace["choice"].index if "choice" in trace else None,
+        method=ask,
+        size=size,
     )
     true = _true_map(scene.recording, i, full, size, ask)
     row: Row = {"scene": scene.name, "pair": [i, i], "method": "judge", **_baseline(asked)}
@@ -216,7 +224,9 @@ def _anchor_row(
         row |= {f"{way}_value.{name}": float(getattr(found, way)[0, 0] / factor) for way in WAYS}
     elsewhere = offered[-1] if offered[-1] > i else offered[0]
     later = _true_map(scene.recording, elsewhere, look(elsewhere), size, ask)
-    shown = ask.backproject(near, dense.pixels(near, (true.shape[-2], true.shape[-1]))).usable.unflatten(1, true.shape[-2:])
+    shown = ask.backproject(near, dense.pixels(near, (true.shape[-2], true.shape[-1]))).usable.unflatten(
+        1, true.shape[-2:]
+    )
     for name in PIXELS:
         spoilt = true if name == "none" else spoil(name, true, seed=i, other=later)[0]
         row |= _pixels(name, spoilt, true, say(spoilt), shown)
@@ -266,7 +276,9 @@ def _scene_row(scene: Scene, rows: Sequence[Row]) -> Row:
         for key, column in (("jump_auroc", "auroc"), ("jump_auroc_all", "auroc_all")):
             out[f"{name}.{key}"] = mean([r[prefix + column] for r in wide if r.get(prefix + column) is not None])
         count = {k: sum(r[f"{prefix}{k}.{p}"] for r in rows for p in PIXELS) for k in ("consistent", "consistent_off")}
-        out[f"{name}.called_right_wrong"] = count["consistent_off"] / count["consistent"] if count["consistent"] else None
+        out[f"{name}.called_right_wrong"] = (
+            count["consistent_off"] / count["consistent"] if count["consistent"] else None
+        )
         n = sum(row[f"{prefix}n.none"] for row in wide)
         known, wrong = (sum(row[f"{prefix}{k}.none"] for row in wide) for k in ("known", "wrong"))
         out[f"{name}.known"] = known / n if n else None
@@ -315,7 +327,9 @@ def _over_picture(frame: Frame, size: int = 320) -> Tensor:
     """A frame's depth over the field of its picture, nearest pixels."""
     hw = dense.map_hw(frame.hw, size)
     uv = dense.pixels(frame, hw)[None]
-    place = cam.depth_pixels(frame.camera, frame.hw, frame.depth_camera, (frame.depth.shape[-2], frame.depth.shape[-1]), uv)
+    place = cam.depth_pixels(
+        frame.camera, frame.hw, frame.depth_camera, (frame.depth.shape[-2], frame.depth.shape[-1]), uv
+    )
     depth, inside = nearest(frame.depth.to(uv), place)
     return torch.where(inside, depth, 0.0).unflatten(1, hw)
 
@@ -358,7 +372,9 @@ def _true_map(recording: Recording, i: int, full: Frame, size: int, ask: Method)
     """The true map (1, h, w) on the grid: exact where the recording knows it, else all that the sensor returned."""
     hw = dense.map_hw(full.hw, size)
     if isinstance(recording, TruthRecording):
-        exact = full.replace(depth=recording.truth(i)["depth"].to(full.camera.f), depth_camera=None, conf=None, sparse=None)
+        exact = full.replace(
+            depth=recording.truth(i)["depth"].to(full.camera.f), depth_camera=None, conf=None, sparse=None
+        )
         return _over_picture(exact, size)
     samples = ask.backproject(full, dense.pixels(full, hw))
     return torch.where(samples.depth > 0, samples.depth, 0.0).unflatten(1, hw)
