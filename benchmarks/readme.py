@@ -1,4 +1,4 @@
-"""The tables of README.md, benchmarks/README.md and docs/kornia.md, from committed result files; README's picture.
+"""The tables of README.md, benchmarks/README.md, docs/kornia.md and docs/judge.md from result files; README's picture.
 
 python benchmarks/readme.py            rewrite the tables between their markers
 python benchmarks/readme.py --check    exit 1 if they do not say what the result files say
@@ -320,6 +320,36 @@ PIXELS = {
     "dense.room_within_1_of_all": ("the same of all that was asked, silence counted as a miss", ""),
 }
 
+#: What the judge is to find, in words, and its bars.
+FOUND = {
+    "scale_found": ("metre off by a tenth: found, anchors with a baseline", "≥ 0.95"),
+    "scale_found_5": ("metre off by a twentieth: found", "≥ 0.90"),
+    "false_alarm": ("sound maps whose metre is called wrong", "≤ 0.02"),
+    "scale_found_far": ("a tenth, by triangulated points alone", ""),
+    "scale_found_5_far": ("a twentieth, by triangulated points alone", ""),
+    "false_alarm_far": ("false alarms of triangulated points alone", ""),
+    "jump_auroc": (
+        "surfaces moved to three times their depth, where no return is shown: area under the curve",
+        "≥ 0.95",
+    ),
+    "called_right_wrong": ("pixels called consistent that are a fifth off", "≤ 0.01"),
+    "called_wrong_right": ("pixels of sound maps called wrong, of those judged", ""),
+    "known": ("pixels of sound maps of which something is said", ""),
+    "named_worst": ("cause named, worst kind, windows moved by two pixels", "≥ 0.90"),
+    "misnamed": ("cause named in sound windows", ""),
+}
+
+
+def judge() -> str:
+    """What the judge finds, beside a fixed-threshold photometric check and the bars."""
+    summary = json.loads((RESULTS / "judge_study.json").read_text())["summary"]
+    rows = []
+    for name, (words, bar) in FOUND.items():
+        values = (summary.get(f"{who}.{name}", {}).get("value") for who in ("judge", "photometric"))
+        rows.append([words, *("" if value is None else f"{value:.3f}" for value in values), bar])
+    return table(["number", "`judge`", "photometric check", "bar"], rows)
+
+
 BOUND = dict.fromkeys(NUMBER, "≤") | {"coverage_at_5": "≥", "within_2sigma": "≥", "within_sigma": "±0.07 of"}
 
 #: Results whose verdicts are shown, beside those with a table.
@@ -337,6 +367,7 @@ PAGES = {
     README: TABLES,
     HERE / "README.md": speed_tables.TABLES | {"mutants": caught},
     HERE.parent / "docs" / "kornia.md": kornia_tables.TABLES,
+    HERE.parent / "docs" / "judge.md": {"judge": judge},
 }
 
 

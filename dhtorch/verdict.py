@@ -293,7 +293,8 @@ def _of_frame(grid: Tensor, anchor: Frame, found: References, own: bool) -> Numb
     at, inside = nearest(grid, (found.uv + 0.5) * scale - 0.5)
     used = found.used & inside & (at > 0)
     ratio = torch.where(used, at / found.depth, 1.0)
-    log, own_sigma = ratio.log(), (found.sigma.square() - found.shared.square()).clamp_min(1e-6).sqrt()
+    log = ratio.log()
+    own_sigma = (found.sigma.square() - found.shared.square()).clamp_min(1e-6).sqrt()
     kinds = []
     for kind, metre in ((found.near, SENSOR_METRE), (~found.near, 0.0)):
         common = median(found.shared, used & kind)[:, 0].nan_to_num()
@@ -347,7 +348,8 @@ def _shape(ratio: Tensor, found: References, used: Tensor, sigma: Tensor, hw: tu
     place = (found.uv + 0.5) / size - 0.5
     inverse = torch.where(used, 1 / found.depth, 0.0)
     X = torch.cat([torch.ones_like(inverse)[..., None], inverse[..., None], place], -1).double()
-    y, at = ratio.double(), median(ratio, used).double()
+    y = ratio.double()
+    at = median(ratio, used).double()
     spread = 1.483 * median((ratio - at.to(ratio)).abs(), used).double()
     width = (sigma.double().square() + spread.square()).sqrt().clamp_min(1e-4)
     residual = y - at

@@ -21,7 +21,7 @@ def auroc(
     Source: J. A. Hanley, B. J. McNeil, "The meaning and use of the area under a ROC curve", 1982.
     """
     check("auroc", score=(score, "N"), wrong=(wrong, "N"))
-    n, m = int(wrong.sum()), int((~wrong).sum())
+    n, m = (int(kind.sum()) for kind in (wrong, ~wrong))
     if not n or not m:
         return None
     _, place, count = score.detach().double().unique(return_inverse=True, return_counts=True)
