@@ -321,6 +321,36 @@ def captures() -> str:
     return text.grid(Table("", ["capture", "seconds", "what came out"], rows))
 
 
+#: What the judge is to find, in words, and its bars.
+FOUND = {
+    "scale_found": ("metre off by a tenth: found, anchors with a baseline", "≥ 0.95"),
+    "scale_found_5": ("metre off by a twentieth: found", "≥ 0.90"),
+    "false_alarm": ("sound maps whose metre is called wrong", "≤ 0.02"),
+    "scale_found_far": ("a tenth, by triangulated points alone", ""),
+    "scale_found_5_far": ("a twentieth, by triangulated points alone", ""),
+    "false_alarm_far": ("false alarms of triangulated points alone", ""),
+    "jump_auroc": (
+        "surfaces moved to three times their depth, where no return is shown: area under the curve",
+        "≥ 0.95",
+    ),
+    "called_right_wrong": ("pixels called consistent that are a fifth off", "≤ 0.01"),
+    "called_wrong_right": ("pixels of sound maps called wrong, of those judged", ""),
+    "known": ("pixels of sound maps of which something is said", ""),
+    "named_worst": ("cause named, worst kind, windows moved by two pixels", "≥ 0.90"),
+    "misnamed": ("cause named in sound windows", ""),
+}
+
+
+def judge() -> str:
+    """What the judge finds, beside a fixed-threshold photometric check and the bars."""
+    summary = json.loads((RESULTS / "judge_study.json").read_text())["summary"]
+    rows = []
+    for name, (words, bar) in FOUND.items():
+        values = (summary.get(f"{who}.{name}", {}).get("value") for who in ("judge", "photometric"))
+        rows.append([words, *("" if value is None else f"{value:.3f}" for value in values), bar])
+    return table(["number", "`judge`", "photometric check", "bar"], rows)
+
+
 def questions() -> str:
     """Every archived answer, in alphabetical order."""
     found = {path.stem: json.loads(path.read_text()) for path in sorted(RESULTS.glob("*.json"))}
@@ -339,6 +369,7 @@ def caught() -> str:
 TABLES = {"room": room, "room seeds": room_by_seed, "shared": shared, "truths": truths, "comparison": comparison}
 TABLES |= {"comparison scenes": partial(by_scene, "method_comparison"), "stress": partial(by_scene, "stress")}
 TABLES |= {"chosen views": partial(chosen_views, "method_comparison", "streams"), "beside chosen": beside_chosen}
+TABLES |= {"judge": judge}
 TABLES |= {"every pixel": partial(every_pixel, "dense", "dense_streams")}
 TABLES |= {"pixels by scene": partial(pixels_by_scene, "dense")}
 TABLES |= {"speed": speed_tables.stages, "mutants": caught} | speed_tables.TABLES | kornia_tables.TABLES

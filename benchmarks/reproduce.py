@@ -36,6 +36,7 @@ EXPERIMENTS = {
     "stress": "experiment=method_comparison data=synthetic_stress experiment.seeds=2",
     "views_study": "experiment=views_study data=shared_scenes experiment.anchors=3",
     "dense": "experiment=dense_comparison data=shared_scenes experiment.anchors=6",
+    "judge_study": "experiment=judge_study data=shared_scenes",
     "dense_streams": "experiment=dense_comparison data=streams experiment.anchors=6 experiment.rooms=[]",
     "shared_scenes": "experiment=opencv_twin data=shared_scenes",
     "room_exact": "experiment=opencv_twin data=synthetic_seeds data.lidar=exact data.image_noise=0",

@@ -15,10 +15,11 @@ if TYPE_CHECKING:
     from dhtorch.method import Method
     from dhtorch.methods import AUTO, MAP, PAPER, WINDOW, extend
     from dhtorch.pair import merge
-    from dhtorch.records import Camera, Estimate, Frame, Map, Pose, PoseFit, Samples, TrackHint, Tracks
+    from dhtorch.records import Camera, Estimate, Frame, Map, Pose, PoseFit, Samples, TrackHint, Tracks, Verdict
     from dhtorch.stream import Stream
-    from dhtorch.transform import ExtendDepth
+    from dhtorch.transform import ExtendDepth, JudgeDepth
     from dhtorch.tree import collate
+    from dhtorch.verdict import judge
 
 __version__ = "0.1.0"
 
@@ -31,6 +32,7 @@ __all__ = [
     "Estimate",
     "ExtendDepth",
     "Frame",
+    "JudgeDepth",
     "Map",
     "Method",
     "Pose",
@@ -39,14 +41,23 @@ __all__ = [
     "Stream",
     "TrackHint",
     "Tracks",
+    "Verdict",
     "collate",
     "extend",
+    "judge",
     "merge",
 ]
 
 #: Where a public name lives, if not among the records.
 _HOMES = dict.fromkeys(("AUTO", "MAP", "PAPER", "WINDOW", "extend"), "methods") | {"Method": "method"}
-_HOMES |= {"ExtendDepth": "transform", "Stream": "stream", "collate": "tree", "merge": "pair"}
+_HOMES |= {
+    "ExtendDepth": "transform",
+    "JudgeDepth": "transform",
+    "Stream": "stream",
+    "collate": "tree",
+    "judge": "verdict",
+    "merge": "pair",
+}
 
 
 def __getattr__(name: str) -> Any:

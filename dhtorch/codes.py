@@ -86,6 +86,14 @@ class Source:
     SWEPT: Final = 3  #: a pixel of a dense map, found on its epipolar line
 
 
+class State:
+    """What is said of a pixel of a judged depth map."""
+
+    CANNOT_KNOW: Final = 0  #: nothing that was seen could tell: no baseline, no texture, hidden, or no depth
+    CONSISTENT: Final = 1  #: what would have told an error of a fifth speaks for it
+    WRONG: Final = 2  #: something speaks against it, and nothing for it
+
+
 def names(table: type) -> dict[int, str]:
     """``{code: name}`` of a code table, in numeric order; composite masks are left out for bit sets."""
     pairs = {v: k for k, v in vars(table).items() if k.isupper() and isinstance(v, int) and k != "UNUSABLE"}

@@ -202,7 +202,7 @@ def swept(
     _check_options("complete", dict(zip(OPTIONS, given, strict=True)))
     index, wanted = worthiest(asked, partners)
     base = sweep.base(*resized(anchor, size))
-    partner = [_partner(asked, k, size, use, base.image) for k, use in zip(index, wanted, strict=True)]
+    partner = [partner_of(asked, k, size, use, base.image) for k, use in zip(index, wanted, strict=True)]
     q = torch.linspace(0, 1, planes).to(base.ray) / _nearest(asked.samples)[:, None].to(base.ray)
     start = _best_planes(base, partner, q)
     found = _fitted(base, partner, start, q, refinements)
@@ -306,7 +306,7 @@ def worthiest(asked: Asked, partners: int) -> tuple[Tensor, Tensor]:
     return index[:partners], worth[:partners] > WORTH
 
 
-def _partner(asked: Asked, index: Tensor, size: int, use: Tensor, like: Tensor) -> Partner:
+def partner_of(asked: Asked, index: Tensor, size: int, use: Tensor, like: Tensor) -> Partner:
     """The views (B,) of that index and their motions, harmless ones where there are none."""
     at = index, torch.arange(len(index), device=index.device)
     frame, fit = asked.frames[at], asked.fits[at]
@@ -410,7 +410,7 @@ def _joined(
             own = (one.noise + GREY_NOISE**2) / (INDEPENDENT * one.contrast)
             say = torch.where(here & (one.correlation > SAY), 1 / own, 0.0)
             if last:
-                shared = shared + say * _pose_variance(base, view, fit, at, one.motion)
+                shared = shared + say * pose_variance(base, view, fit, at, one.motion)
             weight, seen = weight + say, seen | here
             best = torch.where(here, torch.maximum(best, one.correlation), best)
         total = total + say * torch.minimum(torch.maximum(one.step, -most), most)
@@ -421,7 +421,7 @@ def _joined(
     return total / weight, Fitted(at, own, shared, best, seen)
 
 
-def _pose_variance(base: sweep.Base, view: sweep.View, fit: PoseFit, q: Tensor, motion: Tensor) -> Tensor:
+def pose_variance(base: sweep.Base, view: sweep.View, fit: PoseFit, q: Tensor, motion: Tensor) -> Tensor:
     """Variance (B, h, w) of q, 1/m², by the motion's covariance."""
     flat = q.flatten(1).clamp_min(1e-6)
     X = se3.rotate(view.T_1_from_0.R, base.ray) / flat[..., None] + view.T_1_from_0.t[:, None]

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dhtorch.codes import Gate, PoseCode
+from dhtorch.codes import Gate, PoseCode, State
 from dhtorch.geometry.camera import Camera
 from dhtorch.geometry.pyramid import Pyramids
 from dhtorch.geometry.se3 import Pose
@@ -31,6 +31,7 @@ __all__ = [
     "Shutter",
     "TrackHint",
     "Tracks",
+    "Verdict",
 ]
 
 
@@ -208,3 +209,31 @@ class Map(Record):
     sigma: Tensor  # (B, N) m; 0 where neither source answers
     score: Tensor  # (B, N) in [0, 1]: sensor confidence or selective score
     source: Tensor  # (B, N) int32, codes.Source
+
+
+@record
+class Verdict(Record):
+    """Whether a depth map is right: of every pixel, and of the frame as (value, low, high) with 95 % between.
+
+    Evidence is in sigmas, positive where the map is too far, NaN where a kind of evidence says nothing.
+    """
+
+    depth: Tensor  # (B, h, w) m, the map on the grid that is judged; 0 = it says nothing
+    state: Tensor  # (B, h, w) int32, codes.State
+    evidence: Tensor  # (B, h, w) of the kind that decided
+    view: Tensor  # (B, h, w) int32, the other view that decided, in the order asked; -1 = our own answers, -2 = none
+    by_answers: Tensor  # (B, h, w) against near returns and triangulated points
+    by_views: Tensor  # (B, h, w) against the pictures of other views
+    by_maps: Tensor  # (B, h, w) against the same source's maps of other views; negative only: seen through
+    scale: Tensor  # (B, 3) the map's metre over the true one; NaN where nothing but the map itself says what a metre is
+    scale_near: Tensor  # (B, 3) by near returns alone
+    scale_far: Tensor  # (B, 3) by triangulated points alone
+    ruler: Tensor  # (B, 3) the sensor's metre over that of the given trajectory
+    shift: Tensor  # (B, 3) m, in the map = scale · truth + shift
+    tilt: Tensor  # (B, 3) relative error from one side of the picture to the other, along its steepest direction
+    wrong: Tensor  # (B, 3) share of wrong ones among pixels of which something is known
+
+    @property
+    def known(self) -> Tensor:
+        """(B, h, w) bool: something is said of the pixel."""
+        return self.state != State.CANNOT_KNOW

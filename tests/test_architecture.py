@@ -19,6 +19,8 @@ LEVELS = [
     {"method"},
     {"pair", "window", "methods", "first_release", "views", "offers"},
     {"stream", "dense"},
+    {"evidence", "causes"},
+    {"verdict"},
     {"transform", "integrate", "viewer"},
     {"extract"},
     {"studies"},

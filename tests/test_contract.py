@@ -9,7 +9,7 @@ import pytest
 import torch
 from contract import PROMISES, NoMasksAsNumbers, Row, equal, leaves, reorder, take, tensor_map
 
-from dhtorch import dense, method, pair, views, window
+from dhtorch import causes, dense, evidence, method, pair, verdict, views, window
 from dhtorch.evaluate import holdout, probe
 from dhtorch.geometry import (
     affine,
@@ -510,6 +510,11 @@ ELSEWHERE = {
     *(f"dhtorch.geometry.sweep.{name}" for name in ("add_costs", "level", "misfit", "rivals")),
     *(f"dhtorch.dense.{name}" for name in ("complete", "map_hw", "options", "pixels", "resized", "sensed", "shipped")),
     *(f"dhtorch.dense.{name}" for name in ("swept", "views_asked", "worthiest")),
+    *(f"dhtorch.dense.{name}" for name in ("partner_of", "pose_variance")),
+    *(f"dhtorch.verdict.{name}" for name in ("judge", "judged", "decided", "share")),
+    *(f"dhtorch.evidence.{name}" for name in ("references", "silent", "by_answers", "by_views", "by_maps")),
+    *(f"dhtorch.causes.{name}" for name in ("turned", "name_cause", "decided", "watch")),
+    "dhtorch.evaluate.detection.auroc",
     "dhtorch.geometry.exact.filled",
     "dhtorch.geometry.least_squares.minimise",
     *(
@@ -721,7 +726,7 @@ ESTIMATORS = (arms, clusters, registration, blur, filling, sharpness)
 
 
 def public_functions():
-    parts = [method, pair, views, window, dense, *ESTIMATORS]
+    parts = [method, pair, views, window, dense, evidence, causes, verdict, *ESTIMATORS]
     for package in ("geometry", "stages", "evaluate", "integrate"):
         module = importlib.import_module(f"dhtorch.{package}")
         found = pkgutil.iter_modules(module.__path__, f"dhtorch.{package}.")

@@ -37,19 +37,20 @@ CONFIGURED = {
     "complete": "dhtorch.commands.complete",
     "extract": "dhtorch.extract",
     "integrate": "dhtorch.integrate.mapping",
+    "judge": "dhtorch.commands.judge",
     "stream": "dhtorch.commands.stream",
     "view": "dhtorch.commands.view",
 }
 
 #: Sub-command → the option that a first word without a name sets.
-FIRST_WORD = {"complete": "data.root", "stream": "data.root", "view": "result"}
+FIRST_WORD = {"complete": "data.root", "judge": "data.root", "stream": "data.root", "view": "result"}
 
 DONE, SOME_FAILED, FAILED, INTERRUPTED, UNHEARD = 0, 1, 2, 130, 141
 
 #: Exit codes, as ``dhtorch --help`` lists them.
 EXIT_CODES = {
     DONE: "all done or left untouched",
-    SOME_FAILED: "some jobs of a sweep failed",
+    SOME_FAILED: "some jobs of a sweep failed, or a judged depth exceeds fail_on",
     FAILED: "bad option, bad data or failed job",
     INTERRUPTED: "interrupted",
     UNHEARD: "nobody reads the output any more",

@@ -1,7 +1,8 @@
 """Everything that is drawn: figures of a job, of the report's page and of notebooks, and the project's colours.
 
 ``colours`` is the one page of colours; ``axis`` says where a number stands, ``canvas`` is a bare figure, ``panel`` one
-pair of axes, ``pictures`` shows what a pair found, ``maps`` a completed view, ``svg`` puts a panel into a page.
+pair of axes, ``pictures`` shows what a pair found, ``maps`` a completed view, ``verdicts`` a judged one, ``svg`` puts a
+panel into a page.
 matplotlib is imported when something is drawn.
 """
 
@@ -14,6 +15,7 @@ from dhtorch.drawing.maps import draw_completed
 from dhtorch.drawing.panel import Panel
 from dhtorch.drawing.pictures import FEWEST, Layer, Picture, draw_depth, draw_holes, draw_risk_coverage, draw_samples
 from dhtorch.drawing.svg import inline
+from dhtorch.drawing.verdicts import draw_verdict
 
 __all__ = [
     "FEWEST",
@@ -30,6 +32,7 @@ __all__ = [
     "draw_holes",
     "draw_risk_coverage",
     "draw_samples",
+    "draw_verdict",
     "inline",
     "save",
     "series",

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dhtorch.codes import Gate, Hole, Source
+from dhtorch.codes import Gate, Hole, Source, State
 
 #: What a depth comes from; what is silent is paler than what was answered.
 SENSOR, RECOVERED, SWEPT, SILENT = "#0072B2", "#E69F00", "#C653A6", "#B4B4B4"
@@ -80,6 +80,9 @@ HOLES = {
     Hole.AT_BORDER: "#009E73",
 }
 SOURCES = {Source.NONE: SILENT, Source.SENSOR: SENSOR, Source.RECOVERED: RECOVERED, Source.SWEPT: SWEPT}
+
+#: What is said of a pixel of a judged map.
+STATES = {State.CANNOT_KNOW: PICTURE, State.CONSISTENT: "#63c98a", State.WRONG: "#a8321f"}
 
 #: Quantity → matplotlib's name of its colour map.
 DEPTH, SCORE, ERROR, SIGNED, GREY = "turbo", "viridis", "Spectral_r", "RdBu_r", "gray"

@@ -41,19 +41,19 @@ def draw_completed(
     Depth is drawn by its logarithm, the nearest blue, the farthest red; what lies beyond the ends of a scale, of the
     depths a hundredth on each side, has the colour of that end. Silence is left blank.
     """
-    z, s, code = (_array(x) for x in (depth, sigma, source))
+    z, s, code = (as_array(x) for x in (depth, sigma, source))
     known = np.isfinite(z) & (z > 0) & (code != Source.NONE)
-    metres, share = _depths(z[known]), Axis(*SIGMA_REL, "sigma / depth, %", log=True, percent=True)
+    metres, share = depths(z[known]), Axis(*SIGMA_REL, "sigma / depth, %", log=True, percent=True)
     sensed = known & (code == Source.SENSOR)
     height = WIDTH * z.shape[0] / z.shape[1]
     canvas = Canvas(2 * WIDTH + GAP, 2 * (height + TITLE) + SCALE, dpi=160)
     rows = SCALE, SCALE + height + TITLE
     ratio = np.where(known, s / np.where(known, z, 1), 1)
     shown = [
-        (_title("Picture", title), rows[1], _rgb(image)),
-        (f"Sensor: {_percent(sensed)}", rows[1], _coloured(z, sensed, metres, colours.DEPTH)),
-        (f"Completed: {_percent(known)}, the rest is silent", rows[0], _coloured(z, known, metres, colours.DEPTH)),
-        ("Sigma / depth", rows[0], _coloured(ratio, known, share, colours.ERROR)),
+        (_title("Picture", title), rows[1], rgb_of(image)),
+        (f"Sensor: {_percent(sensed)}", rows[1], coloured(z, sensed, metres, colours.DEPTH)),
+        (f"Completed: {_percent(known)}, the rest is silent", rows[0], coloured(z, known, metres, colours.DEPTH)),
+        ("Sigma / depth", rows[0], coloured(ratio, known, share, colours.ERROR)),
     ]
     for k, (words, bottom, pixels) in enumerate(shown):
         left = (k % 2) * (WIDTH + GAP)
@@ -64,22 +64,22 @@ def draw_completed(
     save(canvas.figure, path)
 
 
-def _depths(depth: np.ndarray) -> Axis:
+def depths(depth: np.ndarray) -> Axis:
     """The scale of all depths."""
     low, high = np.quantile(depth, (NEAREST, FARTHEST)).tolist() if depth.size else (0.5, 5.0)
     high = max(high, 1.25 * low)
     return Axis(low, high, "depth, m", log=True)
 
 
-def _coloured(values: np.ndarray, there: np.ndarray, axis: Axis, kind: str) -> np.ndarray:
+def coloured(values: np.ndarray, there: np.ndarray, axis: Axis, kind: str) -> np.ndarray:
     """(h, w, 3) in [0, 1]: values by a colour map along a logarithmic axis, the ground where there is none."""
     low, high = math.log(axis.low), math.log(axis.high)
     places = (np.log(np.where(there, values, axis.low).clip(1e-9)) - low) / (high - low)
     ground = np.array(colours.rgb(colours.PICTURE)) / 255
-    return np.where(there[..., None], _mapped(places.clip(0, 1), kind), ground)
+    return np.where(there[..., None], mapped(places.clip(0, 1), kind), ground)
 
 
-def _mapped(places: np.ndarray, kind: str) -> np.ndarray:
+def mapped(places: np.ndarray, kind: str) -> np.ndarray:
     """Colours (…, 3) of places in [0, 1]."""
     from matplotlib import colormaps  # noqa: PLC0415
 
@@ -89,7 +89,7 @@ def _mapped(places: np.ndarray, kind: str) -> np.ndarray:
 def _scale(canvas: Canvas, axis: Axis, kind: str, left: float) -> None:
     """A colour map from end to end under a picture, with round numbers and what they mean."""
     base, height = SCALE - 18.0, 9.0
-    canvas.picture(_mapped(np.linspace(0, 1, 256)[None].repeat(2, 0), kind), (left, base, WIDTH, height))
+    canvas.picture(mapped(np.linspace(0, 1, 256)[None].repeat(2, 0), kind), (left, base, WIDTH, height))
     ticks = axis.ticks(8) if axis.high > DECADES * axis.low else Axis(axis.low, axis.high).ticks(8)
     for tick in ticks:
         u = left + WIDTH * axis.place(tick)
@@ -106,13 +106,14 @@ def _title(word: str, title: str) -> str:
     return f"{title}: {word.lower()}" if title else word
 
 
-def _rgb(image: Any) -> np.ndarray:
+def rgb_of(image: Any) -> np.ndarray:
     """(H, W) or (H, W, 3) in [0, 1]."""
-    pixels = _array(image)
+    pixels = as_array(image)
     pixels = pixels / 255.0 if pixels.dtype == np.uint8 else pixels
     pixels = np.clip(pixels, 0, 1)
     return pixels[0] if len(pixels) == 1 else pixels.transpose(1, 2, 0)
 
 
-def _array(x: Any) -> np.ndarray:
+def as_array(x: Any) -> np.ndarray:
+    """A tensor of any device, or an array, as an array."""
     return x.detach().cpu().numpy() if hasattr(x, "detach") else np.asarray(x)

@@ -14,6 +14,7 @@ from dhtorch.transform.adapters import (
     one_thread,
 )
 from dhtorch.transform.extend_depth import ExtendDepth
+from dhtorch.transform.judge_depth import JudgeDepth
 from dhtorch.transform.leaves import SampleError
 from dhtorch.transform.maps import Maps
 from dhtorch.transform.problems import SampleProblem
@@ -26,6 +27,7 @@ __all__ = [
     "ExtendDepth",
     "ExtendedDataset",
     "ExtendedStream",
+    "JudgeDepth",
     "Maps",
     "NumpyTransform",
     "RldsBatchTransform",

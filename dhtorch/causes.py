@@ -1,0 +1,315 @@
+"""Why a depth is wrong: what was done to a whole recording's maps, told by undoing each known fault in turn.
+
+A fault that all frames share leaves a pattern: undo the right one, and the depth explains how points moved between the
+pictures. Points are tracked once; under each hypothesis only their depth changes, and with it where the other picture
+should show them. The one that explains clearly more than none at all, and more than any of another kind, is named.
+
+Alphabet: P pairs of a window of frames, N samples; a *miss* is how far a track ends from where a depth says, in pixels
+of a picture 640 wide; the *loss* of a pair is the mean of miss² / (miss² + c²), between 0 and 1.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from dhtorch import tree
+from dhtorch.geometry import camera as cam
+from dhtorch.geometry import se3
+from dhtorch.geometry.lookup import nearest
+from dhtorch.geometry.start import coarse_flow
+from dhtorch.method import Method
+from dhtorch.pair import Clock, under_pose
+from dhtorch.records import Frame, Pose, Samples, Tracks
+from dhtorch.stages.pose import pnp_ransac
+from dhtorch.stages.track import lucas_kanade
+
+#: How pairs of a window are tracked and placed.
+TRACKING = Method(
+    n=384,
+    hypotheses=100,
+    track=partial(lucas_kanade, levels=5, window=21, normalise="bias", start=coarse_flow),
+    pose=pnp_ransac,
+)
+
+#: Miss at which the loss of a sample is a half, px of a picture 640 wide.
+HALF_PX = 2.0
+
+#: Loss that an explanation must save over none, its standard errors over the pairs, and what it must save over the best
+#: of another kind.
+SAVES, ERRORS, BEYOND = 0.04, 3.0, 0.015
+
+#: Frames that a depth may be early or late at most, and the factors on the focal length that are tried.
+LAG = 5
+FOCALS = (0.8, 0.87, 0.93, 0.95, 1.05, 1.07, 1.15, 1.25)
+
+#: Factors that take a depth in another unit to metres.
+UNITS = {"mm read as m": 1e-3, "m read as mm": 1e3, "inch read as m": 0.0254, "m read as inch": 1 / 0.0254}
+
+#: Pairs of a window, fewest that may name a cause, frames from one of a pair to the other, the widest first in which
+#: such a share of the textured samples is found again.
+PAIRS, FEWEST, GAPS, FOUND = 8, 4, (8, 4, 2, 1), 0.4
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A fault that maps of a recording may share, and how it is undone."""
+
+    kind: str  # unit | mirrored | rolled | time offset | focal length
+    name: str  # of this one
+    undo: Callable[[Tensor], Tensor] = lambda depth: depth  # map (B, h, w) → as it should be
+    lag: int = 0  # frames by which the maps come late
+    focal: float = 1.0  # what the focal length is to be multiplied by
+
+
+def turned(depth: Tensor, quarters: int) -> Tensor:
+    """A map (…, h, w) rolled counter-clockwise by quarter turns and stretched to its old size (nearest pixels)."""
+    rolled = torch.rot90(depth, quarters, (-2, -1))
+    if rolled.shape == depth.shape:
+        return rolled
+    flat = rolled.reshape(1, -1, *rolled.shape[-2:])
+    return F.interpolate(flat, depth.shape[-2:], mode="nearest-exact").reshape(depth.shape)
+
+
+def _mirrored(depth: Tensor) -> Tensor:
+    return depth.flip(-1)
+
+
+def _times(depth: Tensor, factor: float) -> Tensor:
+    return depth * factor
+
+
+#: Hypotheses: nothing first, then what is undone.
+NONE = Cause("none", "none")
+CAUSES: tuple[Cause, ...] = (
+    *(Cause("unit", name, partial(_times, factor=factor)) for name, factor in UNITS.items()),
+    Cause("mirrored", "mirrored left to right", _mirrored),
+    *(Cause("rolled", f"rolled by {90 * k} degrees", partial(turned, quarters=4 - k)) for k in (1, 2, 3)),
+    *(
+        Cause("time offset", f"{abs(k)} frames {'late' if k > 0 else 'early'}", lag=k)
+        for k in range(-LAG, LAG + 1)
+        if k
+    ),
+    *(Cause("focal length", f"focal length {1 / factor:.2f} of the true one", focal=factor) for factor in FOCALS),
+)
+
+
+class Named(NamedTuple):
+    """What was found out about a window of frames."""
+
+    cause: str | None  # name; None = nothing explains better than no fault, or it cannot be known
+    kind: str | None  # of the cause
+    loss: Mapping[str, float]  # hypothesis → mean loss over the pairs, "none" among them
+    n_pairs: int  # pairs that could tell
+    pairs: Sequence[tuple[int, int]] = ()  # that were looked at, as places in the window
+
+
+def name_cause(
+    frames: Sequence[Frame],
+    maps: Sequence[Tensor] | None = None,
+    *,
+    method: Method = TRACKING,
+    seed: int = 0,
+    watched: Watched | None = None,
+) -> Named:
+    """The known fault that the maps of a window of frames share, if one explains the pictures clearly best.
+
+    Args:
+        frames: some twenty views in their order, B = 1 each, of equal sizes.
+        maps: (1, h, w) m of each, over the field of the picture, held against the motions that the sensor's near
+            returns give; None = the sensor's own depth, whose hypotheses each give motions of their own.
+        method: how pairs are tracked and placed; its seats 1 to 5 count.
+        seed: of the pose search.
+        watched: what :func:`watch` found in the same pictures; None = it is asked.
+
+    Where all frames carry a pose of their own (``T_world_from_cam``) misses under that motion count as well, so that a
+    unit or a focal length, which motions fitted to the same depth swallow, shows. Without, a unit of the sensor's own
+    depth cannot be known and is not named.
+
+    Raises:
+        ValueError: fewer than two frames, or not one map for each.
+
+    Gradient: none.
+    Cost: a track of each pair, and a pose of each pair and hypothesis.
+    """
+    if len(frames) < 2 or (maps is not None and len(maps) != len(frames)):
+        found = "none" if maps is None else len(maps)
+        raise ValueError(f"name_cause: found {len(frames)} frames and {found} maps, expected two or more, as many maps")
+    with torch.no_grad():
+        watched = watch(frames, method) if watched is None else watched
+        if not watched.pairs:
+            return Named(None, None, {}, 0)
+        window = Window(
+            anchors=tree.collate([frames[i] for i, _ in watched.pairs]),
+            others=tree.collate([frames[j] for _, j in watched.pairs]),
+            samples=tree.collate(watched.samples),
+            tracks=tree.collate(watched.tracks),
+            maps=maps,
+            depths=[frame.depth for frame in frames],
+            pairs=watched.pairs,
+            method=method,
+            seed=seed,
+        )
+        losses = {cause.name: window.loss(cause) for cause in window.hypotheses()}
+    return decided(losses)._replace(pairs=watched.pairs)
+
+
+def decided(losses: Mapping[str, Tensor]) -> Named:
+    """What is named by losses (P,) of the pairs under each hypothesis, NaN where a pair cannot tell. Gradient: none."""
+    kinds = {cause.name: cause.kind for cause in (NONE, *CAUSES)}
+    base = losses[NONE.name]
+    able = base.isfinite()
+    mean = {name: float(loss[able & loss.isfinite()].mean()) for name, loss in losses.items()}
+    n = int(able.sum())
+    known = {name: value for name, value in mean.items() if math.isfinite(value)}
+    nothing = Named(None, None, known, n)
+    others = {name: value for name, value in known.items() if name != NONE.name}
+    if n < FEWEST or not others:
+        return nothing
+    best = min(others, key=lambda name: others[name])
+    both = able & losses[best].isfinite()
+    saved = (base - losses[best])[both]
+    rivals = [value for name, value in others.items() if kinds[name] != kinds[best]]
+    error = float(saved.std() / len(saved) ** 0.5) if len(saved) >= FEWEST else float("inf")
+    clear = float(saved.mean()) > max(SAVES, ERRORS * error)
+    alone = not rivals or min(rivals) - others[best] > BEYOND
+    return Named(best, kinds[best], known, n) if clear and alone else nothing
+
+
+class Watched(NamedTuple):
+    """Pairs of a window, and the samples of each first picture with where the second shows them."""
+
+    pairs: Sequence[tuple[int, int]]
+    samples: Sequence[Samples]
+    tracks: Sequence[Tracks]
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """Pairs of a window, tracked: what stays the same whatever the depth."""
+
+    anchors: Frame  # (P, …)
+    others: Frame  # (P, …)
+    samples: Samples  # (P, N) as the sensor has them
+    tracks: Tracks  # (P, N)
+    maps: Sequence[Tensor] | None  # of all frames
+    depths: Sequence[Tensor]  # of all frames, the sensor's own
+    pairs: Sequence[tuple[int, int]]  # frames of each
+    method: Method
+    seed: int
+
+    def hypotheses(self) -> Sequence[Cause]:
+        """What could be known: a motion fitted to near returns swallows a focal length, and the unit of its own."""
+        if self.anchors.T_world_from_cam is not None and self.others.T_world_from_cam is not None:
+            return (NONE, *CAUSES)
+        swallowed = {"focal length", "unit"} if self.maps is None else {"focal length"}
+        return (NONE, *(cause for cause in CAUSES if cause.kind not in swallowed))
+
+    def loss(self, cause: Cause) -> Tensor:
+        """(P,) loss with that fault undone; NaN where a pair cannot tell."""
+        place = [i + cause.lag for i, _ in self.pairs]
+        there = torch.tensor([0 <= i < len(self.depths) for i in place], device=self.samples.uv.device)
+        place = [min(max(i, 0), len(self.depths) - 1) for i in place]
+        scaled = (self._scaled(self.anchors, cause.focal), self._scaled(self.others, cause.focal))
+        own = self.maps is None
+        sensor = self.anchors.depth
+        if own:
+            sensor = cause.undo(torch.cat([self.depths[i] for i in place]))
+        view = scaled[0].replace(depth=sensor)
+        samples = self.method.backproject(view, self.samples.uv).replace(trackability=self.samples.trackability)
+        depth = torch.where(samples.usable, samples.depth, 0.0)
+        if self.maps is not None:
+            depth = cause.undo(torch.cat([self.maps[i] for i in place])).to(depth)
+            depth = nearest(depth, _place(self.samples.uv, view.hw, depth))[0].nan_to_num(0.0, 0.0, 0.0)
+        found = self._under_fit(samples, depth, scaled)
+        given = self._under_trajectory(depth, scaled)
+        if given is not None:
+            found = torch.where(found.isfinite(), found, 1.0) + given
+        return torch.where(there, found, torch.nan)
+
+    @staticmethod
+    def _scaled(frame: Frame, factor: float) -> Frame:
+        camera = frame.camera.replace(f=frame.camera.f * factor)
+        depth_camera = frame.depth_camera
+        if depth_camera is not None:
+            depth_camera = depth_camera.replace(f=depth_camera.f * factor)
+        return frame.replace(camera=camera, depth_camera=depth_camera)
+
+    def _under_fit(self, samples: Samples, depth: Tensor, views: tuple[Frame, Frame]) -> Tensor:
+        """Under motions fitted to near returns; a pair without one misses everything, of the sensor's own depth."""
+        cameras = views[0].camera, views[1].camera
+        _, usable, fit = under_pose(
+            self.method, samples, self.tracks, *cameras, seed=self.seed, fit=None, clock=Clock(None)
+        )
+        still = fit.t_snr < 3
+        loss = self._missed(depth, usable, fit.T_1_from_0, cameras)
+        lost = 1.0 if self.maps is None else torch.nan
+        return torch.where(fit.ok & ~(still & (self.maps is not None)), loss, lost)
+
+    def _under_trajectory(self, depth: Tensor, views: tuple[Frame, Frame]) -> Tensor | None:
+        """Under the motions of the frames' own poses; None where they have none."""
+        a, b = views[0].T_world_from_cam, views[1].T_world_from_cam
+        if a is None or b is None:
+            return None
+        T = se3.relative(a, b).map(lambda x: x.to(depth))
+        return self._missed(depth, self.tracks, T, (views[0].camera, views[1].camera))
+
+    def _missed(self, depth: Tensor, tracks: Tracks, T: Pose, cameras: tuple[cam.Camera, cam.Camera]) -> Tensor:
+        """Mean loss (P,) of the samples that have a depth and a track."""
+        xyz = cam.unproject(cameras[0], self.samples.uv, depth)
+        used = tracks.valid & (depth > 0) & xyz.isfinite().all(-1)
+        there = se3.apply(T, torch.where(used[..., None], xyz, 1.0))
+        ahead = used & (there[..., 2] > 1e-6)
+        uv = cam.project(cameras[1], torch.where(ahead[..., None], there, 1.0))
+        miss = (uv - self.tracks.uv_1).norm(dim=-1) * (640 / self.anchors.hw[1])
+        loss = torch.where(ahead, miss.square() / (miss.square() + HALF_PX**2), 1.0)
+        n = used.sum(-1)
+        mean = torch.where(used, loss, 0.0).sum(-1) / n.clamp_min(1)
+        return torch.where(n >= 12, mean, torch.nan)
+
+
+def watch(frames: Sequence[Frame], method: Method = TRACKING) -> Watched:
+    """How points move between the pictures of a window, in pairs as wide as tracks hold: what no depth changes.
+
+    Gradient: none.
+    """
+    found: dict[int, tuple[int, Samples, Tracks]] = {}
+    for gap in [gap for gap in GAPS if gap < len(frames)]:
+        firsts = [i for i in _firsts(len(frames)) if i not in found and i + gap < len(frames)]
+        if not firsts:
+            continue
+        with torch.no_grad():
+            samples, tracks = _tracked([frames[i] for i in firsts], [frames[i + gap] for i in firsts], method)
+        textured = (samples.trackability >= method.min_trackability).sum(-1).clamp_min(1)
+        holds = tracks.valid.sum(-1) >= FOUND * textured
+        for k, i in enumerate(firsts):
+            if bool(holds[k]):
+                found[i] = gap, samples[k : k + 1], tracks[k : k + 1]
+    order = sorted(found)
+    pairs = [(i, i + found[i][0]) for i in order]
+    return Watched(pairs, [found[i][1] for i in order], [found[i][2] for i in order])
+
+
+def _tracked(anchors: Sequence[Frame], others: Sequence[Frame], method: Method) -> tuple[Samples, Tracks]:
+    """Samples of some frames found again in others."""
+    samples = method.look(tree.collate(anchors))
+    tracks = method.track(tree.collate(anchors).image, tree.collate(others).image, samples.uv)
+    return samples, tracks.replace(valid=tracks.valid & (samples.trackability >= method.min_trackability))
+
+
+def _firsts(n: int) -> list[int]:
+    """Anchors of a window, spread evenly, not so near its ends that no earlier or later map is known."""
+    low, high = (LAG, n - 1 - LAG) if n > 3 * LAG else (0, n - 2)
+    return sorted({low + round((high - low) * k / (PAIRS - 1)) for k in range(PAIRS)})
+
+
+def _place(uv: Tensor, hw: tuple[int, int], depth: Tensor) -> Tensor:
+    scale = torch.tensor([depth.shape[-1] / hw[1], depth.shape[-2] / hw[0]]).to(uv)
+    return (uv + 0.5) * scale - 0.5

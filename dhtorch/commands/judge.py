@@ -1,0 +1,301 @@
+"""``dhtorch judge``: whether the depth of a recording is right, its sensor's own or maps from elsewhere.
+
+Writes ``judge.json`` (a row for every frame, what they come to, the causes named in windows of frames) and
+``judge.html``, worst first. The exit code is 1 where a limit of ``fail_on`` is exceeded, so that it can stand in a data
+pipeline.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+import statistics
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from dhtorch import causes, storage
+from dhtorch.codes import State, names
+from dhtorch.data import depth_maps, files
+from dhtorch.data.depth_maps import DepthMaps
+from dhtorch.data.pairs import around
+from dhtorch.data.scene import Scene, scenes_of
+from dhtorch.drawing import draw_verdict
+from dhtorch.evaluate.holdout import range_split
+from dhtorch.method import Method
+from dhtorch.records import Frame, Verdict
+from dhtorch.tree import stack
+from dhtorch.verdict import judge
+from dhtorch.viewer import judged as pages
+
+Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
+Row = dict[str, Any]
+
+#: Numbers of a frame with their interval.
+NUMBERS = ("scale", "scale_near", "scale_far", "ruler", "shift", "tilt", "wrong")
+
+#: What ``fail_on`` may name → what is held against the limit, in words. All are of a whole recording.
+LIMITS = {
+    "wrong": "share of wrong pixels among those of which something is known",
+    "scale": "|median scale - 1| of the frames whose scale is known",
+    "shift": "median |shift| of the frames, m",
+    "tilt": "median tilt of the frames",
+    "causes": "share of the windows in which a cause is named",
+    "unknown": "share of the pixels with a depth of which nothing can be known",
+}
+
+#: Columns of the page's table.
+COLUMNS = ("wrong", "known", "scale", "shift, m", "tilt")
+
+_LIMIT = re.compile(r"\s*([a-z]+)\s*>\s*([0-9.eE+-]+)\s*")
+
+
+@dataclass
+class Found:
+    """What is said of one recording."""
+
+    scene: Scene
+    maps: DepthMaps | None
+    rows: list[Row] = field(default_factory=list)
+    windows: list[Row] = field(default_factory=list)
+    pictures: dict[int, bytes] = field(default_factory=dict)  # frame → PNG, of the worst
+
+
+def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:
+    """Judge every scene of the settings; returns the exit code, 1 where a limit is exceeded.
+
+    Raises:
+        ValueError, OSError: bad options or data.
+    """
+    limits = _checked(settings)
+    if settings["threads"] is not None:
+        torch.set_num_threads(settings["threads"])
+        files.set_opencv_threads(settings["threads"])
+    scenes = scenes_of(parts["data"])
+    if settings["depth"] is not None and len(scenes) > 1:
+        raise ValueError(f"depth: found {len(scenes)} recordings for one folder of maps, expected one (data.root=…)")
+    folder = Path(str(settings["output"])).expanduser()
+    written, failed, told = [], [], []
+    for scene in scenes:
+        maps = None
+        if settings["depth"] is not None:
+            maps = depth_maps.open_maps(settings["depth"], scene.recording, settings["depth_unit"])
+        found = _judged(Found(scene, maps), parts["method"], settings, progress)
+        whole = _whole(found)
+        over = exceeded(whole, limits)
+        place = folder if len(scenes) == 1 else folder / scene.name
+        content = {"scene": scene.name, "source": "sensor" if maps is None else "maps", "fail_on": settings["fail_on"]}
+        content |= {"exceeded": over, "whole": whole, "windows": found.windows, "frames": found.rows}
+        written += [storage.write_json(place / "judge.json", storage.strict(content)), _page(place, found, whole, over)]
+        told += [*_said(scene.name, whole), *(f"  exceeded: {line}" for line in over)]
+        failed += over
+    print("\n".join([*told, "wrote", *(f"  {path}" for path in written)]))
+    return int(bool(failed))
+
+
+def exceeded(whole: Mapping[str, Any], limits: Mapping[str, float]) -> list[str]:
+    """Limits that a recording's numbers exceed, in words; a number that cannot be known exceeds none."""
+    found = []
+    for name, limit in limits.items():
+        value = whole["held"][name]
+        if value is not None and value > limit:
+            found.append(f"{name} is {value:.4g}, limit {limit:g} ({LIMITS[name]})")
+    return found
+
+
+def parse_limits(text: str | None) -> dict[str, float]:
+    """``wrong>0.05,scale>0.1`` as numbers by name.
+
+    Raises:
+        ValueError: something else.
+    """
+    limits: dict[str, float] = {}
+    for part in (text or "").split(",") if text else ():
+        match = _LIMIT.fullmatch(part)
+        try:
+            if match is None or match.group(1) not in LIMITS:
+                raise ValueError
+            limits[match.group(1)] = float(match.group(2))
+        except ValueError:
+            expected = f"NAME>NUMBER, separated by commas, of {', '.join(LIMITS)}"
+            raise ValueError(f"fail_on: found {part.strip()!r}, expected {expected}") from None
+    return limits
+
+
+# ------------------------------------------------------------------------------------------------------------- frames
+
+
+def _judged(found: Found, method: Method, settings: Mapping[str, Any], progress: Progress) -> Found:
+    """Every frame by itself, then windows of frames."""
+    n = len(found.scene.recording)
+    frames = range(0, n, settings["every"])[: settings["most"]]
+    for i in progress(frames, f"{found.scene.name}: frames", len(frames)):
+        frame = _shown(found.scene, settings, i)
+        verdict = _verdict(found, frame, i, method, settings)
+        row = _row(int(found.scene.recording.number[i]), verdict)
+        found.rows.append(row)
+        _keep_worst(found, i, frame, verdict, settings["pictures"])
+    if settings["window"]:
+        size = min(settings["window"], n)
+        firsts = sorted({min(k, n - size) for k in range(0, max(frames[-1] + 1 - size, 0) + 1, size)}) if n > 1 else []
+        for first in progress(firsts, f"{found.scene.name}: windows", len(firsts)):
+            found.windows.append(_window(found, first, size, settings))
+    return found
+
+
+def _shown(scene: Scene, settings: Mapping[str, Any], i: int) -> Frame:
+    frame = scene.recording[i].to(getattr(torch, settings["dtype"])).to(settings["device"])
+    if 0 in frame.hw:
+        raise ValueError(f"{scene.name}: found frames without pictures, expected pictures (data.images=true)")
+    return range_split(frame, settings["cutoff"])
+
+
+def _verdict(found: Found, frame: Frame, i: int, method: Method, settings: Mapping[str, Any]) -> Verdict:
+    recording = found.scene.recording
+    depth, others, beside = None, None, None
+    if found.maps is not None:
+        given = found.maps[i]
+        depth = torch.zeros(1, *frame.hw) if given is None else given
+        depth = depth.to(frame.camera.f)
+    if len(recording) > 1:
+        offered = around(recording, i, settings["steps"])
+        others = stack([_shown(found.scene, settings, k) for k in offered])
+        maps = [] if found.maps is None else [found.maps[k] for k in offered]
+        known = [m for m in maps if m is not None]
+        if known and len({m.shape for m in known}) == 1:
+            beside = torch.stack([torch.zeros_like(known[0]) if m is None else m for m in maps])
+    options = {k: settings[k] for k in ("views", "partners", "size", "tolerance", "seed")}
+    return judge(depth, frame, others, other_maps=beside, method=method, hint=found.scene.hint, **options)
+
+
+def _row(number: int, verdict: Verdict) -> Row:
+    """A frame's numbers."""
+    there = verdict.depth > 0
+    n = int(there.sum())
+    row: Row = {"frame": number, "pixels": n}
+    for code, name in names(State).items():
+        row[f"share_{name.lower()}"] = int(((verdict.state == code) & there).sum()) / n if n else None
+    for name in NUMBERS:
+        value, low, high = (float(x) for x in getattr(verdict, name)[0])
+        row[name] = None if math.isnan(value) else {"value": value, "low": low, "high": high}
+    for name in ("by_answers", "by_views", "by_maps"):
+        said = getattr(verdict, name)[there]
+        against = said.abs() > 3
+        row[name] = {"told": float(said.isfinite().double().mean()) if n else None, "against": int(against.sum())}
+    return row
+
+
+def _keep_worst(found: Found, i: int, frame: Frame, verdict: Verdict, most: int) -> None:
+    """The pictures of the worst frames so far."""
+    order = sorted(range(len(found.rows)), key=lambda k: -_worse(found.rows[k]))[:most]
+    here = len(found.rows) - 1
+    if here not in order:
+        return
+    out = io.BytesIO()
+    one = verdict[0]
+    number = found.rows[here]["frame"]
+    draw_verdict(out, frame.image[0].cpu(), one.depth, one.state, one.evidence, title=f"{found.scene.name} {number}")
+    found.pictures[number] = out.getvalue()
+    kept = {found.rows[k]["frame"] for k in order}
+    found.pictures = {k: v for k, v in found.pictures.items() if k in kept}
+
+
+def _worse(row: Row) -> float:
+    """By which frames are ordered: the share of all pixels that are wrong."""
+    share = row["share_wrong"]
+    return float(share) if share is not None else -1.0
+
+
+def _window(found: Found, first: int, size: int, settings: Mapping[str, Any]) -> Row:
+    """What is named in some consecutive frames."""
+    frames = [_shown(found.scene, settings, k) for k in range(first, first + size)]
+    named = causes.Named(None, None, {}, 0)
+    if found.maps is None:
+        named = causes.name_cause(frames, seed=settings["seed"])
+    else:
+        given = [found.maps[k] for k in range(first, first + size)]
+        shapes = {m.shape for m in given if m is not None}
+        if len(shapes) == 1:  # maps of several sizes share no fault of the file
+            blank = torch.zeros(next(iter(shapes)))
+            named = causes.name_cause(frames, [blank if m is None else m for m in given], seed=settings["seed"])
+    number = found.scene.recording.number
+    row: Row = {"frames": [int(number[first]), int(number[first + size - 1])], "pairs": named.n_pairs}
+    return row | {"cause": named.cause, "kind": named.kind, "loss": dict(named.loss)}
+
+
+# -------------------------------------------------------------------------------------------------------- what is said
+
+
+def _whole(found: Found) -> Row:
+    """A recording's numbers, and those that limits are held against."""
+    rows = found.rows
+    pixels = sum(row["pixels"] for row in rows)
+    states = [name.lower() for name in names(State).values()]
+    count = {name: sum(row[f"share_{name}"] * row["pixels"] for row in rows if row["pixels"]) for name in states}
+    known = count["wrong"] + count["consistent"]
+    middle = {}
+    for name in ("scale", "ruler", "shift", "tilt"):
+        values = [row[name]["value"] for row in rows if row[name] is not None]
+        middle[name] = statistics.median(values) if values else None
+    told = [row for row in found.windows if row["pairs"] >= causes.FEWEST]
+    kinds = Counter(row["cause"] for row in told if row["cause"] is not None)
+    held = {
+        "wrong": count["wrong"] / known if known else None,
+        "scale": None if middle["scale"] is None else abs(middle["scale"] - 1),
+        "shift": None if middle["shift"] is None else abs(middle["shift"]),
+        "tilt": middle["tilt"],
+        "causes": sum(kinds.values()) / len(told) if told else None,
+        "unknown": count["cannot_know"] / pixels if pixels else None,
+    }
+    return {
+        "frames": len(rows),
+        "pixels": pixels,
+        "median": middle,
+        "causes": dict(kinds),
+        "windows": len(told),
+        "held": held,
+    }
+
+
+def _said(name: str, whole: Row) -> list[str]:
+    """A recording in words."""
+    held, middle = whole["held"], whole["median"]
+    wrong = "nothing can be known" if held["wrong"] is None else f"{held['wrong']:.1%} of what is known is wrong"
+    unknown = "no depth" if held["unknown"] is None else f"{held['unknown']:.1%} cannot be known"
+    scale = "scale cannot be known" if middle["scale"] is None else f"scale {middle['scale']:.3f}"
+    lines = [f"{name}: {whole['frames']} frames: {wrong}, {unknown}; {scale}"]
+    for cause, n in sorted(whole["causes"].items(), key=lambda item: -item[1]):
+        lines.append(f"  likely cause in {n} of {whole['windows']} windows: {cause}")
+    return lines
+
+
+def _page(place: Path, found: Found, whole: Row, over: Sequence[str]) -> Path:
+    rows = sorted(found.rows, key=_worse, reverse=True)
+    frames = []
+    for row in rows:
+        known = None if row["share_cannot_know"] is None else 1 - row["share_cannot_know"]
+        cells = [pages.cell(row["wrong"]), "–" if known is None else f"{known:.2f}"]
+        cells += [pages.cell(row[name]) for name in ("scale", "shift", "tilt")]
+        frames.append(pages.JudgedFrame(f"frame {row['frame']}", cells, found.pictures.get(row["frame"])))
+    failed = [f"Exceeded: {line}" for line in over]
+    said = _said(found.scene.name, whole)
+    return pages.write(place / "judge.html", found.scene.name, said=said, columns=COLUMNS, frames=frames, failed=failed)
+
+
+def _checked(settings: Mapping[str, Any]) -> dict[str, float]:
+    """The limits; options that would only fail later."""
+    for name, low in (("every", 1), ("most", 1), ("window", 0), ("pictures", 0), ("partners", 1), ("size", 16)):
+        value = settings[name]
+        whole = isinstance(value, int) and not isinstance(value, bool) and value >= low
+        if not whole and not (name == "most" and value is None):
+            raise ValueError(f"{name}: found {value!r}, expected a whole number of at least {low}")
+    if settings["window"] == 1:
+        raise ValueError("window: found 1, expected 0 or at least 2 frames")
+    if settings["dtype"] not in ("float32", "float64"):
+        raise ValueError(f"dtype: found {settings['dtype']!r}, expected float32 or float64")
+    return parse_limits(settings["fail_on"])

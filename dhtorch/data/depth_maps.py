@@ -1,0 +1,116 @@
+"""Depth maps beside a recording: a folder with one file a frame, from a network or any other source.
+
+``*.png`` of 16 bits in steps of a stated unit, or ``*.npy`` of floats in the same unit; (h, w) over the field of the
+frame's picture, of any size. 0, and what is not finite, is no depth. What ``dhtorch complete`` wrote is read as it is:
+its ``complete.json`` says the unit.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dhtorch.data import files
+from dhtorch.data.files import MAX_PIXELS, FormatError
+from dhtorch.data.recording import Recording
+
+#: Name of a unit → metres.
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
+
+_ENDINGS = (".png", ".npy")
+
+
+@dataclass(frozen=True)
+class DepthMaps:
+    """The maps of a folder, by position in a recording."""
+
+    files: Sequence[Path | None]  # of every frame
+    unit: float  # m
+
+    def __getitem__(self, i: int) -> Tensor | None:
+        """(1, h, w) m float32 of frame ``i``, 0 = no depth; None where there is no file.
+
+        Raises:
+            FormatError: a damaged file, or one of another kind.
+        """
+        file = self.files[i]
+        if file is None:
+            return None
+        array = files.read_depth_png(file, 1.0) if file.suffix.lower() == ".png" else _npy(file)
+        depth = torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))[None] * self.unit
+        return torch.where(depth.isfinite() & (depth > 0), depth, 0.0)
+
+
+def open_maps(folder: str | Path, recording: Recording, unit: str | float | None = None) -> DepthMaps:
+    """The maps of a recording's frames.
+
+    A file belongs to the frame whose number its name ends in; where a name has none, files and frames are matched in
+    their order, and there must be as many.
+
+    Args:
+        folder: of the files, or one that ``dhtorch complete`` wrote.
+        recording: whose frames they are of.
+        unit: m, cm, mm, inch, or metres a step; None = what ``complete.json`` says, else mm for PNG and m for NPY.
+
+    Raises:
+        FormatError: no folder, no map, both kinds, or files that cannot be matched.
+        ValueError: an unknown unit.
+    """
+    root = Path(folder).expanduser()
+    if not root.is_dir():
+        raise FormatError(root, "depth", "no folder", "a folder of 16-bit PNG or NPY files")
+    about = root / "complete.json" if (root / "complete.json").is_file() else root.parent / "complete.json"
+    place = root / "depth" if (root / "depth").is_dir() else root
+    found = sorted(file for file in place.iterdir() if file.suffix.lower() in _ENDINGS)
+    kinds = {file.suffix.lower() for file in found}
+    if len(kinds) != 1:
+        what = "both kinds" if kinds else "no such file"
+        raise FormatError(place, "depth", what, "one 16-bit PNG or NPY file a frame")
+    step = _unit(unit)
+    if step is None and about.is_file():
+        step = files.to_positive(files.read_json(about).get("unit_m"), about, "unit_m")
+    if step is None:
+        step = UNITS["mm"] if kinds == {".png"} else UNITS["m"]
+    return DepthMaps(_matched(place, found, recording), step)
+
+
+def _matched(place: Path, found: Sequence[Path], recording: Recording) -> list[Path | None]:
+    number = recording.number.tolist()
+    named = [re.search(r"(\d+)\D*$", file.stem) for file in found]
+    by_number = {int(match.group(1)): file for match, file in zip(named, found, strict=True) if match}
+    if len(by_number) == len(found) and set(by_number) & set(number):
+        return [by_number.get(k) for k in number]
+    if len(found) == len(number):
+        return list(found)
+    raise FormatError(place, "depth", f"{len(found)} files of other names", f"one for each of {len(number)} frames")
+
+
+def _unit(given: str | float | None) -> float | None:
+    if given is None:
+        return None
+    if isinstance(given, str) and given in UNITS:
+        return UNITS[given]
+    if isinstance(given, int | float) and not isinstance(given, bool) and given > 0:
+        return float(given)
+    raise ValueError(f"depth_unit: found {given!r}, expected {', '.join(UNITS)}, or metres a step")
+
+
+def _npy(file: Path) -> np.ndarray:
+    """Numbers (h, w) of a NPY file; never objects, which could run code."""
+    try:
+        array = np.load(io.BytesIO(files.read_bytes(file)), allow_pickle=False)
+    except (ValueError, EOFError, OSError) as error:
+        raise FormatError(file, "depth", f"{type(error).__name__}", "a NPY array of numbers") from error
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+        raise FormatError(file, "depth", "no array of numbers", "a NPY array of numbers")
+    array = array.squeeze()
+    if array.ndim != 2 or not 0 < array.size <= MAX_PIXELS:
+        raise FormatError(file, "depth", f"shape {array.shape}", "(height, width)")
+    return array

@@ -1,0 +1,60 @@
+"""A judged depth map: the picture, the map, what is said of every pixel, and how strongly.
+
+Arrays may be torch tensors or numpy arrays, on any device, of one view (no batch dimension).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from dhtorch.codes import State
+from dhtorch.drawing import colours
+from dhtorch.drawing.axis import Axis
+from dhtorch.drawing.canvas import Canvas, save
+from dhtorch.drawing.maps import GAP, TITLE, WIDTH, as_array, coloured, depths, mapped, rgb_of
+
+#: Sigmas at the ends of the colour map of evidence.
+END = 6.0
+
+
+def draw_verdict(
+    path: str | Path | IO[bytes],
+    image: Any,  # (C, H, W) uint8, or float in [0, 1]
+    depth: Any,  # (h, w) m, 0 or NaN where nothing is known
+    state: Any,  # (h, w) codes.State
+    evidence: Any,  # (h, w) sigmas, positive where the map is too far; NaN where nothing is said
+    *,
+    title: str = "",
+) -> None:
+    """Draw the picture, the map by the logarithm of its depth, the states, and the evidence.
+
+    Evidence is red where the map is too far and blue where it is too near. What cannot be known is left blank.
+    """
+    z, code, sigmas = (as_array(x) for x in (depth, state, evidence))
+    known = np.isfinite(z) & (z > 0)
+    height = WIDTH * z.shape[0] / z.shape[1]
+    canvas = Canvas(2 * WIDTH + GAP, 2 * (height + TITLE), dpi=110)
+    ground = np.array(colours.rgb(colours.PICTURE)) / 255
+    states = np.array([colours.rgb(colours.STATES[k]) for k in sorted(colours.STATES)])[code.astype(np.int64)] / 255
+    strength = mapped((np.nan_to_num(sigmas).clip(-END, END) + END) / (2 * END), colours.SIGNED)
+    wrong, fine = ((code == k).mean() for k in (State.WRONG, State.CONSISTENT))
+    strength = np.where(np.isnan(sigmas)[..., None], ground, strength)
+    metres: Axis = depths(z[known])
+    shown = [
+        (f"{title}: picture" if title else "Picture", 1, rgb_of(image)),
+        (f"Depth, {metres.low:.2g} to {metres.high:.2g} m", 1, coloured(z, known, metres, colours.DEPTH)),
+        (f"Wrong {100 * wrong:.1f} %, consistent {100 * fine:.0f} %, else cannot know", 0, states),
+        (
+            f"Evidence to {END:g} sigmas: red too far, blue too near",
+            0,
+            np.where(np.isnan(sigmas)[..., None], ground, strength),
+        ),
+    ]
+    for k, (words, row, pixels) in enumerate(shown):
+        left, bottom = (k % 2) * (WIDTH + GAP), row * (height + TITLE)
+        canvas.title(words, WIDTH, bottom + height + TITLE, left)
+        canvas.picture(pixels, (left, bottom, WIDTH, height))
+    save(canvas.figure, path)

@@ -1,0 +1,234 @@
+"""A depth map gone wrong in a known way: what networks, sensors and hands full of files do to depth.
+
+Every fault takes a true map (B, h, w) in m, 0 where there is none, and gives a map of the same size with as many zeros
+or fewer. Random ones draw from a seed on the CPU, the same for every map of a batch, so that a map's fault does not
+depend on its batch mates.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+
+import torch
+from torch import Generator, Tensor
+
+from dhtorch.geometry.filters import gaussian
+from dhtorch.geometry.shapes import check
+
+#: Scales of a map that is otherwise right, and the shift of one, m.
+SCALES, SHIFT = (0.8, 1.25), 0.15
+
+#: Tilt: share of the depth from one side of the picture to the other.
+TILT = 0.10
+
+#: Standard deviations of low-frequency warps, of log depth, and how many waves they have across the picture at most.
+WARPS, WAVES = (0.013, 0.05), 2.5
+
+#: Standard deviation of the blur that mixes both sides of an edge, as a share of the width.
+BLUR = 0.012
+
+#: Local jumps: so many objects moved away by this factor (0.6 m → 1.8 m), each of pixels within a share of the width
+#: whose depth differs little from that of the middle.
+JUMPS, JUMP, OBJECT, SAME = 3, 3.0, 0.12, 0.08
+
+#: Inventions: so many discs of this radius (share of the width) are cut out and filled smoothly, off by this at most.
+DISCS, DISC, INVENTED = 4, 0.10, 0.25
+
+#: Structured light: disparities of f · baseline / z px come in eighths.
+FOCAL_BASELINE, DISPARITY_STEP = 580 * 0.075, 0.125
+
+#: A unit of another data set (5000 a metre read as 1000), and a focal length that is too long by this factor.
+UNIT, FOCAL = 5.0, 1.1
+
+#: A map that was rolled sideways by this share of its width.
+ROLL = 0.1
+
+#: From which relative change on a pixel of a faulty map counts as wrong.
+WRONG = 0.02
+
+Fault = Callable[[Tensor, Generator], Tensor]
+
+
+def scaled(depth: Tensor, factor: float) -> Tensor:
+    """The map in another metre."""
+    return depth * factor
+
+
+def shifted(depth: Tensor, shift: float) -> Tensor:
+    """All depths ``shift`` m more, at least a hundredth of what they were."""
+    return torch.where(depth > 0, (depth + shift).clamp_min(0).maximum(0.01 * depth), 0.0)
+
+
+def tilted(depth: Tensor, share: float, angle: float) -> Tensor:
+    """Depths that grow by ``share`` from one side of the picture to the other, in the direction ``angle`` (rad)."""
+    x, y = _places(depth)
+    return depth * (1 + 0.5 * share * (math.cos(angle) * x + math.sin(angle) * y))
+
+
+def warped(depth: Tensor, sigma: float, generator: Generator) -> Tensor:
+    """A smooth error: log depth plus a few waves of standard deviation ``sigma``, of mean zero over the picture."""
+    x, y = _places(depth)
+    field = torch.zeros_like(x + y)
+    for _ in range(6):
+        across, down, phase = torch.rand(3, generator=generator, dtype=torch.float64).tolist()
+        across, down = (WAVES * (2 * u - 1) for u in (across, down))
+        field = field + torch.cos(math.pi * (across * x + down * y) + 2 * math.pi * phase)
+    field = (field - field.mean()) / field.std().clamp_min(1e-6)
+    return depth * (sigma * field).exp()
+
+
+def blurred(depth: Tensor, share: float = BLUR) -> Tensor:
+    """Edges that mix foreground and background: the Gaussian mean of what is known around each pixel."""
+    sigma_px = max(0.5, share * depth.shape[-1])
+    known = (depth > 0).to(depth)
+    mean = gaussian(depth[:, None], sigma_px) / gaussian(known[:, None], sigma_px).clamp_min(1e-6)
+    return torch.where(depth > 0, mean[:, 0], 0.0)
+
+
+def jumped(depth: Tensor, generator: Generator, *, n: int = JUMPS, factor: float = JUMP) -> Tensor:
+    """Objects that stand elsewhere: pixels around ``n`` places that lie as deep as the place does, ``factor`` times as
+    deep."""
+    found = depth
+    for u, v in _spots(depth, generator, n):
+        middle = _at(depth, u, v)
+        level = (depth / middle.clamp_min(1e-6)).clamp_min(1e-6).log().abs() < SAME
+        inside = _within(depth, u, v, OBJECT) & level & (depth > 0) & (middle > 0)
+        found = torch.where(inside, factor * depth, found)
+    return found
+
+
+def invented(depth: Tensor, generator: Generator) -> Tensor:
+    """Holes filled with something smooth: discs in which the map is the blurred surroundings times a smooth factor."""
+    wide = blurred(depth, DISC)
+    found = depth
+    for u, v in _spots(depth, generator, DISCS):
+        off = INVENTED * (2 * float(torch.rand((), generator=generator)) - 1)
+        x, y = _places(depth)
+        r = _distance(depth, u, v) / DISC
+        lie = wide * (1 + off * (1 - r.square()).clamp_min(0) + 0.05 * off * (x + y))
+        found = torch.where((r < 1) & (depth > 0), lie, found)
+    return found
+
+
+def quantised(depth: Tensor) -> Tensor:
+    """Depth of structured light, which comes in steps that grow as its square; none beyond what one step can tell."""
+    steps = (FOCAL_BASELINE / depth.clamp_min(1e-6) / DISPARITY_STEP).round()
+    return torch.where((depth > 0) & (steps >= 1), FOCAL_BASELINE / (steps.clamp_min(1) * DISPARITY_STEP), 0.0)
+
+
+def mirrored(depth: Tensor) -> Tensor:
+    """Left for right."""
+    return depth.flip(-1)
+
+
+def rolled(depth: Tensor, share: float = ROLL) -> Tensor:
+    """Columns moved to the right by a share of the width, those beyond the edge to the left."""
+    return depth.roll(round(share * depth.shape[-1]), -1)
+
+
+def magnified(depth: Tensor, factor: float = FOCAL) -> Tensor:
+    """Depth laid over the picture with a focal length that is wrong by ``factor``: each pixel shows what lies nearer to
+    the middle by that factor, or farther from it; none where that is outside."""
+    h, w = depth.shape[-2:]
+    rows, columns = (((torch.arange(n, device=depth.device) - (n - 1) / 2) / factor + (n - 1) / 2) for n in (h, w))
+    row, column = rows.round().long(), columns.round().long()
+    inside = ((row >= 0) & (row < h))[:, None] & ((column >= 0) & (column < w))
+    return torch.where(inside, depth[:, row.clamp(0, h - 1)][:, :, column.clamp(0, w - 1)], 0.0)
+
+
+def _fixed(fault: Callable[[Tensor], Tensor]) -> Fault:
+    """A fault without anything drawn."""
+    return lambda depth, _generator: fault(depth)
+
+
+#: What a network's map does wrong: shape and metre, alone and together.
+OF_NETWORKS: dict[str, Fault] = {
+    "scale_short": _fixed(partial(scaled, factor=SCALES[0])),
+    "scale_long": _fixed(partial(scaled, factor=SCALES[1])),
+    "shift": _fixed(partial(shifted, shift=SHIFT)),
+    "tilt": _fixed(partial(tilted, share=TILT, angle=0.6)),
+    "warp_small": lambda depth, g: warped(depth, WARPS[0], g),
+    "warp_large": lambda depth, g: warped(depth, WARPS[1], g),
+    "simulated": lambda depth, g: scaled(warped(depth, WARPS[0], g), 1.05),
+    "blur": _fixed(blurred),
+    "jumps": jumped,
+    "invented": invented,
+    "quantised": _fixed(quantised),
+}
+
+#: What sensors and data sets do wrong with maps that are right by themselves.
+OF_FILES: dict[str, Fault] = {
+    "unit": _fixed(partial(scaled, factor=UNIT)),
+    "mirrored": _fixed(mirrored),
+    "rolled": _fixed(rolled),
+    "wrong_k": _fixed(magnified),
+}
+FAULTS = OF_NETWORKS | OF_FILES
+
+#: A fault that is another frame's map: it is no function of this one.
+WRONG_TIME = "time"
+
+
+def spoil(
+    name: str,
+    depth: Tensor,  # (B, h, w) m, 0 = none
+    *,
+    seed: int = 0,
+    other: Tensor | None = None,  # (B, h, w) m, of another time
+) -> tuple[Tensor, Tensor]:
+    """A map with a fault, and which of its pixels are wrong by more than ``WRONG``, (B, h, w) each.
+
+    Args:
+        name: of :data:`FAULTS`, or ``time``.
+        depth: the true map.
+        seed: of what is drawn.
+        other: what ``time`` gives instead.
+
+    Raises:
+        ValueError: an unknown fault, no map of another time, or wrong shapes.
+
+    Gradient: to ``depth`` where the fault is a function of values, not through places.
+    """
+    check("spoil", depth=(depth, "B h w"), other=(other, "B h w"))
+    if name == WRONG_TIME:
+        if other is None:
+            raise ValueError("spoil: found no map of another time, expected other=")
+        found = other
+    elif name in FAULTS:
+        found = FAULTS[name](depth, Generator().manual_seed(seed))
+    else:
+        raise ValueError(f"spoil: found {name!r}, expected one of {', '.join((*FAULTS, WRONG_TIME))}")
+    wrong = (found > 0) & (depth > 0) & ((found - depth).abs() > WRONG * depth)
+    return found, wrong
+
+
+def _places(depth: Tensor) -> tuple[Tensor, Tensor]:
+    """Columns (1, w) and rows (h, 1) of a map from -1 to 1."""
+    h, w = depth.shape[-2:]
+    x, y = (torch.linspace(-1, 1, n, dtype=depth.dtype, device=depth.device) for n in (w, h))
+    return x[None], y[:, None]
+
+
+def _spots(depth: Tensor, generator: Generator, n: int) -> list[tuple[int, int]]:
+    """Columns and rows of ``n`` places away from the border."""
+    h, w = depth.shape[-2:]
+    share = 0.1 + 0.8 * torch.rand(n, 2, generator=generator, dtype=torch.float64)
+    return [(int(x * w), int(y * h)) for x, y in share.tolist()]
+
+
+def _distance(depth: Tensor, u: int, v: int) -> Tensor:
+    """Of every pixel (h, w) from a place, in widths of the map."""
+    h, w = depth.shape[-2:]
+    rows, columns = (torch.arange(n, dtype=depth.dtype, device=depth.device) for n in (h, w))
+    return ((columns[None] - u).square() + (rows[:, None] - v).square()).sqrt() / w
+
+
+def _within(depth: Tensor, u: int, v: int, radius: float) -> Tensor:
+    return _distance(depth, u, v) < radius
+
+
+def _at(depth: Tensor, u: int, v: int) -> Tensor:
+    """Depth (B, 1, 1) at a place."""
+    return depth[:, v, u][:, None, None]

@@ -1,0 +1,98 @@
+"""Faults that all maps of a window share are named by undoing them, and nothing else is."""
+
+import pytest
+import torch
+
+from dhtorch.causes import CAUSES, NONE, TRACKING, decided, name_cause, turned, watch
+from dhtorch.evaluate.holdout import range_split
+from dhtorch.synthetic import SyntheticRoom
+from dhtorch.synthetic.depth_faults import mirrored
+
+N, FIRST = 16, 4
+METHOD = TRACKING.replace(n=256)
+
+
+@pytest.fixture(scope="module")
+def frames():
+    room = SyntheticRoom(n_frames=N, hw=(180, 240), depth_hw=(90, 120), supersample=1, seed=1, step_m=0.03)
+    return [room[k] for k in range(N)]
+
+
+@pytest.fixture(scope="module")
+def watched(frames):
+    return watch(frames, METHOD)
+
+
+FAULTS = {
+    "unit": lambda d: 1000 * d,
+    "mirrored": mirrored,
+    "rolled": lambda d: turned(d, 1),
+}
+
+
+@pytest.mark.parametrize("own", [True, False])
+@pytest.mark.parametrize("kind", FAULTS)
+def test_a_planted_fault_is_named(kind, own, frames, watched):
+    spoilt = [FAULTS[kind](frame.depth) for frame in frames]
+    if own:
+        shown, maps = [f.replace(depth=d) for f, d in zip(frames, spoilt, strict=True)], None
+    else:
+        shown, maps = [range_split(f, 2.0).replace(T_world_from_cam=None) for f in frames], spoilt
+    found = name_cause(shown, maps, method=METHOD, watched=watched)
+    assert found.kind == kind
+    assert found.n_pairs >= 4
+
+
+def test_a_sound_recording_has_no_cause(frames, watched):
+    found = name_cause(frames, method=METHOD, watched=watched)
+    assert found.cause is None
+    assert found.loss["none"] < 1
+
+
+def test_a_wrong_focal_length_is_named_with_a_trajectory_alone(frames, watched):
+    long = [f.replace(camera=f.camera.replace(f=1.15 * f.camera.f)) for f in frames]
+    assert name_cause(long, method=METHOD, watched=watched).kind == "focal length"
+    lost = [f.replace(T_world_from_cam=None) for f in long]
+    found = name_cause(lost, method=METHOD, watched=watched)
+    assert not any("focal" in name for name in found.loss), "it cannot be known"
+
+
+def test_the_unit_of_a_sensor_cannot_be_known_without_a_trajectory(frames, watched):
+    shown = [f.replace(depth=1000 * f.depth, T_world_from_cam=None) for f in frames]
+    assert name_cause(shown, method=METHOD, watched=watched).cause is None
+
+
+def test_nothing_is_named_where_nothing_can_be_tracked(frames):
+    blank = [f.replace(image=torch.full_like(f.image, 128)) for f in frames]
+    found = name_cause(blank, method=METHOD)
+    assert found.cause is None
+    assert found.n_pairs == 0
+
+
+def test_one_map_a_frame(frames):
+    with pytest.raises(ValueError, match="as many maps"):
+        name_cause(frames, [frames[0].depth])
+
+
+def test_an_explanation_must_be_clear_and_alone():
+    def losses(**saved):
+        base = torch.linspace(0.5, 0.6, 8)
+        found = {cause.name: base.clone() for cause in (NONE, *CAUSES)}
+        for name, by in saved.items():
+            found[{"mirror": "mirrored left to right", "mm": "mm read as m"}[name]] -= by
+        return found
+
+    assert decided(losses(mirror=0.2)).kind == "mirrored"
+    assert decided(losses()).cause is None
+    assert decided(losses(mirror=0.02)).cause is None, "saves little"
+    assert decided(losses(mirror=0.2, mm=0.195)).cause is None, "two kinds explain it"
+    assert decided(losses(mirror=torch.tensor([0.9, -0.3] * 4))).cause is None, "some pairs only"
+    few = {name: torch.cat([x[:3], torch.full((5,), torch.nan)]) for name, x in losses(mirror=0.2).items()}
+    assert decided(few).cause is None, "too few pairs tell"
+
+
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_a_roll_is_undone(quarters):
+    depth = torch.arange(48.0).reshape(1, 6, 8).repeat_interleave(8, 1).repeat_interleave(8, 2)
+    back = turned(turned(depth, quarters), 4 - quarters)
+    assert (back == depth).float().mean() > 0.8

@@ -1,0 +1,206 @@
+"""Is a depth right: what speaks for and against pixels, numbers of a frame, and that silence is never called right."""
+
+import math
+
+import pytest
+import torch
+
+from dhtorch import AUTO, judge
+from dhtorch.codes import State
+from dhtorch.evaluate.detection import auroc
+from dhtorch.evaluate.holdout import range_split
+from dhtorch.evidence import Said
+from dhtorch.synthetic import SyntheticRoom
+from dhtorch.tree import collate, stack
+from dhtorch.verdict import decided, share
+
+NEAR, ANCHOR, OTHERS = 2.0, 5, (0, 2, 8, 11)
+METHOD = AUTO.replace(n=768)
+SMALL = {"method": METHOD, "size": 160}
+
+
+@pytest.fixture(scope="module")
+def room():
+    return SyntheticRoom(n_frames=12, hw=(180, 240), depth_hw=(90, 120), supersample=1, seed=0)
+
+
+@pytest.fixture(scope="module")
+def anchor(room):
+    return range_split(room[ANCHOR], NEAR)
+
+
+@pytest.fixture(scope="module")
+def others(room):
+    return stack([range_split(room[k], NEAR) for k in OTHERS])
+
+
+@pytest.fixture(scope="module")
+def true(room):
+    return room.truth(ANCHOR)["depth"]
+
+
+@pytest.fixture(scope="module")
+def sound(true, anchor, others):
+    return judge(true, anchor, others, **SMALL)
+
+
+def at_grid(x, verdict):
+    return torch.nn.functional.interpolate(x[None].float(), verdict.state.shape[-2:], mode="nearest-exact")[0]
+
+
+def test_a_true_map_is_consistent_and_its_numbers_hold(sound):
+    known = sound.known
+    assert known.float().mean() > 0.6
+    assert (sound.state == State.WRONG).sum() < 0.1 * known.sum()
+    for name in ("scale", "scale_near", "scale_far"):
+        value, low, high = getattr(sound, name)[0]
+        assert low < value < high
+        assert low < 1.02
+        assert high > 0.98
+    assert sound.shift[0, 1] < 0 < sound.shift[0, 2]
+
+
+@pytest.mark.parametrize("factor", [1.1, 1 / 1.1])
+def test_a_wrong_metre_is_found_by_near_returns_and_by_far_answers(factor, true, anchor, others, sound):
+    found = judge(factor * true, anchor, others, **SMALL, views=False)
+    for name in ("scale", "scale_near", "scale_far"):
+        value, low, high = getattr(found, name)[0] / factor
+        assert abs(math.log(value)) < 0.03
+        assert not low * factor <= 1 <= high * factor
+    assert (found.state == State.CONSISTENT).sum() < 0.4 * (sound.state == State.CONSISTENT).sum()
+
+
+def test_a_surface_that_stands_elsewhere_is_wrong_and_its_surroundings_are_not(true, anchor, others):
+    moved = torch.zeros_like(true, dtype=torch.bool)
+    moved[:, 60:120, 70:140] = True
+    found = judge(torch.where(moved, 1.6 * true, true), anchor, others, **SMALL)
+    inside = at_grid(moved, found) > 0
+    assert ((found.state == State.CONSISTENT) & inside).sum() <= 0.003 * inside.sum()
+    assert auroc(found.evidence.abs()[found.known], inside[found.known]) > 0.97
+    signs = found.evidence[inside & (found.state == State.WRONG)]
+    assert (signs > 0).float().mean() > 0.9, "too far"
+
+
+def test_without_another_view_near_returns_alone_speak(true, anchor):
+    found = judge(true, anchor, **SMALL)
+    near = at_grid(true, found) < 0.9 * NEAR
+    far = at_grid(true, found) > 1.2 * NEAR
+    assert (found.known & near).sum() > 0.5 * near.sum()
+    assert not (found.state == State.CONSISTENT)[far].any(), "nothing tells"
+    assert found.known[far].float().mean() < 0.02, "but for returns that mix an edge"
+    assert found.by_views.isnan().all()
+    assert found.scale_far.isnan().all()
+
+
+def test_a_single_sensor_view_can_know_nothing_of_itself(room):
+    found = judge(None, room[ANCHOR], **SMALL)
+    assert not found.known.any()
+    assert found.scale.isnan().all()
+    assert (found.view == -2).all()
+
+
+def test_a_camera_that_only_turns_knows_nothing_of_what_is_far():
+    turning = SyntheticRoom(n_frames=6, hw=(180, 240), path="rotation", supersample=1, seed=0)
+    near = [range_split(turning[k], NEAR) for k in (0, 2, 5)]
+    true = turning.truth(2)["depth"]
+    found = judge(1.3 * true, near[1], stack([near[0], near[2]]), **SMALL)
+    far = at_grid(true, found) > 1.2 * NEAR
+    assert (found.state == State.CONSISTENT)[far].float().mean() < 0.003
+
+
+def test_the_sensors_own_metre_is_told_by_a_trajectory_alone(room, others):
+    wrong = 1.25
+    swollen = [room[k].replace(depth=wrong * room[k].depth) for k in (ANCHOR, *OTHERS)]
+    found = judge(None, swollen[0], stack(swollen[1:]), **SMALL, views=False)
+    _, low, high = found.scale[0]
+    assert low < wrong < high
+    assert not low <= 1 <= high
+    assert found.scale_near.isnan().all()
+    lost = [frame.replace(T_world_from_cam=None) for frame in swollen]
+    assert judge(None, lost[0], stack(lost[1:]), **SMALL, views=False).scale.isnan().all()
+
+
+def test_exposure_of_other_views_changes_little(true, anchor, others, sound):
+    dim = others.replace(image=(others.image.float() / 255 * 0.7 + 0.05))
+    found = judge(true, anchor.replace(image=anchor.image.float() / 255), dim, **SMALL)
+    both = found.known & sound.known
+    assert both.sum() > 0.8 * sound.known.sum()
+    assert (found.state == sound.state)[both].float().mean() > 0.95
+
+
+def test_maps_of_other_views_see_through_what_stands_too_near(room, true, anchor, others):
+    maps = torch.stack([room.truth(k)["depth"] for k in OTHERS])
+    blob = true.clone()
+    blob[:, 60:120, 70:140] *= 0.6
+    found = judge(blob, anchor, others, other_maps=maps, **SMALL)
+    inside = at_grid(blob < 0.9 * true, found) > 0
+    told = found.by_maps.isfinite()
+    assert (found.by_maps[told & inside] < -3).float().mean() > 0.8
+    assert (told & inside).sum() > 0.3 * inside.sum()
+    assert (found.by_maps[told & ~inside] < -3).float().mean() < 0.1
+
+
+def test_no_depth_is_never_right_or_wrong(true, anchor, others):
+    holes = true.clone()
+    holes[:, :, :120] = torch.nan
+    holes[:, :60] = 0
+    found = judge(holes, anchor, others, **SMALL)
+    assert not found.known[at_grid((~(holes > 0)), found) > 0].any()
+    nothing = judge(torch.zeros_like(true), anchor, others, **SMALL)
+    assert not nothing.known.any()
+    assert nothing.wrong.isnan().all()
+
+
+def test_kinds_of_evidence_that_contradict_each_other_cannot_be_known():
+    def said(misfit, sure):
+        return Said(torch.tensor([[[misfit]]]), torch.tensor([[[sure]]]), torch.zeros(1, 1, 1, dtype=torch.int32))
+
+    nan = math.nan
+    silent = said(nan, False)
+    cases = [
+        ((said(0.1, True), silent, silent), State.CONSISTENT),
+        ((said(0.1, False), silent, silent), State.CANNOT_KNOW),
+        ((said(-4.0, False), silent, silent), State.WRONG),
+        ((said(-4.0, True), said(0.1, False), silent), State.WRONG),
+        ((said(-4.0, True), said(0.1, True), silent), State.CANNOT_KNOW),
+        ((said(2.5, True), silent, silent), State.CANNOT_KNOW),
+        ((silent, silent, silent), State.CANNOT_KNOW),
+    ]
+    for kinds, expected in cases:
+        assert int(decided(*kinds)[0]) == expected
+
+
+def test_a_share_of_few_has_a_wide_interval():
+    few, many = (share(torch.tensor([0.1 * n]), torch.tensor([n]))[0] for n in (10.0, 1000.0))
+    assert few[1] < many[1] < 0.1 < many[2] < few[2]
+    assert share(torch.zeros(1), torch.zeros(1)).isnan().all()
+
+
+def test_area_under_the_curve():
+    score = torch.tensor([0.1, 0.4, 0.35, 0.8])
+    assert auroc(score, torch.tensor([False, False, True, True])) == pytest.approx(0.75)
+    assert auroc(torch.ones(4), torch.tensor([True, False, True, False])) == pytest.approx(0.5)
+    assert auroc(score, torch.zeros(4, dtype=torch.bool)) is None
+
+
+@pytest.mark.parametrize("option", [{"tolerance": 0.2}, {"tolerance": 0}, {"size": 4}, {"partners": 0}])
+def test_options_out_of_range_are_refused(option, true, anchor, others):
+    with pytest.raises(ValueError, match="judge: "):
+        judge(true, anchor, others, **option)
+
+
+def test_a_map_of_another_batch_is_refused(true, anchor, others):
+    with pytest.raises(ValueError, match="judge"):
+        judge(true.expand(2, -1, -1), anchor, others)
+
+
+def test_a_batch_is_judged_as_its_members_are(room, true, anchor, others):
+    other = range_split(room[6], NEAR)
+
+    both = collate([anchor, other])
+    maps = torch.cat([true, 1.1 * room.truth(6)["depth"]])
+    views = others[:2]
+    found = judge(maps, both, views.map(lambda x: x.expand(-1, 2, *x.shape[2:])), **SMALL, views=False)
+    alone = judge(maps[1:], other, views, **SMALL, views=False)
+    assert torch.equal(found.state[1:], alone.state)
+    assert torch.allclose(found.scale[1:], alone.scale)

@@ -1,0 +1,198 @@
+"""``dhtorch judge``: files, limits and exit codes; maps beside a recording; the transform; what a study counts."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from sample_dicts import SIDE, frames
+from torch.utils.data import DataLoader
+
+from dhtorch.codes import State
+from dhtorch.commands import run
+from dhtorch.commands.judge import exceeded, parse_limits
+from dhtorch.data.depth_maps import open_maps
+from dhtorch.data.files import FormatError
+from dhtorch.export import png
+from dhtorch.methods import AUTO
+from dhtorch.studies.compare import judge_study
+from dhtorch.studies.protocol import Settings
+from dhtorch.synthetic import SyntheticRoom
+from dhtorch.transform import JudgeDepth, SampleError
+
+ROOM = ["data=synthetic", "data.hw=[96,128]", "data.depth_hw=[96,128]", "data.supersample=1", "data.n_frames=6"]
+LITTLE = ["method.n=256", "size=96", "window=0", "most=2", "every=3"]
+
+
+@pytest.fixture(scope="module")
+def room():
+    return SyntheticRoom(n_frames=6, hw=(96, 128), depth_hw=(96, 128), supersample=1)
+
+
+@pytest.fixture
+def maps(tmp_path, room):
+    for k in range(len(room)):
+        np.save(tmp_path / f"depth_{k:04d}.npy", room.truth(k)["depth"][0].numpy())
+    return tmp_path
+
+
+def judged(out, *words, capsys=None):
+    code = run.main(["judge", *ROOM, *LITTLE, f"output={out}", *words])
+    return code, json.loads((out / "judge.json").read_text())
+
+
+def test_files_are_written_and_limits_decide_the_exit_code(tmp_path, maps):
+    out = tmp_path / "out"
+    code, found = judged(out, f"depth={maps}", "depth_unit=mm", 'fail_on="scale>0.5,unknown>1"')
+    assert code == run.SOME_FAILED, "metres read as millimetres"
+    assert len(found["exceeded"]) == 1
+    assert found["whole"]["held"]["scale"] == pytest.approx(0.999, abs=0.002)
+    assert [row["frame"] for row in found["frames"]] == [0, 3]
+    page = (out / "judge.html").read_text()
+    assert page.count("data:image/png;base64,") == 2
+    assert "Exceeded: scale" in page
+    code, found = judged(out, f"depth={maps}", 'fail_on="scale>0.5"', "pictures=0", "views=false")
+    assert code == run.DONE
+    assert found["exceeded"] == []
+    assert "data:image" not in (out / "judge.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("fail_on=wrong", "fail_on"),
+        ("fail_on='colour>1'", "fail_on"),
+        ("depth=/nowhere", "no folder"),
+        ("window=1", "window"),
+        ("every=0", "every"),
+        ("tolerance=0.5", "tolerance"),
+    ],
+)
+def test_what_cannot_be_is_said_in_one_line(word, said, tmp_path, capsys):
+    assert run.main(["judge", *ROOM, *LITTLE, f"output={tmp_path}", word]) == run.FAILED
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert said in lines[0]
+
+
+def test_limits():
+    assert parse_limits("wrong>0.05, scale > 0.1") == {"wrong": 0.05, "scale": 0.1}
+    assert parse_limits(None) == {}
+    held = {"wrong": 0.06, "scale": None}
+    assert exceeded({"held": held}, {"wrong": 0.06, "scale": 0.0}) == [], "not more, and not known"
+    assert len(exceeded({"held": held}, {"wrong": 0.05})) == 1
+
+
+def test_maps_are_matched_by_number_unit_and_kind(tmp_path, maps, room):
+    found = open_maps(maps, room)
+    assert torch.equal(found[3], room.truth(3)["depth"])
+    (maps / "depth_0002.npy").unlink()
+    assert open_maps(maps, room)[2] is None
+    shorter = tmp_path / "png"
+    shorter.mkdir()
+    steps = (room.truth(1)["depth"][0].numpy() * 500).round().astype(np.uint16)
+    (shorter / "1.png").write_bytes(png(steps))
+    assert torch.allclose(open_maps(shorter, room, 0.002)[1], room.truth(1)["depth"], atol=0.0011)
+    (shorter / "complete.json").write_text('{"unit_m": 0.002}')
+    assert open_maps(shorter, room).unit == 0.002
+    with pytest.raises(ValueError, match="depth_unit"):
+        open_maps(shorter, room, "furlong")
+
+
+def test_damaged_or_hostile_maps_are_refused(tmp_path, room):
+    with pytest.raises(FormatError, match="no such file"):
+        open_maps(tmp_path, room)
+    np.save(tmp_path / "0.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    with pytest.raises(FormatError, match="NPY array"):
+        open_maps(tmp_path, room)[0]
+    np.save(tmp_path / "0.npy", np.zeros((2, 3, 4)))
+    with pytest.raises(FormatError, match="shape"):
+        open_maps(tmp_path, room)[0]
+    (tmp_path / "0.png").write_bytes(b"")
+    with pytest.raises(FormatError, match="both kinds"):
+        open_maps(tmp_path, room)
+
+
+OPTIONS = {"image": "image", "depth": "depth", "intrinsics": "intrinsics", "depth_unit": "mm", "n": 256}
+
+
+def test_a_loader_gets_verdicts_of_one_shape():
+    transform = JudgeDepth(map="map", judging={"size": 64}, **OPTIONS)
+    samples = []
+    for k, factor in ((0, 1.0), (1, 1.4)):
+        sample = frames()[k]
+        metres = sample["depth"].astype(np.float32) / 1000
+        samples.append(transform({**sample, "map": factor * metres}))
+    batch = next(iter(DataLoader(samples, batch_size=2)))
+    assert batch["dhtorch.state"].shape == (2, 64, 64)
+    assert batch["dhtorch.scale_known"].all()
+    assert batch["dhtorch.scale"][:, 0].tolist() == pytest.approx([1.0, 1.4], abs=0.02)
+    assert batch["dhtorch.state_share"][0, State.CONSISTENT] > 0.5
+    assert batch["dhtorch.state_share"][1, State.WRONG] > 0.5
+    assert all(x.isfinite().all() for k, x in batch.items() if k.startswith("dhtorch.") and x.is_floating_point())
+
+
+def test_a_loader_judges_the_sensor_by_another_view():
+    first, second = frames()[0], frames()[6]
+    both = {k: np.stack([first[k], second[k]]) for k in ("image", "depth")}
+    alone = JudgeDepth(judging={"size": 64, "views": False}, **OPTIONS)({**first})
+    assert not alone["dhtorch.scale_known"]
+    assert (alone["dhtorch.state"] == State.CANNOT_KNOW).all()
+    seen = JudgeDepth(judging={"size": 64}, other_at=-1, at=0, **OPTIONS)({**first, **both})
+    assert seen["dhtorch.state"].shape == (64, 64)
+
+
+def test_options_of_the_transform_that_cannot_be():
+    with pytest.raises(ValueError, match="judging"):
+        JudgeDepth(judging={"colour": 1}, **OPTIONS)
+    with pytest.raises(ValueError, match="method"):
+        JudgeDepth(method="none", **OPTIONS)
+    with pytest.raises(ValueError, match="map_unit"):
+        JudgeDepth(map="map", map_unit=0.0, **OPTIONS)
+    with pytest.raises(SampleError, match="no such key"):
+        JudgeDepth(map="map", **OPTIONS)(dict(frames()[0]))
+    assert frames()[0]["image"].shape[0] == SIDE
+
+
+def test_a_study_counts_what_was_planted():
+    rows = [
+        {"scene": "a", "pair": None, "method": "judge", "role": None, "judge.scale_found": 1.0, "judge.known": 0.5},
+        {"scene": "b", "pair": None, "method": "judge", "role": None, "judge.scale_found": 0.5, "judge.known": None},
+        {"scene": "c", "pair": None, "method": "judge", "role": "rotation", "judge.scale_found": 0.0},
+    ]
+
+    def window(fault, kind, named, moved):
+        found = {"scene": "a", "pair": [0, 19], "method": "causes", "fault": fault, "planted_kind": kind}
+        return {**found, "named_kind": named, "moved_px": moved}
+
+    rows += [window("unit_mm", "unit", "unit", 50.0), window("unit_m", "unit", None, 50.0)]
+    rows += [window("mirrored", "mirrored", "mirrored", 9.0), window("mirrored", "mirrored", None, 1.0)]
+    rows += [window("none", None, None, 0.0), window("none", None, "rolled", 0.0)]
+    found = judge_study.summary(rows)
+    assert found["judge.scale_found"]["value"] == 0.75
+    assert found["judge.known"]["value"] == 0.5
+    assert found["judge.named.unit"]["value"] == 0.5
+    assert found["judge.named.mirrored"]["value"] == 1.0, "what moves less than two pixels does not count"
+    assert found["judge.named_worst"]["value"] == 0.5
+    assert found["judge.misnamed"]["value"] == 0.5
+    holds, why = judge_study.verdict(found)
+    assert holds is False
+    assert "judge.scale_found 0.750" in why
+    assert "not measured: " in why
+
+
+def test_an_alarm_needs_an_interval_without_one_and_a_distance():
+    assert judge_study.alarm(torch.tensor([1.1, 1.05, 1.15])) is True
+    assert judge_study.alarm(torch.tensor([1.1, 0.99, 1.2])) is False
+    assert judge_study.alarm(torch.tensor([1.02, 1.01, 1.03])) is False
+    assert judge_study.alarm(torch.full((3,), math.nan)) is None
+
+
+@pytest.mark.slow
+def test_the_study_runs_on_a_room(room):
+
+    options = {"anchors": 1, "windows": 0, "rooms": [], "size": 96}
+    found = judge_study.run([room], {"auto": AUTO.replace(n=512)}, None, Settings(cutoff=2.0), **options)
+    assert {"judge.called_right_wrong", "photometric.called_right_wrong"} <= set(found.summary)
+    assert found.verdict in ("supported", "refuted", "undecided")
