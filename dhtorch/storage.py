@@ -14,6 +14,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+#: Lists and objects inside one another that a file may hold: whoever walks through them does so by recursion.
+MAX_DEPTH = 64
+
 #: How the name of a file ends while it is written.
 _UNFINISHED = ".tmp"
 
@@ -55,9 +58,20 @@ def loads(text: str) -> Any:
     """The value of a text in strict JSON.
 
     Raises:
-        ValueError: no JSON, a number that is not finite, or a key that stands twice in one object.
+        ValueError: no JSON, a number that is not finite, a key that stands twice in one object, or values nested
+            deeper than ``MAX_DEPTH``.
     """
-    return json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_unique)
+    try:
+        value = json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_unique)
+    except RecursionError:
+        raise ValueError(f"values nested deeper than {MAX_DEPTH}") from None
+    level = [value] if isinstance(value, dict | list) else []
+    for _ in range(MAX_DEPTH):
+        level = [inner for each in level for inner in (each.values() if isinstance(each, dict) else each)]
+        level = [each for each in level if isinstance(each, dict | list)]
+    if level:
+        raise ValueError(f"values nested deeper than {MAX_DEPTH}")
+    return value
 
 
 def write_json(path: str | Path, value: Any) -> Path:

@@ -441,7 +441,7 @@ def test_bad_pairs_and_arrays(tmp_path: Path) -> None:
     archive = npz / "scene_disp.npz"
     good = archive.read_bytes()
     archive.write_bytes(good[:100])
-    fails(r"scene_disp.npz: archive: found .*, expected a whole .npz archive", npz)
+    fails(r"scene_disp.npz: archive: found .*, expected a whole zip archive", npz)
     np.savez(archive, np.array([{"a": 1}], dtype=object))
     fails(r"scene_disp.npz: arr_0 dtype: found object, expected real numbers", npz)
     np.savez(archive, other=np.zeros(HW))
@@ -458,7 +458,9 @@ def test_npz_bomb_is_not_unpacked(tmp_path: Path) -> None:
     for name, body in (("liar", bytes(64)), ("big", bytes(files.MAX_BYTES))):
         with zipfile.ZipFile(tmp_path / f"{name}.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             archive.writestr("data.npy", head.getvalue() + body)
-    with pytest.raises(FormatError, match=r"liar.npz: data: found 64 bytes, expected \(1000000000000,\) of float64"):
+    with pytest.raises(
+        FormatError, match=r"liar.npz: data: found \(1000000000000,\) of float64: \d+ bytes of memory, expected at most"
+    ):
         npy.read_npz(tmp_path / "liar.npz", "data")
     with pytest.raises(FormatError, match=r"big.npz: data: found an array that unpacks beyond the limit"):
         npy.read_npz(tmp_path / "big.npz", "data")

@@ -350,7 +350,7 @@ def test_pages_that_unpack_into_too_much_are_refused(tmp_path: Path, monkeypatch
     file = tmp_path / "x.parquet"
     parquet.write_table(pyarrow.table({"x": [bytes(3 << 20)] * 2}), file, compression="zstd", use_dictionary=False)
     assert file.stat().st_size < 10_000 and len(codec_parquet.read_columns(file, ["x"])["x"][1]) == 3 << 20
-    monkeypatch.setattr(codec_parquet, "_MAX_CHUNK_BYTES", 4 << 20)
+    monkeypatch.setattr(codec_parquet, "_MAX_UNPACKED", 4 << 20)
     with pytest.raises(FormatError, match=r"x.parquet: x: found \d+ bytes, expected at most 4194304"):
         codec_parquet.read_columns(file, ["x"])
     parquet.write_table(pyarrow.table({"x": np.arange(100)}), file, use_dictionary=False, compression="none")

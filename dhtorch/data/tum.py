@@ -217,7 +217,7 @@ def _camera_number(root: Path) -> int | None:
     """1, 2 or 3 from the folder's name, else from the comments on top of the trajectory."""
     texts = [root.resolve().name]
     if (root / "groundtruth.txt").is_file():
-        lines = files.read_text(root / "groundtruth.txt").splitlines()[:5]
+        lines = files.read_lines(root / "groundtruth.txt")[:5]
         texts += [line for line in lines if line.startswith("#")]
     found = [m for text in texts if (m := re.search(r"(?:freiburg|fr)([123])(?![0-9])", text))]
     return int(found[0][1]) if found else None
