@@ -15,6 +15,7 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import re
 import stat
 import struct
 import zlib
@@ -143,6 +144,11 @@ def decode_depth_png(
         found = f"{header.kind} with {header.channels} channels of {header.bits} bits"
         raise FormatError(file, "depth", found, "png with 1 channel of 16 bits")
     code = _decode(file, data, cv2.IMREAD_UNCHANGED, header.hw)
+    return to_metres(code, units_per_metre, invalid)
+
+
+def to_metres(code: np.ndarray, units_per_metre: float, invalid: Sequence[int] = (0,)) -> np.ndarray:
+    """Depth float32 in m of codes of any shape; 0 where the code is one of ``invalid``."""
     depth = code.astype(np.float32) / np.float32(units_per_metre)
     for value in invalid:
         depth[code == value] = 0
@@ -467,6 +473,16 @@ def unreadable(file: Path, error: Exception) -> FormatError:
     """What to raise instead of ``error``, one of ``UNREADABLE``."""
     found = "no such file" if isinstance(error, FileNotFoundError) else error
     return FormatError(file, "file", found, "a readable file")
+
+
+def natural(name: Path | str) -> tuple[object, ...]:
+    """Key of an order in which 1, 2 and 10 follow one another, with or without leading zeros."""
+    parts = re.split(r"(\d+)", str(name))
+    return tuple((not part.isdecimal(), int(part[:_DIGITS]) if part.isdecimal() else part) for part in parts)
+
+
+#: Digits of a number in a file's name that count.
+_DIGITS = 300
 
 
 def left_out(names: Sequence[int | str], why: str) -> list[str]:

@@ -36,7 +36,10 @@ _MAX_POSE_GAP = 0.05  # s
 
 def recognise(root: Path) -> str | None:
     """What makes ``root`` a recording of this format, in words; None if nothing does."""
-    if (root / "rgb").is_dir() and (root / "depth").is_dir():
+    listed = any((root / name).is_file() for name in ("rgb.txt", "associations.txt", "groundtruth.txt"))
+    if not (root / "rgb").is_dir() or not (root / "depth").is_dir():
+        return None
+    if listed or not any(file.stem.isdigit() for file in (root / "rgb").iterdir()):  # numbers are no times
         return "rgb/ and depth/ folders of time-stamped pictures"
     return None
 

@@ -150,7 +150,7 @@ class _Decoder:
         self.next = -1  # number of the frame that comes next; −1 = unknown
         av = need("av")
         self.errors: tuple[type[Exception], ...] = (av.FFmpegError, ValueError, MemoryError, OverflowError, EOFError)
-        if not file.is_file():
+        if not file.exists():
             raise FormatError(file, "file", "no such file", "a video")
         kind = _container(file)
         # No list of other files, no network: the decoder is told what this is and may open nothing else.
