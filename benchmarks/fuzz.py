@@ -49,8 +49,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     hostile.SECONDS, hostile.BYTES = SECONDS, MAX_MEMORY
     names = [options.only] if options.only else list(SAMPLES)
     numbers = [options.case] if options.case is not None else range(MANY if options.full else SOME)
-    stop = time.monotonic() + (MINUTES * 60 if not options.full else float("inf"))
-    found = {name: attack(name, numbers, options.seed, stop) for name in names}
+    end = time.monotonic() + (MINUTES * 60 if not options.full else float("inf"))
+    found = {}
+    for k, name in enumerate(names):  # each its share of what is left, so that a slow one starves no other
+        now = time.monotonic()
+        found[name] = attack(name, numbers, options.seed, now + (end - now) / (len(names) - k))
     failures = [failure for each in found.values() for failure in each["failures"]]
     total = sum(each["cases"] for each in found.values())
     print(f"{total} cases, {len(failures)} failures")

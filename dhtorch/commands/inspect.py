@@ -177,8 +177,7 @@ def _seen(capture: Found, recordings: Sequence[Recording], warning: list[str]) -
         _ = recordings[0]
     except lerobot.NoIntrinsics:
         warning.append(_NO_K)
-        meta = lerobot.read_meta(capture.path)
-        h, w = meta.features[lerobot.colour_keys(meta)[0]].hw
+        h, w = lerobot.picture_hw(capture.path)
         stand_in = (float(w), float(w), w / 2, h / 2)
         return data.open_all(capture.path, capture.format, follow_links=capture.follow_links, K=stand_in)
     return recordings

@@ -443,7 +443,7 @@ def allow(file: Path, field: str, takes: int, found: object, asked: int = 0) -> 
     Args:
         file, field, found: for the error.
         takes: bytes that are about to be taken, by a bound that costs nothing.
-        asked: bytes of the arrays asked for, of a shape that was checked against the length of the file.
+        asked: bytes of the arrays asked for, of a shape that the file is long enough for.
 
     Raises:
         FormatError: more than that.

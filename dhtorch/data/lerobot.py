@@ -99,16 +99,29 @@ def read(
     keys = colour_keys(meta, camera)
     wanted = None if episode is None else [episode] if isinstance(episode, int) else [int(e) for e in episode]
     episodes = read_episodes(meta, wanted)
-    if camera is None:  # a feature that is only declared is no camera
-        videos = episodes[0].videos
-        filmed = [key for key in keys if key not in videos or videos[key][0].is_file()]
-        keys = filmed or keys
+    keys = keys if camera is not None else _filmed(keys, episodes)
     rigs = [
         _Rig(meta, key, depth, K, K_depth, distortion, intrinsics, pose, depth_unit, span, tolerance) for key in keys
     ]
     columns = sorted({c for rig in rigs for c in (rig.K_key, rig.pose_key) if c})
     names = [rig.name(number) for number in episodes.numbers for rig in rigs]
     return Recordings(names, _Make(episodes, tuple(rigs), tuple(columns)))
+
+
+def picture_hw(root: Path) -> tuple[int, int]:
+    """Height and width of the first camera's pictures, which needs no K.
+
+    Raises:
+        FormatError: damaged metadata.
+    """
+    meta = read_meta(root)
+    return meta.features[_filmed(colour_keys(meta), read_episodes(meta, None))[0]].hw
+
+
+def _filmed(keys: list[str], episodes: Episodes) -> list[str]:
+    """Keys of the cameras that there are: a feature that is only declared is none."""
+    videos = episodes[0].videos
+    return [key for key in keys if key not in videos or videos[key][0].is_file()] or keys
 
 
 @dataclass(frozen=True, eq=False)
