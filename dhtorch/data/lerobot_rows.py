@@ -56,7 +56,7 @@ def episode_rows(
     rows = np.flatnonzero(table.get("episode_index", every) == episode.number)
     stamp = table["timestamp"][rows].astype(np.float64)
     number = table["frame_index"][rows].astype(np.float64) if "frame_index" in table else np.arange(float(len(rows)))
-    sound = (number >= 0) & (number < 2**31) & (stamp >= 0) & (stamp < 1e9)  # false for NaN
+    sound = (number >= 0) & (number < 2**31) & (number == np.floor(number)) & (stamp >= 0) & (stamp < 1e9)  # not NaN
     keep = sound & _later(number, sound) & _later(stamp, sound)
     report = []
     if not keep.all():
