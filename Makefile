@@ -12,7 +12,7 @@ TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 TORCH = test -z "$(TORCH_INDEX)" || $(PIP) --retries 0 --timeout 15 --index-url "$(TORCH_INDEX)" torch \
 	|| echo "== found no torch for the CPU at $(TORCH_INDEX): pip takes its own choice"
 
-.PHONY: run test test-all everything lint conf clean
+.PHONY: run test test-all everything fuzz lint conf clean
 
 run: $(VENV)/.installed
 	@echo "== dhtorch on the built-in scene"
@@ -31,6 +31,11 @@ test-all:
 everything: $(VENV)/.installed-all lint
 	@echo "== all tests, the slow ones too (real sequences: $${DHTORCH_DATA:-DHTORCH_DATA is unset, their tests skip})"
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "" $(ARGS)
+
+# Hostile files of every format: a suite of its own, within ten minutes; ARGS=--full for 20,000 cases.
+fuzz: $(VENV)/.installed-dev
+	@echo "== hostile files"
+	$(BIN)/python benchmarks/fuzz.py $(ARGS)
 
 lint: $(VENV)/.installed-dev
 	@echo "== lint, format, types"

@@ -108,6 +108,7 @@ _TOP: dict[str, Any] = {
 _META: dict[str, Any] = {"utc": str, "git": _TEXT, "versions": dict}
 _META |= {"device": str, "dtype": str, "threads": int, "seed": int}
 #: What results did not hold from the start.
+_TOP_LATER: dict[str, Any] = {"seal": str}
 _META_LATER: dict[str, Any] = {"processor": str}
 _DATA: dict[str, Any] = {"name": str, "scenes": list, "n_pairs": int, "digest": str}
 _SUMMARY: dict[str, Any] = {"value": _NUMBER, "low": _NUMBER, "high": _NUMBER, "n": int, "unit": str}
@@ -147,7 +148,13 @@ def build(
     parts = {"meta": meta, "config": portable(config), "data": data, "summary": summary, "rows": rows}
     result = strict({"schema": SCHEMA, "experiment": experiment, **fields, **parts})
     validate(result)
-    return result
+    return dict(result)
+
+
+def seal(result: Mapping[str, Any]) -> str:
+    """SHA-256 over all of a result but itself, so that a change by hand shows."""
+    content = {name: value for name, value in result.items() if name != "seal"}
+    return hashlib.sha256(dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 def validate(result: Any, where: str = "result") -> None:
@@ -156,7 +163,7 @@ def validate(result: Any, where: str = "result") -> None:
     Raises:
         ValueError: names the first field that is missing, unknown, of the wrong kind or out of range.
     """
-    _fields(result, _TOP, where)
+    _fields(result, _TOP | {k: v for k, v in _TOP_LATER.items() if isinstance(result, dict) and k in result}, where)
     _expect(result["schema"] == SCHEMA, f"{where}.schema", result["schema"], str(SCHEMA))
     _verdict(result, where)
     key = result["key"]
@@ -199,6 +206,7 @@ def write(path: str | Path, result: Mapping[str, Any]) -> Path:
     Raises:
         ValueError: the result is not valid; nothing is written.
     """
+    result = {**result, "seal": seal(result)}
     validate(result, str(path))
     return replace_file(path, _text(result).encode("utf-8"))
 
@@ -238,9 +246,10 @@ def read(path: str | Path) -> dict[str, Any]:
 
 
 def finished(path: str | Path, key: str) -> bool:
-    """Whether ``path`` holds a valid result of this key, so that the job need not run again."""
+    """Whether ``path`` holds a valid result of this key as it was written, so that the job need not run again."""
     try:
-        return bool(read(path)["key"] == key)
+        result = read(path)
+        return bool(result["key"] == key and result.get("seal") == seal(result))
     except (OSError, ValueError):
         return False
 

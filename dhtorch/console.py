@@ -11,9 +11,10 @@ import io
 import logging
 import os
 import sys
+import unicodedata
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
+from typing import Any, TextIO
 
 #: Flag → level.
 FLAGS = {"-q": "quiet", "--quiet": "quiet", "-v": "verbose", "--verbose": "verbose"}
@@ -22,8 +23,70 @@ VERBOSITY = "DHTORCH_VERBOSITY"
 #: Below the options of a sub-command that reads its own arguments.
 EPILOG = (
     "-q says no more than what was asked for and -v what is read and done, as for every word of dhtorch. "
-    "Exit code: 0 done, 2 bad option or bad data, 130 interrupted."
+    "Exit code: 0 done, 2 bad option or bad data, 130 interrupted, 143 or 129 told to end (SIGTERM, SIGHUP)."
 )
+
+
+def plain(text: str) -> str:
+    """The text without what a terminal would obey: control characters, and marks that turn the direction of writing,
+    are spelt out. Line ends and tabs stay."""
+    if text.isascii() and text.isprintable():
+        return text
+    return "".join(
+        c if c in "\n\t" or unicodedata.category(c) not in ("Cc", "Cf", "Cs", "Zl", "Zp") else _spelt(c) for c in text
+    )
+
+
+def _spelt(c: str) -> str:
+    return f"\\x{ord(c):02x}" if ord(c) < 256 else f"\\u{ord(c):04x}" if ord(c) < 65536 else f"\\U{ord(c):08x}"
+
+
+def markup(text: str) -> str:
+    """The text as rich takes it, with nothing in it that rich or a terminal would obey."""
+    from rich.markup import escape  # noqa: PLC0415
+
+    return escape(plain(text))
+
+
+def terminal(stream: Any) -> TextIO:
+    """The stream for a writer that commands a terminal on purpose, and passes the rest through :func:`markup`."""
+    found: TextIO = stream.stream if isinstance(stream, Plain) else stream
+    return found
+
+
+class Plain:
+    """A stream that names from files, values and errors pass on their way to a terminal; see :func:`plain`.
+
+    All but writing is the stream's own. It is no subclass of Python's streams, which close what they hold when they go.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self.stream = stream  # what goes there directly is obeyed: a progress bar
+
+    def write(self, text: str) -> int:
+        """As of every stream."""
+        self.stream.write(plain(text))
+        return len(text)
+
+    def writelines(self, lines: Iterable[str]) -> None:
+        """As of every stream."""
+        for line in lines:
+            self.write(line)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
+
+
+@contextlib.contextmanager
+def neutral() -> Iterator[None]:
+    """Meanwhile nothing that is printed reaches a terminal as a command."""
+    before: Any = sys.stdout, sys.stderr
+    guarded: Any = tuple(s if isinstance(s, Plain) else Plain(s) for s in before)
+    sys.stdout, sys.stderr = guarded
+    try:
+        yield
+    finally:
+        sys.stdout, sys.stderr = before
 
 
 def progress(items: Iterable[Any], text: str, total: int) -> Iterator[Any]:
@@ -33,8 +96,8 @@ def progress(items: Iterable[Any], text: str, total: int) -> Iterator[Any]:
 
     columns = ("{task.description:24}", BarColumn(), MofNCompleteColumn(), "{task.fields[rate]}", TimeRemainingColumn())
     hidden = not sys.stderr.isatty() or verbosity() == "quiet"
-    with Progress(*columns, console=Console(stderr=True), disable=hidden, transient=True) as bar:
-        task = bar.add_task(text, total=total, rate="")
+    with Progress(*columns, console=Console(file=terminal(sys.stderr)), disable=hidden, transient=True) as bar:
+        task = bar.add_task(markup(text), total=total, rate="")
         for item in items:
             yield item
             speed = bar.tasks[task].speed

@@ -5,14 +5,18 @@ Strict JSON is what every reader of JSON understands alike: no ``NaN``, no ``Inf
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
+
+#: Lists and objects inside one another that a file may hold: whoever walks through them does so by recursion.
+MAX_DEPTH = 64
 
 #: How the name of a file ends while it is written.
 _UNFINISHED = ".tmp"
@@ -55,9 +59,20 @@ def loads(text: str) -> Any:
     """The value of a text in strict JSON.
 
     Raises:
-        ValueError: no JSON, a number that is not finite, or a key that stands twice in one object.
+        ValueError: no JSON, a number that is not finite, a key that stands twice in one object, or values nested
+            deeper than ``MAX_DEPTH``.
     """
-    return json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_unique)
+    try:
+        value = json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_unique)
+    except RecursionError:
+        raise ValueError(f"values nested deeper than {MAX_DEPTH}") from None
+    level = [value] if isinstance(value, dict | list) else []
+    for _ in range(MAX_DEPTH):
+        level = [inner for each in level for inner in (each.values() if isinstance(each, dict) else each)]
+        level = [each for each in level if isinstance(each, dict | list)]
+    if level:
+        raise ValueError(f"values nested deeper than {MAX_DEPTH}")
+    return value
 
 
 def write_json(path: str | Path, value: Any) -> Path:
@@ -69,13 +84,24 @@ def write_json(path: str | Path, value: Any) -> Path:
     return replace_file(path, (dumps(value, indent=1) + "\n").encode("utf-8"))
 
 
+@contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """An error of the system that names no file (a full disk, a limit of size) names ``path``."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None or error.errno is None:
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
+
+
 def replace_file(path: str | Path, content: bytes) -> Path:
     """Write a file so that, whatever happens, ``path`` holds either what it held before or all of the new content."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=_UNFINISHED, dir=path.parent)
     try:
-        with os.fdopen(handle, "wb") as file:
+        with naming(path), os.fdopen(handle, "wb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
@@ -97,7 +123,8 @@ def copy_file(source: str | Path, path: str | Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(f".{path.name}.copy{_UNFINISHED}")
     try:
-        shutil.copyfile(source, unfinished)
+        with naming(path):
+            shutil.copyfile(source, unfinished)
         unfinished.replace(path)
     except BaseException:
         unfinished.unlink(missing_ok=True)

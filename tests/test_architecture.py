@@ -12,7 +12,7 @@ import dhtorch
 
 ROOT = Path(dhtorch.__file__).parent
 LEVELS = [
-    {"tree", "codes", "storage", "closure", "archive", "console"},
+    {"tree", "codes", "storage", "closure", "archive", "console", "leash", "lock"},
     {"geometry"},
     {"records", "drawing"},
     {"stages", "data", "evaluate", "export", "synthetic", "testing", "calibration"},
@@ -30,6 +30,7 @@ LEVEL = {name: level for level, group in enumerate(LEVELS) for name in group}
 SIDEWAYS = {
     ("archive", "closure"),
     ("archive", "storage"),
+    ("lock", "storage"),
     ("synthetic", "data"),
     ("synthetic", "testing"),
     ("testing", "data"),

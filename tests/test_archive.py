@@ -53,7 +53,8 @@ def test_a_result_survives_the_disk_and_is_strict(tmp_path):
     path = archive.write(tmp_path / "deep" / "result.json", written)
     text = path.read_text()
     assert "NaN" not in text and "Infinity" not in text
-    assert archive.read(path) == archive.read(path.parent) == written == json.loads(text)
+    sealed = {**written, "seal": archive.seal(written)}
+    assert archive.read(path) == archive.read(path.parent) == sealed == json.loads(text)
     assert written["rows"][1]["corr"] is None and written["config"]["holdout"]["cutoff"] is None
     assert written["rows"][0]["pair"] == [0, 5] and written["rows"][0]["n_kept"] == 3
     assert [p.name for p in path.parent.iterdir()] == ["result.json"]

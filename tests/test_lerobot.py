@@ -22,6 +22,7 @@ import pyarrow
 from pyarrow import parquet
 
 from dhtorch import data
+from dhtorch.commands import run
 from dhtorch.data import lerobot_depth, lerobot_rows
 from dhtorch.data.codecs import parquet as codec_parquet
 from dhtorch.data.codecs.video import close_videos
@@ -350,7 +351,7 @@ def test_pages_that_unpack_into_too_much_are_refused(tmp_path: Path, monkeypatch
     file = tmp_path / "x.parquet"
     parquet.write_table(pyarrow.table({"x": [bytes(3 << 20)] * 2}), file, compression="zstd", use_dictionary=False)
     assert file.stat().st_size < 10_000 and len(codec_parquet.read_columns(file, ["x"])["x"][1]) == 3 << 20
-    monkeypatch.setattr(codec_parquet, "_MAX_CHUNK_BYTES", 4 << 20)
+    monkeypatch.setattr(codec_parquet, "_MAX_UNPACKED", 4 << 20)
     with pytest.raises(FormatError, match=r"x.parquet: x: found \d+ bytes, expected at most 4194304"):
         codec_parquet.read_columns(file, ["x"])
     parquet.write_table(pyarrow.table({"x": np.arange(100)}), file, use_dictionary=False, compression="none")
@@ -384,3 +385,39 @@ def hostile_v3(root: Path) -> None:
 
 def hostile_v2(root: Path) -> None:
     write_lerobot(root, [episodes()[0]], version=2, image="image", depth="tiff", intrinsics="side-car")
+
+
+def test_rows_without_numbers_whose_clock_is_late_keep_their_pictures(tmp_path: Path) -> None:
+    """Times that begin one frame after the video: by time every row would get the next picture."""
+    shots = episodes()[1]
+    write_lerobot(tmp_path, [shots], version=2, depth="tiff")
+    (file,) = (tmp_path / "data").rglob("*.parquet")
+    table = parquet.read_table(file)
+    late = pyarrow.array(np.asarray(table.column("timestamp").to_numpy() + 1 / 30, np.float32))
+    table = table.set_column(table.column_names.index("timestamp"), "timestamp", late).drop_columns(["frame_index"])
+    parquet.write_table(table, file)
+    recording = data.open(tmp_path)
+    assert (
+        len(recording) == 4 and "times begin at 0.03333 s: pictures taken by the order of rows" in recording.report[0]
+    )
+    for i, shot in enumerate(shots):
+        assert float((recording[i].image.float() - shot.image.float()).abs().mean()) < 5
+    assert recording.times is not None and float(recording.times[0]) == 0
+
+
+def test_a_camera_that_is_only_declared_is_none(tmp_path: Path) -> None:
+    write_lerobot(tmp_path, [episodes()[0]], version=2)
+    info = tmp_path / "meta" / "info.json"
+    said = json.loads(info.read_text())
+    said["features"]["observation.images.ghost"] = said["features"]["observation.images.front"]
+    info.write_text(json.dumps(said))
+    assert len(data.open_all(tmp_path)) == 1
+    with pytest.raises(FormatError):
+        data.open_all(tmp_path, camera="observation.images.ghost")[0][0]
+
+
+def test_a_set_without_intrinsics_can_be_looked_at(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_lerobot(tmp_path / "x", [episodes()[0]], version=2, intrinsics=None, depth=None, poses=False)
+    assert run.main(["inspect", str(tmp_path / "x"), "--out", str(tmp_path / "out")]) == 0
+    out = capsys.readouterr().out
+    assert "no intrinsics: nothing can be measured" in out and "frames " in out and "field of view" not in out

@@ -10,6 +10,7 @@ import torch
 from box import disagreement
 
 from dhtorch import data
+from dhtorch.data.codecs.video import read_video_frame
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import lookup, se3
 from dhtorch.records import Pose
@@ -93,7 +94,33 @@ def test_real_pairs_match_along_the_disparity(name: str) -> None:
 def test_all_real_pieces_are_recognised_by_their_content() -> None:
     want = {"holo_a": "frames_dir", "7s_redkitchen_000": "frames_dir", "tum_fr1_desk9": "tum", "tum_fr1_rpy_a": "tum"}
     want |= {"middlebury_motorcycle": "rectified", "eth3d_terrace": "rectified", "dgp_drive6cam": "driving"}
+    want |= {"slambook_rgbd": "frames_dir", "lingbot_examples/0": "frames_dir", "realsense_slam": "frames_dir"}
+    want |= {"gr00t_demo": "lerobot", "lerobot_g1": "lerobot"}
     assert {name: data.recognise(Path(ROOT) / name)[0] for name in want} == want
+
+
+@pytest.mark.data
+@real
+def test_plain_folders_have_depth_poses_and_the_order_of_their_numbers() -> None:
+    slambook = data.open(Path(ROOT) / "slambook_rgbd")
+    assert slambook.poses is not None and slambook.number.tolist() == [1, 2, 3, 4, 5]
+    error, count = disagreement(slambook[0], slambook[1], reach=3)
+    assert error < 0.06 and count > 300
+    one = data.open(Path(ROOT) / "lingbot_examples" / "0")[0]
+    assert one.camera.f[0].tolist() == pytest.approx([460.139587, 460.199005]) and one.T_world_from_cam is None
+    assert 0.9 < float(one.depth[one.depth > 0].median()) < 4
+    slam = data.open(Path(ROOT) / "realsense_slam", K=(383.0, 383.0, 320.0, 240.0))
+    assert slam.number.tolist() == list(range(8, 38))
+
+
+@pytest.mark.data
+@real
+def test_every_row_of_a_real_set_has_its_own_picture() -> None:
+    """Its times begin at 0.05 s and its film at 0."""
+    recording = data.open_all(Path(ROOT) / "gr00t_demo", K=(200.0, 200.0, 128.0, 128.0))[0]
+    film = recording.load.videos["observation.images.ego_view"][0]  # type: ignore[attr-defined]
+    for i in (0, 1, len(recording) - 1):
+        assert torch.equal(recording[i].image[0], torch.from_numpy(read_video_frame(film, i)).permute(2, 0, 1))
 
 
 @pytest.mark.data
@@ -106,6 +133,6 @@ def test_side_cars_are_not_required_where_the_format_says_it(tmp_path: Path) -> 
         for entry in (Path(ROOT) / name).iterdir():
             if entry.name != "meta.json":
                 (bare / entry.name).symlink_to(entry)
-        a, b = data.open_all(bare)[0][0], data.open_all(Path(ROOT) / name)[0][0]
+        a, b = data.open_all(bare, follow_links=True)[0][0], data.open_all(Path(ROOT) / name)[0][0]
         assert torch.equal(a.depth, b.depth)
         torch.testing.assert_close(a.camera.f, b.camera.f)

@@ -9,8 +9,9 @@ from __future__ import annotations
 import argparse
 import inspect
 import re
+import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import islice
 from pathlib import Path
@@ -21,8 +22,9 @@ import torch
 from torch import Tensor
 
 from dhtorch import data
-from dhtorch.console import EPILOG, progress
-from dhtorch.data import FormatError, files
+from dhtorch.console import EPILOG, markup, progress, terminal
+from dhtorch.data import FormatError, files, lerobot
+from dhtorch.data.recording import Recording
 from dhtorch.data.survey import Survey, survey_pictures, survey_recording
 from dhtorch.drawing.colours import DEPTH, GREY, INK, OTHERS, SCORE, SILENT
 from dhtorch.studies.focal import formats
@@ -30,6 +32,7 @@ from dhtorch.studies.focal.survey import survey_stacks
 
 _LEVELS = 2  # folders below the path
 _MOST = 12  # recordings that are shown of one capture
+_NO_K = "no intrinsics: nothing can be measured in it before data.K says them"
 _SPARSE = 0.1  # share of returns below which they are drawn larger
 _ARCHIVES = (".r3d", ".mp4", ".mov", ".tar", ".h5", ".hdf5")  # files that may be a whole capture
 _PICTURES = (".png", ".jpg", ".jpeg")
@@ -43,6 +46,7 @@ class Found:
     kind: str  # "recording", "stacks" or "pictures"
     format: str
     evidence: str
+    follow_links: bool = False
 
 
 def main(argv: Sequence[str]) -> int:
@@ -59,11 +63,14 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--out", type=Path, help="folder of the contact sheet (default: outputs/<date>/<time>)")
     parser.add_argument("--format", default="auto", help="name of the format, where it is not to be recognised")
     parser.add_argument("--frames", type=int, default=8, help="frames to decode and show (default: 8)")
+    parser.add_argument("--follow-links", action="store_true", help="links may lead out of a capture")
     parser.add_argument("--traceback", action="store_true", help="show where an error came from")
     options = parser.parse_args(argv)
     if options.frames < 1:
         raise ValueError(f"--frames: found {options.frames}, expected at least 1")
-    found = find(options.path) if options.format == "auto" else [_named(options.path, options.format)]
+    auto = options.format == "auto"
+    found = find(options.path, options.follow_links) if auto else [_named(options.path, options.format)]
+    found = [replace(capture, follow_links=options.follow_links) for capture in found]
     now = datetime.now()
     out = options.out or Path("outputs") / f"{now:%Y-%m-%d}" / f"{now:%H-%M-%S}"
     sheets: list[Path] = []
@@ -80,7 +87,7 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-def find(path: Path) -> list[Found]:
+def find(path: Path, follow_links: bool = False) -> list[Found]:
     """The captures at ``path``, else one folder below, else two; the nearest level that has any, folders before files.
 
     Raises:
@@ -90,9 +97,9 @@ def find(path: Path) -> list[Found]:
         raise FormatError(path, "path", "no such file or folder", "a capture")
     level = [path]
     for _ in range(_LEVELS + 1):
-        inside = [entry for folder in level if folder.is_dir() for entry in sorted(folder.iterdir())]
+        inside = [entry for folder in level if folder.is_dir() for entry in sorted(folder.iterdir(), key=files.natural)]
         for candidates in (level, [entry for entry in inside if entry.suffix.lower() in _ARCHIVES]):
-            found = [capture for entry in candidates if (capture := _recognised(entry)) is not None]
+            found = [capture for entry in candidates if (capture := _recognised(entry, follow_links)) is not None]
             if found:
                 return found
         level = [entry for entry in inside if entry.is_dir()]
@@ -132,11 +139,12 @@ def _named(path: Path, format: str) -> Found:
     return Found(path, "recording", format, "as told")
 
 
-def _recognised(path: Path) -> Found | None:
+def _recognised(path: Path, follow_links: bool) -> Found | None:
     """What stands at this very path: a recording wins over focal stacks, these over loose pictures."""
-    for name, reader in (data.FORMATS | formats.STACK_FORMATS).items():
-        if evidence := reader.recognise(path):
-            return Found(path, "recording" if name in data.FORMATS else "stacks", name, evidence)
+    with files.inside(None if follow_links else path):
+        for name, reader in (data.FORMATS | formats.STACK_FORMATS).items():
+            if evidence := reader.recognise(path):
+                return Found(path, "recording" if name in data.FORMATS else "stacks", name, evidence)
     if path.is_dir() and (count := sum(file.suffix.lower() in _PICTURES for file in path.iterdir())):
         return Found(path, "pictures", "loose pictures", f"{count} pictures of no known format")
     return None
@@ -144,30 +152,46 @@ def _recognised(path: Path) -> Found | None:
 
 def _recordings(capture: Found, frames: int) -> Iterator[Survey]:
     """Each recording; without its pictures where these are missing and the reader can do so."""
-    warning = []
+    warning, links = [], capture.follow_links
     try:
-        recordings = data.open_all(capture.path, capture.format)
+        recordings = data.open_all(capture.path, capture.format, follow_links=links)
     except FormatError as error:
         if "images" not in inspect.signature(data.FORMATS[capture.format].read).parameters:
             raise
-        recordings, warning = data.open_all(capture.path, capture.format, images=False), [f"no pictures: {error}"]
+        recordings = data.open_all(capture.path, capture.format, follow_links=links, images=False)
+        warning = [f"no pictures: {error}"]
     if len(recordings) > _MOST:
         warning.append(f"{len(recordings)} recordings in this capture: the first {_MOST} are shown")
-    for recording in islice(recordings, _MOST):
+    shown = _seen(capture, recordings, warning)
+    for recording in islice(shown, _MOST):
         survey = survey_recording(recording, frames, progress=progress)
+        if _NO_K in warning:
+            survey.facts = [(what, text) for what, text in survey.facts if what != "intrinsics"]
         survey.warnings.extend(warning)
         yield survey
 
 
+def _seen(capture: Found, recordings: Sequence[Recording], warning: list[str]) -> Sequence[Recording]:
+    """The recordings; where nobody says K with one that serves to look at them, and a warning."""
+    try:
+        _ = recordings[0]
+    except lerobot.NoIntrinsics:
+        warning.append(_NO_K)
+        h, w = lerobot.picture_hw(capture.path)
+        stand_in = (float(w), float(w), w / 2, h / 2)
+        return data.open_all(capture.path, capture.format, follow_links=capture.follow_links, K=stand_in)
+    return recordings
+
+
 def _stacks(capture: Found, frames: int) -> Iterator[Survey]:
-    yield survey_stacks(formats.open_stacks(capture.path, capture.format), frames)
+    yield survey_stacks(formats.open_stacks(capture.path, capture.format, follow_links=capture.follow_links), frames)
 
 
 def _classified(folder: Path) -> tuple[list[Path], list[Path]]:
     """Pictures and depth maps (16 bits, one channel) of a folder and of those directly in it."""
     pictures: list[Path] = []
     depths: list[Path] = []
-    for file in sorted((*folder.glob("*"), *folder.glob("*/*"))):
+    for file in sorted((*folder.glob("*"), *folder.glob("*/*")), key=files.natural):
         if file.suffix.lower() in _PICTURES and file.is_file():
             try:
                 header = files.image_header(file)
@@ -180,6 +204,11 @@ def _classified(folder: Path) -> tuple[list[Path], list[Path]]:
 
 def _loose(capture: Found, frames: int) -> Iterator[Survey]:
     """Some of the pictures and depth maps of a folder, the latter taken to be in millimetres."""
+    with files.inside(None if capture.follow_links else capture.path):
+        yield from _loose_inside(capture, frames)
+
+
+def _loose_inside(capture: Found, frames: int) -> Iterator[Survey]:
     pictures, depths = _classified(capture.path)
     shown: dict[str, dict[str, Tensor]] = {"image": {}, "depth": {}}
     unreadable: list[str] = []
@@ -211,22 +240,21 @@ def _spread(items: Sequence[Path], count: int) -> list[Path]:
 def print_survey(capture: Found, survey: Survey, console: Any = None) -> None:
     """Facts and warnings as a table (``console``: a ``rich.console.Console``; None = standard output)."""
     from rich.console import Console  # noqa: PLC0415
-    from rich.markup import escape  # noqa: PLC0415
     from rich.table import Table  # noqa: PLC0415
 
-    console = console or Console()
+    console = console or Console(file=terminal(sys.stdout))
     if not console.is_terminal:
         console.width = max(console.width, 140)  # a file has no edge to wrap at
     table = Table.grid(padding=(0, 2))
     table.add_column(style="dim", no_wrap=True)
     table.add_column()
-    table.add_row("path", escape(str(capture.path)))
-    table.add_row("format", escape(f"{survey.format} ({capture.evidence})"))
+    table.add_row("path", markup(str(capture.path)))
+    table.add_row("format", markup(f"{survey.format} ({capture.evidence})"))
     for what, text in survey.facts:
-        table.add_row(escape(what), escape(text))
+        table.add_row(markup(what), markup(text))
     for text in survey.warnings:
-        table.add_row("[yellow]warning[/]", f"[yellow]{escape(text)}[/]")
-    console.print(f"[bold]{escape(survey.name)}[/]")
+        table.add_row("[yellow]warning[/]", f"[yellow]{markup(text)}[/]")
+    console.print(f"[bold]{markup(survey.name)}[/]")
     console.print(table)
 
 

@@ -13,6 +13,7 @@ import hashlib
 import importlib
 import logging
 import math
+import multiprocessing
 import os
 import re
 import shlex
@@ -24,8 +25,8 @@ from pathlib import Path
 from typing import Any
 
 import dhtorch
-from dhtorch import console
-from dhtorch.commands import together, words
+from dhtorch import console, leash, lock
+from dhtorch.commands import signals, together, words
 from dhtorch.commands.words import quote
 
 #: Sub-command → module with ``main(argv) -> int``.
@@ -46,6 +47,7 @@ CONFIGURED = {
 FIRST_WORD = {"complete": "data.root", "judge": "data.root", "stream": "data.root", "view": "result"}
 
 DONE, SOME_FAILED, FAILED, INTERRUPTED, UNHEARD = 0, 1, 2, 130, 141
+HUNG_UP, TERMINATED = 129, 143
 
 #: Exit codes, as ``dhtorch --help`` lists them.
 EXIT_CODES = {
@@ -53,6 +55,8 @@ EXIT_CODES = {
     SOME_FAILED: "some jobs of a sweep failed, or a judged depth exceeds fail_on",
     FAILED: "bad option, bad data or failed job",
     INTERRUPTED: "interrupted",
+    HUNG_UP: "told to end by SIGHUP, as when a terminal is closed",
+    TERMINATED: "told to end by SIGTERM",
     UNHEARD: "nobody reads the output any more",
 }
 
@@ -84,19 +88,26 @@ def main(argv: list[str] | None = None) -> int:
     """Entry point of the console script; returns the exit code."""
     argv = sys.argv[1:] if argv is None else argv
     flags, argv = [a for a in argv if a in console.FLAGS], [a for a in argv if a not in console.FLAGS]
-    with console.speaking(flags), console.hushed():
-        try:
-            code = _run(argv)
-            sys.stdout.flush()
-            return code
-        except BrokenPipeError:  # as of `dhtorch report … | head`
-            console.leave_the_pipe()
-            return UNHEARD
-        except USER_ERRORS as error:
-            return _fail(error, show="--traceback" in argv)
-        except KeyboardInterrupt as stop:  # a sub-command may say how to go on
-            print(": ".join(["dhtorch: interrupted", *map(str, stop.args)]), file=sys.stderr)
-            return INTERRUPTED
+    with console.neutral(), console.speaking(flags), console.hushed():
+        with signals.ending() as told:
+            code = _outcome(argv)
+        return told.code(code)
+
+
+def _outcome(argv: list[str]) -> int:
+    """The exit code, with whatever went wrong said in a line."""
+    try:
+        code = _run(argv)
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError:  # as of `dhtorch report … | head`
+        console.leave_the_pipe()
+        return UNHEARD
+    except USER_ERRORS as error:
+        return _fail(error, show="--traceback" in argv)
+    except KeyboardInterrupt as stop:  # a sub-command may say how to go on
+        print(": ".join(["dhtorch: interrupted", *map(str, stop.args)]), file=sys.stderr)
+        return INTERRUPTED
 
 
 def _run(argv: list[str]) -> int:
@@ -250,9 +261,10 @@ def _run_hydra(argv: list[str]) -> int:
             folder = _output(cfg, overrides, sweep)
             overrides = [o for o in overrides if not o.startswith("output=")] + [f"output={quote(str(folder))}"]
             again = _again(argv, folder)
-            if sweep:
-                return _sweep(engine, overrides, folder, again, show=cfg.traceback)
-            return _single(engine, overrides, again)
+            with lock.held(folder.parent / f".{folder.name}.lock", f"output: {folder}"):
+                if sweep:
+                    return _sweep(engine, overrides, folder, again, show=cfg.traceback)
+                return _single(engine, overrides, again)
     except (HydraException, OmegaConfBaseException) as error:
         return _fail(error)
 
@@ -318,6 +330,13 @@ def _compare(folders: Sequence[Path], sweep: Path) -> None:
 
 def _job(cfg: Any) -> Any:
     """One job, in whatever process a launcher runs it: build what the settings name and run it. Never raises."""
+    if multiprocessing.current_process().name != "MainProcess":  # of a launcher
+        leash.follow_parent()
+    with console.neutral():
+        return _run_job(cfg)
+
+
+def _run_job(cfg: Any) -> Any:
     from hydra.core.hydra_config import HydraConfig  # noqa: PLC0415
     from hydra.errors import InstantiationException  # noqa: PLC0415
     from omegaconf import OmegaConf  # noqa: PLC0415

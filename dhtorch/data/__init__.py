@@ -10,12 +10,13 @@ from __future__ import annotations
 import inspect
 import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, Protocol
 
 from dhtorch.data import arkitscenes, ca1m, driving, frames_dir, lerobot, record3d, rectified, rh20t, stray, tum
-from dhtorch.data.files import FormatError
+from dhtorch.data.files import FormatError, inside
 from dhtorch.data.recording import Recording, Recordings
 from dhtorch.data.scene import Given, Scene, Scenes, scenes_of
 
@@ -70,13 +71,13 @@ ROOT_VARIABLE: Final = "DHTORCH_DATA"
 _SHOWN = 4  # names of many recordings in a message
 
 
-def open(root: str | Path, format: str = "auto", **options: object) -> Recording:
+def open(root: str | Path, format: str = "auto", *, follow_links: bool = False, **options: object) -> Recording:
     """The one recording at ``root``; see :func:`open_all` for the arguments.
 
     Raises:
         FormatError: as :func:`open_all`, and where there are several recordings (a car with many cameras).
     """
-    found = open_all(root, format, **options)
+    found = open_all(root, format, follow_links=follow_links, **options)
     if len(found) > 1:
         names = found.names if isinstance(found, Recordings) else [each.name for each in found]
         shown = ", ".join(names[:_SHOWN]) + (" …" if len(names) > _SHOWN else "")
@@ -87,6 +88,8 @@ def open(root: str | Path, format: str = "auto", **options: object) -> Recording
 def open_all(
     root: str | Path,
     format: str = "auto",
+    *,
+    follow_links: bool = False,
     **options: object,
 ) -> Sequence[Recording]:
     """Every recording at ``root``, opened lazily: nothing is decoded before a frame is asked for.
@@ -94,6 +97,7 @@ def open_all(
     Args:
         root: a folder (or file) of one of the known formats.
         format: a name of ``FORMATS``, or ``"auto"`` to recognise it by its content.
+        follow_links: whether symbolic links inside the capture may lead out of it.
         options: keyword options of the reader, see ``dhtorch.data.<format>.read``.
 
     Returns:
@@ -105,8 +109,9 @@ def open_all(
         ValueError: an option that the reader does not have.
     """
     root = Path(root)
+    bounds = None if follow_links else root
     if format == "auto":
-        format = recognise(root)[0]
+        format = recognise(root, follow_links=follow_links)[0]
     elif format not in FORMATS:
         raise FormatError(root, "format", format, f"auto, {', '.join(FORMATS)}")
     elif not root.exists():
@@ -116,7 +121,23 @@ def open_all(
     for option in options:
         if option not in known:
             raise ValueError(f"data: format {format} has no option {option!r}, expected one of {', '.join(known)}")
-    return read(root, **options)
+    with inside(bounds):
+        found = read(root, **options)
+    if isinstance(found, Recordings):
+        return replace(found, make=_Bounded(found.make, bounds))
+    return [replace(recording, bounds=bounds) for recording in found]
+
+
+@dataclass(frozen=True)
+class _Bounded:
+    """Opens one of many recordings, no link of which may lead out of the capture."""
+
+    make: Callable[[int], Recording]
+    bounds: Path | None
+
+    def __call__(self, i: int) -> Recording:
+        with inside(self.bounds):
+            return replace(self.make(i), bounds=self.bounds)
 
 
 def open_capture(
@@ -128,22 +149,23 @@ def open_capture(
     levels: int | None = None,
     room: str | None = None,
     role: str | None = None,
+    follow_links: bool = False,
     **options: object,
 ) -> Scenes:
     """Every recording at ``root`` as a scene, with the same notes, opened lazily.
 
     Args:
-        root, format, options: as :func:`open_all`.
+        root, format, follow_links, options: as :func:`open_all`.
         near, gap, levels, room, role: notes of the :class:`Scene`.
 
     Raises:
         FormatError, ValueError: as :func:`open_all`.
     """
     noted = partial(Scene, near=near, gap=gap, levels=levels, room=room, role=role)
-    return Scenes(open_all(root, format, **options), noted)
+    return Scenes(open_all(root, format, follow_links=follow_links, **options), noted)
 
 
-def recognise(root: str | Path) -> tuple[str, str]:
+def recognise(root: str | Path, *, follow_links: bool = False) -> tuple[str, str]:
     """(format, what makes it one, in words) of a capture.
 
     Raises:
@@ -152,14 +174,15 @@ def recognise(root: str | Path) -> tuple[str, str]:
     root = Path(root)
     if not root.exists():
         raise FormatError(root, "path", "no such file or folder", "a capture")
-    for name, reader in FORMATS.items():
-        if evidence := reader.recognise(root):
-            return name, evidence
-    inside = (
+    with inside(None if follow_links else root):
+        for name, reader in FORMATS.items():
+            if evidence := reader.recognise(root):
+                return name, evidence
+    listed = (
         sorted(entry.name for entry in root.iterdir())[:6] if root.is_dir() else [f"a {root.suffix or 'plain'} file"]
     )
     expected = f"one of {', '.join(FORMATS)} (dhtorch inspect looks further down)"
-    raise FormatError(root, "format", ", ".join(inside) or "an empty folder", expected)
+    raise FormatError(root, "format", ", ".join(listed) or "an empty folder", expected)
 
 
 def open_scenes(root: str | Path | None = None, scenes: Sequence[Mapping[str, Any]] = ()) -> list[Scene]:

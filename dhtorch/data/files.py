@@ -4,6 +4,9 @@ Every function returns plain numpy arrays or Python values and checks lengths an
 bytes. Whatever is wrong with a file is a :class:`FormatError`: one line with the file, the field, what was found and
 what was expected.
 
+Two doors stand here for all readers. :func:`opened` is the only way to a file's bytes: regular files alone, inside the
+capture. :func:`allow` is the law of memory: whoever is about to make much of few bytes asks first.
+
 Alphabet: ``hw`` (height, width); depth and disparity maps are (h, w) float32.
 """
 
@@ -11,12 +14,17 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
+import re
+import stat
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import cv2
 import numpy as np
@@ -25,6 +33,21 @@ import numpy as np
 MAX_PIXELS = 64_000_000
 MAX_BYTES = 256_000_000  # of an array or a file
 MAX_TEXT_BYTES = 64_000_000  # of a table or a JSON document
+
+#: What opening a capture or reading one frame may take: so many bytes, or so many times what was asked for.
+MAX_MEMORY, GROWTH = 256 << 20, 8
+
+#: Bytes that Python's own objects take, at most: of a line and a word of a table; of an object, a list, a text and an
+#: entry of a JSON document.
+_LINE, _WORD = 250, 64
+_JSON = {"{": 240, "[": 64, '"': 32, ",": 40}
+
+_LINE_ENDS = "\n\r\v\f\x1c\x1d\x1e\x85\u2028\u2029"
+
+#: Deflate makes at most 1032 bytes of one, a JPEG at most a square of pixels of one bit.
+DEFLATE = 1032
+_JPEG_PIXELS = 8 * 1024
+_MAX_SCANS, _MAX_SCANNED = 1000, 20 * MAX_PIXELS  # of a JPEG: passes over the picture, and pixels of all of them
 
 
 class FormatError(ValueError):
@@ -121,6 +144,11 @@ def decode_depth_png(
         found = f"{header.kind} with {header.channels} channels of {header.bits} bits"
         raise FormatError(file, "depth", found, "png with 1 channel of 16 bits")
     code = _decode(file, data, cv2.IMREAD_UNCHANGED, header.hw)
+    return to_metres(code, units_per_metre, invalid)
+
+
+def to_metres(code: np.ndarray, units_per_metre: float, invalid: Sequence[int] = (0,)) -> np.ndarray:
+    """Depth float32 in m of codes of any shape; 0 where the code is one of ``invalid``."""
     depth = code.astype(np.float32) / np.float32(units_per_metre)
     for value in invalid:
         depth[code == value] = 0
@@ -148,6 +176,9 @@ def _checked_header(file: Path, data: bytes, hw: tuple[int, int] | None) -> Imag
     whole = _png_is_whole(data) if header.kind == "png" else data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda")
     if not whole:
         raise FormatError(file, "data", f"a truncated or damaged {header.kind} file of {len(data)} bytes", "all of it")
+    scans = data.count(b"\xff\xda") if header.kind == "jpeg" else 1
+    if scans > _MAX_SCANS or (scans > 1 and scans * header.hw[0] * header.hw[1] > _MAX_SCANNED):
+        raise FormatError(file, "scans", f"{scans} passes over {_size(header.hw)} pixels", "a picture of few passes")
     return header
 
 
@@ -161,6 +192,8 @@ def _parse_header(file: Path, data: bytes) -> ImageHeader:
         raise FormatError(file, "content", f"{data[:8]!r}", "a PNG or JPEG image")
     if not 0 < header.hw[0] * header.hw[1] <= MAX_PIXELS:
         raise FormatError(file, "size", _size(header.hw), f"1 to {MAX_PIXELS} pixels")
+    if header.hw[0] * header.hw[1] > len(data) * (_JPEG_PIXELS if header.kind == "jpeg" else 8 * DEFLATE):
+        raise FormatError(file, "size", f"{_size(header.hw)} in {len(data)} bytes", "as many bytes as pixels need")
     return header
 
 
@@ -223,8 +256,20 @@ def read_table(file: Path, columns: int | None = None) -> np.ndarray:
 
 def read_rows(file: Path) -> list[tuple[int, list[str]]]:
     """(line number, words) of every line of a text file that is neither blank nor a ``#`` comment."""
-    lines = enumerate(read_text(file).splitlines(), 1)
+    lines = enumerate(read_lines(file), 1)
     return [(i, line.split()) for i, line in lines if line.strip() and not line.lstrip().startswith("#")]
+
+
+def read_lines(file: Path) -> list[str]:
+    """The lines of a text file, which may be taken apart into words.
+
+    Raises:
+        FormatError: no such text, or more lines and words than memory is allowed for.
+    """
+    text = read_text(file)
+    lines, words = (sum(map(text.count, marks)) for marks in (_LINE_ENDS, " ,\t"))
+    allow(file, "text", _LINE * lines + _WORD * words, f"{lines} lines with {words} gaps between words")
+    return text.splitlines()
 
 
 def read_json(file: Path) -> dict[str, Any]:
@@ -243,8 +288,11 @@ def decode_json(text: str | bytes, file: Path) -> Any:
     """Any JSON value; ``file`` names the text in errors.
 
     Raises:
-        FormatError: no JSON.
+        FormatError: no JSON, or more values than memory is allowed for.
     """
+    raw = text.encode("utf-8", "replace") if isinstance(text, str) else text
+    counts = {mark: raw.count(mark.encode()) for mark in _JSON}
+    allow(file, "JSON", sum(_JSON[mark] * n for mark, n in counts.items()), f"{counts[',']} entries")
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:  # ValueError: bytes that are no text, too
@@ -299,7 +347,9 @@ def to_positive(value: object, file: Path, field: str) -> float:
 def read_text(file: Path) -> str:
     """The UTF-8 text of a file of at most ``MAX_TEXT_BYTES``."""
     try:
-        return read_bytes(file, MAX_TEXT_BYTES).decode("utf-8-sig")
+        data = read_bytes(file, MAX_TEXT_BYTES)
+        allow(file, "text", len(data) * (2 if data.isascii() else 5), f"{len(data)} bytes")
+        return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise FormatError(file, "text", error.reason, "UTF-8") from None
 
@@ -308,17 +358,99 @@ def read_bytes(file: Path, limit: int = MAX_BYTES) -> bytes:
     """All bytes of a file, at least one and at most ``limit``.
 
     Raises:
-        FormatError: the file is missing, unreadable, empty or too large.
+        FormatError: the file is missing, unreadable, no regular file, outside the capture, empty or too large.
     """
-    try:
-        size = file.stat().st_size
+    with opened(file) as stream:
+        size = os.fstat(stream.fileno()).st_size
         if not 0 < size <= limit:
             raise FormatError(file, "file size", f"{size} bytes", f"1 to {limit} bytes")
-        return file.read_bytes()
+        try:
+            return stream.read(limit)
+        except OSError as error:
+            raise unreadable(file, error) from None
+
+
+@contextmanager
+def opened(file: Path) -> Iterator[BinaryIO]:
+    """A file of a capture, open for reading: the only way to its bytes.
+
+    Raises:
+        FormatError: missing, unreadable, a pipe, socket, device or folder (which might never answer), or a link that
+            leads out of the capture (see :func:`inside`).
+    """
+    try:
+        kind = file.stat().st_mode  # before it is opened: some devices act on that alone
+        _stay(file)
+        if not stat.S_ISREG(kind):
+            raise FormatError(file, "file", _KINDS.get(stat.S_IFMT(kind), "something else"), "a regular file")
+        stream = os.fdopen(os.open(file, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)), "rb")
     except FormatError:
         raise
     except UNREADABLE as error:
         raise unreadable(file, error) from None
+    with stream:
+        yield stream
+
+
+_KINDS = {
+    stat.S_IFIFO: "a pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFDIR: "a folder",
+}
+
+
+def check_file(file: Path) -> int:
+    """Bytes of a file that a library will open by its name.
+
+    Raises:
+        FormatError: as :func:`opened`.
+    """
+    with opened(file) as stream:
+        return os.fstat(stream.fileno()).st_size
+
+
+#: The capture that is being read, and whether its links may lead out of it.
+_capture: ContextVar[Path | None] = ContextVar("capture", default=None)
+
+
+@contextmanager
+def inside(root: Path | None) -> Iterator[None]:
+    """Meanwhile links below ``root`` that lead out of it are refused; None: links are followed anywhere."""
+    before = _capture.set(root)
+    try:
+        yield
+    finally:
+        _capture.reset(before)
+
+
+def _stay(file: Path) -> None:
+    """Refuse a link that leads out of the capture that is being read."""
+    root = _capture.get()
+    if root is None or not file.is_relative_to(root):
+        return
+    home = root.resolve()
+    if root.is_file():
+        home = home.parent
+    if not file.resolve().is_relative_to(home):
+        raise FormatError(file, "link", "one that leads out of the capture", "a file inside (follow_links=true allows)")
+
+
+def allow(file: Path, field: str, takes: int, found: object, asked: int = 0) -> None:
+    """The law of memory: at most ``MAX_MEMORY`` bytes, or ``GROWTH`` times the bytes that were asked for.
+
+    Args:
+        file, field, found: for the error.
+        takes: bytes that are about to be taken, by a bound that costs nothing.
+        asked: bytes of the arrays asked for, of a shape that the file is long enough for.
+
+    Raises:
+        FormatError: more than that.
+    """
+    most = max(MAX_MEMORY, GROWTH * asked)
+    if takes > most:
+        raise FormatError(file, field, f"{found}: {takes} bytes of memory", f"at most {most}")
 
 
 def last_change(file: Path) -> int:
@@ -341,6 +473,16 @@ def unreadable(file: Path, error: Exception) -> FormatError:
     """What to raise instead of ``error``, one of ``UNREADABLE``."""
     found = "no such file" if isinstance(error, FileNotFoundError) else error
     return FormatError(file, "file", found, "a readable file")
+
+
+def natural(name: Path | str) -> tuple[object, ...]:
+    """Key of an order in which 1, 2 and 10 follow one another, with or without leading zeros."""
+    parts = re.split(r"(\d+)", str(name))
+    return tuple((not part.isdecimal(), int(part[:_DIGITS]) if part.isdecimal() else part) for part in parts)
+
+
+#: Digits of a number in a file's name that count.
+_DIGITS = 300
 
 
 def left_out(names: Sequence[int | str], why: str) -> list[str]:

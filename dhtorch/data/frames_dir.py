@@ -1,8 +1,10 @@
-"""Folders of numbered RGB-D frames, in two layouts.
+"""Folders of numbered RGB-D frames, in three layouts.
 
 - *named*: ``frame-XXXXXX.color.{jpg,png}``, ``.depth.png``, ``.pose.txt`` (4×4) side by side, as 7-Scenes and its
   descendants, with or without ``camera-intrinsics.txt`` (3×3).
-- *counted*: ``images/*``, ``depth/*.png``, ``poses.txt`` (one row-major 4×4 a line), ``K.txt`` (3×3).
+- *counted*: ``images/*`` (or ``color/``, ``rgb/``), ``depth/*.png`` or ``.pgm``, and where there are poses
+  ``poses.txt`` or ``pose.txt``: a line a frame, a 4×4 by rows or tx ty tz qx qy qz qw. ``K.txt`` (3×3).
+- *single*: ``rgb.{jpg,png}``, ``raw_depth.png`` and ``intrinsics.txt`` (3×3), one frame without a pose.
 
 Poses are camera-to-world with our axes. The intrinsics file holds for colour and depth unless ``K`` says otherwise:
 7-Scenes' depth (f = 585) is not registered to its colour (f = 525), and its file gives the depth camera's. A side-car
@@ -22,18 +24,25 @@ import numpy as np
 import torch
 
 from dhtorch.data import convert, files
+from dhtorch.data.codecs import pgm
 from dhtorch.data.files import FormatError
 from dhtorch.data.recording import Recording
 from dhtorch.records import Camera, Frame, Pose
 
 _PART = re.compile(r"frame-(\d+)\.(color|depth|pose)\.(?:png|jpg|jpeg|txt)")
-_IMAGE = re.compile(r"(.+)\.(?:png|jpg|jpeg)")
+_IMAGE = re.compile(r"(.+)\.(?:png|jpg|jpeg|pgm)")
+_FOLDERS = ("images", "color", "rgb")  # of pictures that are counted
+_POSES = ("poses.txt", "pose.txt")
+_INTRINSICS = ("K.txt", "camera-intrinsics.txt", "intrinsics.txt")
 
 
 def recognise(root: Path) -> str | None:
     """What makes ``root`` a recording of this format, in words; None if nothing does."""
-    if (root / "images").is_dir() and (root / "depth").is_dir() and (root / "poses.txt").is_file():
-        return "images/, depth/ and poses.txt"
+    pictures, poses = _folder(root), _first(root, _POSES)
+    if pictures is not None and any(map(_IMAGE.fullmatch, _names(root / "depth"))):
+        return f"{pictures.name}/ and depth/" + (f" and {poses.name}" if poses else "")
+    if _single(root) is not None:
+        return "rgb, raw_depth.png and intrinsics.txt"
     if root.is_dir() and any(_PART.fullmatch(file.name) for file in root.iterdir()):
         return "frame-XXXXXX.{color,depth,pose} files"
     return None
@@ -73,10 +82,9 @@ def read(
     root = Path(root)
     side = root / "meta.json"
     meta = files.read_json(side) if side.is_file() else {}
-    named = not (root / "images").is_dir()
-    frames, poses, report = _named_frames(root) if named else _counted_frames(root)
+    frames, poses, report = _frames(root)
     hw = files.image_header(frames[0].image).hw
-    depth_hw = files.image_header(frames[0].depth).hw
+    depth_hw = _depth_hw(frames[0].depth)
     own = _intrinsics(root, "K", K, meta)
     if own is None:
         raise FormatError(root, "K", "neither meta.json nor an intrinsics file", "one of them, or option K")
@@ -136,11 +144,50 @@ class _Load:
     def __call__(self, i: int) -> Frame:
         frame = self.frames[i]
         image = torch.from_numpy(files.read_image(frame.image, self.hw))
-        depth = torch.from_numpy(files.read_depth_png(frame.depth, self.units_per_metre, self.depth_hw, self.invalid))
+        depth = torch.from_numpy(self._depth(frame.depth))
         depth_camera = self.depth_camera
         if depth_camera is not None and self.register:
             depth, depth_camera = convert.register_depth(depth, depth_camera, self.camera, self.hw), None
         return Frame(image[None], depth[None], self.camera, depth_camera)
+
+    def _depth(self, file: Path) -> np.ndarray:
+        if file.suffix == ".pgm":
+            return files.to_metres(pgm.read_pgm(file, self.depth_hw), self.units_per_metre, self.invalid)
+        return files.read_depth_png(file, self.units_per_metre, self.depth_hw, self.invalid)
+
+
+def _names(folder: Path) -> list[str]:
+    return [file.name for file in folder.iterdir()] if folder.is_dir() else []
+
+
+def _first(root: Path, names: Sequence[str]) -> Path | None:
+    return next((root / name for name in names if (root / name).is_file()), None)
+
+
+def _folder(root: Path) -> Path | None:
+    """The folder of counted pictures."""
+    return next((root / name for name in _FOLDERS if any(map(_IMAGE.fullmatch, _names(root / name)))), None)
+
+
+def _single(root: Path) -> _Files | None:
+    image = _first(root, ("rgb.png", "rgb.jpg", "rgb.jpeg"))
+    depth, K = root / "raw_depth.png", root / "intrinsics.txt"
+    return _Files(0, image, depth) if image is not None and depth.is_file() and K.is_file() else None
+
+
+def _depth_hw(file: Path) -> tuple[int, int]:
+    if file.suffix != ".pgm":
+        return files.image_header(file).hw
+    h, w = pgm.read_pgm(file).shape
+    return h, w
+
+
+def _frames(root: Path) -> tuple[list[_Files], Pose | None, list[str]]:
+    """The frames of whatever layout this is, their poses where there are any, and what was left out."""
+    if (pictures := _folder(root)) is not None or (root / "images").is_dir():
+        return _counted_frames(root, pictures or root / "images")
+    single = _single(root)
+    return ([single], None, ["no poses in this layout"]) if single is not None else _named_frames(root)
 
 
 def _named_frames(root: Path) -> tuple[list[_Files], Pose, list[str]]:
@@ -172,34 +219,41 @@ def _named_frames(root: Path) -> tuple[list[_Files], Pose, list[str]]:
         raise
 
 
-def _counted_frames(root: Path) -> tuple[list[_Files], Pose, list[str]]:
-    images, depths = _pictures(root / "images"), _pictures(root / "depth")
-    rows = files.read_table(root / "poses.txt", 16)
+def _counted_frames(root: Path, folder: Path) -> tuple[list[_Files], Pose | None, list[str]]:
+    images, depths = _pictures(folder), _pictures(root / "depth")
+    file = _first(root, _POSES)
+    rows = None if file is None else files.read_table(file)
     if not images:
-        raise FormatError(root / "images", "frames", "no image", "at least one .png or .jpg")
+        raise FormatError(folder, "frames", "no image", "at least one .png or .jpg")
     # Rows carry no name: unless all counts agree nobody knows which row belongs to which picture.
-    for field, count in (("depth", len(depths)), ("poses.txt", len(rows))):
+    counts = {"depth": len(depths)} | ({} if file is None or rows is None else {file.name: len(rows)})
+    for field, count in counts.items():
         if count != len(images):
-            raise FormatError(root, f"{field} count", count, f"{len(images)}, one for each file of images/")
+            raise FormatError(root, f"{field} count", count, f"{len(images)}, one for each file of {folder.name}/")
     if images.keys() != depths.keys():
         odd = min(images.keys() ^ depths.keys())
-        raise FormatError(root, "file names", f"{odd} in one of images/ and depth/", "the same names in both")
-    stems = sorted(images, key=_sort_key)
+        raise FormatError(root, "file names", f"{odd} in one of {folder.name}/ and depth/", "the same names in both")
+    stems = sorted(images, key=files.natural)
     digits = [re.search(r"(\d+)\D*$", stem) for stem in stems]
     values = [int(m[1]) for m in digits if m]
     counted = len(values) == len(stems) and all(a < b for a, b in itertools.pairwise(values))
     numbers = values if counted else range(len(stems))
     frames = [_Files(number, images[stem], depths[stem]) for number, stem in zip(numbers, stems, strict=True)]
-    return frames, convert.to_poses(rows.reshape(-1, 4, 4), root / "poses.txt"), []
+    if file is None or rows is None:
+        return frames, None, ["no poses.txt: no poses"]
+    return frames, _poses(rows, file), []
+
+
+def _poses(rows: np.ndarray, file: Path) -> Pose:
+    if rows.shape[1] not in (7, 16):
+        raise FormatError(file, "columns", rows.shape[1], "16 (4x4 by rows) or 7 (tx ty tz qx qy qz qw) numbers")
+    if rows.shape[1] == 7:
+        return convert.to_poses(convert.to_c2w(rows[:, 3:], rows[:, :3], file, "pose"), file)
+    return convert.to_poses(rows.reshape(-1, 4, 4), file)
 
 
 def _pictures(folder: Path) -> dict[str, Path]:
-    return {m[1]: file for file in folder.iterdir() if (m := _IMAGE.fullmatch(file.name))}
-
-
-def _sort_key(stem: str) -> tuple[object, ...]:
-    """1, 2, 10 in this order, with or without leading zeros."""
-    return tuple((not part.isdigit(), int(part) if part.isdigit() else part) for part in re.split(r"(\d+)", stem))
+    return {m[1]: file for file in sorted(folder.glob("*")) if (m := _IMAGE.fullmatch(file.name))}
 
 
 def _intrinsics(
@@ -210,7 +264,7 @@ def _intrinsics(
         return convert.matrix_of(*files.to_array(option, (4,), root, f"option {key}")), root, f"option {key}"
     if key in meta:
         return meta[key], root / "meta.json", key
-    file = next((root / name for name in ("K.txt", "camera-intrinsics.txt") if (root / name).is_file()), None)
+    file = _first(root, _INTRINSICS)
     return (files.read_table(file, 3), file, "K") if file else None
 
 

@@ -29,6 +29,11 @@ from dhtorch.data.lerobot_rows import episode_rows, read_table
 from dhtorch.data.recording import Recording, Recordings
 from dhtorch.records import Camera, Frame, Pose
 
+
+class NoIntrinsics(FormatError):
+    """Nobody says K of a camera: nothing can be measured in it, though it can be looked at."""
+
+
 _UNITS = {"m": 1.0, "mm": 1000.0}
 
 
@@ -92,14 +97,31 @@ def read(
         (0.0, np.inf) if depth_range is None else tuple(files.to_array(depth_range, (2,), root, "option depth_range"))
     )
     keys = colour_keys(meta, camera)
+    wanted = None if episode is None else [episode] if isinstance(episode, int) else [int(e) for e in episode]
+    episodes = read_episodes(meta, wanted)
+    keys = keys if camera is not None else _filmed(keys, episodes)
     rigs = [
         _Rig(meta, key, depth, K, K_depth, distortion, intrinsics, pose, depth_unit, span, tolerance) for key in keys
     ]
-    wanted = None if episode is None else [episode] if isinstance(episode, int) else [int(e) for e in episode]
     columns = sorted({c for rig in rigs for c in (rig.K_key, rig.pose_key) if c})
-    episodes = read_episodes(meta, wanted)
     names = [rig.name(number) for number in episodes.numbers for rig in rigs]
     return Recordings(names, _Make(episodes, tuple(rigs), tuple(columns)))
+
+
+def picture_hw(root: Path) -> tuple[int, int]:
+    """Height and width of the first camera's pictures, which needs no K.
+
+    Raises:
+        FormatError: damaged metadata.
+    """
+    meta = read_meta(root)
+    return meta.features[_filmed(colour_keys(meta), read_episodes(meta, None))[0]].hw
+
+
+def _filmed(keys: list[str], episodes: Episodes) -> list[str]:
+    """Keys of the cameras that there are: a feature that is only declared is none."""
+    videos = episodes[0].videos
+    return [key for key in keys if key not in videos or videos[key][0].is_file()] or keys
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,6 +188,8 @@ class _Load:
     def _video(self, i: int, feature: Feature, pixels: str) -> np.ndarray:
         file, start = self.videos[feature.key]
         times, want = video_times(file), start + float(self.times[i])
+        if start == 0 and len(times):
+            want += float(times[0])  # a film of its own begins with the episode, whatever its clock says
         at = int(np.abs(times - want).argmin()) if len(times) else -1
         if at < 0 or abs(times[at] - want) > self.tolerance:
             found = f"nearest frame at {times[at]:.6f} s" if at >= 0 else "no frame"
@@ -285,7 +309,7 @@ class _Rig:
         if "K" not in entry:
             found = "no K in option, feature or side-car"
             expected = f"option K, a feature such as {self.key}.intrinsics (option intrinsics), or meta/intrinsics.json"
-            raise FormatError(side, self.key, found, expected)
+            raise NoIntrinsics(side, self.key, found, expected)
         return convert.to_camera(entry["K"], hw, side, f"{self.key} K", lens), of_depth
 
 

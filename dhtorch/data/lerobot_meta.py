@@ -185,7 +185,7 @@ def _columns_v3(meta: Meta) -> dict[str, np.ndarray]:
 def _columns_v2(meta: Meta) -> dict[str, np.ndarray]:
     table = meta.root / "meta" / "episodes.jsonl"
     rows = []
-    for line, text in enumerate(files.read_text(table).splitlines(), 1):
+    for line, text in enumerate(files.read_lines(table), 1):
         if text.strip():
             row = files.decode_json(text, table)
             rows.append([files.get(row, key, int, table) for key in ("episode_index", "length")])

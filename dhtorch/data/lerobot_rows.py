@@ -12,6 +12,9 @@ from dhtorch.data.codecs.parquet import parquet_header, read_columns
 from dhtorch.data.files import FormatError
 from dhtorch.data.lerobot_meta import Episode, Meta
 
+#: s; stamps are float32, and the grid that they were rounded from is exact.
+_ON_GRID = 1e-4
+
 
 def read_table(file: Path, more: tuple[str, ...]) -> dict[str, np.ndarray]:
     """The columns that place a row, and ``more``, of a whole table; pictures stay where they are.
@@ -28,7 +31,7 @@ def read_table(file: Path, more: tuple[str, ...]) -> dict[str, np.ndarray]:
 def _read_table(file: Path, _changed: int, more: tuple[str, ...]) -> dict[str, np.ndarray]:
     have = parquet_header(file).columns
     table: dict[str, np.ndarray] = {}
-    places = [name for name in ("timestamp", "frame_index", "episode_index") if name in have or name != "episode_index"]
+    places = [name for name in ("timestamp", "frame_index", "episode_index") if name in have or name == "timestamp"]
     for name, values in read_columns(file, [*places, *more]).items():
         if not isinstance(values, np.ndarray):
             raise FormatError(file, name, "no numbers", "numbers")
@@ -43,13 +46,17 @@ def episode_rows(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
     """Rows of the episode, their frame numbers and times (s), and what was left out.
 
+    A table without frame numbers counts its rows. Times that all lie by one shift beside the grid of these numbers
+    (a clock that does not begin at 0) are brought back to it: pictures follow the rows, and the shift is reported.
+
     Raises:
         FormatError: no usable row.
     """
     every = np.full(len(table["timestamp"]), episode.number)
     rows = np.flatnonzero(table.get("episode_index", every) == episode.number)
-    number, stamp = table["frame_index"][rows].astype(np.float64), table["timestamp"][rows].astype(np.float64)
-    sound = (number >= 0) & (number < 2**31) & (stamp >= 0) & (stamp < 1e9)  # false for NaN
+    stamp = table["timestamp"][rows].astype(np.float64)
+    number = table["frame_index"][rows].astype(np.float64) if "frame_index" in table else np.arange(float(len(rows)))
+    sound = (number >= 0) & (number < 2**31) & (number == np.floor(number)) & (stamp >= 0) & (stamp < 1e9)  # not NaN
     keep = sound & _later(number, sound) & _later(stamp, sound)
     report = []
     if not keep.all():
@@ -59,9 +66,12 @@ def episode_rows(
     rows, number, stamp = rows[keep], number[keep], stamp[keep]
     if len(rows) == 0:
         raise FormatError(episode.data, f"episode {episode.number}", "no usable row", "frames")
-    # Stamps are float32; the grid that they were rounded from is exact.
     grid = number / meta.fps
-    return rows, number.astype(np.int64), np.where(np.abs(grid - stamp) < 1e-4, grid, stamp), report
+    shift = float(np.median(stamp - grid))
+    if abs(shift) > _ON_GRID and (np.abs(stamp - grid - shift) < _ON_GRID).all():
+        report.append(f"episode {episode.number}: times begin at {stamp[0]:.4g} s: pictures taken by the order of rows")
+        stamp = grid
+    return rows, number.astype(np.int64), np.where(np.abs(grid - stamp) < _ON_GRID, grid, stamp), report
 
 
 def _later(values: np.ndarray, sound: np.ndarray) -> np.ndarray:

@@ -11,10 +11,11 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from io import RawIOBase
 from pathlib import Path
+from typing import BinaryIO
 
-from dhtorch.data.files import MAX_BYTES, FormatError, read_bytes
+from dhtorch.data.codecs.zips import check_directory
+from dhtorch.data.files import MAX_BYTES, FormatError, opened, read_bytes
 
 MAX_MEMBERS = 2_000_000
 _LOCAL_HEADER = 30  # bytes before the name
@@ -37,11 +38,11 @@ class Member:
     def ends(self, count: int) -> tuple[bytes, bytes] | None:
         """First and last ``count`` bytes without reading the rest; None where that is not possible."""
         try:
-            with self.path.open("rb") as stream:
+            with opened(self.path) as stream:
                 first = stream.read(count)
                 stream.seek(-min(count, stream.seek(0, 2)), 2)
                 return first, stream.read(count)
-        except OSError:
+        except (OSError, FormatError):
             return b"", b""
 
 
@@ -87,7 +88,7 @@ class ZipMember(Member):
     def _stored(self, *spans: tuple[int, int]) -> list[bytes]:
         """(start, count) bytes as they lie in the archive; the entry's header says how far behind it they begin."""
         try:
-            with self.archive.open("rb", buffering=0) as stream:
+            with opened(self.archive) as stream:
                 stream.seek(self.offset)
                 mark, name, extra = struct.unpack("<4s22xHH", stream.read(_LOCAL_HEADER))
                 begin = self.offset + _LOCAL_HEADER + name + extra
@@ -101,14 +102,10 @@ class ZipMember(Member):
         return found
 
 
-def _read(stream: RawIOBase, start: int, count: int) -> bytes:
-    """Up to ``count`` bytes; a raw stream may give them in pieces."""
+def _read(stream: BinaryIO, start: int, count: int) -> bytes:
+    """Up to ``count`` bytes."""
     stream.seek(start)
-    pieces, missing = [], count
-    while missing and (piece := stream.read(missing)):
-        pieces.append(piece)
-        missing -= len(piece)
-    return b"".join(pieces)
+    return stream.read(count)
 
 
 def folder_members(root: Path) -> dict[str, Member]:
@@ -125,8 +122,12 @@ def zip_members(archive: Path) -> dict[str, Member]:
         FormatError: no zip archive, or more than ``MAX_MEMBERS`` entries.
     """
     try:
-        with zipfile.ZipFile(archive) as directory:
-            entries = directory.infolist()
+        with opened(archive) as stream:
+            check_directory(stream, archive)
+            with zipfile.ZipFile(stream) as directory:
+                entries = directory.infolist()
+    except FormatError:
+        raise
     except (zipfile.BadZipFile, struct.error, ValueError, RuntimeError, EOFError, OSError) as error:
         raise FormatError(archive, "archive", error, "a whole zip archive") from None
     if len(entries) > MAX_MEMBERS:

@@ -133,7 +133,7 @@ def _metadata(file: Path) -> tuple[dict[str, Any], Path]:
 
 def _tail(file: Path) -> bytes:
     try:
-        with file.open("rb") as stream:
+        with files.opened(file) as stream:
             stream.seek(-min(_TAIL, stream.seek(0, 2)), 2)
             return stream.read()
     except OSError as error:

@@ -15,6 +15,7 @@ from typing import ClassVar, overload
 import torch
 from torch import Tensor
 
+from dhtorch.data.files import inside
 from dhtorch.records import Frame, Pose
 
 
@@ -44,6 +45,7 @@ class Recording(Sequence[Frame]):
     sparse: bool = False  # depth is a projected LiDAR sweep: mostly empty between returns
     episode: int | None = None  # its number in the data set, where episodes have one
     report: tuple[str, ...] = ()  # what was left out, and why
+    bounds: Path | None = None  # no link below it may lead out of it; None = links are followed
 
     def __post_init__(self) -> None:
         n = self.number.shape[0]
@@ -64,7 +66,8 @@ class Recording(Sequence[Frame]):
 
     def __getitem__(self, index: int) -> Frame:  # type: ignore[override]  # one frame at a time: slices would decode
         i = self._position(index)
-        frame = self.load(i)
+        with inside(self.bounds):
+            frame = self.load(i)
         return frame.replace(
             time=None if self.times is None else self.times[i : i + 1],
             T_world_from_cam=None if self.poses is None else self.poses[i : i + 1],
@@ -112,7 +115,8 @@ class MeasuredRecording(TruthRecording):
             ``surface`` is all 0: kinds of surface are not told apart. ``disagreement`` counts where both instruments
             answer, NaN where they share no pixel. A truth that was rejected for it is 0 everywhere.
         """
-        depth, disagreement = self.load_truth(self._position(index))
+        with inside(self.bounds):
+            depth, disagreement = self.load_truth(self._position(index))
         surface = torch.zeros(1, *depth.shape, dtype=torch.uint8)
         return {"depth": depth[None], "surface": surface, "disagreement": torch.tensor([disagreement])}
 

@@ -194,7 +194,7 @@ class _Load:
 def _odometry(file: Path) -> tuple[list[_Row], list[str]]:
     """The rows, by the names in the header: other columns may come and cells may be empty."""
     try:
-        lines = [[cell.strip() for cell in line] for line in csv.reader(files.read_text(file).splitlines())]
+        lines = [[cell.strip() for cell in line] for line in csv.reader(files.read_lines(file))]
     except csv.Error as error:
         raise FormatError(file, "table", error, "comma-separated columns") from None
     lines = [line for line in lines if any(line)]
@@ -239,7 +239,7 @@ def _number(cell: str, file: Path, field: str) -> float:
 
 def _intrinsics(root: Path, hw: tuple[int, int], K_hw: Sequence[int] | None, per_frame: bool) -> _Intrinsics:
     file = root / "camera_matrix.csv"
-    lines = [line.replace(",", " ").split() for line in files.read_text(file).splitlines() if line.strip()]
+    lines = [line.replace(",", " ").split() for line in files.read_lines(file) if line.strip()]
     return _Intrinsics(file, files.to_array(lines, (3, 3), file, "K"), _size(K_hw, root) or hw, per_frame)
 
 

@@ -36,7 +36,10 @@ _MAX_POSE_GAP = 0.05  # s
 
 def recognise(root: Path) -> str | None:
     """What makes ``root`` a recording of this format, in words; None if nothing does."""
-    if (root / "rgb").is_dir() and (root / "depth").is_dir():
+    listed = any((root / name).is_file() for name in ("rgb.txt", "associations.txt", "groundtruth.txt"))
+    if not (root / "rgb").is_dir() or not (root / "depth").is_dir():
+        return None
+    if listed or not any(file.stem.isdigit() for file in (root / "rgb").iterdir()):  # numbers are no times
         return "rgb/ and depth/ folders of time-stamped pictures"
     return None
 
@@ -217,7 +220,7 @@ def _camera_number(root: Path) -> int | None:
     """1, 2 or 3 from the folder's name, else from the comments on top of the trajectory."""
     texts = [root.resolve().name]
     if (root / "groundtruth.txt").is_file():
-        lines = files.read_text(root / "groundtruth.txt").splitlines()[:5]
+        lines = files.read_lines(root / "groundtruth.txt")[:5]
         texts += [line for line in lines if line.startswith("#")]
     found = [m for text in texts if (m := re.search(r"(?:freiburg|fr)([123])(?![0-9])", text))]
     return int(found[0][1]) if found else None

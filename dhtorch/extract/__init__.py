@@ -17,7 +17,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from dhtorch import archive, storage
+from dhtorch import archive, lock, storage
 from dhtorch.data.files import need
 from dhtorch.data.scene import Scene, scenes_of
 from dhtorch.extract import columns, engines, plan, shards
@@ -93,8 +93,22 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Call
     scenes = scenes_of(parts["data"])
     whole = plan.make(scenes, options.gap, parts["method"].views)
     rows = _rows(scenes, whole, parts["method"], settings["seed"], options)
-    shared = _shared(settings, options, whole, rows)
     folder = _folder(settings["out"])
+    with lock.held(folder / ".lock", f"out: {folder}"):
+        shards.clear(folder)  # what a killed run left there
+        return _write(settings, options, whole, rows, folder, progress)
+
+
+def _write(
+    settings: Mapping[str, Any],
+    options: ExtractOptions,
+    whole: plan.Plan,
+    rows: Rows,
+    folder: Path,
+    progress: Callable[..., Iterable[Any]],
+) -> int:
+    """The shards that are not there yet; the exit code."""
+    shared = _shared(settings, options, whole, rows)
     every = whole.shards(options.shard_rows)
     done = shards.finished(folder, shared)
     counts = dict(done)
@@ -182,12 +196,11 @@ def _shared(settings: Mapping[str, Any], options: ExtractOptions, whole: plan.Pl
 
 
 def _folder(out: str) -> Path:
-    """The folder of the shards, made where it is missing, without what a killed run left there."""
+    """The folder of the shards, made where it is missing."""
     folder = Path(str(out)).expanduser()
     if folder.exists() and not folder.is_dir():
         raise NotADirectoryError(f"out: {folder} is a file, expected a folder, or a place for one")
     folder.mkdir(parents=True, exist_ok=True)
-    shards.clear(folder)
     return folder
 
 

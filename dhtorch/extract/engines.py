@@ -17,6 +17,7 @@ from torch.utils.data import DataLoader
 
 from dhtorch.data.files import need, set_opencv_threads
 from dhtorch.extract.dataset import Extracted, Rows
+from dhtorch.leash import follow_parent
 from dhtorch.transform import one_thread
 
 #: Rows of one Ray task: what is done again where a node is lost.
@@ -42,7 +43,7 @@ def here(rows: Rows, positions: Sequence[int], workers: int) -> Iterator[Extract
         batch_size=None,
         sampler=positions,
         num_workers=workers,
-        worker_init_fn=one_thread,
+        worker_init_fn=_worker,
         collate_fn=_as_it_is,
     )
     try:
@@ -99,6 +100,11 @@ def _reach(address: str | None) -> None:
         socket.create_connection((host, int(port)), timeout=PATIENCE_S).close()
     except OSError as error:
         raise ConnectionError(f"extract.address: nothing answers at {address} ({error}), expected a cluster") from None
+
+
+def _worker(number: int) -> None:
+    one_thread(number)
+    follow_parent()
 
 
 def _as_it_is(answer: Any) -> Any:

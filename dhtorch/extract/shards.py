@@ -51,7 +51,7 @@ def write(
     counts: Counter[str] = Counter()
     unfinished = folder / f".{shard.name}{_UNFINISHED}"
     try:
-        with unfinished.open("wb") as file:
+        with storage.naming(folder / shard.name), unfinished.open("wb") as file:
             with parquet.ParquetWriter(file, layout, compression="zstd") as writer:
                 for group in _groups(rows, group_rows(wanted)):
                     counts.update(problems[str(int(row["problem"]))].lower() for row in group)

@@ -25,6 +25,7 @@ from dhtorch.data.recording import Recording, TruthRecording
 from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import errors, holdout
 from dhtorch.geometry.lookup import nearest, patches, round_half_up
+from dhtorch.leash import follow_parent
 from dhtorch.method import Method, Trace
 from dhtorch.offers import Picked, choosing, picked
 from dhtorch.records import NO_HINT, Estimate, Frame, PoseFit, Samples, TrackHint, Tracks
@@ -495,7 +496,7 @@ def _load(recording: Recording, pairs: list[Pair], protocol: Protocol, settings:
         batch_size=protocol.batch(settings, pairs),
         num_workers=settings.workers if pairs else 0,
         collate_fn=_collate,
-        worker_init_fn=_one_thread,
+        worker_init_fn=_worker,
         # A fork would copy the locks of whatever threads torch and OpenCV run here, and may never return.
         multiprocessing_context="spawn" if settings.workers and pairs else None,
     )
@@ -528,7 +529,9 @@ def _to(item: Any, device: str) -> Any:
     return tuple(_to(i, device) for i in item) if isinstance(item, tuple) else item.to(device)
 
 
-def _one_thread(_worker: int) -> None:
+def _worker(_number: int) -> None:
+    """One thread in a worker of a loader, which ends with this process."""
+    follow_parent()
     torch.set_num_threads(1)
     set_opencv_threads(1)
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dhtorch.data.files import MAX_BYTES, UNREADABLE, FormatError, need, unreadable
+from dhtorch.data.files import MAX_BYTES, FormatError, check_file, need, opened, unreadable
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _FILTERS = {"gzip", "lzf", "shuffle", "fletcher32"}  # come with the library
@@ -67,9 +67,9 @@ def hdf5_arrays(file: Path) -> dict[str, Hdf5Array]:
 def _opened(file: Path) -> Iterator[Any]:
     library = need("h5py")
     try:
-        with file.open("rb") as stream:
+        with opened(file) as stream:
             head = stream.read(len(_SIGNATURE))
-    except UNREADABLE as error:
+    except OSError as error:
         raise unreadable(file, error) from None
     if head != _SIGNATURE:
         raise FormatError(file, "content", repr(head), "an HDF5 file")
@@ -97,6 +97,8 @@ def _checked(group: Any, key: str, file: Path) -> Any:
     filters = {names.get(pipeline.get_filter(i)[0], "unknown") for i in range(pipeline.get_nfilters())}
     if not filters <= _FILTERS:
         raise FormatError(file, f"{key} filters", ", ".join(sorted(filters)), ", ".join(sorted(_FILTERS)))
+    if array.shape[0] > (size := check_file(file)):
+        raise FormatError(file, f"{key} size", f"{array.shape[0]} rows in {size} bytes", "at most one a byte")
     row = math.prod(array.shape[1:]) * array.dtype.itemsize
     chunk = math.prod(array.chunks or (1,)) * array.dtype.itemsize
     if max(row, chunk) > MAX_BYTES:

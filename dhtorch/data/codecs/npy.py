@@ -17,7 +17,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dhtorch.data.files import MAX_BYTES, FormatError, read_bytes
+from dhtorch.data.codecs.zips import check_directory
+from dhtorch.data.files import MAX_BYTES, FormatError, allow, read_bytes
+
+#: Bytes in which a header ends.
+_HEAD = 12_288
 
 
 class NpyHeader(NamedTuple):
@@ -69,7 +73,13 @@ def real_numbers(file: Path, field: str, raw: bytes) -> np.ndarray:
         raise FormatError(file, field, f"{left} bytes", f"{header.shape} of {header.dtype}")
     array = np.frombuffer(raw, header.dtype, count, header.start)
     array = array.reshape(header.shape, order="F" if header.fortran else "C")
-    return array.astype(np.float32 if header.dtype.itemsize <= 4 and header.dtype.kind == "f" else np.float64)
+    return array.astype(_floating(header.dtype))
+
+
+def _floating(dtype: np.dtype) -> type[np.floating]:
+    """The smallest floating point that holds all values."""
+    exact = dtype.itemsize <= (4 if dtype.kind == "f" else 2)
+    return np.float32 if exact else np.float64
 
 
 def read_npz(file: Path, key: str) -> np.ndarray:
@@ -79,7 +89,9 @@ def read_npz(file: Path, key: str) -> np.ndarray:
         FormatError: missing or damaged archive, no such key, not numeric, or larger than it says or than ``MAX_BYTES``.
     """
     try:
-        with zipfile.ZipFile(io.BytesIO(read_bytes(file))) as archive:
+        data = read_bytes(file)
+        check_directory(io.BytesIO(data), file)
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
             if f"{key}.npy" not in archive.namelist():
                 raise FormatError(file, "key", ", ".join(sorted(archive.namelist())[:8]) or "nothing", f"{key}.npy")
             member = archive.getinfo(f"{key}.npy")
@@ -87,6 +99,10 @@ def read_npz(file: Path, key: str) -> np.ndarray:
                 raise FormatError(file, key, "an array that unpacks beyond the limit", f"at most {MAX_BYTES} bytes")
             if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
                 raise FormatError(file, key, f"compression {member.compress_type}", "none or deflate, as numpy writes")
+            with archive.open(member) as stream:
+                header = real_header(file, key, stream.read(_HEAD))
+            takes = member.file_size + math.prod(header.shape) * np.dtype(_floating(header.dtype)).itemsize
+            allow(file, key, takes, f"{header.shape} of {header.dtype}", len(data))
             raw = archive.read(member)
     except FormatError:
         raise

@@ -14,17 +14,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dhtorch.data.files import (
+    GROWTH,
     MAX_BYTES,
+    MAX_MEMORY,
     MAX_TEXT_BYTES,
-    UNREADABLE,
     FormatError,
     last_change,
     need,
+    opened,
     unreadable,
 )
 
 MAX_ROWS = 50_000_000
-_MAX_CHUNK_BYTES = 1 << 30  # of one column in one row group, unpacked
+_MAX_UNPACKED = MAX_MEMORY // 4  # bytes of columns asked for, where the file is smaller: decoding makes some copies
 
 
 class ParquetHeader(NamedTuple):
@@ -129,12 +131,12 @@ def _open(file: Path) -> tuple[Any, ParquetHeader]:
 
 def _footer_size(file: Path) -> int:
     try:
-        size = file.stat().st_size
-        with file.open("rb") as stream:
+        with opened(file) as stream:
             head = stream.read(4)
+            size = stream.seek(0, 2)
             stream.seek(max(size - 8, 0))
             tail = stream.read(8)
-    except UNREADABLE as error:
+    except OSError as error:
         raise unreadable(file, error) from None
     length = int.from_bytes(tail[:4], "little")
     if size < 12 or head != b"PAR1" or tail[4:] != b"PAR1" or not 0 < length <= min(size - 12, MAX_TEXT_BYTES):
@@ -179,7 +181,8 @@ def _check_pages(file: Path, table: Any, columns: Sequence[str], groups: Sequenc
     """Refuse a chunk whose pages, by their own headers, unpack into more than the footer says or than the limit."""
     meta = table.metadata
     total = 0
-    with file.open("rb") as stream:
+    with opened(file) as stream:
+        most = max(_MAX_UNPACKED, GROWTH * stream.seek(0, 2))
         for g in groups:
             group = meta.row_group(g)
             for i in range(group.num_columns):
@@ -189,8 +192,8 @@ def _check_pages(file: Path, table: Any, columns: Sequence[str], groups: Sequenc
                 ):
                     continue
                 total += _chunk_bytes(file, stream, chunk)
-                if total > _MAX_CHUNK_BYTES:
-                    raise FormatError(file, chunk.path_in_schema, f"{total} bytes", f"at most {_MAX_CHUNK_BYTES}")
+                if total > most:
+                    raise FormatError(file, chunk.path_in_schema, f"{total} bytes", f"at most {most}")
 
 
 def _chunk_bytes(file: Path, stream: Any, chunk: Any) -> int:
@@ -217,11 +220,35 @@ def _chunk_bytes(file: Path, stream: Any, chunk: Any) -> int:
             found = f"a page of {packed} bytes that unpack into {full}"
             raise FormatError(file, chunk.path_in_schema, found, f"at most {chunk.total_uncompressed_size}")
         values += count
+        if entries and chunk.physical_type in _TEXTS:
+            width = max(width, _longest(file, chunk, data[at : at + packed], full))
         unpacked += max(full, width * max(count, entries))
         at += packed
     if values != chunk.num_values:
         raise FormatError(file, chunk.path_in_schema, f"pages of {values} values", chunk.num_values)
     return unpacked
+
+
+#: Types whose values have a length each.
+_TEXTS = ("BYTE_ARRAY", "FIXED_LEN_BYTE_ARRAY")
+
+
+def _longest(file: Path, chunk: Any, packed: bytes, full: int) -> int:
+    """Bytes of the longest entry of a dictionary: a row costs some bits in the file and an entry in memory."""
+    pyarrow = need("pyarrow")
+    if full > _MAX_UNPACKED or chunk.physical_type != "BYTE_ARRAY":
+        return full  # a fixed length is at most all of it
+    try:
+        plain = packed
+        if chunk.compression != "UNCOMPRESSED":
+            plain = pyarrow.Codec(chunk.compression.lower()).decompress(packed, full, asbytes=True)
+    except (pyarrow.ArrowException, OSError, ValueError, TypeError) as error:
+        raise FormatError(file, chunk.path_in_schema, error, "a dictionary that unpacks") from None
+    at = longest = 0
+    while at + 4 <= len(plain):
+        length = int.from_bytes(plain[at : at + 4], "little")
+        at, longest = at + 4 + length, max(longest, length)
+    return longest
 
 
 def _thrift(data: bytes, at: int, depth: int = 0) -> tuple[dict[int, Any], int]:

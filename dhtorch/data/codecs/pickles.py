@@ -25,6 +25,10 @@ MAX_PICKLE_BYTES: Final = 128_000_000
 MAX_STEPS: Final = 10_000_000  # instructions of one pickle
 MAX_DEPTH: Final = 32  # containers inside containers
 
+#: Bytes that a value takes on the stack, in its container, in the memo and in the copy that is handed out, at most.
+_SIZES: Final = {set: 500, dict: 500, list: 250, tuple: 120, float: 40, int: 40, bool: 16, type(None): 16}
+_OTHER: Final = 100
+
 _MARK = object()
 
 
@@ -73,6 +77,7 @@ class _Machine:
         self.stack: list[Any] = []
         self.memo: dict[int, Any] = {}
         self.steps = self.nodes = 0
+        self.taken, self.most = 0, max(files.MAX_MEMORY, files.GROWTH * len(data))  # bytes of Python's own objects
         self.budget = 4 * len(data) + 4096  # bytes that calls may make of this file; shared values could multiply
 
     def run(self) -> Any:
@@ -113,6 +118,20 @@ class _Machine:
 
     def push(self, value: Any) -> None:
         self.stack.append(value)
+        self.take_memory(_SIZES.get(type(value), _OTHER))
+
+    def remember(self, key: int) -> None:
+        self.memo[key] = self.stack[-1]
+        self.take_memory(_OTHER)
+
+    def recall(self, key: int) -> None:
+        self.stack.append(self.memo[key])
+        self.take_memory(_SIZES[bool])
+
+    def take_memory(self, n: int) -> None:
+        self.taken += n
+        if self.taken > self.most:
+            files.allow(self.file, "pickle", self.taken, f"{self.steps} instructions", len(self.data))
 
     def top(self, kind: type) -> Any:
         if type(self.stack[-1]) is not kind:
@@ -206,11 +225,11 @@ def _bytes(form: str) -> Callable[[_Machine], None]:
 
 
 def _stores(form: str) -> Callable[[_Machine], None]:
-    return lambda m: m.memo.__setitem__(m.unpack(form), m.stack[-1])
+    return lambda m: m.remember(m.unpack(form))
 
 
 def _recalls(form: str) -> Callable[[_Machine], None]:
-    return lambda m: m.push(m.memo[m.unpack(form)])
+    return lambda m: m.recall(m.unpack(form))
 
 
 def _collects(make: Callable[[Any], Any]) -> Callable[[_Machine], None]:
@@ -277,7 +296,7 @@ _STEPS: Final[dict[int, Callable[[_Machine], Any]]] = {
         "u": lambda m: m.set_items(m.since_mark()),
         "q": _stores("<B"),
         "r": _stores("<I"),
-        "\x94": lambda m: m.memo.__setitem__(len(m.memo), m.stack[-1]),
+        "\x94": lambda m: m.remember(len(m.memo)),
         "h": _recalls("<B"),
         "j": _recalls("<I"),
         "c": lambda m: m.name(m.line(), m.line()),

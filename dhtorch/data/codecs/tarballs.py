@@ -12,10 +12,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from dhtorch.data.files import MAX_BYTES, FormatError, unreadable
+from dhtorch.data.files import MAX_BYTES, FormatError, opened, unreadable
 
 _BLOCK = 512
 _MAX_NAME_BYTES = 1_000_000  # of a long name or a pax header
+_MAX_DIGITS = 18  # of a size in a pax header
 _FILES, _PAX, _LONG_NAME, _SPARSE = b"0\x007", b"x", b"L", b"S"
 _NO_DATA = b"123456"  # links, devices, folders: whatever size they claim
 
@@ -35,7 +36,7 @@ def members(file: Path) -> Iterator[Member]:
         FormatError: missing file, a damaged header, or an archive that ends too early.
     """
     try:
-        with file.open("rb") as stream:
+        with opened(file) as stream:
             yield from _walk(file, stream.fileno())
     except OSError as error:
         raise unreadable(file, error) from None
@@ -50,7 +51,7 @@ def read_member(file: Path, offset: int, size: int, limit: int = MAX_BYTES) -> b
     if size > limit:
         raise FormatError(file, f"member at byte {offset}", f"{size} bytes", f"at most {limit} bytes")
     try:
-        with file.open("rb") as stream:
+        with opened(file) as stream:
             data = os.pread(stream.fileno(), size, offset)
     except OSError as error:
         raise unreadable(file, error) from None
@@ -67,7 +68,7 @@ def _walk(file: Path, stream: int) -> Iterator[Member]:
         if not header.strip(b"\0"):
             return
         name, kind, size = _header(file, header, at)
-        size = int(special.get("size", size)) if special.get("size", "0").isdecimal() else size
+        size = _said_size(file, special["size"], at) if "size" in special else size
         size = 0 if kind in _NO_DATA else size
         data, at = at + _BLOCK, at + _BLOCK + (size + _BLOCK - 1) // _BLOCK * _BLOCK
         if data + size > total:
@@ -97,6 +98,13 @@ def _header(file: Path, header: bytes, at: int) -> tuple[str, bytes, int]:
         raise FormatError(file, f"header at byte {at}", f"size {header[124:136]!r}", "a number of bytes")
     name, folder = _text(header[:100]), _text(header[345:500]) if header[257:263] == b"ustar\0" else ""
     return (f"{folder}/{name}" if folder else name), header[156:157], size
+
+
+def _said_size(file: Path, text: str, at: int) -> int:
+    """The size that a pax header says."""
+    if not (text.isascii() and text.isdecimal() and len(text) <= _MAX_DIGITS):
+        raise FormatError(file, f"header at byte {at}", f"size {text}", "a number of bytes")
+    return int(text)
 
 
 def _number(field: bytes) -> int | None:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dhtorch.data.files import MAX_PIXELS, FormatError, need, read_bytes
+from dhtorch.data.files import DEFLATE, MAX_PIXELS, FormatError, allow, need, read_bytes
 
 _SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8}  # bytes of a tag's value by type
 _KINDS = {1: "u", 2: "i", 3: "f"}  # sample format
@@ -79,6 +79,9 @@ def decode_tiff(
         )
         raise FormatError(file, "layout", found, wanted)
     _check_strips(tags, data, file, math.prod(shape) * dtype.itemsize if one[259] == 1 else None)
+    tile = _one(tags, 322, size[1], file) * _one(tags, 323, size[0], file) * count * dtype.itemsize
+    asked = math.prod(shape) * dtype.itemsize if math.prod(shape) * dtype.itemsize <= DEFLATE * len(data) else 0
+    allow(file, "tile", len(tags.get(324, (0,))) * tile, f"tiles of {tile} bytes", asked)
     library = need("tifffile")
     try:
         with library.TiffFile(io.BytesIO(data)) as tiff:

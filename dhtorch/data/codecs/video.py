@@ -20,7 +20,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dhtorch.data.files import FormatError, last_change, need
+from dhtorch.data.codecs.mp4 import FIRST, check_samples
+from dhtorch.data.files import FormatError, last_change, need, opened
 
 MAX_VIDEO_PIXELS = 36_000_000  # 8K; a decoder holds up to 17 pictures
 _MAX_FRAMES = 10_000_000
@@ -124,6 +125,20 @@ def close_videos() -> None:
     _open.clear()
 
 
+def _container(file: Path) -> str:
+    """The names of a container's format, by its first bytes; what it claims fits the file."""
+    with opened(file) as stream:
+        head = stream.read(16)
+        if head[4:8] in FIRST:
+            check_samples(stream, file)
+            return "mov,mp4,m4a,3gp,3g2,mj2"
+    if head.startswith(b"\x1a\x45\xdf\xa3"):
+        return "matroska,webm"
+    if head.startswith(b"RIFF") and head[8:12] == b"AVI ":
+        return "avi"
+    raise FormatError(file, "content", repr(head[:12]), "a video file: mp4, mov, mkv, webm or avi")
+
+
 class _Decoder:
     """One open video and the place where it stands."""
 
@@ -135,12 +150,14 @@ class _Decoder:
         self.next = -1  # number of the frame that comes next; −1 = unknown
         av = need("av")
         self.errors: tuple[type[Exception], ...] = (av.FFmpegError, ValueError, MemoryError, OverflowError, EOFError)
-        if not file.is_file():
+        if not file.exists():
             raise FormatError(file, "file", "no such file", "a video")
-        limits = {"max_pixels": str(MAX_VIDEO_PIXELS)}
+        kind = _container(file)
+        # No list of other files, no network: the decoder is told what this is and may open nothing else.
+        limits = {"max_pixels": str(MAX_VIDEO_PIXELS), "protocol_whitelist": "file", "format_whitelist": kind}
         edits = {"advanced_editlist": "0"} if all_frames else {}
         try:
-            self.container = av.open(str(file), options=limits, container_options=edits)
+            self.container = av.open(str(file), format=kind.split(",")[0], options=limits, container_options=edits)
         except self.errors as error:
             raise FormatError(file, "content", error, "a video file") from None
         try:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
 from dhtorch.data import scenes_root
-from dhtorch.data.files import FormatError
+from dhtorch.data.files import FormatError, inside
 from dhtorch.studies.focal import ddff12, fod500, image_folder
 from dhtorch.studies.focal.stacks import Stacks
 
@@ -17,12 +18,13 @@ from dhtorch.studies.focal.stacks import Stacks
 STACK_FORMATS: Final[dict[str, ModuleType]] = {"fod500": fod500, "ddff12": ddff12, "images": image_folder}
 
 
-def open_stacks(root: str | Path, format: str = "auto", **options: Any) -> Stacks:
+def open_stacks(root: str | Path, format: str = "auto", *, follow_links: bool = False, **options: Any) -> Stacks:
     """The focal stacks at ``root``, opened lazily: nothing is decoded before a stack is asked for.
 
     Args:
         root: a folder, or an HDF5 file.
         format: ``fod500``, ``ddff12``, ``images``, or ``auto`` to recognise it by its content.
+        follow_links: whether symbolic links inside may lead out of it.
         options: keyword options of the reader, see ``dhtorch.studies.focal.<format>.read`` (``images``:
             ``image_folder``).
 
@@ -34,7 +36,7 @@ def open_stacks(root: str | Path, format: str = "auto", **options: Any) -> Stack
     if not root.exists():
         raise FormatError(root, "path", "no such file or folder", "focal stacks")
     if format == "auto":
-        format = recognise_stacks(root)[0]
+        format = recognise_stacks(root, follow_links=follow_links)[0]
     elif format not in STACK_FORMATS:
         raise FormatError(root, "format", format, f"auto, {', '.join(STACK_FORMATS)}")
     read = STACK_FORMATS[format].read
@@ -42,18 +44,21 @@ def open_stacks(root: str | Path, format: str = "auto", **options: Any) -> Stack
     for option in options:
         if option not in known:
             raise ValueError(f"stacks: format {format} has no option {option!r}, expected one of {', '.join(known)}")
-    return read(root, **options)
+    bounds = None if follow_links else root
+    with inside(bounds):
+        return replace(read(root, **options), bounds=bounds)
 
 
-def recognise_stacks(root: str | Path) -> tuple[str, str]:
+def recognise_stacks(root: str | Path, *, follow_links: bool = False) -> tuple[str, str]:
     """(format, what makes it one, in words) of focal stacks.
 
     Raises:
         FormatError: no format recognises it.
     """
-    for name, reader in STACK_FORMATS.items():
-        if evidence := reader.recognise(Path(root)):
-            return name, evidence
+    with inside(None if follow_links else Path(root)):
+        for name, reader in STACK_FORMATS.items():
+            if evidence := reader.recognise(Path(root)):
+                return name, evidence
     raise FormatError(root, "format", "no focal stack", f"one of {', '.join(STACK_FORMATS)}")
 
 

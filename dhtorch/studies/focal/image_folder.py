@@ -15,12 +15,15 @@ from dhtorch.data.files import FormatError
 from dhtorch.studies.focal.stacks import FocalStack, Stacks, focus_distances, read_pictures
 
 _LOOKED_AT = 16  # pictures of a folder, to tell whether they are of one kind
+_DEPTH = ("depth", "depths", "depth_maps")
 _PICTURE = re.compile(r"[^.].*\.(png|jpe?g|tiff?)", re.IGNORECASE)
 
 
 def recognise(root: Path) -> str | None:
     """What makes ``root`` a focal stack of this format, in words; None if nothing does."""
-    pictures = sorted(_files(root), key=_by_number)
+    if any((root / name).is_dir() for name in _DEPTH):
+        return None  # a camera that measures depth, whatever its pictures are called
+    pictures = sorted(_files(root), key=files.natural)
     some = pictures[:: max(1, len(pictures) // _LOOKED_AT)]
     kinds = {_kind(file) for file in (*some, *pictures[-1:])}
     if len(pictures) < 2 or None in kinds or len(kinds) != 1:
@@ -39,7 +42,7 @@ def read(root: str | Path, *, focus_m: Sequence[float] | None = None) -> Stacks:
         FormatError: less than two pictures, or another number of distances.
     """
     root = Path(root)
-    pictures = tuple(sorted(_files(root), key=_by_number))
+    pictures = tuple(sorted(_files(root), key=files.natural))
     if len(pictures) < 2:
         raise FormatError(root, "pictures", len(pictures), "at least two, at different focus")
     focus = None if focus_m is None else focus_distances(focus_m, root, len(pictures))
@@ -60,12 +63,6 @@ class _Load:
 
 def _files(root: Path) -> list[Path]:
     return [file for file in root.iterdir() if _PICTURE.fullmatch(file.name)] if root.is_dir() else []
-
-
-def _by_number(file: Path) -> tuple[object, ...]:
-    """1, 2, 10 in this order, with or without leading zeros."""
-    parts = re.split(r"(\d+)", file.name)
-    return tuple((not part.isdecimal(), int(part) if part.isdecimal() else part) for part in parts)
 
 
 def _kind(file: Path) -> tuple[object, ...] | None:

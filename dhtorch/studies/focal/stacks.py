@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dhtorch.data import files
 from dhtorch.data.codecs import tiff
-from dhtorch.data.files import FormatError
+from dhtorch.data.files import FormatError, inside
 from dhtorch.records import Camera
 from dhtorch.tree import Record, record
 
@@ -53,6 +53,7 @@ class Stacks(Sequence[FocalStack]):
     root: Path | None = None  # folder or file that was opened
     report: tuple[str, ...] = ()  # what was left out, and why
     scenes: tuple[str, ...] | None = None  # the scene that each stack shows; None = each its own
+    bounds: Path | None = None  # no link below it may lead out of it; None = links are followed
 
     def __post_init__(self) -> None:
         if not self.names:
@@ -75,7 +76,8 @@ class Stacks(Sequence[FocalStack]):
         i, n = operator.index(index), len(self)
         if not -n <= i < n:
             raise IndexError(f"stacks {self.name}: stack {i} of {n}")
-        return self.load(i % n)
+        with inside(self.bounds):
+            return self.load(i % n)
 
     def __repr__(self) -> str:
         return f"Stacks({self.name!r}, {self.format}, {len(self)} stacks)"

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable
 from typing import Any
 
+from dhtorch.console import markup, terminal
 from dhtorch.studies.report.tables import INTERVAL, Table
 
 
@@ -12,27 +14,26 @@ def print_table(table: Table, console: Any = None) -> None:
     """Print a table with rich; ``console`` is a ``rich.console.Console``, None = standard output."""
     from rich import box  # noqa: PLC0415
     from rich.console import Console  # noqa: PLC0415
-    from rich.markup import escape  # noqa: PLC0415
     from rich.table import Table as RichTable  # noqa: PLC0415
 
-    console = console or Console()
+    console = console or Console(file=terminal(sys.stdout))
     if not console.is_terminal:
         console.width = max(console.width, 240)  # a file has no edge to wrap at
     shown = RichTable(
-        title=escape(table.title), box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False
+        title=markup(table.title), box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False
     )
     for k, head in enumerate(table.flat_head()):
-        shown.add_column(escape(head), justify="left" if k < table.n_label else "right", overflow="fold")
+        shown.add_column(markup(head), justify="left" if k < table.n_label else "right", overflow="fold")
     n_body = len(table.rows) - table.footer - table.quoted
     for k, cells in enumerate(table.rows):
         summed = n_body <= k < n_body + table.footer
         style = "bold" if summed and cells[0] != INTERVAL else "dim" if summed else "yellow" if k >= n_body else None
         last_of_part = k + 1 in (n_body, n_body + table.footer) and k + 1 < len(table.rows)
-        texts = [f"[bold]{escape(c)}[/bold]" if (k, n) in table.best else escape(c) for n, c in enumerate(cells)]
+        texts = [f"[bold]{markup(c)}[/bold]" if (k, n) in table.best else markup(c) for n, c in enumerate(cells)]
         shown.add_row(*texts, style=style, end_section=last_of_part)
     console.print(shown)
     if table.note:
-        console.print(f"{escape(table.note)}\n", style="dim", highlight=False)
+        console.print(f"{markup(table.note)}\n", style="dim", highlight=False)
 
 
 def markdown(tables: Iterable[Table]) -> str:

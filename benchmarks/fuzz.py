@@ -1,0 +1,93 @@
+"""Hostile files of every format, each read by a child under the law of docs/data.md: time, memory, writes, code.
+
+    make fuzz                                            # some thousand seeded cases, within ten minutes
+    python benchmarks/fuzz.py --full --json benchmarks/results/fuzz.json   # 20,000 and more
+    python benchmarks/fuzz.py --only lerobot_v2 --case 17                  # one case again
+
+Half of the cases are bytes damaged (``tests/mutations.py``), half are files taken apart and put together again with one
+thing changed (``tests/recoders.py``). A case is known by its format, seed and number. Exit code 1 where one is neither
+valid data nor a FormatError in one line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tests"))
+
+import hostile  # noqa: E402
+import mutations  # noqa: E402
+import recoders  # noqa: E402
+from test_hostile import SAMPLES  # noqa: E402
+
+from dhtorch import storage  # noqa: E402
+from dhtorch.data.files import MAX_MEMORY  # noqa: E402
+
+SOME, MANY = 150, 1000  # cases of every format
+SECONDS = 20  # of a processor
+MINUTES = 9  # after which the seeded part stops, wherever it is
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the cases, print a line for every format; returns the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--full", action="store_true", help=f"{MANY} cases of every format instead of {SOME}")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", help="one format")
+    parser.add_argument("--case", type=int, help="one case of it")
+    parser.add_argument("--json", type=Path, help="write a summary")
+    options = parser.parse_args(argv)
+    hostile.SECONDS, hostile.BYTES = SECONDS, MAX_MEMORY
+    names = [options.only] if options.only else list(SAMPLES)
+    numbers = [options.case] if options.case is not None else range(MANY if options.full else SOME)
+    end = time.monotonic() + (MINUTES * 60 if not options.full else float("inf"))
+    found = {}
+    for k, name in enumerate(names):  # each its share of what is left, so that a slow one starves no other
+        now = time.monotonic()
+        found[name] = attack(name, numbers, options.seed, now + (end - now) / (len(names) - k))
+    failures = [failure for each in found.values() for failure in each["failures"]]
+    total = sum(each["cases"] for each in found.values())
+    print(f"{total} cases, {len(failures)} failures")
+    if options.json:
+        words = " ".join(["python benchmarks/fuzz.py", *(argv if argv is not None else sys.argv[1:])])
+        law = {"cpu_s": SECONDS, "bytes": MAX_MEMORY}
+        summary = {"command": words, "law": law, "cases": total, "failures": len(failures), "formats": found}
+        storage.write_json(options.json, summary)
+    return int(bool(failures))
+
+
+def attack(name: str, numbers: Sequence[int], seed: int, stop: float) -> dict[str, Any]:
+    """Cases of one format by outcome, the worst of them, and what failed."""
+    counts, failures = Counter[str](), list[str]()
+    slowest = largest = 0.0
+    with (
+        tempfile.TemporaryDirectory(prefix="dhtorch-fuzz-") as folder,
+        hostile.sample(*SAMPLES[name], Path(folder)) as (good, outcome_of),
+    ):
+        for number in numbers:
+            if time.monotonic() > stop:
+                break
+            draw = random.Random(f"{name}/{seed}/{number}")
+            what, want = (mutations.mutate if number % 2 else recoders.recode)(good, draw)
+            outcome = outcome_of(want)
+            counts[outcome.kind] += 1
+            slowest, largest = max(slowest, outcome.seconds), max(largest, outcome.bytes / 2**20)
+            if outcome.kind not in hostile.FINE:
+                failures.append(f"{name} case {number} ({what}): {outcome.kind}: {outcome.detail[-500:]}")
+                print(failures[-1], flush=True)
+    print(f"{name:20} {counts.total():5} cases, {dict(counts)}, at most {slowest:.1f} s, {largest:.0f} MiB", flush=True)
+    worst = {"slowest_s": round(slowest, 2), "largest_mib": round(largest)}
+    return {"cases": counts.total(), "outcomes": dict(counts), **worst, "failures": failures}
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,83 @@
+"""What an mp4 says of the number of its samples, held against its length before a decoder makes room for them.
+
+Some tables are short however many samples they speak of: all of one size, runs of one duration, fragments of defaults.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO, Final, NamedTuple
+
+from dhtorch.data.files import MAX_TEXT_BYTES, FormatError, allow
+
+#: The first box of a film.
+FIRST: Final = (b"ftyp", b"styp", b"moov", b"moof", b"mdat", b"wide", b"free", b"skip", b"uuid", b"pnot")
+
+_FOLDERS: Final = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"moof", b"traf", b"edts", b"mvex")
+_RUNS: Final = (b"stts", b"ctts")  # tables of (count, value)
+_SAMPLE: Final = 200  # bytes that a decoder and our own table take for one
+_MAX_DEPTH: Final = 12
+_MAX_BOXES: Final = 200_000
+
+
+class _Box(NamedTuple):
+    kind: bytes
+    start: int  # of its content
+    end: int
+
+
+def check_samples(stream: BinaryIO, file: Path) -> None:
+    """Refuse a film with more samples than bytes, or than memory is allowed for.
+
+    Raises:
+        FormatError: that, or boxes without end.
+    """
+    total = stream.seek(0, 2)
+    found = 0
+    for number, box in enumerate(_boxes(stream, _Box(b"", 0, total), 0)):
+        if number > _MAX_BOXES:
+            raise FormatError(file, "boxes", f"more than {_MAX_BOXES}", "a film of fewer")
+        claimed = _claimed(stream, box, file)
+        if claimed > total:
+            raise FormatError(file, box.kind.decode(), f"{claimed} samples in {total} bytes", "at most one a byte")
+        found += claimed if box.kind in (b"stsz", b"stz2", b"trun") else 0
+        allow(file, "samples", _SAMPLE * max(found, claimed), f"{max(found, claimed)} samples")
+
+
+def _boxes(stream: BinaryIO, inside: _Box, depth: int) -> Iterator[_Box]:
+    """Boxes in their order, those inside others behind them; one that is damaged ends its folder."""
+    at = inside.start
+    while at + 8 <= inside.end:
+        stream.seek(at)
+        size, kind = struct.unpack(">I4s", stream.read(8))
+        start = at + 8
+        if size == 1:
+            (size,) = struct.unpack(">Q", stream.read(8).ljust(8, b"\0"))
+            start += 8
+        end = inside.end if size == 0 else at + size
+        if end < start:
+            return
+        box = _Box(kind, start, min(end, inside.end))
+        yield box
+        if kind in _FOLDERS and depth < _MAX_DEPTH:
+            yield from _boxes(stream, box, depth + 1)
+        at = end
+
+
+def _claimed(stream: BinaryIO, box: _Box, file: Path) -> int:
+    """Samples that a table speaks of."""
+    stream.seek(box.start)
+    if box.kind in (b"stsz", b"stz2"):
+        _, _, n = struct.unpack(">III", stream.read(12).ljust(12, b"\0"))
+        return int(n)
+    if box.kind == b"trun":
+        _, n = struct.unpack(">II", stream.read(8).ljust(8, b"\0"))
+        return int(n)
+    if box.kind in _RUNS:
+        if box.end - box.start > MAX_TEXT_BYTES:
+            raise FormatError(file, box.kind.decode(), f"{box.end - box.start} bytes", f"at most {MAX_TEXT_BYTES}")
+        table = stream.read(box.end - box.start)[8:]
+        return sum(n for n, _ in struct.iter_unpack(">II", table[: len(table) // 8 * 8]))
+    return 0

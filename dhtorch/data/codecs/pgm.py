@@ -1,0 +1,33 @@
+"""Portable grey maps of 16 bits, as depth is written by some tools: three numbers in text, then the most significant
+byte of every code first."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from dhtorch.data.files import MAX_PIXELS, FormatError, read_bytes
+
+_HEAD = re.compile(rb"P5\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s")
+
+
+def read_pgm(file: Path, hw: tuple[int, int] | None = None) -> np.ndarray:
+    """Codes (h, w) uint16 of a binary grey map.
+
+    Raises:
+        FormatError: missing or truncated file, no codes of 16 bits, another size than ``hw``.
+    """
+    data = read_bytes(file)
+    head = _HEAD.match(data[:1024])
+    if head is None:
+        raise FormatError(file, "header", repr(data[:16]), "P5, width, height and largest code")
+    w, h, largest = map(int, head.groups())
+    if not 255 < largest < 65536:
+        raise FormatError(file, "largest code", largest, "256 to 65535")
+    if hw is not None and (h, w) != tuple(hw):
+        raise FormatError(file, "size", f"{w}x{h}", f"{hw[1]}x{hw[0]}")
+    if not 0 < h * w <= MAX_PIXELS or len(data) - head.end() != 2 * h * w:
+        raise FormatError(file, "data", f"{len(data) - head.end()} bytes", f"2 for each of {w}x{h} pixels")
+    return np.frombuffer(data, ">u2", h * w, head.end()).reshape(h, w).astype(np.uint16)

@@ -1,0 +1,26 @@
+"""Workers that end with the process that started them, even where that one was killed and could not tell them."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+
+#: Seconds between two looks.
+_LOOK = 1.0
+
+_held: set[int] = set()  # processes that watch already: a fork inherits the note and not the thread
+
+
+def follow_parent() -> None:
+    """End this process at once when its parent is gone. Called in a worker; a second call changes nothing."""
+    if os.getpid() in _held or not hasattr(os, "getppid"):
+        return
+    _held.add(os.getpid())
+    threading.Thread(target=_watch, args=(os.getppid(),), name="dhtorch-leash", daemon=True).start()
+
+
+def _watch(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(_LOOK)
+    os._exit(1)  # what is half written is no result, and nobody waits for one
