@@ -637,4 +637,4 @@ def test_up_is_the_formats_axis_else_the_floors():
     found = level.floor(torch.cat((ground, wall)) @ askew.T, torch.tensor([0.0, -1.0, 0.0]).double(), 0.02)
     assert (found - askew @ torch.tensor([0.0, -1.0, 0.0]).double()).norm() < 0.02
     up = (askew @ torch.tensor([0.0, -1.0, 0.0]).double()).tolist()
-    assert (se3.turn_between(up) @ torch.tensor(up) - torch.tensor([0.0, -1.0, 0.0])).norm() < 1e-9
+    assert (se3.turn_between(up) @ torch.tensor(up, dtype=torch.float64) - torch.tensor([0.0, -1.0, 0.0])).norm() < 1e-9

@@ -78,15 +78,14 @@ def test_a_sweep_ends_with_one_table_and_its_file(command, tmp_path):  # noqa: F
     assert command("report", "a=b", "--html", "p.html")[0] == 0 and "2 jobs" in (tmp_path / "p.html").read_text()
     results = [archive.read(p) for p in sorted(tmp_path.rglob("result.json"))]
     for k, (coverage, error) in enumerate(((0.5, 0.1), (0.4, 0.05))):
-        results[k]["summary"]["coverage"]["value"] = coverage
-        results[k]["summary"]["median_rel"]["value"] = error
+        results[k]["summary"] |= {"coverage": {"value": coverage}, "median_rel": {"value": error}}
     assert {(0, 1), (1, 2)} <= jobs.table(results).best
 
 
 def test_a_job_says_little_and_all_of_it_when_asked(command):  # noqa: F811
     code, out, _ = command(*TINY)
     assert code == 0 and len(out.splitlines()) <= 15 and "what became of samples" not in out
-    assert "what became of samples" in command("-v", *TINY)[1]
+    assert len(command("-v", *TINY)[1].splitlines()) > len(out.splitlines())
 
 
 def test_jobs_note_how_far_they_are(tmp_path):

@@ -34,6 +34,9 @@ Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
 Row = dict[str, Any]
 Pairs = Callable[[Scene], Iterable[Pair]]
 
+#: Edges of voxels that are chosen from the depth, m.
+LEAST_VOXEL, MOST_VOXEL = 0.005, 0.2
+
 #: Settings groups whose names are kept with the result.
 GROUPS = ("method", "data", "pairs")
 
@@ -141,7 +144,7 @@ def voxel_of(recording: Recording) -> float:
             f = frame.camera.f * frame.depth.shape[-1] / frame.hw[1] if own is None else own
             sizes.append(float(depth.median() / f.mean()))
     middle = 2 * sorted(sizes)[len(sizes) // 2] if sizes else 0.02
-    return float(f"{min(max(middle, 0.005), 0.2):.2g}")
+    return float(f"{min(max(middle, LEAST_VOXEL), MOST_VOXEL):.2g}")
 
 
 def _fused(
@@ -339,5 +342,6 @@ def _check(settings: Mapping[str, Any]) -> None:
     if settings["mesh"] and not _meshed(None):
         raise ImportError("mesh: found no scikit-image, expected the extra: pip install 'dhtorch[mesh]'")
     integrate.points(
-        integrate.empty(settings["voxel"], truncation=settings["truncation"]), min_weight=settings["min_weight"]
+        integrate.empty(settings["voxel"] or LEAST_VOXEL, truncation=settings["truncation"]),
+        min_weight=settings["min_weight"],
     )
