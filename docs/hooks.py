@@ -8,10 +8,12 @@ the API and of the notebooks are made while the site is built.
 from __future__ import annotations
 
 import ast
+import base64
 import contextlib
 import io
 import json
 import re
+import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
@@ -45,18 +47,25 @@ _ASKED = re.compile(
 
 
 def on_config(config: Any) -> Any:
-    """The API's pages join the navigation."""
+    """The API's pages and the notebooks join the navigation; the repository is where this clone came from."""
+    config.repo_url = config.repo_url or origin()
+    config.nav.insert(2, {"Notebooks": [{notebook_title(n): f"notebooks/{n.stem}.md"} for n in notebooks()]})
     pages = [{"dhtorch": "api/dhtorch.md"}, *({part: f"api/{part}.md"} for part in parts())]
     config.nav.insert(len(config.nav) - 1, {"API": pages})
     return config
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """The API's pages."""
+    """The API's pages and the notebooks, with their pictures."""
     from mkdocs.structure.files import File  # noqa: PLC0415
 
     for part in ("dhtorch", *parts()):
         files.append(File.generated(config, f"api/{part}.md", content=api_page(part)))
+    for notebook in notebooks():
+        text, figures = article(notebook)
+        files.append(File.generated(config, f"notebooks/{notebook.stem}.md", content=text))
+        for name, content in figures.items():
+            files.append(File.generated(config, f"notebooks/{name}", content=content))
     return files
 
 
@@ -75,6 +84,58 @@ def made(mark: str) -> str:
     if name not in MAKERS:
         raise ValueError(f"docs: found the mark {name!r}, expected one of {', '.join(MAKERS)}")
     return MAKERS[name](*([argument] if argument else [])).strip("\n")
+
+
+# ----------------------------------------------------------------------------------------- repository and notebooks
+
+
+def origin() -> str:
+    """Web address of the repository that this clone came from; nothing where there is none."""
+    asked = ["git", "-C", str(REPO), "remote", "get-url", "origin"]
+    with contextlib.suppress(OSError):
+        said = subprocess.run(asked, capture_output=True, text=True, check=False).stdout.strip().removesuffix(".git")
+        said = re.sub(r"^(?:ssh://)?git@([^:/]+)[:/]", r"https://\1/", said)
+        return said if said.startswith("https://") else ""
+    return ""
+
+
+def notebooks() -> list[Path]:
+    """The articles that run."""
+    return sorted((REPO / "notebooks").glob("*.ipynb"))
+
+
+def notebook_title(path: Path) -> str:
+    """The first heading of a notebook."""
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    found = re.search(
+        r"^# +(.+)$", "\n".join("".join(c["source"]) for c in cells if c["cell_type"] == "markdown"), re.M
+    )
+    return found[1] if found else path.stem
+
+
+def article(path: Path) -> tuple[str, dict[str, bytes]]:
+    """A notebook as Markdown with what it printed and drew: the page, and its pictures by name."""
+    parts: list[str] = []
+    pictures: dict[str, bytes] = {}
+    for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
+        source = "".join(cell["source"])
+        if cell["cell_type"] == "markdown":
+            parts.append(
+                re.sub(r"\]\((?!https?:|#)[^)]*\)", "]", source)
+            )  # files beside the notebook are not on the site
+        elif cell["cell_type"] == "code":
+            parts.append(f"```python\n{source}\n```")
+        for output in cell.get("outputs", []):
+            data = output.get("data", {})
+            if "image/png" in data:
+                name = f"{path.stem}_{len(pictures) + 1}.png"
+                pictures[name] = base64.b64decode("".join(data["image/png"]))
+                parts.append(f"![A figure of this article]({name})")
+                continue
+            said = data.get("text/markdown") or data.get("text/html")
+            plain = "".join(data.get("text/plain", output.get("text", ""))).rstrip()
+            parts.append("".join(said) if said else f"```text\n{plain}\n```" if plain else "")
+    return "\n\n".join(parts), pictures
 
 
 # ----------------------------------------------------------------------------------------------------------- the API

@@ -238,7 +238,8 @@ def chromium(folder, page, *flags, script=""):
     options += ["--hide-scrollbars", "--virtual-time-budget=8000", "--window-size=1300,900", "--enable-logging=stderr"]
     options += [f"--user-data-dir={folder / 'profile'}", *flags, file.as_uri()]
     done = subprocess.run([CHROMIUM, *options], check=True, capture_output=True, text=True, timeout=120)
-    return done.stdout, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+    lines = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+    return done.stdout, [line for line in lines if "GPU stall due to ReadPixels" not in line]  # the test's own readings
 
 
 @browser
@@ -254,8 +255,10 @@ def test_a_browser_draws_the_points(scene, tmp_path, dark):
     assert ((blue > red + 40) & (blue > 60)).sum() > 300, "returns of the sensor"
     assert ((red > blue + 90) & (green > blue + 40)).sum() > 300, "recovered points"
     assert ((red > green + 50) & (blue > green + 25)).sum() > 300, "swept pixels"
-    empty = (np.abs(stage - stage[0, -1]).max(-1) < 12).mean()
-    assert 0.3 < empty < 0.99 and (stage[0, -1].mean() < 60) == dark
+    colours, counts = np.unique(stage.reshape(-1, 3), axis=0, return_counts=True)
+    ground = colours[counts.argmax()]
+    empty = (np.abs(stage - ground).max(-1) < 12).mean()
+    assert 0.1 < empty < 0.8 and (ground.mean() < 60) == dark, "the overview fills the canvas"
 
 
 @browser

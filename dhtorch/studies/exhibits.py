@@ -169,7 +169,8 @@ def _swept(frame: Frame, found: DepthMap) -> SweptCloud:
     depth, sigma, score = (x.flatten(1)[:, some].float() for x in (found.depth, found.sigma, found.score))
     xyz = cam.unproject(frame.camera.to("cpu"), uv, depth)
     step = apart * frame.hw[1] / hw[1]
-    return SweptCloud(*(x[0].numpy() for x in (xyz.float(), _colours(frame, uv), sigma, score)), step)
+    points, rgb, sigmas, scores = (x[0].numpy() for x in (xyz.float(), _colours(frame, uv), sigma, score))
+    return SweptCloud(points, rgb, sigmas, scores, step_px=step)
 
 
 def _some(places: torch.Tensor, most: int) -> torch.Tensor:
