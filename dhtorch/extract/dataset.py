@@ -47,6 +47,7 @@ class Rows(Dataset[Extracted]):
         method: of one other view or several.
         gap: ``auto`` = the method chooses among earlier frames; a number of frames back to the other view, 0 = none;
             None = the scene's own.
+        past: among earlier frames alone; else also among later ones of the same recording.
         options: of :class:`dhtorch.transform.ExtendDepth`.
     """
 
@@ -58,11 +59,12 @@ class Rows(Dataset[Extracted]):
         *,
         method: Method,
         gap: int | str | None,
+        past: bool = True,
         **options: Any,
     ) -> None:
         self.scenes, self.plan, self.wanted = scenes, plan, wanted
-        self.method, self.gap, self.options = method, gap, options
-        self._opened: tuple[int, _Opened] | None = None
+        self.method, self.gap, self.past, self.options = method, gap, past, options
+        self._opened: tuple[int, Opened] | None = None
 
     def __len__(self) -> int:
         return len(self.plan)
@@ -70,40 +72,46 @@ class Rows(Dataset[Extracted]):
     def __getitem__(self, position: int) -> Extracted:
         k, episode, i = self.plan.place(position)
         if self._opened is None or self._opened[0] != k:
-            self._opened = (k, _Opened(self.scenes[k], self.method, self.gap, self.options))
+            self._opened = (k, Opened(self.scenes[k], self.method, self.gap, self.past, self.options))
         opened = self._opened[1]
         recording = opened.recording
         stamp = np.nan if recording.times is None else float(recording.times[i])
         place: Row = dict(zip(PLACE, (episode, int(recording.number[i]), stamp, recording.name), strict=True))
         try:
             with torch.no_grad():
-                added = opened.answer(i)
-            _check_shapes(added, self.wanted)
+                return Extracted(place, self.features(opened, i))
         except Exception as error:  # whatever a decoder raises; lack of memory is no property of a frame
             if isinstance(error, MemoryError | torch.OutOfMemoryError):
                 raise
             text = f"{recording.name}, frame {place['frame_index']}: {error}"
             return Extracted(place, None, " ".join(text.split()))
+
+    def features(self, opened: Opened, i: int) -> Row:
+        """The columns of frame ``i`` of an opened recording, beside those of its place."""
+        added = opened.answer(opened.recording[i], i)
+        _check_shapes(added, self.wanted)
         keep = {k: c for k, c in self.wanted.items() if k not in PLACE}
-        return Extracted(place, {k: added[k].numpy().astype(c.kind) for k, c in keep.items()})
+        return {k: added[k].numpy().astype(c.kind) for k, c in keep.items()}
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_opened": None}
 
 
-class _Opened:
+class Opened:
     """One recording, and the transforms that fit its frames."""
 
-    def __init__(self, scene: Scene, method: Method, gap: int | str | None, options: dict[str, Any]) -> None:
+    def __init__(
+        self, scene: Scene, method: Method, gap: int | str | None, past: bool, options: dict[str, Any]
+    ) -> None:
         self.scene, self.recording, self.options = scene, scene.recording, options
-        self.offers = offers(scene) if isinstance(gap, str) else None
+        self.offers = offers(scene, past) if isinstance(gap, str) else None
         self.method = method if self.offers is None else choosing(method)
         self.steps = [] if isinstance(gap, str) else steps_back(scene, gap, method.views)
         self.position = {int(number): i for i, number in enumerate(self.recording.number)} if self.steps else {}
         self.transforms: dict[tuple[Any, ...], ExtendDepth] = {}
 
-    def answer(self, i: int) -> dict[str, Tensor]:
-        anchor: Frame = self.recording[i]
+    def answer(self, anchor: Frame, i: int) -> dict[str, Tensor]:
+        """What the transform adds to the sample of frame ``i``, which is ``anchor``."""
         sample = _sample(anchor, self._others(i))
         optional = tuple(key for key in ("confidence", "distortion", "depth_intrinsics") if key in sample)
         kind = (len(sample["image"]), *optional)
