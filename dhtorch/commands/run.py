@@ -32,14 +32,20 @@ COMMANDS = {"inspect": "dhtorch.commands.inspect", "report": "dhtorch.studies.re
 #: is given all options as plain values, and as objects those that name a function. It returns the exit code.
 CONFIGURED = {
     "complete": "dhtorch.commands.complete",
+    "enrich": "dhtorch.commands.enrich",
     "extract": "dhtorch.extract",
     "integrate": "dhtorch.integrate.mapping",
     "stream": "dhtorch.commands.stream",
     "view": "dhtorch.commands.view",
 }
 
-#: Sub-command → the option that a first word without a name sets.
-FIRST_WORD = {"complete": "data.root", "stream": "data.root", "view": "result"}
+#: Sub-command → the options that its first words without a name set.
+FIRST_WORDS = {
+    "complete": ("data.root",),
+    "enrich": ("data.root", "out"),
+    "stream": ("data.root",),
+    "view": ("result",),
+}
 
 DONE, SOME_FAILED, FAILED, INTERRUPTED, UNHEARD = 0, 1, 2, 130, 141
 
@@ -148,8 +154,7 @@ def _run_configured(word: str, argv: list[str]) -> int:
     if SHOW & {a.split("=")[0] for a in argv}:
         return _show(word, argv)
     _refuse_flags(argv, SHOW)
-    if argv and word in FIRST_WORD and ("=" not in argv[0] or Path(argv[0]).exists()):
-        argv = [f"{FIRST_WORD[word]}={_quote(argv[0])}", *argv[1:]]
+    argv = _named(argv, FIRST_WORDS.get(word, ()))
     try:
         with hydra.initialize_config_dir(str(config_dir()), version_base="1.3", job_name="dhtorch"):
             cfg = hydra.compose(word, argv, return_hydra_config=True)
@@ -169,6 +174,15 @@ def _run_configured(word: str, argv: list[str]) -> int:
             return int(module.run({**settings, "choices": groups}, parts, progress=console.progress) or DONE)
     except USER_ERRORS as error:
         return _fail(error, show=settings.get("traceback", False))
+
+
+def _named(argv: list[str], options: Sequence[str]) -> list[str]:
+    """The words with the names of the options that the first of them set."""
+    for k, option in enumerate(options[: len(argv)]):
+        if "=" in argv[k] and not Path(argv[k]).exists():
+            break
+        argv = [*argv[:k], f"{option}={_quote(argv[k])}", *argv[k + 1 :]]
+    return argv
 
 
 def _show(name: str, argv: list[str]) -> int:

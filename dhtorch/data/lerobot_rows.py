@@ -28,7 +28,7 @@ def read_table(file: Path, more: tuple[str, ...]) -> dict[str, np.ndarray]:
 def _read_table(file: Path, _changed: int, more: tuple[str, ...]) -> dict[str, np.ndarray]:
     have = parquet_header(file).columns
     table: dict[str, np.ndarray] = {}
-    places = [name for name in ("timestamp", "frame_index", "episode_index") if name in have or name != "episode_index"]
+    places = [name for name in ("timestamp", "frame_index", "episode_index") if name in have or name == "timestamp"]
     for name, values in read_columns(file, [*places, *more]).items():
         if not isinstance(values, np.ndarray):
             raise FormatError(file, name, "no numbers", "numbers")
@@ -43,15 +43,26 @@ def episode_rows(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
     """Rows of the episode, their frame numbers and times (s), and what was left out.
 
+    A table without ``frame_index`` numbers its rows in their order and counts time from the first.
+
     Raises:
         FormatError: no usable row.
     """
     every = np.full(len(table["timestamp"]), episode.number)
     rows = np.flatnonzero(table.get("episode_index", every) == episode.number)
-    number, stamp = table["frame_index"][rows].astype(np.float64), table["timestamp"][rows].astype(np.float64)
+    stamp = table["timestamp"][rows].astype(np.float64)
+    report = []
+    if "frame_index" in table:
+        number = table["frame_index"][rows].astype(np.float64)
+    else:  # as GR00T's sets: row k is picture k, whatever time the first row bears
+        number = np.arange(len(rows), dtype=np.float64)
+        if len(rows) and stamp[0] != 0:
+            report.append(
+                f"episode {episode.number}: no frame_index, times counted from the first row's {stamp[0]:g} s"
+            )
+            stamp = stamp - stamp[0]
     sound = (number >= 0) & (number < 2**31) & (stamp >= 0) & (stamp < 1e9)  # false for NaN
     keep = sound & _later(number, sound) & _later(stamp, sound)
-    report = []
     if not keep.all():
         report.append(f"episode {episode.number}: {int((~keep).sum())} rows out of order: left out")
     if episode.length is not None and episode.length != len(rows):

@@ -130,7 +130,7 @@ class Opened:
         return readable or [None]
 
     def _frame(self, at: int | None) -> Frame | None:
-        return None if at is None else _readable(self.recording, at)
+        return None if at is None else readable(self.recording, at)
 
     def _transform(self, views: int, optional: tuple[str, ...]) -> ExtendDepth:
         options: dict[str, Any] = {**_TRUSTED, **self.options, **{key: key for key in optional}}
@@ -147,7 +147,7 @@ def maps_hw(scenes: Sequence[Scene], maps: Maps) -> tuple[int, int]:
     """
     first: tuple[str, tuple[int, int]] | None = None
     for recording in (scene.recording for scene in scenes):
-        frames = (_readable(recording, i) for i in range(len(recording)))
+        frames = (readable(recording, i) for i in range(len(recording)))
         frame = next((frame for frame in frames if frame is not None), None)
         if frame is None:
             continue  # said row by row
@@ -163,7 +163,7 @@ def maps_hw(scenes: Sequence[Scene], maps: Maps) -> tuple[int, int]:
     return first[1]
 
 
-def _readable(recording: Recording, at: int) -> Frame | None:
+def readable(recording: Recording, at: int) -> Frame | None:
     """A frame, None where it cannot be read: said where that frame is the anchor."""
     try:
         return recording[at]

@@ -49,10 +49,11 @@ class Plan:
         """The positions of each recording, in order."""
         return [range(a, b) for a, b in pairwise((0, *self.ends))]
 
-    def shards(self, rows: int) -> list[Shard]:
-        """The whole in pieces of so many rows; the last one may be shorter."""
-        starts = range(0, len(self), rows)
-        return [Shard(k, len(starts), range(i, min(i + rows, len(self)))) for k, i in enumerate(starts)]
+    def shards(self, rows: int, *, apart: bool = False) -> list[Shard]:
+        """The whole in pieces of so many rows; the last may be shorter. ``apart``: none has rows of two recordings."""
+        spans = self.spans if apart else [range(len(self))]
+        pieces = [span[i : i + rows] for span in spans for i in range(0, len(span), rows)]
+        return [Shard(k, len(pieces), piece) for k, piece in enumerate(pieces)]
 
 
 #: The ``gap`` with which the method chooses among past frames.

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import io
 import json
-import struct
 import tarfile
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from dhtorch.geometry import camera as cameras
 from dhtorch.export.tiff import float_tiff
+from dhtorch.geometry import camera as cameras
 from dhtorch.records import Camera, Frame
 from dhtorch.testing.parts import K_matrix, depth_codes, pixels, png, pose_matrix, seconds, write
 
