@@ -220,7 +220,7 @@ def write_meta(
     else:
         columns = _episode_columns(episodes)
         written.append(_table(meta / "episodes" / "chunk-000" / "file-000.parquet", columns))
-        numbered = {"task_index": list(range(len(tasks))), "task": list(tasks)}
+        numbered: dict[str, list[Any]] = {"task_index": list(range(len(tasks))), "task": list(tasks)}
         written.append(_table(meta / "tasks.parquet", numbered, index="task"))
     if stats is not None:
         written.append(storage.write_json(meta / "stats.json", stats))
@@ -257,7 +257,12 @@ def _table(path: Path, columns: Mapping[str, list[Any]], index: str | None = Non
 
     table = pyarrow.table(dict(columns))
     if index is not None:
-        about = {"index_columns": [index], "column_indexes": [], "columns": [], "pandas_version": "2.0.0"}
+        kinds = {name: "unicode" if isinstance(cells[0], str) else "int64" for name, cells in columns.items()}
+        named = [
+            {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": kind.replace("unicode", "object")}
+            for name, kind in kinds.items()
+        ]
+        about = {"index_columns": [index], "column_indexes": [], "columns": named, "pandas_version": "2.0.0"}
         table = table.replace_schema_metadata({b"pandas": json.dumps(about).encode()})
     sink = pyarrow.BufferOutputStream()
     parquet.write_table(table, sink)

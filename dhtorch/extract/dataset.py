@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -22,6 +23,10 @@ from dhtorch.transform import ExtendDepth, Maps, SampleError
 
 #: Readers give metres, and the camera of these very pixels: there is no unit that could be wrong.
 _TRUSTED = {"depth_unit": "m", "layout": "chw", "max_depth": np.inf, "min_depth": 0.0, "max_offset": np.inf}
+
+
+#: Bytes of frames that are held because others will ask for them.
+HELD_BYTES = 1 << 26
 
 
 class Extracted(NamedTuple):
@@ -88,7 +93,7 @@ class Rows(Dataset[Extracted]):
 
     def features(self, opened: Opened, i: int) -> Row:
         """The columns of frame ``i`` of an opened recording, beside those of its place."""
-        added = opened.answer(opened.recording[i], i)
+        added = opened.answer(opened.frame(i), i)
         _check_shapes(added, self.wanted)
         keep = {k: c for k, c in self.wanted.items() if k not in PLACE}
         return {k: added[k].numpy().astype(c.kind) for k, c in keep.items()}
@@ -109,6 +114,13 @@ class Opened:
         self.steps = [] if isinstance(gap, str) else steps_back(scene, gap, method.views)
         self.position = {int(number): i for i, number in enumerate(self.recording.number)} if self.steps else {}
         self.transforms: dict[tuple[Any, ...], ExtendDepth] = {}
+        self.held: OrderedDict[int, Frame | None] = OrderedDict()
+
+    def frame(self, i: int) -> Frame:
+        """Frame ``i``, which is likely to be asked for again as another view of those behind it."""
+        self.held[i] = frame = self.recording[i]
+        self._forget()
+        return frame
 
     def answer(self, anchor: Frame, i: int) -> dict[str, Tensor]:
         """What the transform adds to the sample of frame ``i``, which is ``anchor``."""
@@ -130,7 +142,17 @@ class Opened:
         return readable or [None]
 
     def _frame(self, at: int | None) -> Frame | None:
-        return None if at is None else readable(self.recording, at)
+        if at is not None and at not in self.held:
+            self.held[at] = readable(self.recording, at)
+            self._forget()
+        return None if at is None else self.held[at]
+
+    def _forget(self) -> None:
+        """Drop what was read first: decoding a video backwards starts at a key frame every time."""
+        known = [frame for frame in self.held.values() if frame is not None]
+        size = max((frame.image.nbytes + frame.depth.nbytes for frame in known), default=1)
+        while len(self.held) > max(2, HELD_BYTES // size):
+            self.held.popitem(last=False)
 
     def _transform(self, views: int, optional: tuple[str, ...]) -> ExtendDepth:
         options: dict[str, Any] = {**_TRUSTED, **self.options, **{key: key for key in optional}}

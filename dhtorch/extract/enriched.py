@@ -121,7 +121,7 @@ class MapRows(Rows):
     def features(self, opened: Opened, i: int) -> Row:
         """What is kept of frame ``i``."""
         recording = opened.recording
-        anchor = recording[i]
+        anchor = opened.frame(i)
         view = self.views[camera_key(recording)]
         if anchor.hw != view.hw:
             raise SampleError(f"picture of {_size(anchor.hw)}, expected {_size(view.hw)} as of the first frame")

@@ -7,7 +7,7 @@ file, whose metadata say what all rows together amount to. Who is killed begins 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -248,7 +248,7 @@ class RobotTarget:
             table, n = part, part.num_rows
             numbers = part.column("frame_index").to_pylist()
             for key, rows in made.items():
-                found = [rows.take(lambda row, i=i: row["frame_index"] == i) for i in numbers]
+                found = [rows.take(i) for i in numbers]
                 for row in found:
                     tallies[key].add(row)
                 cells = self._cells(key, found, done)
@@ -290,6 +290,7 @@ class RobotTarget:
         """Column → cells of some rows of a camera; None = a frame that could not be read."""
         pyarrow = need("pyarrow", extra="scale")
         nothing, cells = blank(self.views[key]), {}
+        values: list[Any]
         for kind, column in self.keys[key].items():
             if kind in nothing:
                 end = "png" if kind == "source" else "tiff"
@@ -477,10 +478,10 @@ class _Next:
         self.rows = rows
         self.row = next(rows, None)
 
-    def take(self, fits: Callable[[Row], bool]) -> Row | None:
-        """The next row if it fits."""
+    def take(self, frame: int) -> Row | None:
+        """The next row if it is that of the frame."""
         row = self.row
-        if row is None or not fits(row):
+        if row is None or row["frame_index"] != frame:
             return None
         self.row = next(self.rows, None)
         return row
