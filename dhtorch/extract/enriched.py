@@ -127,7 +127,8 @@ class MapRows(Rows):
             raise SampleError(f"picture of {_size(anchor.hw)}, expected {_size(view.hw)} as of the first frame")
         added = opened.answer(anchor, i)
         depth, sigma, source, gate = _maps(added, view)
-        depth, sigma = _stepped(depth, self.step), _stepped(sigma, self.step / SIGMA_STEPS)
+        depth = _stepped(depth, self.step)
+        sigma = _stepped(sigma, self.step / SIGMA_STEPS)
         image = pixels(anchor)
         poses = recording.poses
         pose = np.full(16, np.nan) if poses is None else se3.to_matrix(poses[i : i + 1])[0].double().flatten().numpy()
