@@ -66,7 +66,8 @@ class Tally:
 
     def summary(self) -> Row:
         """Pixels by source and by reason, in all and along time."""
-        pixels, silent = np.array(self.pixels).reshape(len(self.pixels), -1), np.array(self.silent)
+        pixels = np.array(self.pixels).reshape(len(self.pixels), -1)
+        silent = np.array(self.silent)
         if not len(pixels):
             return {"pixels": [], "silent": [], "over_time": [], "unread": self.unread}
         pieces = np.array_split(pixels, min(PARTS, len(pixels)))
