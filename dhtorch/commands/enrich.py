@@ -158,7 +158,7 @@ def _work(settings: Mapping[str, Any], parts: Mapping[str, Any]) -> Work:
         dense=settings["dense"],
     )
     target = _target(settings, (scenes, whole, views), out, format, shared["key"])
-    return Work(out, scenes, whole, views, target, shared, rows)
+    return Work(out=out, scenes=scenes, whole=whole, views=views, target=target, shared=shared, rows=rows)
 
 
 def _target(
