@@ -34,6 +34,7 @@ SIDEWAYS = {
     ("synthetic", "data"),
     ("synthetic", "testing"),
     ("testing", "data"),
+    ("testing", "export"),
     ("calibration", "evaluate"),
     ("method", "pair"),  # when it is called
     ("method", "window"),

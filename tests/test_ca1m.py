@@ -20,9 +20,9 @@ from dhtorch import data
 from dhtorch import testing as writers
 from dhtorch.data import FormatError, ca1m
 from dhtorch.data.codecs import tarballs, tiff
+from dhtorch.export.tiff import float_tiff
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame
-from dhtorch.testing.ca1m import float_tiff
 
 LASER_HW = (72, 96)
 LASER = Camera(torch.tensor([[92.0, 86.0]]), torch.tensor([[50.5, 31.0]]))

@@ -493,9 +493,7 @@ def test_a_cluster_that_does_not_answer_is_said(ray, monkeypatch):
         raise ConnectionRefusedError("refused")
 
     monkeypatch.setattr(engines.socket, "create_connection", refused)
-    with pytest.raises(
-        ConnectionError, match=r"extract.address: nothing answers at ray://head:1 \(refused\), expected a clu"
-    ):
+    with pytest.raises(ConnectionError, match=r"address: nothing answers at ray://head:1 \(refused\), expected a clu"):
         list(engines.on_ray(Counted(), [1], "ray://head:1"))
     assert not ray.log
     monkeypatch.setattr(ray, "init", lambda **_: (_ for _ in ()).throw(ValueError("no node")))

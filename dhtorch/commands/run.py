@@ -36,6 +36,7 @@ COMMANDS = {"inspect": "dhtorch.commands.inspect", "report": "dhtorch.studies.re
 #: is given all options as plain values, and as objects those that name a function. It returns the exit code.
 CONFIGURED = {
     "complete": "dhtorch.commands.complete",
+    "enrich": "dhtorch.commands.enrich",
     "extract": "dhtorch.extract",
     "integrate": "dhtorch.integrate.mapping",
     "judge": "dhtorch.commands.judge",
@@ -43,8 +44,14 @@ CONFIGURED = {
     "view": "dhtorch.commands.view",
 }
 
-#: Sub-command → the option that a first word without a name sets.
-FIRST_WORD = {"complete": "data.root", "judge": "data.root", "stream": "data.root", "view": "result"}
+#: Sub-command → the options that its first words without a name set.
+FIRST_WORDS = {
+    "complete": ("data.root",),
+    "enrich": ("data.root", "out"),
+    "judge": ("data.root",),
+    "stream": ("data.root",),
+    "view": ("result",),
+}
 
 DONE, SOME_FAILED, FAILED, INTERRUPTED, UNHEARD = 0, 1, 2, 130, 141
 HUNG_UP, TERMINATED = 129, 143
@@ -164,8 +171,7 @@ def _run_configured(word: str, argv: list[str]) -> int:
     if SHOW & {a.split("=")[0] for a in argv}:
         return _show(word, argv)
     _refuse_flags(argv, SHOW)
-    if argv and word in FIRST_WORD and ("=" not in argv[0] or Path(argv[0]).exists()):
-        argv = [f"{FIRST_WORD[word]}={quote(argv[0])}", *argv[1:]]
+    argv = _named(argv, FIRST_WORDS.get(word, ()))
     names = {a.partition("=")[0] for a in argv if a not in ("dense=false", "dense=null")}
     if word in ("integrate", "view") and "dense" in names and not {"method", "result"} & names:
         argv = [*argv, "method=auto"]  # others sweep one view alone
@@ -215,6 +221,15 @@ def _settings(path: Path) -> Any:
     from omegaconf import OmegaConf  # noqa: PLC0415
 
     return OmegaConf.to_container(OmegaConf.load(path)) if path.is_file() else {}
+
+
+def _named(argv: list[str], options: Sequence[str]) -> list[str]:
+    """The words with the names of the options that the first of them set."""
+    for k, option in enumerate(options[: len(argv)]):
+        if "=" in argv[k] and not Path(argv[k]).exists():
+            break
+        argv = [*argv[:k], f"{option}={quote(argv[k])}", *argv[k + 1 :]]
+    return argv
 
 
 def _show(name: str, argv: list[str]) -> int:

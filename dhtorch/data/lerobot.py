@@ -52,6 +52,7 @@ def read(
     camera: str | Sequence[str] | None = None,
     depth: str | None = None,
     K: Sequence[float] | None = None,
+    fov: float | None = None,
     K_depth: Sequence[float] | None = None,
     distortion: Sequence[float] | None = None,
     intrinsics: str | None = None,
@@ -69,12 +70,14 @@ def read(
         depth: key of the depth feature. None = the one named like the camera (``…front_depth``, ``…depth.front``), or
             the only one where there is one camera; without any the depth is empty and the report says so.
         K: fx, fy, cx, cy of the image. None = feature ``intrinsics``, else ``meta/intrinsics.json``.
+        fov: degrees from side to side of the image, square pixels around its centre; a K for where none is known.
         K_depth: the same of a depth map that is not registered to colour. None = the side-car's, else as colour.
         distortion: of the image, OpenCV's order. None = the side-car's, else none.
-        intrinsics: key of a feature with 4 (fx fy cx cy) or 9 numbers a frame. None = ``<camera>.intrinsics`` or
-            ``observation.camera.<name>.intrinsics`` where there is one.
+        intrinsics: key of a feature with 4 (fx fy cx cy) or 9 numbers a frame. None = ``<camera>.intrinsics``,
+            ``observation.camera.<name>.intrinsics`` or ``observation.<name>.intrinsics`` where there is one.
         pose: key of a feature with the camera-to-world pose: 16 numbers (4×4 by rows) or 7 (x y z qx qy qz qw). None =
-            ``<camera>.pose`` or ``observation.camera.<name>.pose`` where there is one, else no poses.
+            ``<camera>.pose``, ``observation.camera.<name>.pose`` or ``observation.<name>.T_world_from_cam`` where there
+            is one, else no poses.
         depth_unit: ``"m"`` or ``"mm"`` of depth stored as pictures or arrays. None = ``depth_unit`` of the feature's
             info, else mm for whole numbers and m for others, as LeRobot takes them.
         depth_range: m, nearest and farthest return to keep; for depth videos that were not coded without loss, whose
@@ -101,7 +104,20 @@ def read(
     episodes = read_episodes(meta, wanted)
     keys = keys if camera is not None else _filmed(keys, episodes)
     rigs = [
-        _Rig(meta, key, depth, K, K_depth, distortion, intrinsics, pose, depth_unit, span, tolerance) for key in keys
+        _Rig(
+            meta,
+            key,
+            depth,
+            _wide(K, fov, meta, key),
+            K_depth,
+            distortion,
+            intrinsics,
+            pose,
+            depth_unit,
+            span,
+            tolerance,
+        )
+        for key in keys
     ]
     columns = sorted({c for rig in rigs for c in (rig.K_key, rig.pose_key) if c})
     names = [rig.name(number) for number in episodes.numbers for rig in rigs]
@@ -237,14 +253,17 @@ class _Rig:
 
     @property
     def pose_key(self) -> str | None:
-        return self._column(self.pose, "pose")
+        found = self._column(self.pose, "pose")
+        ours = f"observation.{self.key.split('.')[-1]}.T_world_from_cam"
+        return ours if found is None and ours in self.meta.features else found
 
     def _column(self, option: str | None, what: str) -> str | None:
         if option is not None:
             if option not in self.meta.features:
                 raise FormatError(self.meta.root, f"option {what}", option, f"one of {', '.join(self.meta.features)}")
             return option
-        names = (f"{self.key}.{what}", f"observation.camera.{self.key.split('.')[-1]}.{what}")
+        camera = self.key.split(".")[-1]
+        names = (f"{self.key}.{what}", f"observation.camera.{camera}.{what}", f"observation.{camera}.{what}")
         return next((name for name in names if name in self.meta.features), None)
 
     def name(self, episode: int) -> str:
@@ -311,6 +330,18 @@ class _Rig:
             expected = f"option K, a feature such as {self.key}.intrinsics (option intrinsics), or meta/intrinsics.json"
             raise NoIntrinsics(side, self.key, found, expected)
         return convert.to_camera(entry["K"], hw, side, f"{self.key} K", lens), of_depth
+
+
+def _wide(K: Sequence[float] | None, fov: float | None, meta: Meta, key: str) -> Sequence[float] | None:
+    """K as given, or of a picture that sees ``fov`` degrees from side to side."""
+    if fov is None:
+        return K
+    if K is not None or isinstance(fov, bool) or not isinstance(fov, int | float) or not 1 <= fov < 179:
+        found = "K as well" if K is not None else fov
+        raise FormatError(meta.root, "option fov", found, "1 to 179 degrees from side to side, where no K is given")
+    h, w = meta.features[key].hw
+    f = w / 2 / np.tan(np.radians(fov) / 2)
+    return float(f), float(f), (w - 1) / 2, (h - 1) / 2
 
 
 def _matrix(values: Sequence[float], root: Path, field: str) -> np.ndarray:

@@ -201,7 +201,8 @@ def colour_keys(meta: Meta, asked: str | Sequence[str] | None = None) -> list[st
     Raises:
         FormatError: none, or one that is not there.
     """
-    colour = [key for key, f in meta.features.items() if f.dtype in ("video", "image") and not f.is_depth]
+    pictures = [key for key, f in meta.features.items() if f.dtype in ("video", "image") and not f.is_depth]
+    colour = [key for key in pictures if "codes" not in meta.features[key].info]  # maps of codes, as we write them
     keys = colour if asked is None else [asked] if isinstance(asked, str) else list(asked)
     unknown = [key for key in keys if key not in colour]
     if unknown or not keys:

@@ -57,8 +57,8 @@ def episode_rows(
     stamp = table["timestamp"][rows].astype(np.float64)
     number = table["frame_index"][rows].astype(np.float64) if "frame_index" in table else np.arange(float(len(rows)))
     sound = (number >= 0) & (number < 2**31) & (number == np.floor(number)) & (stamp >= 0) & (stamp < 1e9)  # not NaN
-    keep = sound & _later(number, sound) & _later(stamp, sound)
     report = []
+    keep = sound & _later(number, sound) & _later(stamp, sound)
     if not keep.all():
         report.append(f"episode {episode.number}: {int((~keep).sum())} rows out of order: left out")
     if episode.length is not None and episode.length != len(rows):

@@ -10,7 +10,7 @@ Every recording is an episode, every frame a row: ``plan`` numbers the rows, ``r
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from itertools import islice
@@ -21,10 +21,10 @@ from dhtorch import archive, lock, storage
 from dhtorch.data.files import need
 from dhtorch.data.scene import Scene, scenes_of
 from dhtorch.extract import columns, engines, plan, shards
-from dhtorch.extract.dataset import Extracted, Rows, maps_hw
+from dhtorch.extract.dataset import Rows, maps_hw
 from dhtorch.extract.features import Features, JoinedDataset
 from dhtorch.method import Method
-from dhtorch.transform import CHANNELS, Maps, SampleError, grid, maps
+from dhtorch.transform import CHANNELS, Maps, grid, maps
 from dhtorch.transform.extend_depth import ON_ERROR
 from dhtorch.transform.tokens import FITS
 
@@ -61,7 +61,7 @@ class ExtractOptions:
     shard_rows: int = 512  # of one file: what a kill loses at most
 
     def __post_init__(self) -> None:
-        for name, known in {"engine": ("local", "ray"), "on_error": ON_ERROR, "fit": FITS}.items():
+        for name, known in {"engine": engines.ENGINES, "on_error": ON_ERROR, "fit": FITS}.items():
             if getattr(self, name) not in known:
                 raise ValueError(f"extract.{name}: found {getattr(self, name)!r}, expected one of {', '.join(known)}")
         for name, low in {"gap": 0, "patch": 1, "shard_rows": 1}.items():
@@ -115,11 +115,11 @@ def _write(
     todo = [shard for shard in every if shard.name not in done]
     positions = [position for shard in todo for position in shard.rows]
     complaints: list[str] = []
-    engine = _engine(options, rows, positions, settings["workers"])
+    engine = engines.run(options.engine, rows, positions, workers=settings["workers"], address=options.address)
     try:
         with closing(progress(engine, f"{len(whole)} frames", len(positions))) as answers:  # type: ignore[type-var]
             for shard in todo:
-                kept = _kept(islice(answers, len(shard.rows)), options.on_error, rows, complaints)
+                kept = engines.kept(islice(answers, len(shard.rows)), options.on_error, rows, complaints)
                 counts[shard.name] = shards.write(folder, shard, kept, rows.wanted, shared)
     except KeyboardInterrupt:
         whole_ones = f"{len(counts)} of {len(every)} shards in {folder} are whole and stay"
@@ -151,23 +151,6 @@ def _map_hw(scenes: Sequence[Scene], options: ExtractOptions) -> tuple[int, int]
     asked = Maps.asked(options.dense, "extract.dense")
     named = options.columns is None or not {*maps.NUMBERS, *maps.CODES}.isdisjoint(options.columns)
     return maps_hw(scenes, asked) if asked is not None and named else None
-
-
-def _engine(options: ExtractOptions, rows: Rows, positions: Sequence[int], workers: int) -> Iterator[Extracted]:
-    if options.engine == "ray":
-        return engines.on_ray(rows, positions, options.address)
-    return engines.here(rows, positions, workers)
-
-
-def _kept(answers: Iterable[Extracted], on_error: str, rows: Rows, complaints: list[str]) -> Iterator[columns.Row]:
-    """Rows to write: what becomes of a frame that cannot be read is decided here, for every engine alike."""
-    for place, features, complaint in answers:
-        if features is None and on_error == "raise":
-            raise SampleError(f"{complaint} (with extract.on_error=skip or flag the rest goes on)")
-        if features is None:
-            complaints.append(complaint)
-        if features is not None or on_error == "flag":
-            yield {**place, **(columns.blank(rows.wanted) if features is None else features)}
 
 
 def _shared(settings: Mapping[str, Any], options: ExtractOptions, whole: plan.Plan, rows: Rows) -> dict[str, Any]:

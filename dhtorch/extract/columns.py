@@ -36,18 +36,22 @@ CODES: dict[str, type] = {
 MAY_BE_HALF = ("xyz", "depth", "sigma", "score", "tokens", *maps.NUMBERS)
 
 
+#: Kinds that are no numbers → bytes of one, roughly.
+_GUESS = {"str": 1, "bytes": 1 << 18}
+
+
 class Column(NamedTuple):
     """One column of a table."""
 
-    kind: str  # numpy's name of the type of a number, or "str"
+    kind: str  # numpy's name of the type of a number, "str", or "bytes" = a file
     shape: tuple[int, ...]  # of one row
     unit: str
     about: str
 
     @property
     def n_bytes(self) -> int:
-        """In memory, of one row; texts count as none."""
-        return 0 if self.kind == "str" else np.dtype(self.kind).itemsize * math.prod(self.shape)
+        """In memory, of one row, files and texts by a guess."""
+        return _GUESS.get(self.kind) or np.dtype(self.kind).itemsize * math.prod(self.shape)
 
 
 def columns(n: int, patches: int, *, half: bool = False, map_hw: tuple[int, int] | None = None) -> dict[str, Column]:
@@ -108,7 +112,9 @@ def choose(found: Mapping[str, Column], wanted: Sequence[str] | None) -> dict[st
 
 def blank(wanted: Mapping[str, Column]) -> Row:
     """The features of a frame that cannot be read: zeros, and a ``problem`` that says so."""
-    zeros = {k: np.zeros(c.shape, c.kind) for k, c in wanted.items() if k not in PLACE}
+    empty: dict[str, Any] = {"str": "", "bytes": b""}
+    zeros = {k: empty[c.kind] if c.kind in empty else np.zeros(c.shape, c.kind) for k, c in wanted.items()}
+    zeros = {k: value for k, value in zeros.items() if k not in PLACE}
     return {**zeros, "problem": np.asarray(SampleProblem.UNREADABLE, wanted["problem"].kind)}
 
 
@@ -133,8 +139,8 @@ def table(rows: Iterable[Row], wanted: Mapping[str, Column], layout: Any) -> Any
     rows = list(rows)
     arrays = []
     for name, column in wanted.items():
-        if column.kind == "str":
-            arrays.append(pyarrow.array([row[name] for row in rows], pyarrow.string()))
+        if column.kind in _GUESS:
+            arrays.append(pyarrow.array([row[name] for row in rows], _type(pyarrow, column)))
             continue
         values = np.stack([np.asarray(row[name]).astype(column.kind) for row in rows])
         array = pyarrow.array(values.reshape(-1))
@@ -145,7 +151,8 @@ def table(rows: Iterable[Row], wanted: Mapping[str, Column], layout: Any) -> Any
 
 
 def _type(pyarrow: Any, column: Column) -> Any:
-    kind = pyarrow.string() if column.kind == "str" else pyarrow.from_numpy_dtype(np.dtype(column.kind))
+    named = {"str": pyarrow.string(), "bytes": pyarrow.binary()}
+    kind = named.get(column.kind) or pyarrow.from_numpy_dtype(np.dtype(column.kind))
     for size in reversed(column.shape):
         kind = pyarrow.list_(kind, size)
     return kind

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -22,6 +23,10 @@ from dhtorch.transform import ExtendDepth, Maps, SampleError
 
 #: Readers give metres, and the camera of these very pixels: there is no unit that could be wrong.
 _TRUSTED = {"depth_unit": "m", "layout": "chw", "max_depth": np.inf, "min_depth": 0.0, "max_offset": np.inf}
+
+
+#: Bytes of frames that are held because others will ask for them.
+HELD_BYTES = 1 << 26
 
 
 class Extracted(NamedTuple):
@@ -47,6 +52,7 @@ class Rows(Dataset[Extracted]):
         method: of one other view or several.
         gap: ``auto`` = the method chooses among earlier frames; a number of frames back to the other view, 0 = none;
             None = the scene's own.
+        past: among earlier frames alone; else also among later ones of the same recording.
         options: of :class:`dhtorch.transform.ExtendDepth`.
     """
 
@@ -58,11 +64,12 @@ class Rows(Dataset[Extracted]):
         *,
         method: Method,
         gap: int | str | None,
+        past: bool = True,
         **options: Any,
     ) -> None:
         self.scenes, self.plan, self.wanted = scenes, plan, wanted
-        self.method, self.gap, self.options = method, gap, options
-        self._opened: tuple[int, _Opened] | None = None
+        self.method, self.gap, self.past, self.options = method, gap, past, options
+        self._opened: tuple[int, Opened] | None = None
 
     def __len__(self) -> int:
         return len(self.plan)
@@ -70,40 +77,53 @@ class Rows(Dataset[Extracted]):
     def __getitem__(self, position: int) -> Extracted:
         k, episode, i = self.plan.place(position)
         if self._opened is None or self._opened[0] != k:
-            self._opened = (k, _Opened(self.scenes[k], self.method, self.gap, self.options))
+            self._opened = (k, Opened(self.scenes[k], self.method, self.gap, self.past, self.options))
         opened = self._opened[1]
         recording = opened.recording
         stamp = np.nan if recording.times is None else float(recording.times[i])
         place: Row = dict(zip(PLACE, (episode, int(recording.number[i]), stamp, recording.name), strict=True))
         try:
             with torch.no_grad():
-                added = opened.answer(i)
-            _check_shapes(added, self.wanted)
+                return Extracted(place, self.features(opened, i))
         except Exception as error:  # whatever a decoder raises; lack of memory is no property of a frame
             if isinstance(error, MemoryError | torch.OutOfMemoryError):
                 raise
             text = f"{recording.name}, frame {place['frame_index']}: {error}"
             return Extracted(place, None, " ".join(text.split()))
+
+    def features(self, opened: Opened, i: int) -> Row:
+        """The columns of frame ``i`` of an opened recording, beside those of its place."""
+        added = opened.answer(opened.frame(i), i)
+        _check_shapes(added, self.wanted)
         keep = {k: c for k, c in self.wanted.items() if k not in PLACE}
-        return Extracted(place, {k: added[k].numpy().astype(c.kind) for k, c in keep.items()})
+        return {k: added[k].numpy().astype(c.kind) for k, c in keep.items()}
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_opened": None}
 
 
-class _Opened:
+class Opened:
     """One recording, and the transforms that fit its frames."""
 
-    def __init__(self, scene: Scene, method: Method, gap: int | str | None, options: dict[str, Any]) -> None:
+    def __init__(
+        self, scene: Scene, method: Method, gap: int | str | None, past: bool, options: dict[str, Any]
+    ) -> None:
         self.scene, self.recording, self.options = scene, scene.recording, options
-        self.offers = offers(scene) if isinstance(gap, str) else None
+        self.offers = offers(scene, past) if isinstance(gap, str) else None
         self.method = method if self.offers is None else choosing(method)
         self.steps = [] if isinstance(gap, str) else steps_back(scene, gap, method.views)
         self.position = {int(number): i for i, number in enumerate(self.recording.number)} if self.steps else {}
         self.transforms: dict[tuple[Any, ...], ExtendDepth] = {}
+        self.held: OrderedDict[int, Frame | None] = OrderedDict()
 
-    def answer(self, i: int) -> dict[str, Tensor]:
-        anchor: Frame = self.recording[i]
+    def frame(self, i: int) -> Frame:
+        """Frame ``i``, which is likely to be asked for again as another view of those behind it."""
+        self.held[i] = frame = self.recording[i]
+        self._forget()
+        return frame
+
+    def answer(self, anchor: Frame, i: int) -> dict[str, Tensor]:
+        """What the transform adds to the sample of frame ``i``, which is ``anchor``."""
         sample = _sample(anchor, self._others(i))
         optional = tuple(key for key in ("confidence", "distortion", "depth_intrinsics") if key in sample)
         kind = (len(sample["image"]), *optional)
@@ -122,7 +142,17 @@ class _Opened:
         return readable or [None]
 
     def _frame(self, at: int | None) -> Frame | None:
-        return None if at is None else _readable(self.recording, at)
+        if at is not None and at not in self.held:
+            self.held[at] = readable(self.recording, at)
+            self._forget()
+        return None if at is None else self.held[at]
+
+    def _forget(self) -> None:
+        """Drop what was read first: decoding a video backwards starts at a key frame every time."""
+        known = [frame for frame in self.held.values() if frame is not None]
+        size = max((frame.image.nbytes + frame.depth.nbytes for frame in known), default=1)
+        while len(self.held) > max(2, HELD_BYTES // size):
+            self.held.popitem(last=False)
 
     def _transform(self, views: int, optional: tuple[str, ...]) -> ExtendDepth:
         options: dict[str, Any] = {**_TRUSTED, **self.options, **{key: key for key in optional}}
@@ -139,7 +169,7 @@ def maps_hw(scenes: Sequence[Scene], maps: Maps) -> tuple[int, int]:
     """
     first: tuple[str, tuple[int, int]] | None = None
     for recording in (scene.recording for scene in scenes):
-        frames = (_readable(recording, i) for i in range(len(recording)))
+        frames = (readable(recording, i) for i in range(len(recording)))
         frame = next((frame for frame in frames if frame is not None), None)
         if frame is None:
             continue  # said row by row
@@ -155,7 +185,7 @@ def maps_hw(scenes: Sequence[Scene], maps: Maps) -> tuple[int, int]:
     return first[1]
 
 
-def _readable(recording: Recording, at: int) -> Frame | None:
+def readable(recording: Recording, at: int) -> Frame | None:
     """A frame, None where it cannot be read: said where that frame is the anchor."""
     try:
         return recording[at]

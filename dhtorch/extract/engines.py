@@ -9,16 +9,17 @@ from __future__ import annotations
 import logging
 import pickle
 import socket
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from torch.utils.data import DataLoader
 
 from dhtorch.data.files import need, set_opencv_threads
+from dhtorch.extract import columns
 from dhtorch.extract.dataset import Extracted, Rows
 from dhtorch.leash import follow_parent
-from dhtorch.transform import one_thread
+from dhtorch.transform import SampleError, one_thread
 
 #: Rows of one Ray task: what is done again where a node is lost.
 TASK_ROWS = 16
@@ -28,6 +29,34 @@ STORE_BYTES = 300_000_000
 
 #: Time that a cluster is given to answer, s.
 PATIENCE_S = 10
+
+
+#: Names of the places.
+ENGINES = ("local", "ray")
+
+
+def run(
+    engine: str, rows: Rows, positions: Sequence[int], *, workers: int, address: str | None = None
+) -> Iterator[Extracted]:
+    """The answers of the engine of that name."""
+    return on_ray(rows, positions, address) if engine == "ray" else here(rows, positions, workers)
+
+
+def kept(
+    answers: Iterable[Extracted], on_error: str, rows: Rows, complaints: list[str], option: str = "extract.on_error"
+) -> Iterator[columns.Row]:
+    """Rows to write: what becomes of a frame that cannot be read is decided here, for every engine alike.
+
+    Raises:
+        SampleError: one that cannot be read, where ``on_error`` is raise; ``option`` is what to set otherwise.
+    """
+    for place, features, complaint in answers:
+        if features is None and on_error == "raise":
+            raise SampleError(f"{complaint} (with {option}=skip or flag the rest goes on)")
+        if features is None:
+            complaints.append(complaint)
+        if features is not None or on_error == "flag":
+            yield {**place, **(columns.blank(rows.wanted) if features is None else features)}
 
 
 def here(rows: Rows, positions: Sequence[int], workers: int) -> Iterator[Extracted]:
@@ -72,7 +101,7 @@ def on_ray(rows: Rows, positions: Sequence[int], address: str | None) -> Iterato
     try:
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **own)
     except Exception as error:  # Ray has no class of its own for a node that does not come up
-        raise ConnectionError(f"extract.engine=ray: {error}") from error
+        raise ConnectionError(f"engine=ray: {error}") from error
     try:
         context = data.DataContext.get_current()
         context.execution_options.preserve_order = True
@@ -99,7 +128,7 @@ def _reach(address: str | None) -> None:
     try:
         socket.create_connection((host, int(port)), timeout=PATIENCE_S).close()
     except OSError as error:
-        raise ConnectionError(f"extract.address: nothing answers at {address} ({error}), expected a cluster") from None
+        raise ConnectionError(f"address: nothing answers at {address} ({error}), expected a cluster") from None
 
 
 def _worker(number: int) -> None:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from pathlib import Path
 
 from dhtorch.data.pairs import between, by_choice
@@ -31,7 +32,7 @@ class Plan:
     """Every frame of a data set, by episode and then by frame."""
 
     order: tuple[int, ...]  # place of each recording in the data set
-    episodes: tuple[int, ...]  # its number, increasing
+    episodes: tuple[int, ...]  # its number, never falling
     ends: tuple[int, ...]  # position behind its last frame
     roots: tuple[Path, ...]  # what was opened
 
@@ -43,21 +44,27 @@ class Plan:
         k = bisect_right(self.ends, position)
         return self.order[k], self.episodes[k], position - (self.ends[k - 1] if k else 0)
 
-    def shards(self, rows: int) -> list[Shard]:
-        """The whole in pieces of so many rows; the last one may be shorter."""
-        starts = range(0, len(self), rows)
-        return [Shard(k, len(starts), range(i, min(i + rows, len(self)))) for k, i in enumerate(starts)]
+    @property
+    def spans(self) -> list[range]:
+        """The positions of each recording, in order."""
+        return [range(a, b) for a, b in pairwise((0, *self.ends))]
+
+    def shards(self, rows: int, *, apart: bool = False) -> list[Shard]:
+        """The whole in pieces of so many rows; the last may be shorter. ``apart``: none has rows of two recordings."""
+        spans = self.spans if apart else [range(len(self))]
+        pieces = [span[i : i + rows] for span in spans for i in range(0, len(span), rows)]
+        return [Shard(k, len(pieces), piece) for k, piece in enumerate(pieces)]
 
 
 #: The ``gap`` with which the method chooses among past frames.
 CHOICE = "auto"
 
 
-def offers(scene: Scene) -> dict[int, tuple[int, ...]]:
-    """Frame → the frames before it among which the method chooses; the first has none."""
+def offers(scene: Scene, past: bool = True) -> dict[int, tuple[int, ...]]:
+    """Frame → the frames (``past``: before it) among which the method chooses; the first has none before it."""
     if len(scene.recording) < 2:
         return {}
-    return {pair.anchor: pair.offered for pair in by_choice(scene, stride=1, past=True)}
+    return {pair.anchor: pair.offered for pair in by_choice(scene, stride=1, past=past)}
 
 
 def steps_back(scene: Scene, gap: int | None, views: int) -> list[int]:
@@ -74,18 +81,20 @@ def steps_back(scene: Scene, gap: int | None, views: int) -> list[int]:
     return between(0, gap, views) if gap else []
 
 
-def make(scenes: Sequence[Scene], gap: int | str | None, views: int) -> Plan:
+def make(scenes: Sequence[Scene], gap: int | str | None, views: int, *, rigs: bool = False) -> Plan:
     """The plan of a data set; opens each recording once, for its length.
 
     Args:
         scenes: of the data set.
         gap, views: see :func:`steps_back`; a gap of :data:`CHOICE` is right for all.
+        rigs: an episode may have several cameras, whose recordings follow one another by the order of ``scenes``.
 
     Raises:
         ValueError: two recordings of one episode, or no gap.
         FormatError: a recording that cannot be opened.
     """
-    found: dict[int, tuple[int, str, int]] = {}
+    found: dict[tuple[int, int], tuple[int, str, int]] = {}
+    cameras: Counter[int] = Counter()
     roots: dict[Path, None] = {}
     for k, scene in enumerate(scenes):
         recording = scene.recording
@@ -93,13 +102,13 @@ def make(scenes: Sequence[Scene], gap: int | str | None, views: int) -> Plan:
             steps_back(scene, gap, views)
         number = recording.episode
         number = k if number is None else number
-        if number in found:
-            both = f"{found[number][1]} and {recording.name}"
+        if cameras[number] and not rigs:
+            both = f"{found[number, 0][1]} and {recording.name}"
             raise ValueError(f"data: {both} are one episode, expected one camera of it (data.camera=KEY)")
-        found[number] = (k, recording.name, len(recording))
+        found[number, cameras[number]] = (k, recording.name, len(recording))
+        cameras[number] += 1
         if recording.root is not None:
             roots[recording.root] = None
-    episodes = sorted(found)
-    lengths = [found[number][2] for number in episodes]
-    order = tuple(found[number][0] for number in episodes)
-    return Plan(order, tuple(episodes), tuple(accumulate(lengths)), tuple(roots))
+    places = sorted(found)
+    order, _, lengths = zip(*(found[place] for place in places), strict=True)
+    return Plan(order, tuple(number for number, _ in places), tuple(accumulate(lengths)), tuple(roots))

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import io
 import json
-import struct
 import tarfile
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from dhtorch.export.tiff import float_tiff
 from dhtorch.geometry import camera as cameras
 from dhtorch.records import Camera, Frame
 from dhtorch.testing.parts import K_matrix, depth_codes, pixels, png, pose_matrix, seconds, write
@@ -74,12 +74,3 @@ def _depth_camera(frame: Frame) -> Camera:
 
 def _json(matrix: np.ndarray) -> bytes:
     return json.dumps(matrix.tolist()).encode()
-
-
-def float_tiff(picture: np.ndarray) -> bytes:
-    """TIFF of (h, w) numbers as float32: one strip, little-endian, not compressed."""
-    h, w = picture.shape
-    body = picture.astype("<f4").tobytes()
-    tags = [(256, w), (257, h), (258, 32), (259, 1), (262, 1), (273, 8), (277, 1), (278, h), (279, len(body)), (339, 3)]
-    entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags)
-    return struct.pack("<2sHI", b"II", 42, 8 + len(body)) + body + struct.pack("<H", len(tags)) + entries + bytes(4)

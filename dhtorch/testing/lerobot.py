@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from dhtorch.data.files import need
+from dhtorch.export.tiff import float_tiff
 from dhtorch.records import Frame
-from dhtorch.testing.ca1m import float_tiff
 from dhtorch.testing.lossless import write_lossless
 from dhtorch.testing.parts import K_matrix, depth_codes, pixels, png, pose_matrix, write
 

@@ -1,0 +1,113 @@
+"""One page about an enriched data set: what became of its pixels and why, by camera, along time, by episode."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dhtorch import storage
+from dhtorch.codes import Gate, Source, names, words
+from dhtorch.drawing import Axis, Key, Panel
+from dhtorch.drawing.colours import RECOVERED, SENSOR, SILENT, Stroke, style_sheet
+from dhtorch.studies.report.figure import Figure
+from dhtorch.studies.report.markup import Markup, tag
+from dhtorch.studies.report.page import STYLE, figure_markup, table_markup
+from dhtorch.studies.report.tables import Table
+
+Row = Mapping[str, Any]
+
+#: Episodes that are listed, those with least depth first.
+WORST = 10
+
+#: Kind of a pixel → its codes.
+KINDS = {"sensor": (Source.SENSOR,), "recovered": (Source.RECOVERED, Source.SWEPT), "silent": (Source.NONE,)}
+_COLOURS = {"sensor": SENSOR, "recovered": RECOVERED, "silent": SILENT}
+
+
+def by_camera(owns: Sequence[Row]) -> list[tuple[str, dict[str, float], dict[str, float]]]:
+    """Camera, shares of its pixels by kind, and shares that are silent by gate, the largest first."""
+    cameras = list(dict.fromkeys(name for own in owns for name in own["cameras"]))
+    return [(name, *_shares([own["cameras"][name] for own in owns if name in own["cameras"]])) for name in cameras]
+
+
+def write(path: Path, about: Row, owns: Sequence[Row]) -> Path:
+    """Write the page."""
+    return storage.replace_file(path, page(about, owns).encode("utf-8"))
+
+
+def page(about: Row, owns: Sequence[Row]) -> str:
+    """The page.
+
+    Args:
+        about: what all episodes share.
+        owns: what each amounts to, as :class:`dhtorch.extract.targets.Target` notes it.
+    """
+    title = f"{about['data']['name']}: what it was enriched with"
+    style = Markup(style_sheet() + STYLE.read_text(encoding="utf-8"))
+    metas = ({"charset": "utf-8"}, {"name": "viewport", "content": "width=device-width, initial-scale=1"})
+    head = tag("head", *(tag("meta", **m) for m in metas), tag("title", title), tag("style", style))
+    frames = sum(own["length"] for own in owns)
+    step = f"depth in steps of {1e3 * about['step_m']:.3g} mm" if about["step_m"] else "depth as it was found"
+    lead = f"{len(owns)} episodes, {frames} frames; {step}; dhtorch {about['version']}, method {about['method']}"
+    tables = [_cameras(owns), _worst(owns)]
+    figure = _along(owns)
+    parts = [*(table_markup(t) for t in tables), *([figure_markup(figure)] if figure else [])]
+    body = tag("body", tag("header", tag("h1", title), tag("p", lead, class_="lead")), tag("main", *parts))
+    return "<!doctype html>\n" + tag("html", head, body, lang="en") + "\n"
+
+
+def _shares(cameras: Sequence[Row]) -> tuple[dict[str, float], dict[str, float]]:
+    pixels = np.sum([np.array(c["pixels"], float) for c in cameras if c["pixels"]], 0)
+    silent = np.sum([np.array(c["silent"], float) for c in cameras if c["pixels"]], 0)
+    total = max(1.0, float(np.sum(pixels)))
+    if not np.size(pixels):
+        return dict.fromkeys(KINDS, 0.0) | {"silent": 1.0}, {}
+    kinds = {kind: float(sum(pixels[code] for code in codes)) / total for kind, codes in KINDS.items()}
+    gates = {name: float(silent[code]) / total for code, name in names(Gate).items() if code != Gate.ANSWER}
+    return kinds, {name: share for name, share in sorted(gates.items(), key=lambda x: -x[1]) if share}
+
+
+def _cameras(owns: Sequence[Row]) -> Table:
+    rows = []
+    for name, kinds, reasons in by_camera(owns):
+        why = ", ".join(f"{words(gate)} {share:.1%}" for gate, share in reasons.items())
+        rows.append([name, *(f"{share:.1%}" for share in kinds.values()), why or "—"])
+    return Table("Pixels by camera", ["camera", *KINDS, "silent because"], rows)
+
+
+def _worst(owns: Sequence[Row]) -> Table:
+    found = []
+    for own in owns:
+        for name, camera in own["cameras"].items():
+            kinds, reasons = _shares([camera])
+            found.append((kinds["silent"], own["number"], name, kinds, reasons, camera["unread"]))
+    rows = []
+    for _, number, name, kinds, reasons, unread in sorted(found, key=lambda x: (-x[0], x[1], x[2]))[:WORST]:
+        why = next((words(gate) for gate in reasons), "—")
+        rows.append([str(number), name, *(f"{share:.1%}" for share in kinds.values()), why, str(unread)])
+    head = ["episode", "camera", *KINDS, "most often because", "frames not read"]
+    return Table("Episodes with least depth first", head, rows)
+
+
+def _along(owns: Sequence[Row]) -> Figure | None:
+    """Shares along the episodes, mean over them."""
+    panels = []
+    for name in dict.fromkeys(name for own in owns for name in own["cameras"]):
+        shares = [np.array(own["cameras"][name]["over_time"]) for own in owns if name in own["cameras"]]
+        longest = max((len(x) for x in shares if len(x)), default=0)
+        if longest < 2:
+            continue
+        at = np.linspace(0, 1, longest)
+        spread = [
+            [np.interp(at, np.linspace(0, 1, len(x)), x[:, c]) for c in range(x.shape[1])] for x in shares if len(x)
+        ]
+        mean = np.mean(spread, 0)
+        panel = Panel(name, Axis(0, 1, "part of the episode, %", percent=True), Axis(0, 1, "pixels, %", percent=True))
+        for kind, codes in KINDS.items():
+            panel.line(at.tolist(), sum(mean[code] for code in codes).tolist(), Stroke(_COLOURS[kind], 1.8))
+        panels.append(panel)
+    keys = [Key(kind, colour, "line") for kind, colour in _COLOURS.items()]
+    return Figure("Along time", "Mean over the episodes, by camera.", panels, keys) if panels else None

@@ -1,0 +1,269 @@
+"""LeRobot data sets, v3.0 and v2.1: features, table layouts, statistics and the files below ``meta/``.
+
+A depth map is a picture of the table: float32 TIFF in metres, 0 = no depth, which is how LeRobot itself stores depth
+images (``is_depth_map`` and ``depth_unit`` in the feature's info). Its other form, 12-bit video, has no code for *no
+return*. Tables hold one episode each, in both versions; ``meta/info.json`` is written last.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dhtorch import storage
+
+Feature = dict[str, Any]  # as in meta/info.json
+
+#: Version → what its info says.
+VERSIONS = {3: "v3.0", 2: "v2.1"}
+
+#: Files of a folder.
+CHUNK = 1000
+
+_HWC = ["height", "width", "channels"]
+_PATHS = {
+    3: ("data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+        "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"),
+    2: ("data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
+        "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"),
+}  # fmt: skip
+
+
+class Clip(NamedTuple):
+    """Where the video of an episode lies."""
+
+    chunk: int
+    file: int
+    start: float  # s in the file
+    stop: float
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode, as ``meta/`` describes it; its table is the file of its number."""
+
+    number: int
+    length: int
+    start: int  # index of its first row
+    tasks: Sequence[str] = ()
+    videos: Mapping[str, Clip] = field(default_factory=dict)
+    stats: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Moments(NamedTuple):
+    """What statistics are made of: of some numbers for each of k channels, float64."""
+
+    n: np.ndarray  # (k,)
+    total: np.ndarray
+    square: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    @classmethod
+    def of(cls, values: np.ndarray, valid: np.ndarray | None = None) -> Moments:
+        """Of numbers (n, k), those that are finite and ``valid``; none of them give no statistics."""
+        x = np.asarray(values, np.float64)
+        keep = np.isfinite(x) if valid is None else np.isfinite(x) & valid
+        z = np.where(keep, x, 0.0)
+        low, high = np.where(keep, x, np.inf), np.where(keep, x, -np.inf)
+        return cls(keep.sum(0).astype(np.float64), z.sum(0), (z * z).sum(0), low.min(0, initial=np.inf),
+                   high.max(0, initial=-np.inf))  # fmt: skip
+
+    @classmethod
+    def parse(cls, packed: Sequence[Sequence[float | None]]) -> Moments:
+        """Of what :meth:`pack` gave."""
+        rows = [np.array([np.nan if x is None else x for x in row]) for row in packed]
+        rows[3], rows[4] = np.where(np.isnan(rows[3]), np.inf, rows[3]), np.where(np.isnan(rows[4]), -np.inf, rows[4])
+        return cls(*rows)
+
+    def pack(self) -> list[list[float | None]]:
+        """Lists for strict JSON; an end that is not there is null."""
+        return [[float(x) if np.isfinite(x) else None for x in row] for row in self]
+
+    def __add__(self, other: Moments) -> Moments:  # type: ignore[override]
+        return Moments(self.n + other.n, self.total + other.total, self.square + other.square,
+                       np.minimum(self.low, other.low), np.maximum(self.high, other.high))  # fmt: skip
+
+    def stats(self, frames: int, shape: Sequence[int]) -> dict[str, Any] | None:
+        """The entry of ``meta/stats``, each in that shape; None where there is no number."""
+        if not (self.n > 0).all():
+            return None
+        mean = self.total / self.n
+        std = np.sqrt(np.maximum(self.square / self.n - mean**2, 0.0))
+        found = {"min": self.low, "max": self.high, "mean": mean, "std": std}
+        return {**{k: x.reshape(shape).tolist() for k, x in found.items()}, "count": [frames]}
+
+
+# -------------------------------------------------------------------------------------------------------- features
+
+
+def numbers(kind: str, n: int = 1, names: Sequence[str] | None = None) -> Feature:
+    """A feature of ``n`` numbers a frame."""
+    return {"dtype": kind, "shape": [n], "names": None if names is None else list(names)}
+
+
+def picture(hw: Sequence[int], channels: int = 3, **info: Any) -> Feature:
+    """A feature of pictures in the table."""
+    return {"dtype": "image", "shape": [*hw, channels], "names": list(_HWC), **({"info": info} if info else {})}
+
+
+def depth_map(hw: Sequence[int], step: float) -> Feature:
+    """A feature of maps in metres (see the module), whose values are whole numbers of ``step`` m."""
+    return picture(hw, 1, is_depth_map=True, depth_unit="m", quantiser_step_m=step, no_depth=0.0)
+
+
+def schema(features: Mapping[str, Feature], types: Mapping[str, Any], metadata: Mapping[bytes, bytes]) -> Any:
+    """Arrow schema of a table: ``types`` where a column has one already, else by its feature; videos have no column."""
+    import pyarrow  # noqa: PLC0415
+
+    cell = pyarrow.struct([("bytes", pyarrow.binary()), ("path", pyarrow.string())])
+    fields = []
+    for key, feature in features.items():
+        if feature["dtype"] == "video":
+            continue
+        kind = types.get(key)
+        if kind is None and feature["dtype"] == "image":
+            kind = cell
+        elif kind is None:
+            kind = pyarrow.from_numpy_dtype(np.dtype(feature["dtype"]))
+            kind = kind if list(feature["shape"]) == [1] else pyarrow.list_(kind, int(np.prod(feature["shape"])))
+        fields.append(pyarrow.field(key, kind))
+    return pyarrow.schema(fields, metadata={**dict(metadata), b"huggingface": _huggingface(features)})
+
+
+def _huggingface(features: Mapping[str, Feature]) -> bytes:
+    """What tells the library ``datasets`` which columns are pictures."""
+    found: dict[str, Any] = {}
+    for key, feature in features.items():
+        kind, shape = feature["dtype"], list(feature["shape"])
+        value = {"dtype": kind, "_type": "Value"}
+        if kind == "image":
+            found[key] = {"_type": "Image"}
+        elif kind != "video" and shape in ([], [1]):
+            found[key] = value
+        elif kind != "video" and len(shape) == 1:
+            found[key] = {"feature": value, "length": shape[0], "_type": "Sequence"}
+        elif kind != "video":
+            found[key] = {"shape": shape, "dtype": kind, "_type": f"Array{len(shape)}D"}
+    return json.dumps({"info": {"features": found}}).encode()
+
+
+# ----------------------------------------------------------------------------------------------------------- places
+
+
+def data_file(version: int, number: int) -> str:
+    """Name of the table of an episode."""
+    return _filled(_PATHS[version][0], *divmod(number, CHUNK), number)
+
+
+def video_file(version: int, key: str, clip: Clip, number: int) -> str:
+    """Name of the video of an episode."""
+    return _filled(_PATHS[version][1].replace("{video_key}", key), clip.chunk, clip.file, number)
+
+
+def _filled(template: str, chunk: int, file: int, number: int) -> str:
+    return template.format(chunk_index=chunk, file_index=file, episode_chunk=number // CHUNK, episode_index=number)
+
+
+# ------------------------------------------------------------------------------------------------------------- meta
+
+
+def info(
+    version: int, features: Mapping[str, Feature], episodes: Sequence[Episode], *, fps: float, n_tasks: int, robot: str
+) -> dict[str, Any]:
+    """``meta/info.json``."""
+    data, video = _PATHS[version]
+    videos = [key for key, feature in features.items() if feature["dtype"] == "video"]
+    first, last = episodes[0].number, episodes[-1].number
+    counts = {"total_videos": len(videos) * len(episodes), "total_chunks": last // CHUNK + 1} if version == 2 else {}
+    sizes = {} if version == 2 else {"data_files_size_in_mb": 100, "video_files_size_in_mb": 200}
+    return {
+        "codebase_version": VERSIONS[version],
+        "robot_type": robot,
+        "total_episodes": len(episodes),
+        "total_frames": sum(each.length for each in episodes),
+        "total_tasks": n_tasks,
+        **counts,
+        "chunks_size": CHUNK,
+        **sizes,
+        "fps": int(fps) if float(fps).is_integer() else fps,
+        "splits": {"train": f"{first}:{last + 1}"},
+        "data_path": data,
+        "video_path": video if videos else None,
+        "features": dict(features),
+    }
+
+
+def write_meta(
+    root: Path,
+    version: int,
+    about: Mapping[str, Any],  # of `info`
+    episodes: Sequence[Episode],
+    tasks: Sequence[str],  # by task_index
+    stats: Mapping[str, Any] | None = None,
+) -> list[Path]:
+    """The files below ``meta/``, each whole or not at all; ``info.json`` is the last and makes a folder a data set."""
+    meta, written = root / "meta", []
+    if version == 2:
+        rows = [{"episode_index": e.number, "tasks": list(e.tasks), "length": e.length} for e in episodes]
+        written.append(_lines(meta / "episodes.jsonl", rows))
+        named = [{"task_index": k, "task": task} for k, task in enumerate(tasks)]
+        written.append(_lines(meta / "tasks.jsonl", named))
+        if stats is not None:
+            of_episodes = [{"episode_index": e.number, "stats": e.stats} for e in episodes]
+            written.append(_lines(meta / "episodes_stats.jsonl", of_episodes))
+    else:
+        columns = _episode_columns(episodes)
+        written.append(_table(meta / "episodes" / "chunk-000" / "file-000.parquet", columns))
+        numbered: dict[str, list[Any]] = {"task_index": list(range(len(tasks))), "task": list(tasks)}
+        written.append(_table(meta / "tasks.parquet", numbered, index="task"))
+    if stats is not None:
+        written.append(storage.write_json(meta / "stats.json", stats))
+    return [*written, storage.write_json(meta / "info.json", about)]
+
+
+def _episode_columns(episodes: Sequence[Episode]) -> dict[str, list[Any]]:
+    places = [divmod(e.number, CHUNK) for e in episodes]
+    columns: dict[str, list[Any]] = {
+        "episode_index": [e.number for e in episodes],
+        "tasks": [list(e.tasks) for e in episodes],
+        "length": [e.length for e in episodes],
+        "data/chunk_index": [chunk for chunk, _ in places],
+        "data/file_index": [file for _, file in places],
+        "dataset_from_index": [e.start for e in episodes],
+        "dataset_to_index": [e.start + e.length for e in episodes],
+    }
+    for key in episodes[0].videos:
+        clips = [e.videos[key] for e in episodes]
+        ends = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
+        columns |= {f"videos/{key}/{name}": list(x) for name, x in zip(ends, zip(*clips, strict=True), strict=True)}
+    zeros = [0] * len(episodes)
+    return columns | {"meta/episodes/chunk_index": zeros, "meta/episodes/file_index": zeros}
+
+
+def _lines(path: Path, rows: Iterable[Any]) -> Path:
+    return storage.replace_file(path, "".join(storage.dumps(row) + "\n" for row in rows).encode())
+
+
+def _table(path: Path, columns: Mapping[str, list[Any]], index: str | None = None) -> Path:
+    """A small table; ``index`` is the column that pandas takes as its index."""
+    import pyarrow  # noqa: PLC0415
+    from pyarrow import parquet  # noqa: PLC0415
+
+    table = pyarrow.table(dict(columns))
+    if index is not None:
+        kinds = {name: "unicode" if isinstance(cells[0], str) else "int64" for name, cells in columns.items()}
+        named = [
+            {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": kind.replace("unicode", "object")}
+            for name, kind in kinds.items()
+        ]
+        about = {"index_columns": [index], "column_indexes": [], "columns": named, "pandas_version": "2.0.0"}
+        table = table.replace_schema_metadata({b"pandas": json.dumps(about).encode()})
+    sink = pyarrow.BufferOutputStream()
+    parquet.write_table(table, sink)
+    return storage.replace_file(path, sink.getvalue().to_pybytes())

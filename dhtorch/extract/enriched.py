@@ -1,0 +1,195 @@
+"""A frame of a recording → what a data set is enriched with: its maps as files, its camera, and counts of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dhtorch import dense
+from dhtorch.codes import Gate, Source, names
+from dhtorch.data.recording import Recording
+from dhtorch.data.scene import Scene
+from dhtorch.export import png
+from dhtorch.export.lerobot import Moments
+from dhtorch.export.tiff import float_tiff
+from dhtorch.extract.columns import PLACE, Column, Row
+from dhtorch.extract.dataset import Opened, Rows, readable
+from dhtorch.geometry import camera as cam
+from dhtorch.geometry import se3
+from dhtorch.records import Frame
+from dhtorch.transform import SampleError
+
+#: Steps of sigma in one of depth.
+SIGMA_STEPS: Final = 8
+
+#: Maps of a frame, and what each is: files.
+MAPS = {"depth": "depth as TIFF, m", "sigma": "its standard deviation as TIFF, m", "source": "codes as PNG"}
+
+#: Columns of the counts: pixels by source, and silent ones by reason.
+_N_SOURCES, _N_GATES = max(names(Source)) + 1, max(names(Gate)) + 1
+
+#: Numbers of :class:`dhtorch.export.lerobot.Moments`, over depth, sigma, and the colours of the picture.
+_MOMENTS = (5, 5)
+
+
+@dataclass(frozen=True)
+class View:
+    """One camera of a data set."""
+
+    key: str  # of its pictures, as a LeRobot feature
+    hw: tuple[int, int]  # of the picture
+    map_hw: tuple[int, int]
+    posed: bool
+    lens: tuple[float, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Of the camera alone."""
+        return self.key.removeprefix("observation.").removeprefix("images.")
+
+    @classmethod
+    def of(cls, scene: Scene, size: int) -> View:
+        """The camera of a recording, by the first of its frames that can be read.
+
+        Raises:
+            ValueError: there is none, or frames have no pictures.
+        """
+        recording = scene.recording
+        frames = (readable(recording, i) for i in range(len(recording)))
+        frame = next((frame for frame in frames if frame is not None), None)
+        if frame is None or 0 in frame.hw:
+            recording[0]  # says what is wrong with it
+            raise ValueError(f"{recording.name}: found no frame with a picture, expected one")
+        lens = frame.camera.distortion
+        return cls(
+            camera_key(recording),
+            frame.hw,
+            dense.map_hw(frame.hw, size),
+            recording.poses is not None,
+            () if lens is None else tuple(lens[0].tolist()),
+        )
+
+
+def camera_key(recording: Recording) -> str:
+    """The LeRobot feature of a recording's pictures."""
+    feature = getattr(recording.load, "image", None) if recording.format == "lerobot" else None
+    return "observation.images.camera" if feature is None else str(feature.key)
+
+
+def columns(pictures: bool) -> dict[str, Column]:
+    """What is kept of a frame until its episode is whole."""
+    f, whole = "float64", "int64"
+    place = {
+        "episode_index": Column(whole, (), "1", "number of the episode"),
+        "frame_index": Column(whole, (), "1", "number of the frame in its capture"),
+        "timestamp": Column(f, (), "s", "NaN = none"),
+        "recording": Column("str", (), "1", "name of the recording"),
+    }
+    assert tuple(place) == PLACE
+    return {
+        **place,
+        **{name: Column("bytes", (), "file", about) for name, about in MAPS.items()},
+        **({"picture": Column("bytes", (), "file", "the picture as PNG")} if pictures else {}),
+        "K": Column(f, (9,), "px", "of the picture"),
+        "pose": Column(f, (16,), "1, m", "T_world_from_cam by rows; NaN = none"),
+        "pixels": Column(whole, (_N_SOURCES,), "1", "by source"),
+        "silent": Column(whole, (_N_GATES,), "1", "silent ones by gate"),
+        "moments": Column(f, _MOMENTS, "m, 1", "of depth, sigma, red, green, blue"),
+        "problem": Column("uint8", (), "code", "what was wrong with the frame"),
+    }
+
+
+class MapRows(Rows):
+    """Position in the plan → the maps of that frame; see :class:`dhtorch.extract.dataset.Rows`.
+
+    Args:
+        step: m, of which depths are whole numbers, and sigma of an eighth; 0 = as found. A power of two: float32 holds
+            every step of it and packs well.
+        views: LeRobot feature of a camera → what it must be like.
+        more: of :class:`Rows`.
+    """
+
+    def __init__(self, *args: Any, step: float, views: Mapping[str, View], **more: Any) -> None:
+        super().__init__(*args, **more)
+        self.step, self.views = step, dict(views)
+
+    def features(self, opened: Opened, i: int) -> Row:
+        """What is kept of frame ``i``."""
+        recording = opened.recording
+        anchor = opened.frame(i)
+        view = self.views[camera_key(recording)]
+        if anchor.hw != view.hw:
+            raise SampleError(f"picture of {_size(anchor.hw)}, expected {_size(view.hw)} as of the first frame")
+        added = opened.answer(anchor, i)
+        depth, sigma, source, gate = _maps(added, view)
+        depth = _stepped(depth, self.step)
+        sigma = _stepped(sigma, self.step / SIGMA_STEPS)
+        image = pixels(anchor)
+        poses = recording.poses
+        pose = np.full(16, np.nan) if poses is None else se3.to_matrix(poses[i : i + 1])[0].double().flatten().numpy()
+        found = {
+            "depth": float_tiff(depth, deflate=True),
+            "sigma": float_tiff(sigma, deflate=True),
+            "source": png(source),
+            "K": cam.to_matrix(anchor.camera)[0].double().flatten().numpy(),
+            "pose": pose,
+            "pixels": np.bincount(source.ravel(), minlength=_N_SOURCES),
+            "silent": np.bincount(gate[source == Source.NONE], minlength=_N_GATES),
+            "moments": _moments(depth, sigma, image),
+            "problem": added["problem"].numpy(),
+        }
+        return found if "picture" not in self.wanted else {**found, "picture": png(image)}
+
+
+def pixels(frame: Frame) -> np.ndarray:
+    """The picture (h, w, 3) uint8; grey in all three."""
+    image = frame.image[0].cpu()
+    if image.is_floating_point():
+        image = (image.clamp(0, 1) * 255).round().to(torch.uint8)
+    return image.expand(3, -1, -1).permute(1, 2, 0).contiguous().numpy()
+
+
+def blank(view: View) -> dict[str, bytes]:
+    """The maps of a frame that could not be read: no depth anywhere."""
+    nothing = float_tiff(np.zeros(view.map_hw, np.float32), deflate=True)
+    return {"depth": nothing, "sigma": nothing, "source": png(np.zeros(view.map_hw, np.uint8))}
+
+
+def _maps(added: Mapping[str, Tensor], view: View) -> tuple[np.ndarray, ...]:
+    """Depth, sigma, source and gate (h, w); of samples alone where they stand, elsewhere silence without a reason."""
+    if "depth_map" in added:
+        depth, sigma, source, gate = (added[f"{k}_map"].numpy() for k in ("depth", "sigma", "source", "gate"))
+        return depth, sigma, source.astype(np.uint8), gate
+    h, w = view.map_hw
+    scale = np.array([w / view.hw[1], h / view.hw[0]])
+    at = np.rint((added["uv"].double().numpy() + 0.5) * scale - 0.5).astype(np.int64).clip(0, (w - 1, h - 1))
+    fields: dict[str, Any] = {"depth": np.float32, "sigma": np.float32, "source": np.uint8, "gate": np.int64}
+    found = []
+    for name, kind in fields.items():
+        field = np.zeros((h, w), kind)
+        field[at[:, 1], at[:, 0]] = added[name].numpy()
+        found.append(field)
+    return tuple(found)
+
+
+def _stepped(x: np.ndarray, step: float) -> np.ndarray:
+    """At the nearest step, one at least where there is anything."""
+    if not step:
+        return x.astype(np.float32)
+    return np.where(x > 0, np.rint(x.astype(np.float64) / step).clip(1) * step, 0).astype(np.float32)
+
+
+def _moments(depth: np.ndarray, sigma: np.ndarray, image: np.ndarray) -> np.ndarray:
+    known = depth.reshape(-1, 1) > 0
+    each = [Moments.of(x.reshape(-1, 1), known) for x in (depth, sigma)]
+    each.append(Moments.of(image.reshape(-1, 3) / 255))
+    return np.concatenate([np.stack(moments) for moments in each], 1)
+
+
+def _size(hw: Sequence[int]) -> str:
+    return f"{hw[0]}x{hw[1]}"

@@ -1,0 +1,172 @@
+"""Where the rows of a new data set come from: a LeRobot data set's own tables and videos, or a recording's frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dhtorch.data import files
+from dhtorch.data.files import FormatError, need
+from dhtorch.data.lerobot_meta import Episode, Episodes, Meta, read_episodes, read_meta
+from dhtorch.data.recording import Recording
+from dhtorch.export import lerobot as out
+
+#: Rows that are held together.
+GROUP_ROWS = 32
+
+#: Files of ``meta/`` that are written anew.
+_META = ("info.json", "stats.json", "tasks.parquet", "tasks.jsonl", "episodes.jsonl", "episodes_stats.jsonl",
+         "intrinsics.json")  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class RobotSet:
+    """A LeRobot data set: what it holds beside the depth that is to be added."""
+
+    meta: Meta
+    info: dict[str, Any]
+    episodes: Episodes
+    tasks: tuple[str, ...]
+
+    @classmethod
+    def open(cls, root: Path, numbers: Sequence[int]) -> RobotSet:
+        """The set at ``root`` with those of its episodes.
+
+        Raises:
+            FormatError: damaged metadata.
+        """
+        meta = read_meta(root)
+        info = files.read_json(root / "meta" / "info.json")
+        return cls(meta, info, read_episodes(meta, numbers), tuple(_tasks(meta)))
+
+    @property
+    def features(self) -> dict[str, out.Feature]:
+        """Of its columns and videos, as its info has them, without videos that no episode has."""
+        last = range(len(self.episodes))
+        gone = {k for k in self.meta.videos if not any(self.episodes[i].videos[k][0].is_file() for i in last)}
+        return {k: dict(f) for k, f in self.info["features"].items() if k not in gone}
+
+    def clips(self, i: int, length: int) -> dict[str, tuple[Path, out.Clip]]:
+        """Video key → its file and place, of episode ``i`` of those that were opened.
+
+        Raises:
+            FormatError: a missing file.
+        """
+        episode, found = self.episodes[i], {}
+        for key in (k for k, f in self.features.items() if f["dtype"] == "video"):
+            file, start = episode.videos[key]
+            if not file.is_file():
+                raise FormatError(file, key, "no such file", f"the video of episode {episode.number}")
+            chunk, number = divmod(episode.number, out.CHUNK)
+            if self.meta.version == 3:
+                places = (self.episodes.columns[f"videos/{key}/{name}"][i] for name in ("chunk_index", "file_index"))
+                chunk, number = map(int, places)
+            found[key] = file, out.Clip(chunk, number, float(start), float(start) + length / self.meta.fps)
+        return found
+
+    def batches(self, i: int) -> Iterator[Any]:
+        """The rows of an episode in their order, few at a time; ``frame_index`` and what else is missing is added."""
+        pyarrow, dataset = need("pyarrow", extra="scale"), need("pyarrow.dataset", extra="scale")
+        episode = self.episodes[i]
+        table = dataset.dataset(str(episode.data), format="parquet")
+        own = "episode_index" in table.schema.names
+        rows = dataset.field("episode_index") == episode.number if own else None
+        scan = table.scanner(filter=rows, batch_size=GROUP_ROWS, use_threads=False, batch_readahead=1)
+        done, first = 0, 0.0
+        for batch in scan.to_batches():
+            if not batch.num_rows:
+                continue
+            part = pyarrow.Table.from_batches([batch])
+            if "frame_index" not in part.column_names:
+                first = part.column("timestamp")[0].as_py() if not done else first
+                part = _numbered(part, done, first)
+            yield _completed(part, episode, done)
+            done += batch.num_rows
+
+    def words(self, i: int) -> list[str] | None:
+        """The tasks that ``meta/`` notes for an episode; None = none noted."""
+        number = int(self.episodes.numbers[i])
+        return _episode_tasks(self.meta).get(number)
+
+    @property
+    def more(self) -> dict[str, Path]:
+        """Other files of the set: relative name → file."""
+        root = self.meta.root
+        found = [*(p for p in root.iterdir() if p.is_file()), *(root / "meta").iterdir()]
+        return {str(p.relative_to(root)): p for p in sorted(found) if p.is_file() and p.name not in _META}
+
+
+def _numbered(part: Any, done: int, first: float) -> Any:
+    """Rows without ``frame_index``, numbered in their order; times that begin elsewhere begin at 0."""
+    pyarrow = need("pyarrow", extra="scale")
+    stamp = part.column("timestamp").to_numpy()
+    part = part.append_column("frame_index", pyarrow.array(done + np.arange(len(stamp))))
+    if not first:
+        return part
+    place = part.column_names.index("timestamp")
+    part = part.append_column("source.timestamp", part.column("timestamp"))
+    return part.set_column(place, "timestamp", pyarrow.array((stamp - first).astype(stamp.dtype)))
+
+
+def _completed(part: Any, episode: Episode, done: int) -> Any:
+    """Rows with every column that LeRobot's loader asks for."""
+    pyarrow = need("pyarrow", extra="scale")
+    n = part.num_rows
+    missing = {"episode_index": np.full(n, episode.number), "index": done + np.arange(n), "task_index": np.zeros(n)}
+    for name, values in missing.items():
+        if name not in part.column_names:
+            part = part.append_column(name, pyarrow.array(values.astype(np.int64)))
+    return part
+
+
+def _tasks(meta: Meta) -> list[str]:
+    """Texts by ``task_index``; one that is not there is empty."""
+    lines, table = meta.root / "meta" / "tasks.jsonl", meta.root / "meta" / "tasks.parquet"
+    found: dict[int, str] = {}
+    if lines.is_file():
+        for text in files.read_text(lines).splitlines():
+            row = files.decode_json(text, lines) if text.strip() else None
+            if row is not None:
+                found[files.get(row, "task_index", int, lines)] = files.get(row, "task", str, lines)
+    elif table.is_file():
+        read = need("pyarrow.parquet", extra="scale").read_table(table)
+        names = [name for name in read.column_names if name != "task_index"]
+        if "task_index" not in read.column_names or not names:
+            raise FormatError(table, "columns", ", ".join(read.column_names), "task_index and task")
+        texts = read.column("task" if "task" in names else names[-1]).to_pylist()
+        found = dict(zip(read.column("task_index").to_pylist(), map(str, texts), strict=True))
+    if any(k is None or not 0 <= k < 10**6 for k in found):
+        raise FormatError(lines if lines.is_file() else table, "task_index", sorted(found, key=str)[0], "a count")
+    return [found.get(k, "") for k in range(max(found, default=0) + 1)]
+
+
+def _episode_tasks(meta: Meta) -> dict[int, list[str]]:
+    lines, found = meta.root / "meta" / "episodes.jsonl", {}
+    if meta.version == 2:
+        for text in files.read_text(lines).splitlines():
+            row = files.decode_json(text, lines) if text.strip() else {}
+            if isinstance(row.get("tasks"), list):
+                found[row["episode_index"]] = [str(task) for task in row["tasks"]]
+        return found
+    parquet = need("pyarrow.parquet", extra="scale")
+    for table in sorted((meta.root / "meta" / "episodes").glob("*/*.parquet")):
+        if "tasks" in parquet.read_schema(table).names:
+            read = parquet.read_table(table, columns=["episode_index", "tasks"])
+            rows = zip(read.column("episode_index").to_pylist(), read.column("tasks").to_pylist(), strict=True)
+            found |= {number: list(tasks) for number, tasks in rows if isinstance(tasks, list)}
+    return found
+
+
+def rate(recording: Recording) -> float:
+    """Frames a second: nominal, else by the median step between time stamps, else 30."""
+    if recording.rate_hz is not None:
+        return recording.rate_hz
+    if recording.times is None or len(recording) < 2:
+        return 30.0
+    steps = recording.times.diff() / recording.number.diff()
+    step = float(steps.median())
+    return round(1 / step, 3) if step > 0 else 30.0

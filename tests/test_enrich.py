@@ -1,0 +1,200 @@
+"""dhtorch enrich: what the source had is there value for value, depth stands beside it, whatever interrupts it."""
+
+import io
+import itertools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("pyarrow")
+pytest.importorskip("av")
+
+from PIL import Image
+from pyarrow import parquet
+
+from dhtorch import data, storage
+from dhtorch import testing as writers
+from dhtorch.commands.run import main
+from dhtorch.extract import shards
+from dhtorch.extract.targets import RobotTarget
+from dhtorch.synthetic.recording import SyntheticRoom
+
+HW, LENGTHS, NEAR = (48, 64), (4, 3), 2.5
+CAMERA = "observation.images.front"
+DEPTH = f"{CAMERA}_depth_enriched"  # the source has a depth of its own
+STEP = 2.0**-10
+ASKED = ["method=paper", "method.n=64", "method.hypotheses=10", "gap=2", "dense={size: 64, planes: 8}", "shard_rows=2"]
+
+
+@pytest.fixture(scope="module")
+def shots():
+    """Frames of the synthetic room, whose sensor sees no farther than NEAR."""
+    room = SyntheticRoom(hw=HW, n_frames=sum(LENGTHS), lidar="exact", supersample=1)
+    frames = [room[i] for i in range(len(room))]
+    return [frame.replace(depth=torch.where(frame.depth <= NEAR, frame.depth, 0.0)) for frame in frames]
+
+
+def robot_set(root, shots, version):
+    root.mkdir(parents=True)
+    starts = np.cumsum((0, *LENGTHS))
+    episodes = [shots[a:b] for a, b in itertools.pairwise(starts)]
+    writers.write_lerobot(root, episodes, version=version, depth="tiff")
+    return root
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory, shots):
+    return robot_set(tmp_path_factory.mktemp("robot") / "set", shots, 3)
+
+
+@pytest.fixture(scope="module")
+def enriched(tmp_path_factory, robot):
+    """The robot's set, enriched."""
+    out = tmp_path_factory.mktemp("enriched") / "set"
+    assert main(["enrich", str(robot), str(out), *ASKED]) == 0
+    return out
+
+
+def tree(root):
+    return {str(p.relative_to(root)): p.read_bytes() for p in sorted(Path(root).rglob("*")) if p.is_file()}
+
+
+def rows(root):
+    tables = sorted((Path(root) / "data").rglob("*.parquet"))
+    return [row for table in tables for row in parquet.read_table(table).to_pylist()]
+
+
+def map_of(row, key):
+    return np.array(Image.open(io.BytesIO(row[key]["bytes"])))
+
+
+def test_what_the_source_had_is_there_value_for_value(robot, enriched):
+    for before, after in zip(rows(robot), rows(enriched), strict=True):
+        assert {k: after[k] for k in before} == before
+    videos = {k: v for k, v in tree(robot).items() if k.startswith("videos/")}
+    assert videos and videos.items() <= tree(enriched).items()
+    before, after = (json.loads((r / "meta" / "info.json").read_text())["features"] for r in (robot, enriched))
+    assert {k: after[k] for k in before} == before
+
+
+def test_depth_is_in_steps_and_the_sensor_is_within_half_of_one(enriched, shots):
+    for row, frame in zip(rows(enriched), shots, strict=True):
+        depth, sigma, source = (map_of(row, k) for k in (DEPTH, f"{DEPTH}_sigma", f"{CAMERA}_dhtorch_source"))
+        assert depth.dtype == np.float32 and np.array_equal(np.round(depth / STEP) * STEP, depth)
+        assert np.array_equal(depth > 0, source > 0) and np.array_equal(sigma > 0, source > 0)
+        sensor = source == 1
+        assert sensor.any()
+        assert np.abs(depth - frame.depth[0].numpy())[sensor].max() <= STEP / 2 + 1e-6
+
+
+def test_statistics_are_of_what_is_known(enriched):
+    stats = json.loads((enriched / "meta" / "stats.json").read_text())
+    known = np.concatenate([m[m > 0] for m in (map_of(row, DEPTH) for row in rows(enriched))]).astype(np.float64)
+    found = stats[DEPTH]
+    want = {"min": known.min(), "max": known.max(), "mean": known.mean(), "std": known.std()}
+    assert {k: np.shape(found[k]) for k in want} == dict.fromkeys(want, (1, 1, 1))
+    for name, value in want.items():
+        assert np.ravel(found[name])[0] == pytest.approx(value, rel=1e-6)
+    assert np.shape(stats[CAMERA]["mean"]) == (3, 1, 1) and found["count"] == [sum(LENGTHS)]
+
+
+def test_it_reads_back_as_a_recording(enriched, shots):
+    again = data.open_all(enriched, depth=DEPTH)
+    assert [len(each) for each in again] == list(LENGTHS)
+    frame = again[0][0]
+    assert torch.allclose(frame.camera.f, shots[0].camera.f)
+    near = shots[0].depth > 0
+    assert (frame.depth - shots[0].depth)[near].abs().median() <= STEP
+
+
+@pytest.mark.parametrize("place", ["shard", "table", "meta"])
+def test_interrupted_anywhere_the_same_command_gives_the_same_bytes(
+    place, robot, enriched, tmp_path, monkeypatch, capsys
+):
+    calls = itertools.count()
+
+    def stops(function, after):
+        def called(*args, **options):
+            if next(calls) == after:
+                raise KeyboardInterrupt
+            return function(*args, **options)
+
+        return called
+
+    target, name, after = {
+        "shard": (shards, "write", 2),
+        "table": (RobotTarget, "_copy_videos", 1),
+        "meta": (storage, "write_json", 2),
+    }[place]
+    out = tmp_path / "set"
+    with monkeypatch.context() as patch:
+        patch.setattr(target, name, stops(getattr(target, name), after))
+        assert main(["enrich", str(robot), str(out), *ASKED]) == 130
+    assert not (out / "meta" / "info.json").exists()
+    assert "the same command does the rest" in capsys.readouterr().err
+    assert main(["enrich", str(robot), str(out), *ASKED]) == 0
+    assert tree(out) == tree(enriched)
+
+
+def test_other_options_and_other_folders_are_refused(robot, enriched, tmp_path, capsys):
+    assert main(["enrich", str(robot), str(enriched), *ASKED, "step=0"]) == 2
+    assert "step 0.0009765625 there, 0 here" in capsys.readouterr().err
+    assert main(["enrich", str(robot), str(robot / "new"), *ASKED]) == 2
+    assert "only read" in capsys.readouterr().err and not (robot / "new").exists()
+    (tmp_path / "note.txt").write_text("mine")
+    assert main(["enrich", str(robot), str(tmp_path), *ASKED]) == 2
+    assert "something else" in capsys.readouterr().err and [p.name for p in tmp_path.iterdir()] == ["note.txt"]
+
+
+def test_an_older_set_becomes_one_of_today_and_its_numbers_stay_beside(shots, tmp_path):
+    source = robot_set(tmp_path / "old", shots, 2)
+    out = tmp_path / "new"
+    assert main(["enrich", str(source), str(out), *ASKED, "data=lerobot", "data.episode=1"]) == 0
+    found = rows(out)
+    assert [row["episode_index"] for row in found] == [0] * LENGTHS[1]
+    assert [row["index"] for row in found] == list(range(LENGTHS[1]))
+    assert [row["source.episode_index"] for row in found] == [1] * LENGTHS[1]
+    assert json.loads((out / "meta" / "info.json").read_text())["codebase_version"] == "v3.0"
+    copied = out / "videos" / CAMERA / "chunk-000" / "file-000.mp4"
+    assert copied.read_bytes() == (source / "videos" / "chunk-000" / CAMERA / "episode_000001.mp4").read_bytes()
+
+
+def test_a_recording_becomes_a_set_and_a_nerfstudio_folder(tmp_path, capsys):
+    folder = tmp_path / "room"
+    assert main(["enrich", "out=" + str(folder), "data=synthetic", "data.hw=[48,64]", "data.n_frames=3", *ASKED]) == 0
+    found = rows(folder)
+    assert [row["frame_index"] for row in found] == [0, 1, 2]
+    assert np.array(Image.open(io.BytesIO(found[0]["observation.images.camera"]["bytes"]))).shape == (*HW, 3)
+    nerf = tmp_path / "nerf"
+    more = ["data=synthetic", "data.hw=[48,64]", "data.n_frames=3", "format=nerfstudio"]
+    assert main(["enrich", "out=" + str(nerf), *more, *ASKED]) == 0
+    about = json.loads((nerf / "transforms.json").read_text())
+    assert [frame["file_path"] for frame in about["frames"]] == [f"images/frame_{i:06d}.png" for i in range(3)]
+    depth = np.array(Image.open(nerf / about["frames"][1]["depth_file_path"])) * about["depth_unit_scale_factor"]
+    column = map_of(found[1], "observation.images.camera_depth")
+    assert np.abs(depth - column).max() <= 1e-3
+    pose = np.array(found[1]["observation.camera.T_world_from_cam"]).reshape(4, 4)
+    assert np.allclose(np.array(about["frames"][1]["transform_matrix"]) @ np.diag([1, -1, -1, 1]), pose)
+    assert main(["enrich", "out=" + str(tmp_path / "x"), "data=synthetic", "format=same", *ASKED]) == 2
+    assert "no writer" in capsys.readouterr().err
+
+
+def test_a_table_without_frame_index_counts_its_rows(shots, tmp_path):
+    """As GR00T's sets: the first row bears a time that the video does not know."""
+    source = robot_set(tmp_path / "set", shots, 2)
+    for table in (source / "data").rglob("*.parquet"):
+        read = parquet.read_table(table).drop_columns(["frame_index"])
+        stamps = np.asarray(read.column("timestamp")) + np.float32(0.05)
+        place = read.column_names.index("timestamp")
+        parquet.write_table(read.set_column(place, "timestamp", [stamps]), table)
+    recording = data.open_all(source)[0]
+    assert recording.number.tolist() == list(range(LENGTHS[0])) and float(recording.times[0]) == 0
+    assert recording[2].hw == HW  # its video frame is found
+    assert any("no frame_index" in line for line in recording.report)
+    out = tmp_path / "new"
+    assert main(["enrich", str(source), str(out), *ASKED]) == 0
+    found = rows(out)
+    assert found[0]["timestamp"] == 0 and found[0]["source.timestamp"] == pytest.approx(0.05)
