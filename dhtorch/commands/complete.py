@@ -126,9 +126,9 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         if folder in found:
             raise ValueError(f"data: found two scenes named {scene.name}, expected one (data.camera=KEY, or one root)")
         if scene.root not in digests:
-            digests[scene.root] = _digest(scene, settings, out)
-        task = _task(scene, folder, parts["method"], settings, digests[scene.root])
-        _take_up(task)
+            digests[scene.root] = digest_of(scene, settings, out)
+        task = task_of(scene, folder, parts["method"], settings, digests[scene.root])
+        take_up(task)
         before = sum(task.name(i) in task.done for i in task.frames)
         _make(task, progress)
         found[folder] = _said(task, before)
@@ -136,7 +136,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     return 0
 
 
-def _task(scene: Scene, folder: Path, method: Method, settings: Mapping[str, Any], digest: str) -> Task:
+def task_of(scene: Scene, folder: Path, method: Method, settings: Mapping[str, Any], digest: str) -> Task:
     """What is wanted of a scene, and what is there already."""
     frames = range(0, len(scene.recording), settings["every"])[: settings["most"]]
     hw = scene.recording[0].hw
@@ -184,7 +184,7 @@ def _shared(scene: Scene, layout: Layout, settings: Mapping[str, Any], digest: s
     return found
 
 
-def _digest(scene: Scene, settings: Mapping[str, Any], out: Path) -> str:
+def digest_of(scene: Scene, settings: Mapping[str, Any], out: Path) -> str:
     """Of all data files; what is written here may lie beside them."""
     files = {**archive.files_below([scene.root]), **archive.files_named({k: settings[k] for k in ("data", "method")})}
     place = out.resolve()
@@ -194,7 +194,7 @@ def _digest(scene: Scene, settings: Mapping[str, Any], out: Path) -> str:
 # ------------------------------------------------------------------------------------------------------ what is there
 
 
-def _take_up(task: Task) -> None:
+def take_up(task: Task) -> None:
     """Note the frames of a folder that are whole; what a killed run left of others is removed.
 
     Raises:
@@ -217,14 +217,14 @@ def _take_up(task: Task) -> None:
         raise FileExistsError(f"{about}: found {error}, expected what dhtorch complete writes") from None
     if not same:
         raise FileExistsError(f"{about}: found other frames ({found}), expected these, or another folder for out")
-    task.done.update(_found(task))
+    task.done.update(whole(task))
     for kind in (*task.layout.folders, *EXTRAS):
         for file in (folder / kind).glob("*"):
             if file.stem not in task.done:
                 file.unlink()
 
 
-def _found(task: Task) -> dict[str, Row]:
+def whole(task: Task) -> dict[str, Row]:
     """The frames that are whole, by name."""
     metas = sorted((task.folder / "meta").glob("*.json"))
     return {path.stem: row for path in metas if (row := _row(task, path))}
@@ -249,23 +249,28 @@ def _make(task: Task, progress: Progress) -> None:
     todo = [i for i in task.frames if task.missing(i)]
     try:
         for i in progress(todo, f"{task.scene.name}: frames", len(todo)):
-            if task.name(i) not in task.done:
-                _write(task, i, *_completed(task, i))
-            _write_extras(task, i)
+            make_one(task, i)
     except KeyboardInterrupt:
-        _close(task)
+        close(task)
         n = sum(task.name(i) in task.done for i in task.frames)
         stay = f"{n} of {len(task.frames)} frames in {task.folder} are whole and stay"
         raise KeyboardInterrupt(f"{stay}; the same command does the rest") from None
     except Exception:
-        _close(task)
+        close(task)
         raise
-    _close(task)
+    close(task)
 
 
-def _close(task: Task) -> None:
+def make_one(task: Task, i: int) -> None:
+    """Make what is missing of frame ``i``."""
+    if task.name(i) not in task.done:
+        _write(task, i, *_completed(task, i))
+    _write_extras(task, i)
+
+
+def close(task: Task) -> None:
     """Note what is whole now, and make a recording of it."""
-    task.done.update(_found(task))
+    task.done.update(whole(task))
     known = [i for i in range(len(task.recording)) if task.name(i) in task.done]
     if known:
         task.layout.close(task.folder, task.recording, known, [task.done[task.name(i)] for i in known])
@@ -367,13 +372,8 @@ def _write_extras(task: Task, i: int) -> None:
     wanted = [path for path in task.extras(i) if not path.is_file()]
     if not wanted:
         return
-    name, layout = task.name(i), task.layout
-    maps = {
-        kind: data_files.read_depth_png(layout.file(task.folder, kind, name), 1 / unit)
-        for kind, unit in (("depth", layout.unit), ("sigma", layout.sigma_unit))
-    }
-    source = data_files.read_image(layout.file(task.folder, "source", name))[0]
-    frame = task.recording[i]
+    maps, source = maps_of(task, i)
+    frame, name = task.recording[i], task.name(i)
     picture = _picture(frame, source.shape)
     for path in wanted:
         if path.suffix == ".png":
@@ -382,6 +382,16 @@ def _write_extras(task: Task, i: int) -> None:
             storage.replace_file(path, out.getvalue())
         else:
             _write_points(path, frame, picture, **maps, source=source)
+
+
+def maps_of(task: Task, i: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """``depth`` and ``sigma`` (h, w) in m and the source (h, w) of a whole frame, as its files have them."""
+    layout, name = task.layout, task.name(i)
+    maps = {
+        kind: data_files.read_depth_png(layout.file(task.folder, kind, name), 1 / unit)
+        for kind, unit in (("depth", layout.unit), ("sigma", layout.sigma_unit))
+    }
+    return maps, data_files.read_image(layout.file(task.folder, "source", name))[0]
 
 
 def _write_points(

@@ -115,7 +115,7 @@ def surveys(capture: Found, frames: int = 8) -> Iterator[Survey]:
     try:
         yield from _READ[capture.kind](capture, frames)
     except FormatError as error:
-        if not capture.path.is_dir() or not any(_classified(capture.path)):
+        if not capture.path.is_dir() or not any(classified(capture.path)):
             raise
         (survey,) = _loose(capture, frames)
         survey.warnings.insert(0, f"the {capture.format} reader refuses it: {error}")
@@ -187,7 +187,7 @@ def _stacks(capture: Found, frames: int) -> Iterator[Survey]:
     yield survey_stacks(formats.open_stacks(capture.path, capture.format, follow_links=capture.follow_links), frames)
 
 
-def _classified(folder: Path) -> tuple[list[Path], list[Path]]:
+def classified(folder: Path) -> tuple[list[Path], list[Path]]:
     """Pictures and depth maps (16 bits, one channel) of a folder and of those directly in it."""
     pictures: list[Path] = []
     depths: list[Path] = []
@@ -209,7 +209,7 @@ def _loose(capture: Found, frames: int) -> Iterator[Survey]:
 
 
 def _loose_inside(capture: Found, frames: int) -> Iterator[Survey]:
-    pictures, depths = _classified(capture.path)
+    pictures, depths = classified(capture.path)
     shown: dict[str, dict[str, Tensor]] = {"image": {}, "depth": {}}
     unreadable: list[str] = []
     for kind, sources in (("image", pictures), ("depth", depths)):

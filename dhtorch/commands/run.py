@@ -40,6 +40,7 @@ CONFIGURED = {
     "extract": "dhtorch.extract",
     "integrate": "dhtorch.integrate.mapping",
     "judge": "dhtorch.commands.judge",
+    "recover": "dhtorch.commands.recover",
     "stream": "dhtorch.commands.stream",
     "view": "dhtorch.commands.view",
 }
@@ -49,6 +50,7 @@ FIRST_WORDS = {
     "complete": ("data.root",),
     "enrich": ("data.root", "out"),
     "judge": ("data.root",),
+    "recover": ("path",),
     "stream": ("data.root",),
     "view": ("result",),
 }
@@ -123,11 +125,20 @@ def _run(argv: list[str]) -> int:
         return DONE
     if argv and argv[0] in COMMANDS:
         return int(importlib.import_module(COMMANDS[argv[0]]).main(argv[1:]) or 0)
+    if argv[:1] == ["run"]:
+        argv = argv[1:]
+    elif _is_capture(argv):
+        argv = ["recover", *argv]
     argv = _with_pairs(argv)
     if argv and argv[0] in CONFIGURED:
         return _run_configured(argv[0], argv[1:])
-    words.refuse_words(argv, [*COMMANDS, *CONFIGURED])
+    words.refuse_words(argv, ["run", *COMMANDS, *CONFIGURED])
     return _run_hydra(argv)
+
+
+def _is_capture(argv: Sequence[str]) -> bool:
+    """Whether the first word is a place and no word of the command."""
+    return bool(argv) and argv[0] not in CONFIGURED and argv[0][:1] not in "-~+" and Path(argv[0]).exists()
 
 
 def _with_pairs(argv: list[str]) -> list[str]:

@@ -122,7 +122,7 @@ def make(scene: Scene, method: Method, pairs: Pairs, settings: Mapping[str, Any]
         raise ValueError(f"{recording.name}: found no frame with a finite pose, expected one at least")
     volume, points = _fused(recording, answers, places, settings, progress)
     *_, last = points.values()
-    surface = integrate.mesh(volume, min_weight=settings["min_weight"]) if _meshed(settings["mesh"]) else last
+    surface = integrate.mesh(volume, min_weight=settings["min_weight"]) if meshed(settings["mesh"]) else last
     row: Row = {"scene": recording.name, "pair": None, "method": _name(settings), "truth": settings["poses"]}
     row |= {"role": scene.role, "n_pairs": len(chosen), "n_frames": len(places.poses)}
     row |= {"n_fragments": places.n_fragments, "n_unplaced": places.n_unplaced, "n_recovered": _n_recovered(answers)}
@@ -324,7 +324,8 @@ def _name(settings: Mapping[str, Any]) -> str:
     return str(settings["choices"]["method"])
 
 
-def _meshed(wanted: bool | None) -> bool:
+def meshed(wanted: bool | None) -> bool:
+    """Whether triangles are made: as wanted, else where scikit-image is installed."""
     return importlib.util.find_spec("skimage") is not None if wanted is None else wanted
 
 
@@ -339,7 +340,7 @@ def _check(settings: Mapping[str, Any]) -> None:
     if not isinstance(settings["min_maps"], int) or settings["min_maps"] < 1:
         raise ValueError(f"min_maps: found {settings['min_maps']!r}, expected a whole number of at least 1")
     Sweep.asked(settings["dense"])
-    if settings["mesh"] and not _meshed(None):
+    if settings["mesh"] and not meshed(None):
         raise ImportError("mesh: found no scikit-image, expected the extra: pip install 'dhtorch[mesh]'")
     integrate.points(
         integrate.empty(settings["voxel"] or LEAST_VOXEL, truncation=settings["truncation"]),

@@ -319,11 +319,22 @@ def recovered(answer: PairEstimate, T_world_from_cam: Pose, *, radius: float) ->
 def swept(recording: Recording, answer: PairEstimate, places: Places) -> View:
     """The swept pixels of an anchor's map, with colours from its picture."""
     assert answer.swept is not None
-    frame, hw = recording[answer.pair[0]], answer.swept.hw
-    depth, sigma, score = answer.swept.read()
+    return mapped(recording[answer.pair[0]], *answer.swept.read(), T_world_from_cam=places.poses[answer.pair[0]])
+
+
+def mapped(
+    frame: Frame,
+    depth: Tensor,  # (1, h, w) m, of every pixel of a map over the frame's picture, 0 = none
+    sigma: Tensor,  # (1, h, w) m
+    score: Tensor,  # (1, h, w)
+    *,
+    T_world_from_cam: Pose,
+) -> View:
+    """A map of one frame, with colours from its picture."""
+    hw = depth.shape[-2], depth.shape[-1]
     features = torch.cat((_colour(frame, pixels(frame, hw)[None]), score.view(1, -1, 1)), -1)
     camera = cameras.resize(frame.camera, frame.hw, hw)
-    return View(depth, sigma, features.view(1, *hw, 4), camera, places.poses[answer.pair[0]])
+    return View(depth, sigma, features.view(1, *hw, 4), camera, T_world_from_cam)
 
 
 def _own(recording: Recording, k: int) -> Pose:

@@ -1,0 +1,400 @@
+"""``dhtorch PATH``: a capture of one's own, from its files to completed maps, one map and a page to look at.
+
+Frames are made as ``dhtorch complete`` makes them, coarse to fine until the time is over, so that the first picture is
+there soon and the same command does more. What cannot work is said in one sentence with what would help.
+"""
+
+from __future__ import annotations
+
+import inspect
+import io
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from dhtorch import export, storage
+from dhtorch.codes import Gate, Source, names, words
+from dhtorch.commands import complete
+from dhtorch.commands.complete import Progress, Row, Task
+from dhtorch.commands.inspect import Found, find
+from dhtorch.data import FORMATS, FormatError, files, open_all
+from dhtorch.data.recording import Recording
+from dhtorch.data.scene import Scene
+from dhtorch.drawing import draw_completed
+from dhtorch.integrate.from_maps import FrameMap, join
+from dhtorch.integrate.mapping import meshed, voxel_of
+from dhtorch.viewer import html, points
+
+#: Folder of what is made, where no other is said.
+OUT = Path("dhtorch_out")
+
+#: Frames of which the map is made at most: coarse to fine, they see the same.
+MAPPED = 40
+
+#: Options of ``dhtorch complete`` that are not asked for here.
+OWN = {"format": "auto", "unit": None, "arrays": False, "figures": False, "points": False, "most": None, "every": 1}
+
+
+class NothingToDo(ValueError):
+    """A capture of which nothing can be recovered; the message says why and what would help."""
+
+
+@dataclass
+class Made:
+    """What became of one recording."""
+
+    task: Task
+    frames: list[int]  # whole ones, coarse to fine
+    broken: dict[int, str]  # frames that could not be read
+    left: int  # frames for which there was no time
+
+
+def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:
+    """Make all that the time allows of every recording of a capture; returns the exit code.
+
+    Args:
+        settings: the options of ``conf/recover.yaml``, resolved.
+        parts: ``method``, as an object.
+        progress: wraps a loop: (items, text, number of items) → items.
+
+    Raises:
+        ValueError, OSError: bad options or data, or a capture of which nothing can be recovered.
+        KeyboardInterrupt: Ctrl-C; whole frames stay.
+    """
+    _check(settings)
+    if settings["threads"] is not None:
+        torch.set_num_threads(settings["threads"])
+        files.set_opencv_threads(settings["threads"])
+    path = Path(str(settings["path"])).expanduser()
+    found = captured(path, settings["format"])
+    out = _place(path, settings["out"])
+    recordings = [r for capture in found for r in opened(capture)]
+    chosen = recordings[: settings["recordings"]]
+    refused: list[str] = []
+    began = time.monotonic()
+    for n, recording in enumerate(chosen):
+        minutes = settings["minutes"]
+        until = None if minutes is None else began + 60 * minutes * (n + 1) / len(chosen)
+        folder = out if len(chosen) == 1 else out / recording.name
+        try:
+            said = _one(recording, folder, settings, parts["method"], until, progress)
+        except NothingToDo as nothing:
+            refused.append(str(nothing))
+            continue
+        print("\n".join(said), flush=True)
+    if len(refused) == len(chosen):
+        raise NothingToDo("; ".join(refused[:3]))
+    for line in refused:
+        print(line)
+    if len(chosen) < len(recordings):
+        print(f"{len(chosen)} of {len(recordings)} recordings; recordings=null takes all")
+    return 0
+
+
+# -------------------------------------------------------------------------------------------------------- what is there
+
+
+def captured(path: Path, format: str = "auto") -> list[Found]:
+    """The captures at a path, or up to two folders below, that hold pictures of a moving camera.
+
+    Raises:
+        FormatError: there is no capture.
+        NothingToDo: captures of other kinds.
+    """
+    if format != "auto":
+        return [Found(path, "recording", format, "as told")]
+    found = find(path)
+    recordings = [each for each in found if each.kind == "recording"]
+    if recordings:
+        return recordings
+    if found[0].kind == "stacks":
+        what = f"focal stacks ({found[0].format}) of a still camera"
+        raise NothingToDo(f"{path}: {what}; pictures from two places are needed, and depth of what is near")
+    pictures, depths = classified(found[0].path)
+    if len(depths) == 1:
+        raise NothingToDo(f"{path}: one frame; a second view from another place is needed for what the sensor lacks")
+    if depths:
+        what = f"{len(pictures)} pictures and {len(depths)} depth maps of no known format"
+        raise NothingToDo(f"{path}: {what}; a layout of docs/data.md is needed, as rgb/ beside depth/")
+    what = f"{len(pictures)} pictures without depth"
+    raise NothingToDo(f"{path}: {what}; a sensor's depth of what is near is needed, it gives the metre (docs/data.md)")
+
+
+def opened(capture: Found) -> Sequence[Recording]:
+    """The recordings of a capture.
+
+    Raises:
+        NothingToDo: it has depth and no pictures.
+        FormatError: it cannot be read.
+    """
+    try:
+        return open_all(capture.path, capture.format)
+    except FormatError as error:
+        known = inspect.signature(FORMATS[capture.format].read).parameters
+        if "images" not in known:
+            raise
+        try:
+            open_all(capture.path, capture.format, images=False)
+        except FormatError:
+            raise error from None
+        raise NothingToDo(f"{capture.path}: depth only, nothing to track: it needs the pictures ({error})") from None
+
+
+def coarse_to_fine(n: int) -> list[int]:
+    """0 … n − 1 in an order of which every beginning is spread evenly: the middle first, then that of each half, …"""
+    order, spans = [], [(0, n)]
+    while spans:
+        order += [(a + b) // 2 for a, b in spans if b > a]
+        spans = [half for a, b in spans if b > a for half in ((a, (a + b) // 2), ((a + b) // 2 + 1, b))]
+    return order
+
+
+def _place(path: Path, out: Any) -> Path:
+    """The folder of what is made.
+
+    Raises:
+        ValueError: it lies in the capture.
+    """
+    name = path.resolve().name or "capture"
+    folder = OUT / (path.stem if path.is_file() else name) if out is None else Path(str(out)).expanduser()
+    if path.is_dir() and folder.resolve().is_relative_to(path.resolve()):
+        raise ValueError(
+            f"out: {folder} lies in the capture, which is never written to; expected another place (out=DIR)"
+        )
+    return folder
+
+
+def _refuse(recording: Recording, offers: Mapping[int, Any]) -> None:
+    """Recordings of which nothing can be recovered.
+
+    Raises:
+        NothingToDo: why, and what would help.
+    """
+    name = recording.name
+    if len(recording) < 2 or not offers:
+        raise NothingToDo(f"{name}: one frame; a second view from another place is needed for what the sensor lacks")
+    first = recording[len(recording) // 2]
+    if 0 in first.hw:
+        raise NothingToDo(f"{name}: depth only, nothing to track: it needs its pictures (rgb.mp4, or a folder of them)")
+
+
+# --------------------------------------------------------------------------------------------------------- what is made
+
+
+def _one(
+    recording: Recording,
+    folder: Path,
+    settings: Mapping[str, Any],
+    method: Any,
+    until: float | None,
+    progress: Progress,
+) -> list[str]:
+    """Everything of one recording; what to say of it."""
+    own = {**OWN, **settings, "out": str(folder), "data": {"path": str(settings["path"]), "format": recording.format}}
+    own["choices"] = {**settings["choices"], "data": recording.format}
+    scene = Scene.of(recording)
+    if len(recording) and 0 in recording[0].hw:
+        _refuse(recording, {0: (0,)})
+    task = complete.task_of(scene, folder, method, own, complete.digest_of(scene, own, folder))
+    _refuse(recording, task.offers)
+    order = [i for i in coarse_to_fine(len(recording)) if i in task.offers]
+    task = replace(task, frames=order, offers={i: list(offered) for i, offered in task.offers.items()})
+    complete.take_up(task)
+    made = _make(task, until, progress)
+    if not made.frames:
+        reason = next(iter(made.broken.values()), "no time for a single frame (minutes=)")
+        raise NothingToDo(f"{recording.name}: no frame could be completed: {reason}")
+    rows = [task.done[task.name(i)] for i in made.frames]
+    best = max(zip(rows, made.frames, strict=True), key=lambda each: each[0]["pixels"].get("swept", 0))[1]
+    _overview(task, best)
+    written = ["depth/", "overview.png", *_mapped(made, settings, progress)]
+    return [*_said(made, rows), f"Wrote {', '.join(written)} in {folder}."]
+
+
+def _make(task: Task, until: float | None, progress: Progress) -> Made:
+    """Frames in their order until the time is over; one that cannot be read is left out, and not offered again."""
+    made = Made(task, [], {}, 0)
+    todo = [i for i in task.frames if task.missing(i)]
+    made.frames = [i for i in task.frames if not task.missing(i)]
+    first = not made.frames
+
+    def in_time() -> Iterator[int]:
+        for n, i in enumerate(todo):
+            if until is not None and time.monotonic() > until and made.frames:
+                made.left = len(todo) - n
+                return
+            yield i
+
+    try:
+        for i in progress(in_time(), f"{task.scene.name}: frames", len(todo)):
+            if _tried(made, i) and first:
+                _overview(task, i)
+                first = False
+    except KeyboardInterrupt:
+        complete.close(task)
+        n = len(made.frames)
+        stay = f"{n} of {len(task.frames)} frames in {task.folder} are whole and stay"
+        raise KeyboardInterrupt(f"{stay}; the same command goes on") from None
+    except Exception:
+        complete.close(task)
+        raise
+    complete.close(task)
+    return made
+
+
+def _tried(made: Made, i: int) -> bool:
+    """Make a frame; where a file cannot be read, without the frame that it belongs to."""
+    task = made.task
+    while i not in made.broken:
+        try:
+            complete.make_one(task, i)
+        except FormatError:
+            offered: Any = task.offers.get(i, ())
+            broken = {k: error for k in (i, *offered) if (error := _unreadable(task.recording, k))}
+            if not broken:
+                raise
+            made.broken.update(broken)
+            for others in task.offers.values():
+                others[:] = [k for k in others if k not in broken]  # type: ignore[index]
+        else:
+            made.frames.append(i)
+            task.done[task.name(i)] = storage.loads(
+                task.layout.file(task.folder, "meta", task.name(i)).read_text(encoding="utf-8")
+            )
+            return True
+    return False
+
+
+def _unreadable(recording: Recording, k: int) -> str:
+    try:
+        recording[k]
+    except FormatError as error:
+        return str(error)
+    return ""
+
+
+def _overview(task: Task, i: int) -> None:
+    """The picture that shows most: what the camera saw, the sensor, the completed map."""
+    maps, source = complete.maps_of(task, i)
+    cutoff = task.settings["cutoff"]
+    held = "" if cutoff is None else f", cutoff {cutoff:g} m"
+    out = io.BytesIO()
+    title = f"{task.scene.name} {task.name(i)}{held}"
+    draw_completed(out, task.recording[i].image[0], **maps, source=source, title=title)
+    storage.replace_file(task.folder / "overview.png", out.getvalue())
+
+
+def _mapped(made: Made, settings: Mapping[str, Any], progress: Progress) -> list[str]:
+    """The map of all frames, and the page; the names of what was written."""
+    task = made.task
+    voxel = voxel_of(task.recording) if settings["voxel"] is None else settings["voxel"]
+
+    def read(k: int) -> FrameMap:
+        maps, source = complete.maps_of(task, k)
+        depth, sigma = (torch.from_numpy(np.ascontiguousarray(maps[x])).float() for x in ("depth", "sigma"))
+        return FrameMap(depth, sigma, torch.from_numpy(np.ascontiguousarray(source)))
+
+    frames = made.frames[:MAPPED]
+    surface, up = join(task.recording, frames, read, voxel=voxel, meshed=meshed(settings["mesh"]), progress=progress)
+    if not len(surface.xyz):
+        return []
+    rgb, score = surface.features[:, :3], surface.features[:, 3]
+    codes = ", ".join(f"{code} {words(name)}" for code, name in names(Source).items())
+    world = "world" if task.recording.poses is not None else "camera"
+    said = [
+        f"metres; axes of {task.scene.name}'s {world}",
+        f"up {' '.join(f'{v:.6f}' for v in up)}",
+        f"source: {codes}",
+    ]
+    about = {"sigma": surface.sigma, "score": score, "source": surface.source}
+    ply = task.folder / "map.ply"
+    export.write_ply(ply, surface.xyz, rgb, normal=surface.normal, face=surface.face, comments=said, **about)
+    shape = export.Shape(
+        "map", surface.xyz, rgb, surface.normal, surface.face, values={k: about[k] for k in ("sigma", "source")}
+    )
+    export.write_glb(task.folder / "map.glb", [shape], up=up)
+    html.write(task.folder / "view.html", points.read(ply))
+    return ["map.ply", "map.glb", "view.html"]
+
+
+# ------------------------------------------------------------------------------------------------------ what is said
+
+
+def _said(made: Made, rows: Sequence[Row]) -> list[str]:
+    """What it is, what was recovered, what to do next."""
+    task = made.task
+    recording = task.recording
+    h, w = recording[made.frames[0]].hw
+    kind = f"{task.scene.name}: a {recording.format} capture, {len(recording)} frames of {w}x{h}"
+    share = np.mean([row["pixels"].get("sensor", 0) / sum(row["pixels"].values()) for row in rows])
+    what = f"{kind}; the sensor answers {share:.0%} of the pixels."
+    depth, ratio = _recovered(task, made.frames)
+    n = sum(row["pixels"].get("swept", 0) for row in rows) / len(rows)
+    if len(depth):
+        low, high = np.percentile(depth, (2, 98))
+        found = (
+            f"Recovered {n:,.0f} pixels a frame beyond the sensor, from {low:.1f} m to {high:.1f} m, "
+            f"median stated error {np.median(ratio):.1%} ({len(rows)} frames)."
+        )
+    else:
+        found = f"Nothing was recovered: {_why(rows)}."
+    return [what, found, _next(made)]
+
+
+def _recovered(task: Task, frames: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Depth and sigma / depth of swept pixels, of some frames."""
+    depth, ratio = [np.zeros(0)], [np.zeros(0)]
+    for i in frames[:MAPPED]:
+        maps, source = complete.maps_of(task, i)
+        swept = (source == Source.SWEPT) & (maps["depth"] > 0)
+        depth.append(maps["depth"][swept])
+        ratio.append(maps["sigma"][swept] / maps["depth"][swept])
+    return np.concatenate(depth), np.concatenate(ratio)
+
+
+#: Reason of silence → what would help.
+HELP = {
+    Gate.NO_BASELINE: "the camera only turned; moving it sideways by a tenth of the distance would help",
+    Gate.NO_POSE: "too few returns could be tracked; slower motion, more light and texture would help",
+    Gate.NO_TRACK: "what has no return could not be found in other views; texture and a view from the side would help",
+    Gate.UNCERTAIN: "the views lie too close together for what is far; moving sideways would help",
+    Gate.CONTRADICTED: "what the sensor sees moves, or contradicts the pictures; a still scene would help",
+}
+
+
+def _why(rows: Sequence[Row]) -> str:
+    """Why frames are silent, by the reason that most silent pixels have."""
+    silent: dict[str, float] = {}
+    for row in rows:
+        for name, share in row["silent"].items():
+            silent[name] = silent.get(name, 0.0) + share
+    known = {name.lower(): text for code, name in names(Gate).items() if (text := HELP.get(code))}
+    some = {name: share for name, share in silent.items() if name in known and share > 0.01 * len(rows)}
+    if not some:
+        return "nothing lies beyond the sensor, which answers nearly everywhere; cutoff=2.0 shows what views can do"
+    return known[max(some, key=lambda name: some[name])]
+
+
+def _next(made: Made) -> str:
+    n, name = len(made.broken), made.task.scene.name
+    broken = f" {n} frames of {name} could not be read ({next(iter(made.broken.values()))})." if n else ""
+    if made.left:
+        more = f"the same command does more of the {made.left} frames left (minutes=null: all)"
+        return f"Next: open view.html; {more}.{broken}"
+    judged = "dhtorch data=auto data.root=PATH holdout.cutoff=2.0"
+    return f"Next: open view.html; {judged} says how good it is on yours.{broken}"
+
+
+def _check(settings: Mapping[str, Any]) -> None:
+    for name in ("minutes", "voxel"):
+        value = settings[name]
+        if value is not None and (isinstance(value, bool) or not isinstance(value, int | float) or not value > 0):
+            raise ValueError(f"{name}: found {value!r}, expected a number above 0, or null")
+    value = settings["recordings"]
+    if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
+        raise ValueError(f"recordings: found {value!r}, expected a whole number of at least 1, or null")
