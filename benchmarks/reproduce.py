@@ -80,6 +80,7 @@ SCRIPTS |= {
     "kornia": "--clock cpu",
     "xfeat_noise": "",
     "sweep": "",
+    "captures": "",
 }
 
 #: Scripts of another name than their result: ``kornia.py`` would be imported instead of the library.

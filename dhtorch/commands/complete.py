@@ -136,10 +136,12 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     return 0
 
 
-def task_of(scene: Scene, folder: Path, method: Method, settings: Mapping[str, Any], digest: str) -> Task:
-    """What is wanted of a scene, and what is there already."""
+def task_of(
+    scene: Scene, folder: Path, method: Method, settings: Mapping[str, Any], digest: str, *, sized_as: int = 0
+) -> Task:
+    """What is wanted of a scene, whose pictures are as large as that of frame ``sized_as``."""
     frames = range(0, len(scene.recording), settings["every"])[: settings["most"]]
-    hw = scene.recording[0].hw
+    hw = scene.recording[sized_as].hw
     if 0 in hw:
         raise ValueError(f"{scene.name}: found frames without pictures, expected pictures (data.images=true)")
     same = dense.map_hw(hw, settings["size"]) == hw

@@ -21,7 +21,7 @@ from dhtorch import export, storage
 from dhtorch.codes import Gate, Source, names, words
 from dhtorch.commands import complete
 from dhtorch.commands.complete import Progress, Row, Task
-from dhtorch.commands.inspect import Found, find
+from dhtorch.commands.inspect import Found, classified, find
 from dhtorch.data import FORMATS, FormatError, files, open_all
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
@@ -35,6 +35,9 @@ OUT = Path("dhtorch_out")
 
 #: Frames of which the map is made at most: coarse to fine, they see the same.
 MAPPED = 40
+
+#: Frames that are looked at before a recording is given up.
+TRIED = 8
 
 #: Options of ``dhtorch complete`` that are not asked for here.
 OWN = {"format": "auto", "unit": None, "arrays": False, "figures": False, "points": False, "most": None, "every": 1}
@@ -121,7 +124,7 @@ def captured(path: Path, format: str = "auto") -> list[Found]:
     if depths:
         what = f"{len(pictures)} pictures and {len(depths)} depth maps of no known format"
         raise NothingToDo(f"{path}: {what}; a layout of docs/data.md is needed, as rgb/ beside depth/")
-    what = f"{len(pictures)} pictures without depth"
+    what = f"{_count(len(pictures), 'picture')} without depth"
     raise NothingToDo(f"{path}: {what}; a sensor's depth of what is near is needed, it gives the metre (docs/data.md)")
 
 
@@ -169,18 +172,28 @@ def _place(path: Path, out: Any) -> Path:
     return folder
 
 
-def _refuse(recording: Recording, offers: Mapping[int, Any]) -> None:
-    """Recordings of which nothing can be recovered.
+def _looked_at(recording: Recording) -> int:
+    """A frame that can be read, of a recording of which something may be recovered.
 
     Raises:
-        NothingToDo: why, and what would help.
+        NothingToDo: why nothing can, and what would help.
     """
-    name = recording.name
-    if len(recording) < 2 or not offers:
-        raise NothingToDo(f"{name}: one frame; a second view from another place is needed for what the sensor lacks")
-    first = recording[len(recording) // 2]
-    if 0 in first.hw:
-        raise NothingToDo(f"{name}: depth only, nothing to track: it needs its pictures (rgb.mp4, or a folder of them)")
+    if len(recording) < 2:
+        help = "a second view from another place is needed for what the sensor lacks"
+        raise NothingToDo(f"{recording.name}: {_count(len(recording), 'frame')}; {help}")
+    order = coarse_to_fine(len(recording))[:TRIED]
+    causes = {k: _unreadable(recording, k) for k in order}
+    readable = [k for k, cause in causes.items() if not cause]
+    if not readable:
+        raise NothingToDo(f"{recording.name}: no frame can be read: {causes[order[0]]}")
+    if 0 in recording[readable[0]].hw:
+        what = "depth only, nothing to track: it needs its pictures (rgb.mp4, or a folder of them)"
+        raise NothingToDo(f"{recording.name}: {what}")
+    return readable[0]
+
+
+def _count(n: int, word: str) -> str:
+    return f"{n} {word}{'s' * (n != 1)}"
 
 
 # --------------------------------------------------------------------------------------------------------- what is made
@@ -198,10 +211,8 @@ def _one(
     own = {**OWN, **settings, "out": str(folder), "data": {"path": str(settings["path"]), "format": recording.format}}
     own["choices"] = {**settings["choices"], "data": recording.format}
     scene = Scene.of(recording)
-    if len(recording) and 0 in recording[0].hw:
-        _refuse(recording, {0: (0,)})
-    task = complete.task_of(scene, folder, method, own, complete.digest_of(scene, own, folder))
-    _refuse(recording, task.offers)
+    first = _looked_at(recording)
+    task = complete.task_of(scene, folder, method, own, complete.digest_of(scene, own, folder), sized_as=first)
     order = [i for i in coarse_to_fine(len(recording)) if i in task.offers]
     task = replace(task, frames=order, offers={i: list(offered) for i, offered in task.offers.items()})
     complete.take_up(task)
@@ -292,7 +303,7 @@ def _overview(task: Task, i: int) -> None:
 def _mapped(made: Made, settings: Mapping[str, Any], progress: Progress) -> list[str]:
     """The map of all frames, and the page; the names of what was written."""
     task = made.task
-    voxel = voxel_of(task.recording) if settings["voxel"] is None else settings["voxel"]
+    voxel = voxel_of(task.recording, made.frames) if settings["voxel"] is None else settings["voxel"]
 
     def read(k: int) -> FrameMap:
         maps, source = complete.maps_of(task, k)
@@ -338,7 +349,7 @@ def _said(made: Made, rows: Sequence[Row]) -> list[str]:
     if len(depth):
         low, high = np.percentile(depth, (2, 98))
         found = (
-            f"Recovered {n:,.0f} pixels a frame beyond the sensor, from {low:.1f} m to {high:.1f} m, "
+            f"Recovered {n:,.0f} pixels a frame that the sensor lacks, from {low:.1f} m to {high:.1f} m, "
             f"median stated error {np.median(ratio):.1%} ({len(rows)} frames)."
         )
     else:
@@ -382,12 +393,20 @@ def _why(rows: Sequence[Row]) -> str:
 
 def _next(made: Made) -> str:
     n, name = len(made.broken), made.task.scene.name
-    broken = f" {n} frames of {name} could not be read ({next(iter(made.broken.values()))})." if n else ""
+    cause = next(iter(made.broken.values()), "")
+    broken = f" {_count(n, 'frame')} of {name} could not be read ({cause})." if n else ""
     if made.left:
         more = f"the same command does more of the {made.left} frames left (minutes=null: all)"
         return f"Next: open view.html; {more}.{broken}"
-    judged = "dhtorch data=auto data.root=PATH holdout.cutoff=2.0"
+    judged = f"dhtorch run data=auto data.root={made.task.settings['path']} holdout.cutoff={_middle(made):.2g}"
     return f"Next: open view.html; {judged} says how good it is on yours.{broken}"
+
+
+def _middle(made: Made) -> float:
+    """Median depth of the returns of the first frame, m: what is hidden beyond it tells how good the rest is."""
+    maps, source = complete.maps_of(made.task, made.frames[0])
+    near = maps["depth"][(source == Source.SENSOR) & (maps["depth"] > 0)]
+    return float(np.median(near)) if len(near) else 2.0
 
 
 def _check(settings: Mapping[str, Any]) -> None:

@@ -133,10 +133,14 @@ def make(scene: Scene, method: Method, pairs: Pairs, settings: Mapping[str, Any]
     return MappedScene(recording, answers, places, volume, surface, row)
 
 
-def voxel_of(recording: Recording) -> float:
-    """Edge of a voxel, m: twice the size of a depth pixel at the median return, from 5 mm to 20 cm, to two digits."""
+def voxel_of(recording: Recording, frames: Sequence[int] | None = None) -> float:
+    """Edge of a voxel, m: twice the size of a depth pixel at the median return, from 5 mm to 20 cm, to two digits.
+
+    Told by three ``frames``, None = of all.
+    """
     sizes = []
-    for k in sorted({0, len(recording) // 2, len(recording) - 1}):
+    frames = range(len(recording)) if frames is None else sorted(frames)
+    for k in sorted({frames[0], frames[len(frames) // 2], frames[-1]}):
         frame: Frame = recording[k]
         depth = frame.depth[frame.depth.isfinite() & (frame.depth > 0)]
         if depth.numel():

@@ -1,0 +1,60 @@
+"""``dhtorch PATH`` on every capture below DHTORCH_DATA: how long it took, and what came of it or why nothing did.
+
+    python benchmarks/captures.py --json benchmarks/results/captures.json
+
+As a user has it: a process each, the settings as they are but for where the files go. ``first_s`` is when the first
+picture lay there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from dhtorch import archive, storage
+
+#: Sentences that say what was made, and what to do next, not what was recovered.
+ASIDE = ("Wrote ", "Next: ")
+
+
+def row(path: Path, folder: Path) -> dict[str, Any]:
+    """What the command makes of one capture."""
+    out, began, first = folder / path.name, time.perf_counter(), None
+    words = [sys.executable, "-m", "dhtorch", str(path), f"out={out}"]
+    with subprocess.Popen(words, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        while process.poll() is None:
+            if first is None and (any(out.glob("overview.png")) or any(out.glob("*/overview.png"))):
+                first = time.perf_counter() - began
+            time.sleep(0.2)
+        said, wrong = process.communicate()
+    lines = [line for line in said.splitlines() if not line.startswith(ASIDE)]
+    found: dict[str, Any] = {"name": path.name, "seconds": time.perf_counter() - began, "first_s": first}
+    found |= {"rc": process.returncode}
+    if process.returncode == 0:
+        return found | {"said": " ".join(lines)}
+    return found | {"why": wrong.strip().removeprefix("dhtorch: ").replace(f"{path.parent}{os.sep}", "")}
+
+
+def main() -> int:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, required=True)
+    options = parser.parse_args()
+    data = Path(os.environ["DHTORCH_DATA"])
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for path in sorted(p for p in data.iterdir() if p.is_dir()):
+            rows.append(row(path, Path(folder)) | {"processor": archive.processor(), "cores": os.cpu_count()})
+            print(rows[-1], flush=True)
+            options.json.write_text(storage.dumps(storage.strict(rows), indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
