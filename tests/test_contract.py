@@ -487,12 +487,13 @@ ELSEWHERE = {
     "dhtorch.integrate.sweeps.edges",
     *(f"dhtorch.integrate.surface.{name}" for name in ("points", "mesh")),
     "dhtorch.integrate.picture.draw_map",
-    *(f"dhtorch.integrate.mapping.{name}" for name in ("make", "run", "voxel_of", "write")),
+    "dhtorch.integrate.from_maps.join",
+    *(f"dhtorch.integrate.mapping.{name}" for name in ("make", "run", "voxel_of", "meshed", "write")),
     *(f"dhtorch.integrate.level.{name}" for name in ("upwards", "mean_upwards", "floor")),
     "dhtorch.geometry.se3.turn_between",
     *(
         f"dhtorch.integrate.recording.{name}"
-        for name in ("ask", "place", "chain", "build", "coverage", "sensed", "recovered", "swept")
+        for name in ("ask", "place", "chain", "build", "coverage", "sensed", "recovered", "swept", "mapped")
     ),
     "dhtorch.geometry.filters.gaussian_taps",
     "dhtorch.window.ask_window",

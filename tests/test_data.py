@@ -354,7 +354,7 @@ def test_counted_frames_must_agree(counted: Path) -> None:
     fails(r"depth count: found 2, expected 3", counted)
     for file in (counted / "images").iterdir():
         file.unlink()
-    fails(r"images: frames: found no image", counted)
+    fails(r"images: frames: found no image", counted, "frames_dir")
 
 
 def test_bad_poses(counted: Path) -> None:
@@ -369,12 +369,13 @@ def test_bad_poses(counted: Path) -> None:
         bad[1, column] = float(value)
         np.savetxt(file, bad)
         fails(message, counted)
-    file.write_text("1 2 3\n")
-    fails(r"poses.txt: line 1: found 3 columns, expected 16 numbers", counted)
+    file.write_text("1 2 3\n" * len(rows))
+    fails(r"poses.txt: columns: found 3, expected 16 \(4x4 by rows\) or 7", counted)
     file.write_text(" ".join(["one"] * 16))
     fails(r"poses.txt: line 1: found one one", counted)
     file.unlink()
-    fails(r"poses.txt: file: found no such file", counted, "frames_dir")
+    unplaced = data.open(counted, "frames_dir")
+    assert unplaced.poses is None and "no poses.txt: no poses" in unplaced.report
 
 
 def test_bad_intrinsics(counted: Path) -> None:

@@ -16,7 +16,7 @@ from dhtorch.studies.protocol import Outcome, Settings
 from dhtorch.synthetic import SyntheticRoom
 
 NEAR = 2.0
-METHOD = MAP.replace(n=512)
+METHOD = MAP.replace(n=768)
 SWEEP = {"planes": 32, "partners": 2, "size": 160}
 
 

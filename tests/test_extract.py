@@ -284,7 +284,7 @@ def test_a_corrupt_frame_is_flagged_with_zeros(damaged, command):
         (["data=lerobot", "out=x"], ["data.root"]),
         (["data.n_frames=3"], ["out"]),
         (["out=x", "extract.engine=dask"], ["extract.engine", "dask", "local, ray"]),
-        (["out=x", "extract.tokens_hw=null"], ["extract.tokens_hw", "height and width"]),
+        (["out=x", "extract.tokens_hw=null"], ["extract.tokens_hw", "expected"]),
         (["out=x", "extract.shardrows=4"], ["shardrows"]),
         (["out=file", "data.n_frames=3"], ["file", "expected a folder"]),
         (["out=file/below", "data.n_frames=3"], ["file"]),
@@ -380,7 +380,8 @@ def test_without_a_gap_the_method_chooses_among_earlier_frames(command):
     command(*room, "extract.gap=1", "out=one")
     gap = list(Features("one"))
     assert all(torch.equal(rows[1][k], gap[1][k]) for k in gap[1]), "one earlier frame is asked as a pair"
-    assert rows[5]["dhtorch.pose_ok"] and not gap[5]["dhtorch.pose_ok"], "a wider one is worth more"
+    length = {k: float(found[5]["dhtorch.T_1_from_0"][:3, 3].norm()) for k, found in (("chosen", rows), ("one", gap))}
+    assert rows[5]["dhtorch.pose_ok"] and length["chosen"] > 2 * length["one"], "a wider one is worth more"
 
 
 def test_settings_are_the_defaults():

@@ -497,7 +497,7 @@ def test_a_cluster_that_does_not_answer_is_said(ray, monkeypatch):
         list(engines.on_ray(Counted(), [1], "ray://head:1"))
     assert not ray.log
     monkeypatch.setattr(ray, "init", lambda **_: (_ for _ in ()).throw(ValueError("no node")))
-    with pytest.raises(ConnectionError, match=r"extract\.engine=ray: no node"):
+    with pytest.raises(ConnectionError, match=r"engine=ray: no node"):
         list(engines.on_ray(Counted(), [1], None))
 
 

@@ -431,7 +431,7 @@ class NerfTarget:
     def own(self, k: int) -> Row | None:
         """As :meth:`Target.own`."""
         try:
-            found = [storage.loads(self._file(k, key).read_text())["dhtorch"] for key in self.views]
+            found = [storage.loads(self._file(k, key).read_text(encoding="utf-8"))["dhtorch"] for key in self.views]
         except (OSError, ValueError, KeyError):
             return None
         if any(each["key"] != self.key for each in found):

@@ -40,7 +40,9 @@ def within_reach(
         depth, sigma: of the answers.
 
     Returns:
-        0 where fewer than :data:`FEW` are asked, and for a sensor that is sparse also where it sees.
+        0 where fewer than :data:`FEW` are asked, for a sensor that is sparse also where it sees, and where more returns
+        hold the pose than answers are asked: what moves on its own is then most of what is known, and a sensor that
+        sees far has its holes for other reasons.
 
     Raises:
         ValueError: wrong shapes.
@@ -53,11 +55,13 @@ def within_reach(
     held = held & given
     around = _share_around(uv, given)
     dense = torch.where(given, around, 0).sum(-1) >= DENSE * given.sum(-1).clamp_min(1)
+    few_held = held.sum(-1) <= asked.sum(-1)
     asked = asked & (around == 0)
     close = asked & (depth.detach() + 2 * sigma.detach() < median(sensed.detach(), held))
     n = asked.sum(-1)
     share = close.sum(-1) / n.clamp_min(1).to(depth.dtype)
-    return torch.where(dense & held.any(-1) & (n >= FEW), share, torch.zeros_like(share))
+    told = dense & held.any(-1) & (n >= FEW) & few_held
+    return torch.where(told, share, torch.zeros_like(share))
 
 
 def _share_around(uv: Tensor, given: Tensor) -> Tensor:
