@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from dhtorch.method import Method
     from dhtorch.methods import AUTO, MAP, PAPER, WINDOW, extend
+    from dhtorch.metric import anchor
     from dhtorch.pair import merge
     from dhtorch.records import Camera, Estimate, Frame, Map, Pose, PoseFit, Samples, TrackHint, Tracks
     from dhtorch.stream import Stream
@@ -39,6 +40,7 @@ __all__ = [
     "Stream",
     "TrackHint",
     "Tracks",
+    "anchor",
     "collate",
     "extend",
     "merge",
@@ -47,6 +49,7 @@ __all__ = [
 #: Where a public name lives, if not among the records.
 _HOMES = dict.fromkeys(("AUTO", "MAP", "PAPER", "WINDOW", "extend"), "methods") | {"Method": "method"}
 _HOMES |= {"ExtendDepth": "transform", "Stream": "stream", "collate": "tree", "merge": "pair"}
+_HOMES |= {"anchor": "metric"}
 
 
 def __getattr__(name: str) -> Any:
