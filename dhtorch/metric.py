@@ -46,6 +46,9 @@ LENGTH, RANGE = 0.3, 0.4
 #: Relative error that every map has by itself, from pixel to pixel, and degrees of freedom of Student's t.
 FLOOR, FREEDOM = 0.01, 4.0
 
+#: Share of it that stays where map and anchors agree perfectly.
+LEAST = 0.3
+
 #: Relative error that far answers have beside what they state, each alone and all together: matches that slip, and
 #: motions that their covariance takes for better than they are.
 FAR_ALONE, FAR_SHARED = 0.02, 0.03
@@ -61,6 +64,9 @@ CORRELATED = 0.2
 
 #: Standard errors by which a richer model must beat a simpler one on anchors that it has not seen.
 SURE = 2.0
+
+#: And by what loss at least: an error that all anchors of a kind share is the same in all blocks.
+MARGIN = 0.02
 
 #: Fewest anchors of a fit, and share of a far map's variance that all its pixels share (its motion's).
 FEWEST, SHARED = 8, 0.5
@@ -87,7 +93,7 @@ MODELS: Final = {
     "affine": Model(False, True, True, 0.0, 0.0),
     "scale_field": Model(False, True, False, 0.03, 0.01),
     "affine_field": Model(False, True, True, 0.03, 0.01),
-    "bent_field": Model(False, True, False, 0.08, 0.05),
+    "bent_field": Model(False, True, False, 0.06, 0.02),
 }
 
 #: Kind → models that make sense of it.
@@ -309,7 +315,7 @@ class _Basis:
             self.of_field / model.field**2 if model.field else tight * torch.eye(len(self.of_field)).to(self.of_field)
         )
         curve = self.of_curve / model.curve**2 if model.curve else tight * torch.eye(KNOTS).to(self.of_curve)
-        free = 1e2 if model.field or model.curve else tight
+        free = 1e4 if model.field or model.curve else tight
         one = torch.ones(1, 1).to(field)
         return torch.block_diag(free * one, field, curve, torch.eye(LEANS).to(field))
 
@@ -399,8 +405,8 @@ def _predicted(fit: Fit, points: Anchors, basis: _Basis, kind: str) -> tuple[Ten
 
 def _of_head(fit: Fit, x: Tensor, y: Tensor) -> Tensor:
     """Variance of log depth by the head's covariance."""
-    C = fit.head_cov[:, :, :, None]
-    return (x.square() * C[:, 0, 0] + 2 * x * C[:, 0, 1] + C[:, 1, 1]) / y.detach().square().clamp_min(1e-6)
+    ss, st, tt = (fit.head_cov[:, i, j].view(-1, *(1,) * (x.dim() - 1)) for i, j in ((0, 0), (0, 1), (1, 1)))
+    return (x.square() * ss + 2 * x * st + tt).clamp_min(0) / y.detach().square().clamp_min(1e-6)
 
 
 def _choose(points: Anchors, basis: _Basis, kind: str) -> tuple[list[Fit], Chosen]:
@@ -428,7 +434,7 @@ def _choose(points: Anchors, basis: _Basis, kind: str) -> tuple[list[Fit], Chose
         n = count.sum(-1).clamp_min(1)
         average = (more * count).sum(-1) / n
         spread = (((more - average[..., None]).square() * count).sum(-1) / n / n).sqrt()
-        good = fine & (average <= SURE * spread + 1e-9)
+        good = fine & (average <= SURE * spread + MARGIN)
         model = good.to(torch.int8).argmax(0)
         own = missed.gather(0, model[None, :, None].expand(1, *missed.shape[1:]))[0]
         own_var = var.gather(0, model[None, :, None].expand(1, *var.shape[1:]))[0]
@@ -554,6 +560,6 @@ def _local(points: Anchors, basis: _Basis, fit: Fit, kind: str, hats: tuple[Tens
     everywhere = median(square, points.used) / 0.455
     prior = 5.0
     held = ((weight * square.clamp_max(100.0)[..., None]).sum(1) + prior * everywhere) / (weight.sum(1) + prior)
-    own = ((weight * (noise - FLOOR**2)[..., None]).sum(1) + prior * 0) / (weight.sum(1) + prior)
-    local = (held - own).clamp_min(FLOOR**2).unflatten(1, NODES)
+    own = ((weight * (noise - FLOOR**2)[..., None]).sum(1)) / (weight.sum(1) + prior)
+    local = (held - own).clamp_min((LEAST * FLOOR) ** 2).unflatten(1, NODES)
     return hats[0] @ local @ hats[1].mT

@@ -9,7 +9,7 @@ import pytest
 import torch
 from contract import PROMISES, NoMasksAsNumbers, Row, equal, leaves, reorder, take, tensor_map
 
-from dhtorch import dense, method, pair, views, window
+from dhtorch import dense, method, metric, pair, views, window
 from dhtorch.evaluate import holdout, probe
 from dhtorch.geometry import (
     affine,
@@ -506,6 +506,7 @@ ELSEWHERE = {
     *(f"dhtorch.geometry.sweep.{name}" for name in ("add_costs", "level", "misfit", "rivals")),
     *(f"dhtorch.dense.{name}" for name in ("complete", "map_hw", "options", "pixels", "resized", "sensed", "shipped")),
     *(f"dhtorch.dense.{name}" for name in ("swept", "views_asked", "worthiest")),
+    *(f"dhtorch.metric.{name}" for name in ("anchor", "anchored")),
     "dhtorch.geometry.exact.filled",
     "dhtorch.geometry.least_squares.minimise",
     *(
@@ -717,7 +718,7 @@ ESTIMATORS = (arms, clusters, registration, blur, filling, sharpness)
 
 
 def public_functions():
-    parts = [method, pair, views, window, dense, *ESTIMATORS]
+    parts = [method, pair, views, window, dense, metric, *ESTIMATORS]
     for package in ("geometry", "stages", "evaluate", "integrate"):
         module = importlib.import_module(f"dhtorch.{package}")
         found = pkgutil.iter_modules(module.__path__, f"dhtorch.{package}.")

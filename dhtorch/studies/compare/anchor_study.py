@@ -79,7 +79,7 @@ def run(
     pairs: Pairs,
     settings: Settings,
     *,
-    anchors: int | None = 3,
+    anchors: int | None = 2,
     size: int = 320,
     swept: bool = False,
     faults: Sequence[str] | None = None,
