@@ -136,6 +136,7 @@ class Chosen(NamedTuple):
     names: tuple[str, ...]
     loss: Tensor  # (K, B) mean over blocks, inf where a model could not be fitted
     factor: Tensor  # (B,) by which sigmas were stretched
+    good: Tensor  # (K, B) bool, what the anchors do not refute
 
 
 def anchor(
@@ -152,8 +153,9 @@ def anchor(
     Robust heads (Student's t) tie the map to the anchors: nothing, a scale, a scale and a shift, from the near returns
     alone or from all. On top may lie a field over the picture and a correction over log depth, both Gaussian processes
     on coarse nodes, so that they are zero away from anchors. Every model is fitted without some blocks of the picture
-    and held against the anchors there; the simplest one is taken that is not surely worse than the best. An error
-    that all far answers share (the motion's) is an unknown of the fit and no part of the answer.
+    and held against the anchors there; the simplest one is taken that is not surely worse than the best, and how far
+    the others of these are from it is part of sigma. An error that all far answers share (the motion's) is an unknown
+    of the fit and no part of the answer.
 
     Args:
         depth_map: values (B, h, w) over the field of the picture; not finite, or not positive where depth is meant,
@@ -173,8 +175,8 @@ def anchor(
     Raises:
         ValueError: wrong shapes, an unknown kind, no anchors, a limit that is not positive.
 
-    Gradient: depth to the map and to the anchors' depth, by the last weighted solve; weights, choice and sigma carry
-    none.
+    Gradient: depth to the map and to the anchors' depth and sigma, through all reweighted solves (first order); the
+    choice of the model, ``ordinal``'s order of values and the answer's sigma carry none.
     Source: Student's t by iteratively reweighted least squares: K. Lange et al., "Robust statistical modeling using
     the t distribution", 1989; blocks: D. Roberts et al., "Cross-validation strategies for data with structure", 2017.
     """
@@ -196,11 +198,7 @@ def anchor(
         x = _ordered(x, points)
         points = points._replace(x=_ordered(points.x, points))
     # Values of any unit: 1 is the median of the anchored ones.
-    unit = (
-        median(points.x.detach().abs(), points.used).clamp_min(1e-12)
-        if kind != "metric"
-        else torch.ones_like(x[:, 0, :1])
-    )
+    unit = median(points.x.abs(), points.used).clamp_min(1e-12) if kind != "metric" else torch.ones_like(x[:, 0, :1])
     x, points = x / unit[..., None], points._replace(x=points.x / unit)
     basis = _Basis(x, known, points, size)
     fits, chosen = _choose(points, basis, kind)
@@ -235,7 +233,7 @@ def anchored(x: Tensor, given: Sequence[Samples | Estimate | DepthMap], hw: tupl
         value, inside = nearest(x, place)
         use = keep[:, pick] & inside & value.isfinite() & z.isfinite() & (z > 0) & s.isfinite() & (s >= 0)
         z = torch.where(use, z, 1.0)
-        rel, together = (torch.where(use, q / z.detach(), 0.0) for q in (s, c))
+        rel, together = (torch.where(use, q / z, 0.0) for q in (s, c))
         var = (rel.square() - together.square()).clamp_min(0) + FLOOR**2
         is_far = ~near[:, pick]
         var = var + FAR_ALONE**2 * is_far
@@ -281,7 +279,7 @@ class _Basis:
     def __init__(self, x: Tensor, known: Tensor, points: Anchors, size: tuple[int, int]) -> None:
         rows, columns = NODES
         self.size = size
-        log = torch.where(known & (x > 0), x.detach().clamp_min(1e-12), torch.nan).log().flatten(1)
+        log = torch.where(known & (x > 0), x.clamp_min(1e-12), torch.nan).log().flatten(1)
         low, high = log.nan_to_num(torch.inf).amin(-1), log.nan_to_num(-torch.inf).amax(-1)
         some = low < high
         self.low = torch.where(some, low, 0.0)[:, None]
@@ -289,9 +287,9 @@ class _Basis:
         share = (points.place + 0.5) / x.new_tensor([size[1], size[0]])
         across, down = _hats(share[..., 0], columns), _hats(share[..., 1], rows)
         self.field = (down[..., :, None] * across[..., None, :]).flatten(-2)
-        self.curve = _hats(self.level(points.x.detach()), KNOTS)
+        self.curve = _hats(self.level(points.x), KNOTS)
         # What a wrong motion does to far answers: a wrong scale, and a lean that grows with depth.
-        z = points.depth.detach() / median(points.depth.detach(), points.used)
+        z = points.depth / median(points.depth, points.used)
         lean = torch.stack((torch.ones_like(z), z - 1, *(z * (2 * share[..., k] - 1) for k in (0, 1))), -1).clamp(-3, 3)
         shared = points.shared[..., None] * lean
         self.phi = torch.cat((torch.ones_like(z)[..., None], self.field, self.curve, shared), -1)
@@ -337,7 +335,7 @@ def _solve(points: Anchors, basis: _Basis, model: Model, use: Tensor, kind: str)
     use = use & (points.near | (not model.near))
     far = ~points.near & use
     target = 1 / points.depth if kind == "inverse" else points.depth
-    scale = 1 / target.detach()  # residuals are relative
+    scale = 1 / target  # residuals are relative
     ones = torch.ones_like(points.x)
     A = torch.stack((points.x, ones), -1) * scale[..., None]
     rhs = target * scale
@@ -357,7 +355,7 @@ def _solve(points: Anchors, basis: _Basis, model: Model, use: Tensor, kind: str)
             H = (A * w[..., None]).mT @ A + torch.diag_embed(prior)
             solved, ok = solve_spd(H, (A * w[..., None]).mT @ rhs[..., None])
             head = solved[..., 0]
-            r = ((A * head[:, None]).sum(-1) - rhs).detach()
+            r = (A * head[:, None]).sum(-1) - rhs
         head_cov, _ = solve_spd(H.detach(), torch.eye(2).to(H).expand_as(H))
         enough = enough & ok & (head[:, 0] > 0)
     P = basis.phi.shape[-1]
@@ -365,13 +363,13 @@ def _solve(points: Anchors, basis: _Basis, model: Model, use: Tensor, kind: str)
     if not (model.field or model.curve):
         return Fit(head, head_cov, head.new_zeros(len(head), P), head.new_zeros(len(head), P, P), enough)
     weight = _spread(points, use) / points.var
-    prior_beta, r = basis.precision(model), miss.detach()
+    prior_beta, r = basis.precision(model), miss
     for _ in range(5):
         w = weight * _student(r, points.var)
         phi = basis.phi * w[..., None]
         H = phi.mT @ basis.phi + prior_beta
         beta, ok = solve_spd(H, phi.mT @ miss[..., None])
-        r = (miss - (basis.phi @ beta)[..., 0]).detach()
+        r = miss - (basis.phi @ beta)[..., 0]
     cov, _ = solve_spd(H.detach(), torch.eye(P).to(H).expand_as(H))
     return Fit(head, head_cov, beta[..., 0], cov, enough & ok)
 
@@ -442,7 +440,7 @@ def _choose(points: Anchors, basis: _Basis, kind: str) -> tuple[list[Fit], Chose
         some = fine.any(0) & (points.used.sum(-1) >= FEWEST)
         model = torch.where(some, model, -1)
     fits = [_solve(points, basis, MODELS[name], points.used, kind) for name in names]
-    return fits, Chosen(model, names, mean, factor)
+    return fits, Chosen(model, names, mean, factor, good)
 
 
 def _left_out(
@@ -495,20 +493,21 @@ def _answered(
 
     fit = Fit(*(pick(name) for name in Fit._fields))
     safe = torch.where(known, x, torch.ones_like(x))
-    y = safe * fit.head[:, :1, None] + fit.head[:, 1:, None]
-    rows, columns = NODES
-    n = rows * columns
     share = [(torch.arange(k, device=x.device) + 0.5) / k for k in basis.size]
-    down, across = _hats(share[0].to(x), rows), _hats(share[1].to(x), columns)
-    field = fit.beta[:, 1 : n + 1].unflatten(1, NODES)
-    curve = _between(fit.beta[:, n + 1 : -LEANS], basis.level(safe.detach()))
-    log = _log_depth(y, kind) + fit.beta[:, :1, None] + down @ field @ across.mT + curve
+    hats = _hats(share[0].to(x), NODES[0]), _hats(share[1].to(x), NODES[1])
+    y, log = _log_map(fit, safe, basis, kind, hats)
     depth = log.exp()
+    (down, across), n = hats, NODES[0] * NODES[1]
     with torch.no_grad():
         var = _of_head(fit, safe, y) + _of_field(fit, down, across)
         knots = fit.cov.diagonal(dim1=-2, dim2=-1)[:, n + 1 : -LEANS]
-        var = var + _between(knots, basis.level(safe)) + _local(points, basis, fit, kind, (down, across))
+        var = var + _between(knots, basis.level(safe)) + _local(points, basis, fit, kind, hats)
         sigma_rel = var.sqrt() * chosen.factor[:, None, None]
+        doubt, count = torch.zeros_like(log), chosen.good.sum(0).clamp_min(1)[:, None, None]
+        for one, good in zip(fits, chosen.good, strict=True):
+            apart = _log_map(one, safe, basis, kind, hats)[1] - log
+            doubt = doubt + torch.where(good[:, None, None], apart.square(), 0.0) / count
+        sigma_rel = (sigma_rel.square() + doubt).sqrt()
         log_step = log - _around(log, known)
         sigma_rel = (sigma_rel.square() + (0.5 * log_step).square()).sqrt()
     silent = (chosen.model < 0)[:, None, None].expand_as(known)
@@ -523,6 +522,15 @@ def _answered(
         source=torch.where(keep, Source.ANCHORED, Source.NONE).to(torch.int32),
         gate=gate,
     )
+
+
+def _log_map(fit: Fit, x: Tensor, basis: _Basis, kind: str, hats: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """What a model's head says, and its log depth, (B, h, w) each."""
+    n = NODES[0] * NODES[1]
+    y = x * fit.head[:, :1, None] + fit.head[:, 1:, None]
+    field = hats[0] @ fit.beta[:, 1 : n + 1].unflatten(1, NODES) @ hats[1].mT
+    curve = _between(fit.beta[:, n + 1 : -LEANS], basis.level(x))
+    return y, _log_depth(y, kind) + fit.beta[:, :1, None] + field + curve
 
 
 def _around(x: Tensor, known: Tensor) -> Tensor:
