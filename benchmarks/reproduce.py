@@ -38,6 +38,7 @@ EXPERIMENTS = {
     "dense": "experiment=dense_comparison data=shared_scenes experiment.anchors=6",
     "judge_study": "experiment=judge_study data=shared_scenes",
     "dense_streams": "experiment=dense_comparison data=streams experiment.anchors=6 experiment.rooms=[]",
+    "anchor_study": "experiment=anchor_study data=shared_scenes",
     "shared_scenes": "experiment=opencv_twin data=shared_scenes",
     "room_exact": "experiment=opencv_twin data=synthetic_seeds data.lidar=exact data.image_noise=0",
     "room_phone": "experiment=opencv_twin data=synthetic_seeds",

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from dhtorch.method import Method
     from dhtorch.methods import AUTO, MAP, PAPER, WINDOW, extend
+    from dhtorch.metric import anchor
     from dhtorch.pair import merge
     from dhtorch.records import Camera, Estimate, Frame, Map, Pose, PoseFit, Samples, TrackHint, Tracks, Verdict
     from dhtorch.stream import Stream
@@ -42,6 +43,7 @@ __all__ = [
     "TrackHint",
     "Tracks",
     "Verdict",
+    "anchor",
     "collate",
     "extend",
     "judge",
@@ -54,6 +56,7 @@ _HOMES |= {
     "ExtendDepth": "transform",
     "JudgeDepth": "transform",
     "Stream": "stream",
+    "anchor": "metric",
     "collate": "tree",
     "judge": "verdict",
     "merge": "pair",

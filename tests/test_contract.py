@@ -9,7 +9,7 @@ import pytest
 import torch
 from contract import PROMISES, NoMasksAsNumbers, Row, equal, leaves, reorder, take, tensor_map
 
-from dhtorch import causes, dense, evidence, method, pair, verdict, views, window
+from dhtorch import causes, dense, evidence, method, metric, pair, verdict, views, window
 from dhtorch.evaluate import holdout, probe
 from dhtorch.geometry import (
     affine,
@@ -516,6 +516,7 @@ ELSEWHERE = {
     *(f"dhtorch.evidence.{name}" for name in ("references", "silent", "by_answers", "by_views", "by_maps")),
     *(f"dhtorch.causes.{name}" for name in ("turned", "name_cause", "decided", "watch")),
     "dhtorch.evaluate.detection.auroc",
+    *(f"dhtorch.metric.{name}" for name in ("anchor", "anchored")),
     "dhtorch.geometry.exact.filled",
     "dhtorch.geometry.least_squares.minimise",
     *(
@@ -727,7 +728,7 @@ ESTIMATORS = (arms, clusters, registration, blur, filling, sharpness)
 
 
 def public_functions():
-    parts = [method, pair, views, window, dense, evidence, causes, verdict, *ESTIMATORS]
+    parts = [method, pair, views, window, dense, metric, evidence, causes, verdict, *ESTIMATORS]
     for package in ("geometry", "stages", "evaluate", "integrate"):
         module = importlib.import_module(f"dhtorch.{package}")
         found = pkgutil.iter_modules(module.__path__, f"dhtorch.{package}.")

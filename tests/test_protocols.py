@@ -337,6 +337,7 @@ SMALLER = {
     "defocus": ["data=synthetic_views"],
     "defocus_fusion": ["data=synthetic_views"],
     "focus_stack": ["data=synthetic_views", "experiment.slices=5"],
+    "anchor_study": ["experiment.anchors=1", "experiment.size=64", "experiment.faults=[simulated]"],
     "dense_comparison": [
         *("experiment.anchors=1", "experiment.sweep.planes=16", "experiment.sweep.size=128", "experiment.rooms=[]"),
         *("experiment.rotations.hw=[96,128]", "experiment.rotations.n_frames=4", "experiment.rotations.gap=2"),

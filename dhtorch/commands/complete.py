@@ -341,7 +341,7 @@ def _about(task: Task, i: int, anchor: Frame, steps: export.Steps) -> Row:
 
 def _counts(steps: export.Steps, one: DepthMap) -> Row:
     """Pixels by source, and the shares of all pixels that are silent, by reason."""
-    kinds = {code: name.lower() for code, name in names(Source).items() if code != Source.RECOVERED}
+    kinds = {code: name.lower() for code, name in names(Source).items() if name.lower() in KINDS}
     pixels = {name: int((steps.source == code).sum()) for code, name in kinds.items()}
     gates = {name.lower(): float((one.gate == code).double().mean()) for code, name in names(Gate).items()}
     silent = {name: share for name, share in gates.items() if share and name != "answer"}

@@ -1,0 +1,155 @@
+"""A map of anybody's in metres: its faults taken out as far as anchors tell, alone where they do not, and honest."""
+
+import pytest
+import torch
+
+from dhtorch import anchor
+from dhtorch.codes import Gate, Source
+from dhtorch.records import DepthMap, Estimate, Samples
+from dhtorch.studies.baselines import scale_shift
+from dhtorch.studies.compare import anchor_study
+from dhtorch.synthetic import depth_faults
+
+HW = (48, 64)
+
+
+def world(batch=1, n=400, dtype=torch.float64, noise=0.003, seed=0):
+    """A true map, returns where it is nearer than two metres, and answers everywhere else."""
+    g = torch.Generator().manual_seed(seed)
+    v, u = torch.meshgrid(torch.linspace(0, 1, HW[0]), torch.linspace(0, 1, HW[1]), indexing="ij")
+    truth = (1 + 3 * (1 - v) + 0.5 * (4 * u).sin()).to(dtype).expand(batch, -1, -1).contiguous()
+    uv = (torch.rand(batch, n, 2, generator=g) * torch.tensor([HW[1] - 1.0, HW[0] - 1.0])).to(dtype)
+    at = (uv[..., 1].round() * HW[1] + uv[..., 0].round()).long()
+    z = truth.flatten(1).gather(1, at)
+    z = z * (1 + noise * torch.randn(batch, n, generator=g).to(dtype))
+    zero, near = torch.zeros_like(z), z < 2
+    xyz = torch.where(near[..., None], torch.stack((z, z, z), -1), torch.nan)
+    code = torch.zeros_like(z, dtype=torch.int32)
+    samples = Samples(uv, torch.where(near, z, 0.0), 0.01 * z, xyz, zero + 1, code, zero, code)
+    gate = torch.where(near, Gate.NO_TRACK, Gate.ANSWER).to(torch.int32)
+    far = Estimate(uv, z, 0.02 * z, 0.01 * z, zero + 5, zero, code + 2, zero + 0.5, gate)
+    return truth, samples, far
+
+
+def error(found, truth):
+    return float(((found.depth - truth).abs() / truth)[found.keep].median())
+
+
+@pytest.mark.parametrize("name", ["scale_short", "shift", "tilt", "simulated"])
+def test_faults_are_taken_out(name):
+    truth, near, far = world()
+    x, _ = depth_faults.spoil(name, truth)
+    found = anchor(x, [near, far])
+    assert found.keep.all() and (found.source == Source.ANCHORED).all()
+    assert error(found, truth) < 0.015 < ((x - truth).abs() / truth).median()
+    if name in ("scale_short", "shift"):  # a slope that goes with depth is not told from a scale by few returns
+        assert ((found.depth - truth).abs() <= 2 * found.sigma).double().mean() > 0.9
+
+
+def test_a_map_that_is_right_is_left_alone():
+    truth, near, far = world()
+    trace = {}
+    found = anchor(truth, [near, far], trace=trace)
+    assert trace["chosen"].names[int(trace["chosen"].model)] == "raw"
+    assert torch.allclose(found.depth, truth)
+
+
+@pytest.mark.parametrize("kind", ["scale", "affine", "inverse", "ordinal"])
+def test_kinds_of_maps(kind):
+    truth, near, far = world()
+    x = {"scale": 7 * truth, "affine": 3 * truth - 5, "inverse": 40 / truth + 3, "ordinal": truth.log().exp() ** 2}[
+        kind
+    ]
+    assert error(anchor(x, [near, far], kind=kind), truth) < (0.05 if kind == "ordinal" else 0.01)
+
+
+def test_wrong_anchors_are_outvoted():
+    truth, near, far = world()
+    wrong = torch.arange(far.depth.shape[1]) % 5 == 0
+    far = far.replace(depth=torch.where(wrong, 1.6 * far.depth, far.depth))
+    assert error(anchor(0.8 * truth, [near, far]), truth) < 0.01
+
+
+def test_an_error_that_far_answers_share_does_not_move_the_map():
+    truth, near, far = world()
+    assert error(anchor(truth, [near, far.replace(depth=1.03 * far.depth)]), truth) < 0.005
+
+
+def test_a_map_of_answers_is_an_anchor_too_and_samples_may_be_of_a_larger_picture():
+    truth, near, _ = world()
+    one = torch.full_like(truth, 0, dtype=torch.int32)
+    swept = DepthMap(truth, 0.02 * truth, truth * 0 + 1, one + Source.SWEPT, one)
+    assert error(anchor(1.2 * truth, [near, swept]), truth) < 0.01
+    larger = near.replace(uv=4 * near.uv + 1.5)
+    small = anchor(1.2 * truth, near)
+    assert torch.allclose(anchor(1.2 * truth, larger, hw=(4 * HW[0], 4 * HW[1])).depth, small.depth)
+
+
+def test_silence():
+    truth, near, far = world()
+    x = truth.clone()
+    x[:, :4] = torch.nan
+    found = anchor(x, [near, far])
+    assert (found.gate[:, :4] == Gate.NO_TRACK).all() and found.depth[:, :4].isnan().all()
+    none = near.replace(xyz=torch.full_like(near.xyz, torch.nan))
+    lost = anchor(truth, none)
+    assert (lost.gate == Gate.NO_POSE).all() and (lost.score == 0).all() and lost.depth.isnan().all()
+
+
+def test_alone_as_in_a_batch_and_in_both_floats():
+    truth, near, far = world(batch=2)
+    x = depth_faults.tilted(truth, 0.1, 0.5) * torch.tensor([1.0, 1.3]).view(2, 1, 1).double()
+    both = anchor(x, [near, far])
+    for k in range(2):
+        one = anchor(x[k : k + 1], [near[k : k + 1], far[k : k + 1]])
+        assert torch.allclose(one.depth, both.depth[k : k + 1], rtol=1e-9)
+        assert torch.allclose(one.sigma, both.sigma[k : k + 1], rtol=1e-6)
+    short = anchor(x.float(), [near.to(torch.float32), far.to(torch.float32)])
+    assert short.depth.dtype == torch.float32
+    assert torch.allclose(short.depth.double(), both.depth, rtol=1e-4)
+
+
+def test_gradients_reach_map_and_anchors():
+    truth, near, far = world(n=120)
+    x = (depth_faults.tilted(truth, 0.1, 0.5)).requires_grad_()
+    z = far.depth.clone().requires_grad_()
+    found = anchor(x, [near, far.replace(depth=z)])
+    of_map, of_anchor = torch.autograd.grad(found.depth.nan_to_num().sum(), (x, z))
+    assert of_map.isfinite().all() and of_anchor.isfinite().all()
+    assert (of_map != 0).all() and (of_anchor[far.keep] != 0).double().mean() > 0.9
+    step = 1e-5 * torch.ones_like(z)
+    moved = [anchor(x.detach(), [near, far.replace(depth=z.detach() + k * step)]).depth.sum() for k in (-1, 1)]
+    assert float((moved[1] - moved[0]) / 2e-5) == pytest.approx(float(of_anchor.sum()), rel=1e-3)
+
+
+def test_bad_input_is_named():
+    truth, near, _ = world()
+    with pytest.raises(ValueError, match="expected one of metric"):
+        anchor(truth, near, kind="depth")
+    with pytest.raises(ValueError, match="no anchors"):
+        anchor(truth, [])
+    with pytest.raises(ValueError, match="B h w"):
+        anchor(truth[0], near)
+    with pytest.raises(ValueError, match="max_sigma_rel"):
+        anchor(truth, near, max_sigma_rel=0)
+
+
+def test_usual_fits():
+    x = torch.linspace(1, 3, 40, dtype=torch.float64)
+    assert scale_shift.least_squares(x, 2 * x + 0.5) == pytest.approx((2, 0.5))
+    assert scale_shift.median_ratio(x, 2 * x) == (2, 0)
+    z = 2 * x + 0.5
+    z[::4] = 9
+    assert scale_shift.ransac(x, z) == pytest.approx((2, 0.5))
+
+
+def test_summary_and_verdict_of_the_study():
+    rows = [
+        {"scene": "a", "truth": "simulated", "method": by, "median_rel": e, "within_sigma": 0.7, "within_2sigma": 0.95}
+        for by, e in {"anchor": 0.01, "raw": 0.05, "near least squares": 0.04}.items()
+    ]
+    found = anchor_study.summary(rows, ["simulated"])
+    assert found["anchor.ratio_to_near_affine"]["value"] == pytest.approx(0.25)
+    assert found["anchor.worst_ratio_to_better"]["value"] == pytest.approx(0.2)
+    assert anchor_study.verdict(found) == (True, "5 of 5 bars met")
+    assert anchor_study.verdict({})[0] is None
