@@ -317,8 +317,11 @@ def captures() -> str:
         return "Not measured yet: `benchmarks/results/captures.json` is not there."
     rows = []
     for found in json.loads(file.read_text()):
-        rows.append([found["name"], f"{found['seconds']:.0f}", found.get("said") or found.get("why") or ""])
-    return text.grid(Table("", ["capture", "seconds", "what came out"], rows))
+        first = "" if found["first_s"] is None else f"{found['first_s']:.0f}"
+        said = (found.get("said") or found.get("why") or "").removeprefix(f"{found['name']}: ")
+        rows.append([said, f"`{found['name']}`", first, f"{found['seconds']:.0f}"])
+    grid = text.grid(Table("", ["what came out", "capture", "first picture, s", "all, s"], rows))
+    return f"{grid}\n\n{found['processor']}, {found['cores']} cores, beside other work."
 
 
 #: What the judge is to find, in words, and its bars.

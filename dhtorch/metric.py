@@ -217,7 +217,7 @@ def anchored(x: Tensor, given: Sequence[Samples | Estimate | DepthMap], hw: tupl
             rows, columns = (torch.arange(n, device=x.device).double() for n in depth.shape[-2:])
             v, u = torch.meshgrid((rows + 0.5) / len(rows), (columns + 0.5) / len(columns), indexing="ij")
             share = torch.stack([u, v], -1).flatten(0, 1).expand(len(depth), -1, -1)
-            depth, sigma, keep = depth.flatten(1), sigma.flatten(1), one.keep.flatten(1)
+            depth, sigma, keep = (x.flatten(1) for x in (depth, sigma, one.keep))
             near = (one.source == Source.SENSOR).flatten(1)
             shared = torch.where(near, 0.0, SHARED**0.5 * sigma)
         else:
@@ -241,7 +241,9 @@ def anchored(x: Tensor, given: Sequence[Samples | Estimate | DepthMap], hw: tupl
         cell = (share[:, pick] * share.new_tensor([BLOCKS[1], BLOCKS[0]])).floor().long()
         column, row = cell[..., 0].clamp(0, BLOCKS[1] - 1), cell[..., 1].clamp(0, BLOCKS[0] - 1)
         block = 2 * (row * BLOCKS[1] + column) + near[:, pick].long()
-        found.append(Anchors(place, torch.where(use, value, 1.0), z, var, together, near[:, pick], use, block))
+        x = torch.where(use, value, 1.0)
+        rest = {"var": var, "shared": together, "near": near[:, pick], "used": use, "block": block}
+        found.append(Anchors(place=place, x=x, depth=z, **rest))
     return Anchors(*(torch.cat(parts, 1) for parts in zip(*found, strict=True)))
 
 
@@ -503,7 +505,8 @@ def _answered(
         knots = fit.cov.diagonal(dim1=-2, dim2=-1)[:, n + 1 : -LEANS]
         var = var + _between(knots, basis.level(safe)) + _local(points, basis, fit, kind, hats)
         sigma_rel = var.sqrt() * chosen.factor[:, None, None]
-        doubt, count = torch.zeros_like(log), chosen.good.sum(0).clamp_min(1)[:, None, None]
+        doubt = torch.zeros_like(log)
+        count = chosen.good.sum(0).clamp_min(1)[:, None, None]
         for one, good in zip(fits, chosen.good, strict=True):
             apart = _log_map(one, safe, basis, kind, hats)[1] - log
             doubt = doubt + torch.where(good[:, None, None], apart.square(), 0.0) / count
