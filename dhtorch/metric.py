@@ -241,9 +241,9 @@ def anchored(x: Tensor, given: Sequence[Samples | Estimate | DepthMap], hw: tupl
         cell = (share[:, pick] * share.new_tensor([BLOCKS[1], BLOCKS[0]])).floor().long()
         column, row = cell[..., 0].clamp(0, BLOCKS[1] - 1), cell[..., 1].clamp(0, BLOCKS[0] - 1)
         block = 2 * (row * BLOCKS[1] + column) + near[:, pick].long()
-        x = torch.where(use, value, 1.0)
+        told = torch.where(use, value, 1.0)
         rest = {"var": var, "shared": together, "near": near[:, pick], "used": use, "block": block}
-        found.append(Anchors(place=place, x=x, depth=z, **rest))
+        found.append(Anchors(place=place, x=told, depth=z, **rest))
     return Anchors(*(torch.cat(parts, 1) for parts in zip(*found, strict=True)))
 
 
