@@ -113,7 +113,7 @@ def test_figures_leave_nothing_behind(tmp_path):
 
 
 def test_blue_is_the_sensor_orange_what_was_recovered_purple_what_was_swept_and_nothing_else():
-    own = {colours.SENSOR, colours.RECOVERED, colours.SWEPT}
+    own = {colours.SENSOR, colours.RECOVERED, colours.SWEPT, colours.ANCHORED}
     others = [*colours.METHODS.values(), *colours.OTHERS, *colours.GATES.values(), *colours.HOLES.values()]
     others += [c for pair in colours.PAGE.values() for c in pair] + [colours.PALE, colours.HELD]
     assert not own & {c.upper() for c in others}

@@ -329,7 +329,7 @@ def _mapped(made: Made, settings: Mapping[str, Any], progress: Progress) -> list
         "map", surface.xyz, rgb, surface.normal, surface.face, values={k: about[k] for k in ("sigma", "source")}
     )
     export.write_glb(task.folder / "map.glb", [shape], up=up)
-    html.write(task.folder / "view.html", points.read(ply))
+    html.write(task.folder / "view.html", replace(points.read(ply), name=task.scene.name))
     return ["map.ply", "map.glb", "view.html"]
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from dhtorch.codes import Gate, Hole, Source, State
 
 #: What a depth comes from; what is silent is paler than what was answered.
-SENSOR, RECOVERED, SWEPT, SILENT = "#0072B2", "#E69F00", "#C653A6", "#B4B4B4"
+SENSOR, RECOVERED, SWEPT, ANCHORED, SILENT = "#0072B2", "#E69F00", "#C653A6", "#3F8F6B", "#B4B4B4"
 
 #: Variable of the pages → its colour by day and in the dark. Figures are drawn in those of the day.
 PAGE = {
@@ -79,7 +79,13 @@ HOLES = {
     Hole.HIGHLIGHT: "#CC79A7",
     Hole.AT_BORDER: "#009E73",
 }
-SOURCES = {Source.NONE: SILENT, Source.SENSOR: SENSOR, Source.RECOVERED: RECOVERED, Source.SWEPT: SWEPT}
+SOURCES = {
+    Source.NONE: SILENT,
+    Source.SENSOR: SENSOR,
+    Source.RECOVERED: RECOVERED,
+    Source.SWEPT: SWEPT,
+    Source.ANCHORED: ANCHORED,
+}
 
 #: What is said of a pixel of a judged map.
 STATES = {State.CANNOT_KNOW: PICTURE, State.CONSISTENT: "#63c98a", State.WRONG: "#a8321f"}
