@@ -65,6 +65,7 @@ class Gate:
     UNCERTAIN: Final = 9  #: sigma / depth above the limit
     LOW_SCORE: Final = 10  #: score below the threshold
     CONTRADICTED: Final = 11  #: what lies far contradicts the near returns: these move on their own
+    POSE_REFUTED: Final = 12  #: a pose was given, and the near returns contradict it
 
 
 class PoseCode:
@@ -75,6 +76,7 @@ class PoseCode:
     DEGENERATE: Final = 2  #: the points do not determine a pose (collinear, coincident)
     NO_BASELINE: Final = 3  #: a pose, but its translation is not significant
     KEPT_PNP: Final = 4  #: refinement did not improve the fit; the PnP pose was kept
+    REFUTED: Final = 5  #: a pose was given, and the near returns contradict it
 
 
 class Source:

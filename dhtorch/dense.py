@@ -32,7 +32,7 @@ from dhtorch.geometry.se3 import Pose
 from dhtorch.geometry.shapes import is_static
 from dhtorch.method import Method, Trace
 from dhtorch.methods import AUTO
-from dhtorch.records import NO_HINT, Camera, DepthMap, Estimate, Frame, PoseFit, Samples, TrackHint
+from dhtorch.records import NO_HINT, Camera, DepthMap, Estimate, Frame, GivenPose, PoseFit, Samples, TrackHint
 
 #: Share of the sensor's reach (the depth that nearly all its returns are nearer than) at which the sweep ends: what the
 #: sensor sees as well is what tells whether the sweep is right.
@@ -129,7 +129,7 @@ def complete(
     max_sigma_rel: float = 0.2,
     calibration: Calibration | None = None,
     seed: int | Tensor = 0,
-    fit: PoseFit | None = None,
+    fit: PoseFit | GivenPose | None = None,
     hint: TrackHint = NO_HINT,
     trace: Trace | None = None,
 ) -> DepthMap:
@@ -443,6 +443,7 @@ def _silent_pairs(asked: Asked, wanted: Tensor) -> Tensor:
     none = ~wanted.any(0)
     return first_reason(
         (moving, Gate.CONTRADICTED),
+        (none & (asked.fits.code == PoseCode.REFUTED).any(0), Gate.POSE_REFUTED),
         (none & still.any(0), Gate.NO_BASELINE),
         (none & ~asked.fits.ok.any(0), Gate.NO_POSE),
         (none, Gate.UNCERTAIN),

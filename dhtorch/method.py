@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from dhtorch import tree
-from dhtorch.records import NO_HINT, Choice, Estimate, Frame, PoseFit, Samples, TrackHint, Tracks
+from dhtorch.records import NO_HINT, Choice, Estimate, Frame, GivenPose, PoseFit, Samples, TrackHint, Tracks
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.fuse import inverse_variance
 from dhtorch.stages.holes import classify
@@ -54,6 +54,7 @@ class Method:
     score: Callable[..., Estimate] = rank  # (estimate, samples, tracks, fit)
     fuse: Callable[..., Estimate] = inverse_variance  # (estimates (V, B, N)); asked where there are several views
     choose: Callable[..., Tensor | Choice] | None = None  # (anchor, others, views, *, fit) -> (views, B) indices
+    given: Callable[..., GivenPose] | None = None  # (anchor, others) -> motions from elsewhere, or None
 
     n: int = 2048  # samples per anchor
     hypotheses: int = 200  # minimal samples drawn by the pose search
@@ -67,7 +68,7 @@ class Method:
         others: Frame | Sequence[Frame],
         *,
         seed: int | Tensor = 0,
-        fit: PoseFit | None = None,
+        fit: PoseFit | GivenPose | None = None,
         hint: TrackHint = NO_HINT,
         trace: Trace | None = None,
         **changes: Any,
@@ -80,7 +81,8 @@ class Method:
                 which the camera took them. Their depth is not read. Cameras may differ.
             seed: an int gives every pair the same draws; a (B,) int64 tensor gives each pair its own. All views of an
                 anchor have the same.
-            fit: a pose from elsewhere, (B,) or (V, B); seat 5 is then skipped.
+            fit: a pose that is believed, (B,) or (V, B): seat 5 is then skipped; or a :class:`GivenPose` from
+                elsewhere, which near returns may refute (:func:`dhtorch.stages.given.hold`). None = as ``given`` says.
             hint: what is known of the motion, for the tracker.
             trace: a dict that receives ``samples``, ``tracks`` (as tracked), ``tracks_ideal`` (undistorted), ``fit``,
                 ``estimate`` and ``ms`` (milliseconds by stage). Of several views those of the last, with ``ms`` summed
@@ -110,6 +112,8 @@ class Method:
             if not others:
                 raise ValueError("method: found no other view, expected at least one")
             others = tree.stack(others)
+        if fit is None and method.given is not None:
+            fit = method.given(anchor, others)
         ask = ask_pair if others.image.dim() == 4 else ask_window
         return ask(method, anchor, others, seed=seed, fit=fit, hint=hint, trace=trace)
 

@@ -13,11 +13,28 @@ from dhtorch.geometry import camera as cam
 from dhtorch.geometry.shapes import check, is_transformed
 from dhtorch.geometry.small import product
 from dhtorch.method import Method, Trace
-from dhtorch.records import NO_HINT, Camera, Estimate, Frame, Map, PoseFit, Samples, TrackHint, Tracks
+from dhtorch.records import (
+    NO_HINT,
+    Camera,
+    Estimate,
+    Frame,
+    GivenPose,
+    Map,
+    PoseFit,
+    Samples,
+    StartPose,
+    TrackHint,
+    Tracks,
+)
+from dhtorch.stages.given import hold
+from dhtorch.stages.pose import map_pose
 from dhtorch.tree import in_pieces
 
 #: Pairs tracked at once: more are no faster, and their pyramids cost memory.
 PAIRS = 8
+
+#: Residual of near returns that a pose may leave from which a search only starts, of a ray with z = 1.
+START_MISS = 0.04
 
 
 def ask_pair(
@@ -26,7 +43,7 @@ def ask_pair(
     frame_1: Frame,
     *,
     seed: int | Tensor = 0,
-    fit: PoseFit | None = None,
+    fit: PoseFit | GivenPose | None = None,
     hint: TrackHint = NO_HINT,
     trace: Trace | None = None,
 ) -> Estimate:
@@ -68,7 +85,7 @@ def under_pose(
     camera_1: Camera,
     *,
     seed: int | Tensor,
-    fit: PoseFit | None,
+    fit: PoseFit | GivenPose | None,
     clock: Clock,
 ) -> tuple[Estimate, Tracks, PoseFit]:
     """Seats 5 and 6: what tracks say under the pose that they give, or under a known one.
@@ -80,14 +97,26 @@ def under_pose(
     usable = tracks.replace(valid=tracks.valid & textured)
     usable = undistort_tracks(usable, camera_0, camera_1)
     camera_0, camera_1 = cam.ideal(camera_0), cam.ideal(camera_1)
-    if fit is None:
+    if not isinstance(fit, PoseFit):
         draws = uniform_draws(seed, camera_0.f.shape[0], method.hypotheses).to(camera_0.f)
-        fit = method.pose(samples, usable, camera_0, camera_1, draws)
+        found = method.pose(samples, usable, camera_0, camera_1, draws)
+        fit = found if fit is None else _held(fit, found, samples, usable, camera_0, camera_1)
     clock("pose", fit)
     estimate = clock("triangulate", method.triangulate(samples, usable, fit, camera_0, camera_1))
     untextured = (estimate.gate == Gate.NO_TRACK) & tracks.valid & ~textured
     gate = torch.where(untextured, torch.full_like(estimate.gate, Gate.NO_TEXTURE), estimate.gate)
     return estimate.replace(gate=gate), usable, fit
+
+
+def _held(
+    given: GivenPose, found: PoseFit, samples: Samples, tracks: Tracks, camera_0: Camera, camera_1: Camera
+) -> PoseFit:
+    """A pose from elsewhere as the near returns leave it: held against them, or the start of the most probable one."""
+    if not isinstance(given, StartPose):
+        return hold(given, samples, tracks, camera_0, camera_1, found)
+    held = hold(given.replace(cov=None), samples, tracks, camera_0, camera_1, found, max_miss=START_MISS)
+    unused = samples.uv.new_zeros(len(samples.uv), 1, 3)
+    return map_pose(samples, tracks, camera_0, camera_1, unused, start=lambda *_: held).replace(looks=held.looks)
 
 
 def merge(samples: Samples, estimate: Estimate) -> Map:

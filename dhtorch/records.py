@@ -24,11 +24,13 @@ __all__ = [
     "Choice",
     "Estimate",
     "Frame",
+    "GivenPose",
     "Map",
     "Pose",
     "PoseFit",
     "Samples",
     "Shutter",
+    "StartPose",
     "TrackHint",
     "Tracks",
     "Verdict",
@@ -131,11 +133,29 @@ class PoseFit(Record):
     t_snr: Tensor  # (B,) translation over its standard deviation, sqrt(tᵀ Σ_t⁻¹ t)
     code: Tensor  # (B,) int32, codes.PoseCode
     shutter: Shutter | None = None  # absent: one pose for all rows
+    looks: Tensor | None = None  # (B,) int32, which of geometry.conventions.CONVENTIONS fits where a pose is refuted
 
     @property
     def ok(self) -> Tensor:
         """(B,) bool: there is a pose."""
         return (self.code == PoseCode.OK) | (self.code == PoseCode.KEPT_PNP)
+
+
+@record
+class GivenPose(Record):
+    """A relative pose from elsewhere (kinematics, SLAM, a device's own tracker, a calibration), for ``fit=``.
+
+    Near returns are held against it (:func:`dhtorch.stages.given.hold`): a pose that they contradict is not used.
+    """
+
+    T_1_from_0: Pose  # not finite = not known
+    cov: Tensor | None = None  # (B, 6, 6) of the left perturbation (rad, m); None = not stated
+    readings: Pose | None = None  # (B, K) the same numbers in geometry.conventions.CONVENTIONS; None = not asked
+
+
+@record
+class StartPose(GivenPose):
+    """A relative pose from elsewhere that only starts the search for the most probable one."""
 
 
 @record

@@ -18,7 +18,7 @@ from dhtorch.geometry.shapes import check
 from dhtorch.geometry.start import small
 from dhtorch.method import Method
 from dhtorch.pair import ask_pair, lifted
-from dhtorch.records import Choice, Estimate, Frame, PoseFit
+from dhtorch.records import Choice, Estimate, Frame, GivenPose, PoseFit
 from dhtorch.stages.pose import map_pose
 from dhtorch.stages.track import lucas_kanade
 from dhtorch.stages.triangulate import two_view
@@ -42,7 +42,7 @@ def by_probes(
     others: Frame,  # (V, B)
     views: int,
     *,
-    fit: PoseFit | None = None,  # (V, B)
+    fit: PoseFit | GivenPose | None = None,  # (V, B)
     long: int = LONG,
     good_sigma_rel: float = 0.1,
 ) -> Choice:

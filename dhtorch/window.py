@@ -20,7 +20,7 @@ from dhtorch.geometry.pyramid import Pyramids
 from dhtorch.geometry.shapes import check
 from dhtorch.method import Method, Trace
 from dhtorch.pair import Clock, lifted, tracked, under_pose
-from dhtorch.records import NO_HINT, Choice, Estimate, Frame, PoseFit, Samples, TrackHint, Tracks
+from dhtorch.records import NO_HINT, Choice, Estimate, Frame, GivenPose, PoseFit, Samples, TrackHint, Tracks
 from dhtorch.tree import R, stack
 from dhtorch.views import weighed
 
@@ -34,7 +34,7 @@ def ask_window(
     others: Frame,
     *,
     seed: int | Tensor = 0,
-    fit: PoseFit | None = None,
+    fit: PoseFit | GivenPose | None = None,
     hint: TrackHint = NO_HINT,
     trace: Trace | None = None,
 ) -> Estimate:
@@ -84,7 +84,7 @@ def _chosen(
     samples: Samples,
     *,
     seed: int | Tensor,
-    fit: PoseFit | None,
+    fit: PoseFit | GivenPose | None,
     hint: TrackHint,
 ) -> Choice:
     """Which of the views are asked, as the method chooses them or by a few of the samples."""
@@ -103,7 +103,7 @@ def _ask_views(
     samples: Samples,
     *,
     seed: int | Tensor,
-    fit: PoseFit | None,
+    fit: PoseFit | GivenPose | None,
     hint: TrackHint,
     ms: dict[str, float],
 ) -> list[Trace]:

@@ -14,6 +14,7 @@ from dhtorch.evaluate import holdout, probe
 from dhtorch.geometry import (
     affine,
     camera,
+    conventions,
     covariance,
     epipolar,
     exact,
@@ -34,7 +35,7 @@ from dhtorch.geometry import (
 )
 from dhtorch.methods import MAP, PAPER, WINDOW
 from dhtorch.records import Camera, Frame, Samples, Tracks
-from dhtorch.stages import backproject, holes, pose, score, track, triangulate
+from dhtorch.stages import backproject, given, holes, pose, score, track, triangulate
 from dhtorch.studies.baselines.device_pose import given_pose
 from dhtorch.studies.focal import blur, filling, sharpness
 from dhtorch.studies.negative import arms, clusters, registration
@@ -102,6 +103,12 @@ def tracked(batch, n, dtype, noise=0.2):
     tracks = Tracks(uv_0, uv_1, zero, zero, eye.clone(), zero == 0)
     cov = (1e-6 * torch.eye(6, dtype=dtype)).expand(batch, 6, 6).clone()
     return samples, tracks, given_pose(T, n).replace(cov=cov), camera_0, camera_1
+
+
+def held(batch, n, dtype):
+    """A given pose and what it is held against."""
+    samples, tracks, fit, camera_0, camera_1 = tracked(batch, n, dtype)
+    return given.stated(poses(batch, dtype), sigma=(0.01, 0.01)), samples, tracks, camera_0, camera_1, fit
 
 
 def estimated(batch, n, dtype):
@@ -334,6 +341,13 @@ ROWS = [
     Row(se3.relative, lambda b, n, d: (poses(b, d), poses(b, d, seed=1)), POINTLESS, grad=(0, 1)),
     Row(se3.hat, lambda b, n, d: (uniform(b, n, 3, dtype=d),), "dtype batch vmap capture gradcheck empty shuffle padding nan", (0,), (0,)),
     Row(se3.exp, lambda b, n, d: (uniform(b, 6, dtype=d, low=-1),), POINTLESS + " raises", grad=(0,), bad=wrong_last_axis(0)),
+    Row(se3.log, lambda b, n, d: (poses(b, d),), POINTLESS + " raises", grad=(0,), bad=lambda a: (a[0].replace(t=a[0].t[:, :2]),)),
+    Row(se3.adjoint, lambda b, n, d: (poses(b, d),), POINTLESS + " raises", grad=(0,), bad=lambda a: (a[0].replace(t=a[0].t[:, :2]),)),
+    Row(se3.orthonormal, lambda b, n, d: (poses(b, d).R,), POINTLESS, grad=(0,)),
+    Row(conventions.readings, lambda b, n, d: (poses(b, d), poses(b, d, seed=1)), POINTLESS + " raises", grad=(0, 1), bad=lambda a: (a[0], a[1].replace(t=a[1].t[:, :2]))),
+    Row(conventions.in_axes, lambda b, n, d: (poses(b, d), conventions.STATED["gl"]), POINTLESS, grad=(0,)),
+    Row(conventions.camera_axes, lambda b, n, d: (poses(b, d), conventions.STATED["gl"]), POINTLESS, grad=(0,)),
+    Row(conventions.relative_covariance, lambda b, n, d: (poses(b, d), positive(b, n, d), positive(b, n, d)), POINTLESS + " raises", grad=(0, 1, 2), bad=wrong_last_axis(1)),
     Row(se3.retract, lambda b, n, d: (poses(b, d), uniform(b, 6, dtype=d, low=-1)), POINTLESS + " raises", grad=(0, 1), bad=wrong_last_axis(1)),
     Row(se3.rotation_angle, lambda b, n, d: (poses(b, d).R,), POINTLESS, grad=(0,)),
     Row(lookup.patches, lambda b, n, d: (frames(b, n, d)[0].image, pixels(b, n, d).long(), 5), "dtype batch vmap capture gradcheck empty shuffle padding raises", (1,), (0,), bad=wrong_last_axis(1)),
@@ -376,6 +390,9 @@ ROWS = [
     Row(score.evidence, estimated, "dtype batch vmap capture gradcheck empty shuffle nan raises", (0, 1, 2), (0,), bad=lambda a: (a[0], a[1].replace(uv=a[1].uv[:, 1:]), *a[2:])),
     Row(score.expected_error_loss, lambda b, n, d: (uniform(n, dtype=d, low=-5), uniform(n, dtype=d), uniform(n, dtype=d)), "dtype capture gradcheck raises", grad=(0,), bad=wrong_last_axis(1)),
     Row(pose.pnp_ransac, posed, "dtype batch vmap capture empty padding raises", (0, 1), bad=lambda a: (a[0], a[1].replace(uv_1=a[1].uv_1[:, 1:]), *a[2:]), atol=1e-4),
+    Row(given.hold, held, "dtype batch vmap capture empty raises", (1, 2), bad=lambda a: (a[0], a[1], a[2].replace(uv_1=a[2].uv_1[:, 1:]), *a[3:]), atol=1e-4),
+    Row(given.between, lambda b, n, d: (poses(b, d), poses(b, d, seed=1)), "dtype batch vmap capture gradcheck", grad=(0, 1)),
+    Row(given.stated, lambda b, n, d: (poses(b, d),), "dtype batch vmap capture gradcheck", grad=(0,)),
     Row(pose.map_pose, posed, "dtype batch vmap capture empty padding raises", (0, 1), bad=lambda a: (a[0], a[1].replace(uv_1=a[1].uv_1[:, 1:]), *a[2:]), atol=1e-4, slow="capture"),
     Row(track.lucas_kanade, shifted, "dtype batch capture empty shuffle padding nan raises", (2,), bad=wrong_last_axis(2), atol=1e-4, slow="capture"),
     Row(track.refine, lambda b, n, d: (*shifted(b, n, d), shifted(b, n, d)[2] + 0.3), "dtype batch capture gradcheck empty shuffle padding nan raises", (2, 3), (0, 1), bad=wrong_last_axis(2), atol=1e-4),
@@ -471,6 +488,7 @@ ROWS = [
 #: Functions without a batch of points: samplers, loops over a callable, flat lists of pooled points. Their promises are
 #: tested where they are at home (test_front_end.py, test_pose.py, test_evaluate.py, test_integrate.py).
 ELSEWHERE = {
+    "dhtorch.stages.given.from_frames",
     *(f"dhtorch.stages.sample.{name}" for name in ("spiral", "vogel", "grid")),
     *(f"dhtorch.geometry.shapes.{name}" for name in ("check", "is_static", "is_transformed")),
     *(f"dhtorch.geometry.reference.{name}" for name in ("patch", "nearest", "luma", "offsets", "levels")),

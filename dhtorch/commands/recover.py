@@ -374,6 +374,7 @@ HELP = {
     Gate.NO_POSE: "too few returns could be tracked; slower motion, more light and texture would help",
     Gate.NO_TRACK: "what has no return could not be found in other views; texture and a view from the side would help",
     Gate.UNCERTAIN: "the views lie too close together for what is far; moving sideways would help",
+    Gate.POSE_REFUTED: "the poses given contradict the near returns: see their axes, direction and unit",
     Gate.CONTRADICTED: "what the sensor sees moves, or contradicts the pictures; a still scene would help",
 }
 

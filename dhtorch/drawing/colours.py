@@ -70,6 +70,7 @@ GATES = {
     Gate.UNCERTAIN: "#44AA99",
     Gate.LOW_SCORE: "#999933",
     Gate.CONTRADICTED: "#6B4A1F",
+    Gate.POSE_REFUTED: "#8C2D6B",
 }
 HOLES = {
     Hole.TRACKABLE_NO_LIDAR: "#D55E00",

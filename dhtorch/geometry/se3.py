@@ -100,6 +100,14 @@ def relative(T_world_from_a: Pose, T_world_from_b: Pose) -> Pose:
     return compose(invert(T_world_from_b), T_world_from_a)
 
 
+def orthonormal(R: Tensor) -> Tensor:
+    """The rotation (B, 3, 3) nearest along Gram-Schmidt to one that has drifted by rounding. Gradient: to R."""
+    x = R[:, 0] / (R[:, 0] * R[:, 0]).sum(-1, keepdim=True).sqrt()
+    z = torch.linalg.cross(x, R[:, 1])
+    z = z / (z * z).sum(-1, keepdim=True).sqrt()
+    return torch.stack((x, torch.linalg.cross(z, x), z), 1)
+
+
 def hat(v: Tensor) -> Tensor:
     """Cross-product matrix: (…, 3) → (…, 3, 3), ``hat(v) @ w = v × w``.
 
@@ -136,6 +144,41 @@ def exp(xi: Tensor) -> Pose:
     return Pose(eye + a * W + b * W2, (V @ upsilon[..., None])[..., 0])
 
 
+def log(T: Pose) -> Tensor:
+    """Logarithm (B, 6), rotation vector (rad) then translation part (m): ``exp(log(T))`` is T, for turns below π.
+
+    Gradient: to the pose, exact at no rotation as well. Towards half a turn the axis is lost to rounding.
+    """
+    check("se3.log", R=(T.R, "B 3 3"), t=(T.t, "B 3"))
+    R = T.R
+    axis = 0.5 * _turn_axis(R)
+    sin2 = (axis * axis).sum(-1, keepdim=True)
+    cos = 0.5 * (R.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True) - 1)
+    small = (sin2 < 1e-4) & (cos > 0)
+    sin = torch.where(small, torch.ones_like(sin2), sin2).sqrt()
+    theta = steady(torch.atan2, sin, torch.where(small, torch.zeros_like(cos), cos))
+    omega = axis * torch.where(small, 1 + sin2 * (1 / 6 + sin2 * (3 / 40 + sin2 * (5 / 112))), theta / sin)
+    theta2 = (omega * omega).sum(-1)[..., None, None]
+    half = 0.5 * torch.where(small, torch.ones_like(theta), theta)
+    cotangent = steady(torch.cos, half) / steady(torch.sin, half)
+    whole = (1 - half * cotangent)[..., None] / torch.where(small[..., None], torch.ones_like(theta2), theta2)
+    square = torch.where(small[..., None], (1 + theta2 / 60 * (1 + theta2 / 42)) / 12, whole)
+    W = hat(omega)
+    once = (W @ T.t[..., None])[..., 0]
+    twice = (W @ once[..., None])[..., 0]
+    return torch.cat((omega, T.t - 0.5 * once + square[..., 0] * twice), -1)
+
+
+def adjoint(T: Pose) -> Tensor:
+    """(B, 6, 6) that carries tangents through a motion: ``T · exp(xi) = exp(adjoint(T) @ xi) · T``.
+
+    Gradient: to the pose.
+    """
+    check("se3.adjoint", R=(T.R, "B 3 3"), t=(T.t, "B 3"))
+    top = torch.cat((T.R, torch.zeros_like(T.R)), -1)
+    return torch.cat((top, torch.cat((hat(T.t) @ T.R, T.R), -1)), -2)
+
+
 def retract(T: Pose, xi: Tensor) -> Pose:
     """``exp(xi) · T`` for (B, 6)."""
     return compose(exp(xi), T)
@@ -146,7 +189,7 @@ def rotation_angle(R: Tensor) -> Tensor:
 
     The length of kornia's ``rotation_matrix_to_axis_angle`` takes seven times as long and depends on the batch's size.
     """
-    axis = torch.stack((R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]), -1)
+    axis = _turn_axis(R)
     trace = R.diagonal(dim1=-2, dim2=-1).sum(-1)
     return steady(torch.atan2, axis.norm(dim=-1), trace - 1)
 
@@ -168,3 +211,8 @@ def turn_between(up: Sequence[float], to: Sequence[float] = (0.0, -1.0, 0.0)) ->
     K[0, 1], K[0, 2], K[1, 2] = -v[2], v[1], -v[0]
     K = K - K.T
     return torch.eye(3, dtype=torch.float64) + K + K @ K / (1 + a @ b)
+
+
+def _turn_axis(R: Tensor) -> Tensor:
+    """The axis of rotations (…, 3, 3) times twice the sine of their angle."""
+    return torch.stack((R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]), -1)

@@ -246,7 +246,7 @@ def _robust_pose(
         points, usable, f, c, threshold_px=options.threshold_px, kernel=options.kernel, kernel_px=options.kernel_px
     )
     T, _ = minimise(cost_of, flat[best], options.polish_steps, step=trial_step)
-    return Pose(_orthonormal(T.R.double()), T.t.double()), found
+    return Pose(se3.orthonormal(T.R.double()), T.t.double()), found
 
 
 def _truncated(
@@ -271,14 +271,6 @@ def _truncated(
         return Normal(rho.sum(-1), *normal_equations(rows, torch.where(square < limits, weight, 0.0)))
 
     return evaluate
-
-
-def _orthonormal(R: Tensor) -> Tensor:
-    """The rotation nearest along Gram–Schmidt to one that has drifted by rounding."""
-    x = R[:, 0] / (R[:, 0] * R[:, 0]).sum(-1, keepdim=True).sqrt()
-    z = torch.linalg.cross(x, R[:, 1])
-    z = z / (z * z).sum(-1, keepdim=True).sqrt()
-    return torch.stack((x, torch.linalg.cross(z, x), z), 1)
 
 
 def map_pose(
@@ -391,7 +383,7 @@ def _fit_all(o: FitOptions, threshold_px: float, first: PoseFit, problem: Proble
     # The last step, in float64 and with the graph on.
     problem = problem.to(torch.float64)
     found = pytree.tree_map(lambda x: x.double() if x.is_floating_point() else x, found)
-    found = found._replace(at=found.at._replace(T=Pose(_orthonormal(found.at.T.R), found.at.T.t)))
+    found = found._replace(at=found.at._replace(T=Pose(se3.orthonormal(found.at.T.R), found.at.T.t)))
     normal = partial(
         near_far.normal,
         noise=found.noise,

@@ -92,8 +92,8 @@ def two_view(
         the pose's (with it the sensor's noise, which the pose has from the near points); ``sigma_shared`` is the pose's
         part, common to the pair's points.
 
-    Gates, first reason wins: NO_TRACK, NO_POSE, NO_BASELINE, BEHIND, PARALLAX, RESIDUAL, INCONSISTENT, UNCERTAIN; in
-    the place of an answer CONTRADICTED.
+    Gates, first reason wins: NO_TRACK, NO_BASELINE, POSE_REFUTED, NO_POSE, BEHIND, PARALLAX, RESIDUAL, INCONSISTENT,
+    UNCERTAIN; in the place of an answer CONTRADICTED.
     A rolling shutter that the pose found (``fit.shutter``) is undone in ``uv_1`` and counts in sigma.
 
     Raises:
@@ -130,6 +130,7 @@ def two_view(
     gate = first_reason(
         (~tracked, Gate.NO_TRACK),
         (still[:, None].expand_as(tracked), Gate.NO_BASELINE),
+        ((fit.code == PoseCode.REFUTED)[:, None].expand_as(tracked), Gate.POSE_REFUTED),
         (~posed, Gate.NO_POSE),
         (_below(fit.t_snr[:, None].expand_as(tracked), min_t_snr), Gate.NO_BASELINE),
         (behind, Gate.BEHIND),

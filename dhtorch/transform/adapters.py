@@ -56,8 +56,13 @@ class ExtendedDataset(Dataset[Any]):
         if transform.batched:
             raise ValueError("found a transform for batches, expected one for single samples")
         self.dataset, self.transform, self.gap, self.episode_key = dataset, transform, gap, episode_key
-        other = transform.views.other_image
-        self._lent = (f"{other}", f"{other}_is_pad")  # keys that a gap puts in, for the transform alone
+        views = transform.views
+        self._lent: tuple[str, ...] = (
+            f"{views.other_image}",
+            f"{views.other_image}_is_pad",
+        )  # what a gap puts in, for the transform
+        if views.pose is not None and views.other_pose is not None:
+            self._lent += (views.other_pose,)
 
     def __len__(self) -> int:
         return len(self.dataset)
@@ -88,9 +93,11 @@ class ExtendedDataset(Dataset[Any]):
             return sample
         earlier = self.dataset[i - self.gap] if i >= self.gap else sample
         same = i >= self.gap and self._episode(earlier) == self._episode(sample)
-        image = find(earlier if same else sample, self.transform.views.image)
-        key, pad = self._lent
-        return {**sample, key: image, pad: torch.tensor([not same])}
+        views, source = self.transform.views, earlier if same else sample
+        found = [find(source, views.image), torch.tensor([not same])]
+        if len(self._lent) > len(found):
+            found.append(find(source, str(views.pose)))
+        return {**sample, **dict(zip(self._lent, found, strict=True))}
 
     def _episode(self, sample: Mapping[str, Any]) -> int:
         return 0 if self.episode_key is None else int(find(sample, self.episode_key))

@@ -16,7 +16,7 @@ from dhtorch.method import Method, networks
 from dhtorch.methods import METHODS
 from dhtorch.pair import merge
 from dhtorch.records import NO_HINT, DepthMap, Estimate, PoseFit, Samples, TrackHint
-from dhtorch.transform import maps
+from dhtorch.transform import given, maps
 from dhtorch.transform.leaves import SampleError, find, to_tensor
 from dhtorch.transform.problems import SampleProblem, Tally
 from dhtorch.transform.tokens import CHANNELS, FITS, grid, patch_tokens
@@ -54,8 +54,10 @@ class ExtendDepth(torch.nn.Module):
         The sample and, behind the prefix (N = n, P patches, with B in front of a batch): ``uv`` (N, 2) px;
         ``xyz`` (N, 3) m in the anchor's camera; ``depth``, ``sigma`` (N,) m; ``score`` (N,) in [0, 1]; ``valid`` (N,)
         there is a depth; ``source``, ``flag``, ``hole``, ``gate`` (N,) codes of ``dhtorch.codes``; ``T_1_from_0``
-        (4, 4) and its ``pose_cov`` (6, 6), ``pose_ok``, ``pose_code``; ``tokens`` (P, 10) of
-        :data:`dhtorch.transform.CHANNELS` and ``tokens_valid`` (P,); ``problem``. What is not valid is 0.
+        (4, 4) and its ``pose_cov`` (6, 6), ``pose_ok``, ``pose_code``; with ``pose`` also ``pose_looks``, in which of
+        :data:`dhtorch.geometry.conventions.CONVENTIONS` a pose would fit that the near returns refute;
+        ``tokens`` (P, 10) of :data:`dhtorch.transform.CHANNELS` and ``tokens_valid`` (P,); ``problem``. What is not
+        valid is 0.
 
         With ``dense`` also ``depth_map``, ``sigma_map`` (h, w) m, ``score_map`` (h, w) in [0, 1], ``source_map`` and
         ``gate_map`` (h, w) codes, over the field of the picture and of its size unless that is longer than ``size``.
@@ -171,6 +173,7 @@ class ExtendDepth(torch.nn.Module):
             "hole": samples.hole,
             "gate": estimate.gate,
             **_pose(fit, paired, found.depth),
+            **({} if self.views.pose is None else given.keys(fit, paired, self.views.pose)),
             "tokens": tokens,
             "tokens_valid": known,
             **({} if dense is None else maps.as_keys(dense)),
@@ -189,9 +192,9 @@ class ExtendDepth(torch.nn.Module):
         trace: dict[str, Any] = {}
         if self.maps is None:
             dense = None
-            estimate = self.method(read.anchor, read.other, seed=seed, hint=self.hint, trace=trace)
+            estimate = self.method(read.anchor, read.other, seed=seed, fit=read.given, hint=self.hint, trace=trace)
         else:
-            dense = self.maps.swept(read, self.method, seed=seed, hint=self.hint, trace=trace)
+            dense = self.maps.swept(read, self.method, seed=seed, fit=read.given, hint=self.hint, trace=trace)
             estimate = trace["sparse"]
         estimate = estimate.replace(gate=torch.where(read.paired[:, None], estimate.gate, Gate.NO_TRACK))
         return trace["samples"], estimate, trace["fit"], dense
@@ -218,6 +221,8 @@ class ExtendDepth(torch.nn.Module):
             out[key] = torch.zeros(1, *size, dtype=torch.bool)
         for key, size in {"source": (n,), "flag": (n,), "hole": (n,), "gate": (n,), "pose_code": ()}.items():
             out[key] = torch.zeros(1, *size, dtype=torch.int32)
+        if self.views.pose is not None:
+            out["pose_looks"] = torch.zeros(1, dtype=torch.int32)
         if self.maps is not None:
             size = self.maps.hw(hw)
             out |= {key: torch.zeros(1, *size) for key in maps.NUMBERS}

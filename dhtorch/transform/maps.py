@@ -42,7 +42,7 @@ class Maps:
         Args:
             read: the views.
             method: the sparse method.
-            asked: ``seed``, ``hint`` and ``trace``, as ``complete`` takes them.
+            asked: ``seed``, ``fit``, ``hint`` and ``trace``, as ``complete`` takes them.
         """
         assert read.other is not None
         options = {**self.options, "method": method, "calibration": self.calibration, **asked}

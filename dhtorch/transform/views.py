@@ -17,7 +17,9 @@ import torch
 from torch import Tensor
 
 from dhtorch.geometry import camera as cam
-from dhtorch.records import Camera, Frame
+from dhtorch.geometry import conventions
+from dhtorch.records import Camera, Frame, GivenPose
+from dhtorch.transform import given
 from dhtorch.transform.leaves import Leaves, Numbers, SampleError
 from dhtorch.tree import stack
 
@@ -39,6 +41,7 @@ class Read(NamedTuple):
     paired: Tensor  # (B,) bool: the other view is a view of its own, no copy that pads the start of an episode
     bad: Tensor  # (B,) bool: values contradict what was stated
     complaints: tuple[tuple[Tensor, Tensor, str], ...]  # mask (B,), value (B,) and what to say about it
+    given: GivenPose | None = None  # the motion to the other view, where samples state it; leading dims as of other
 
     def complaint(self) -> str:
         """What to say about the first bad sample."""
@@ -71,6 +74,14 @@ class Views:
     sparse: bool = False  # the depth map is a projected LiDAR sweep, mostly empty between returns
     at: int = -1  # the anchor's place along time
     other_at: int | Sequence[int] = 0  # the other view's; several are for a method of many views
+    pose: str | None = None  # key of a pose from elsewhere, 4x4 or 3x4; NaN where it is not known
+    pose_kind: str = "world_from_cam"  # of each frame; or "1_from_0": maps points of the anchor into the other view
+    pose_cov: Numbers | None = None  # of each such pose: key of 6x6 (left perturbation, rad and m); or two standard
+    # deviations (rad, m) of the relative pose; None = not stated, the near returns then tell
+    other_pose: str | None = None  # key of the other view's pose; None = another frame along time
+    pose_axes: str = "cv"  # of the camera: x right, y down, z forward; "gl": x right, y up, z backward
+    pose_unit: str | float = "m"  # or "mm", or metres per unit
+    refine: bool = False  # only start the search for the most probable pose from it
     layout: str | None = None  # "hwc" or "chw"; None = the axis of 1 or 3 is C, an error where that fits both
     intrinsics_hw: tuple[int, int] | None = None  # image size that the intrinsics belong to; None = the image as it is
     depth_range: tuple[float, float] = (0.0, float("inf"))  # m, returns outside are none (a codec's "no return")
@@ -84,6 +95,7 @@ class Views:
             raise ValueError(f"depth_unit is {unit!r}, expected one of {sorted(UNITS)} or metres per unit")
         if self.layout not in (None, "hwc", "chw"):
             raise ValueError(f"layout is {self.layout!r}, expected hwc, chw or None")
+        self._check_pose()
         if self.other_image is not None and not isinstance(self.other_at, int):
             raise ValueError("other_at is a list, expected one number where other_image names the other view")
 
@@ -114,10 +126,11 @@ class Views:
         if self.sparse:
             anchor = anchor.replace(sparse=torch.ones(len(depth), dtype=torch.bool, device=depth.device))
         other, paired = self._other(leaves, images, depths, anchor, checks)
+        motion = None if other is None else self._motion(leaves, T, checks)
         if other is not None:  # tracking reads all pixels, the front end alone a few where they lie
             anchor = anchor.replace(image=anchor.image.contiguous())
         bad = torch.stack([c[0] for c in checks]).any(0)
-        return Read(anchor, other, paired, bad, tuple(checks))
+        return Read(anchor, other, paired, bad, tuple(checks), motion)
 
     def image_hw(self, sample: Mapping[str, Any]) -> tuple[int, int] | None:
         """Size of the anchor's image, None where it cannot be read."""
@@ -156,6 +169,45 @@ class Views:
             camera = self._camera(leaves, numbers, hw, count, when, checks)
             frames.append(Frame(image, depth, camera, anchor.depth_camera))
         return (frames[0] if isinstance(self.other_at, int) else stack(frames)), torch.stack(own).any(0)
+
+    def _motion(self, leaves: Leaves, T: int, checks: list[Any]) -> GivenPose | None:
+        """The motions to the other views that the samples state."""
+        if self.pose is None:
+            return None
+        T_other = T if self.other_image is None else leaves.images(self.other_image, self.layout).shape[1]
+        wanted = [self.other_at] if isinstance(self.other_at, int) else self.other_at
+        places = [_place(p, T_other, self.other_image or self.image) for p in wanted]
+        unit = self.pose_unit
+        found = given.motions(
+            leaves,
+            (_place(self.at, T, self.image), places),
+            (T, T_other),
+            checks,
+            keys=(self.pose, self.other_pose),
+            cov=self.pose_cov,
+            kind=self.pose_kind,
+            axes=self.pose_axes,
+            unit=1 / UNITS[unit] if isinstance(unit, str) else unit,
+            refine=self.refine,
+        )
+        return found[0] if isinstance(self.other_at, int) else found
+
+    def _check_pose(self) -> None:
+        unit = self.pose_unit
+        if self.pose is None:
+            options = {"pose_cov": self.pose_cov, "other_pose": self.other_pose, "refine": self.refine or None}
+            if said := [name for name, value in options.items() if value is not None]:
+                raise ValueError(f"found {said[0]} without pose, expected the key of a pose")
+        if self.pose_kind not in given.KINDS:
+            raise ValueError(f"pose_kind is {self.pose_kind!r}, expected {' or '.join(given.KINDS)}")
+        if self.pose_axes not in conventions.STATED:
+            raise ValueError(f"pose_axes is {self.pose_axes!r}, expected {' or '.join(conventions.STATED)}")
+        if not (unit in UNITS or (isinstance(unit, float | int) and 0 < unit < float("inf"))):
+            raise ValueError(f"pose_unit is {unit!r}, expected one of {sorted(UNITS)} or metres per unit")
+        between_two = self.other_image is not None and self.pose_kind == "world_from_cam"
+        if self.pose is not None and between_two and self.other_pose is None:
+            raise ValueError("found pose and other_image, expected other_pose: the other view's pose")
+        given.sigmas(self.pose_cov)
 
     def _metres(self, x: Tensor) -> Tensor:
         """Depth in metres, 0 = no return."""
