@@ -190,11 +190,13 @@ class ExtendDepth(torch.nn.Module):
             dense = None if self.maps is None else self.maps.sensed(read.anchor, self.method)
             return samples, Estimate.silent(samples, Gate.NO_TRACK, n_views=0), None, dense
         trace: dict[str, Any] = {}
+        told: dict[str, Any] = {"seed": seed, "hint": self.hint, "trace": trace}
+        told |= {} if read.given is None else {"fit": read.given}
         if self.maps is None:
             dense = None
-            estimate = self.method(read.anchor, read.other, seed=seed, fit=read.given, hint=self.hint, trace=trace)
+            estimate = self.method(read.anchor, read.other, **told)
         else:
-            dense = self.maps.swept(read, self.method, seed=seed, fit=read.given, hint=self.hint, trace=trace)
+            dense = self.maps.swept(read, self.method, **told)
             estimate = trace["sparse"]
         estimate = estimate.replace(gate=torch.where(read.paired[:, None], estimate.gate, Gate.NO_TRACK))
         return trace["samples"], estimate, trace["fit"], dense
