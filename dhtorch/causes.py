@@ -227,7 +227,8 @@ class Window:
         depth = torch.where(samples.usable, samples.depth, 0.0)
         if self.maps is not None:
             depth = cause.undo(torch.cat([self.maps[i] for i in place])).to(depth)
-            depth = nearest(depth, _place(self.samples.uv, view.hw, depth))[0].nan_to_num(0.0, 0.0, 0.0)
+            at = cam.resize_pixels(self.samples.uv, view.hw, (depth.shape[-2], depth.shape[-1]))
+            depth = nearest(depth, at)[0].nan_to_num(0.0, 0.0, 0.0)
         found = self._under_fit(samples, depth, scaled)
         given = self._under_trajectory(depth, scaled)
         if given is not None:
@@ -308,8 +309,3 @@ def _firsts(n: int) -> list[int]:
     """Anchors of a window, spread evenly, not so near its ends that no earlier or later map is known."""
     low, high = (LAG, n - 1 - LAG) if n > 3 * LAG else (0, n - 2)
     return sorted({low + round((high - low) * k / (PAIRS - 1)) for k in range(PAIRS)})
-
-
-def _place(uv: Tensor, hw: tuple[int, int], depth: Tensor) -> Tensor:
-    scale = torch.tensor([depth.shape[-1] / hw[1], depth.shape[-2] / hw[0]]).to(uv)
-    return (uv + 0.5) * scale - 0.5

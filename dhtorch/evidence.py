@@ -22,6 +22,7 @@ from torch import Tensor
 from dhtorch import dense
 from dhtorch.codes import Flag
 from dhtorch.geometry import se3, sweep
+from dhtorch.geometry.camera import resize_pixels
 from dhtorch.geometry.lookup import nearest, nearest_index, pixels
 from dhtorch.geometry.shapes import check
 from dhtorch.records import Estimate, Samples
@@ -97,7 +98,7 @@ def by_answers(
     """
     check("by_answers", depth=(depth, "B h w"), uv=(found.uv, "B N 2"))
     h, w = depth.shape[-2:]
-    place = _grid_place(found.uv, hw, (h, w))
+    place = resize_pixels(found.uv, hw, (h, w))
     at, inside = nearest(depth, place)
     used = found.used & inside & (at > 0)
     ratio = torch.where(used, (at / found.depth).clamp_min(1e-9), 1.0).log()
@@ -234,11 +235,6 @@ def _filled(depth: Tensor) -> tuple[Tensor, Tensor]:
     count = sweep.window_sum(there.to(q), RADIUS)
     mean = sweep.window_sum(q, RADIUS) / count.clamp_min(1)
     return torch.where(there, q, mean), there & (count >= FILLED * (2 * RADIUS + 1) ** 2)
-
-
-def _grid_place(uv: Tensor, hw: tuple[int, int], grid: tuple[int, int]) -> Tensor:
-    scale = torch.tensor([grid[1] / hw[1], grid[0] / hw[0]]).to(uv)
-    return (uv + 0.5) * scale - 0.5
 
 
 def _spread(columns: Tensor, place: Tensor, depth: Tensor, at: Tensor) -> Tensor:

@@ -60,3 +60,15 @@ AUTO = MAP.replace(
 )
 
 METHODS = {"paper": PAPER, "map": MAP, "window": WINDOW, "auto": AUTO}
+
+
+def chosen(method: str | Method, n: int | None = None) -> Method:
+    """A method by its name or as it is, with ``n`` samples where that is said.
+
+    Raises:
+        ValueError: a name of :data:`METHODS` is unknown, or something else.
+    """
+    if method not in METHODS if isinstance(method, str) else not isinstance(method, Method):
+        raise ValueError(f"method is {method!r}, expected one of {sorted(METHODS)} or a Method")
+    found = METHODS[method] if isinstance(method, str) else method
+    return found if n is None else found.replace(n=n)

@@ -13,7 +13,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 #: Lists and objects inside one another that a file may hold: whoever walks through them does so by recursion.
 MAX_DEPTH = 64
@@ -100,18 +100,27 @@ def replace_file(path: str | Path, content: bytes) -> Path:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=_UNFINISHED, dir=path.parent)
-    try:
-        with naming(path), os.fdopen(handle, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
+    os.close(handle)
+    with whole(path, Path(name)) as file:
+        file.write(content)
         Path(name).chmod(0o644)
-        Path(name).replace(path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
     _sync_folder(path.parent)
     return path
+
+
+@contextlib.contextmanager
+def whole(path: Path, unfinished: Path) -> Iterator[IO[bytes]]:
+    """The file ``unfinished``, in the folder of ``path``, to be written: it is ``path`` once the block ends, and gone
+    where the block fails."""
+    try:
+        with naming(path), unfinished.open("wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        unfinished.replace(path)
+    except BaseException:
+        unfinished.unlink(missing_ok=True)
+        raise
 
 
 def copy_file(source: str | Path, path: str | Path) -> Path:
@@ -121,14 +130,8 @@ def copy_file(source: str | Path, path: str | Path) -> Path:
     if not source.is_file() or (path.is_file() and path.stat().st_size == source.stat().st_size):
         return path
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.copy{_UNFINISHED}")
-    try:
-        with naming(path):
-            shutil.copyfile(source, unfinished)
-        unfinished.replace(path)
-    except BaseException:
-        unfinished.unlink(missing_ok=True)
-        raise
+    with source.open("rb") as found, whole(path, path.with_name(f".{path.name}.copy{_UNFINISHED}")) as file:
+        shutil.copyfileobj(found, file)
     return path
 
 

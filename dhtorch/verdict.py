@@ -289,8 +289,7 @@ class Numbers(NamedTuple):
 
 def _of_frame(grid: Tensor, anchor: Frame, found: References, own: bool) -> Numbers:
     h, w = grid.shape[-2:]
-    scale = torch.tensor([w / anchor.hw[1], h / anchor.hw[0]]).to(grid)
-    at, inside = nearest(grid, (found.uv + 0.5) * scale - 0.5)
+    at, inside = nearest(grid, cam.resize_pixels(found.uv, anchor.hw, (h, w)))
     used = found.used & inside & (at > 0)
     ratio = torch.where(used, at / found.depth, 1.0)
     log = ratio.log()

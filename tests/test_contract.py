@@ -323,6 +323,7 @@ ROWS = [
     Row(camera.from_matrix, lambda b, n, d: (camera.to_matrix(cameras(b, d)),), POINTLESS + " raises", grad=(0,), bad=wrong_last_axis(0)),
     Row(camera.to_matrix, lambda b, n, d: (cameras(b, d),), POINTLESS, grad=(0,)),
     Row(camera.ideal, lambda b, n, d: (cameras(b, d, True),), POINTLESS, grad=(0,)),
+    Row(camera.resize_pixels, lambda b, n, d: (pixels(b, n, d), HW, (24, 32)), "dtype batch vmap capture gradcheck empty", grad=(0,)),
     Row(camera.resize, lambda b, n, d: (cameras(b, d), HW, (24, 32)), POINTLESS, grad=(0,)),
     Row(camera.project, lambda b, n, d: (cameras(b, d, True), uniform(b, n, 3, dtype=d, low=1, high=2)), ALL, (1,), (0, 1), bad=wrong_last_axis(1), leaks=True),
     Row(camera.unproject, lambda b, n, d: (cameras(b, d, True), pixels(b, n, d), uniform(b, n, dtype=d, low=1)), ALL, (1, 2), (0, 1, 2), bad=wrong_last_axis(1), leaks=True),
@@ -506,7 +507,7 @@ ELSEWHERE = {
     *(f"dhtorch.integrate.surface.{name}" for name in ("points", "mesh")),
     "dhtorch.integrate.picture.draw_map",
     "dhtorch.integrate.from_maps.join",
-    *(f"dhtorch.integrate.mapping.{name}" for name in ("make", "run", "voxel_of", "meshed", "write")),
+    *(f"dhtorch.integrate.mapping.{name}" for name in ("make", "run", "voxel_of", "meshed", "write", "write_surface")),
     *(f"dhtorch.integrate.level.{name}" for name in ("upwards", "mean_upwards", "floor")),
     "dhtorch.geometry.se3.turn_between",
     *(

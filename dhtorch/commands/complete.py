@@ -7,10 +7,11 @@ format where that can hold what was found. Only whole frames count: the same com
 
 from __future__ import annotations
 
+import contextlib
 import io
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -249,18 +250,9 @@ def _row(task: Task, path: Path) -> Row | None:
 def _make(task: Task, progress: Progress) -> None:
     """Make what is missing, frame by frame; the folder is a recording at every end but a kill."""
     todo = [i for i in task.frames if task.missing(i)]
-    try:
+    with closing(task):
         for i in progress(todo, f"{task.scene.name}: frames", len(todo)):
             make_one(task, i)
-    except KeyboardInterrupt:
-        close(task)
-        n = sum(task.name(i) in task.done for i in task.frames)
-        stay = f"{n} of {len(task.frames)} frames in {task.folder} are whole and stay"
-        raise KeyboardInterrupt(f"{stay}; the same command does the rest") from None
-    except Exception:
-        close(task)
-        raise
-    close(task)
 
 
 def make_one(task: Task, i: int) -> None:
@@ -270,7 +262,25 @@ def make_one(task: Task, i: int) -> None:
     _write_extras(task, i)
 
 
-def close(task: Task) -> None:
+@contextlib.contextmanager
+def closing(task: Task) -> Iterator[None]:
+    """While frames are made: the folder is a recording however this ends, but for a kill.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C, with what stays.
+    """
+    try:
+        try:
+            yield
+        finally:
+            _close(task)
+    except KeyboardInterrupt:
+        n = sum(task.name(i) in task.done for i in task.frames)
+        stay = f"{n} of {len(task.frames)} frames in {task.folder} are whole and stay"
+        raise KeyboardInterrupt(f"{stay}; the same command does the rest") from None
+
+
+def _close(task: Task) -> None:
     """Note what is whole now, and make a recording of it."""
     task.done.update(whole(task))
     known = [i for i in range(len(task.recording)) if task.name(i) in task.done]
@@ -320,6 +330,7 @@ def _write(task: Task, i: int, anchor: Frame, found: DepthMap, asked: Row) -> No
         storage.replace_file(layout.file(task.folder, "arrays", name), _arrays(one))
     row = storage.strict(_about(task, i, anchor, steps) | asked | _counts(steps, one))
     storage.write_json(layout.file(task.folder, "meta", name), row)
+    task.done[name] = row
 
 
 def _about(task: Task, i: int, anchor: Frame, steps: export.Steps) -> Row:

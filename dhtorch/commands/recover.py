@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from dhtorch import export, storage
-from dhtorch.codes import Gate, Source, names, words
+from dhtorch.codes import Gate, Source, names
 from dhtorch.commands import complete
 from dhtorch.commands.complete import Progress, Row, Task
 from dhtorch.commands.inspect import Found, classified, find
@@ -27,7 +27,8 @@ from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
 from dhtorch.drawing import draw_completed
 from dhtorch.integrate.from_maps import FrameMap, join
-from dhtorch.integrate.mapping import meshed, voxel_of
+from dhtorch.integrate.mapping import meshed, voxel_of, write_surface
+from dhtorch.method import Method
 from dhtorch.viewer import html, points
 
 #: Folder of what is made, where no other is said.
@@ -69,7 +70,6 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         ValueError, OSError: bad options or data, or a capture of which nothing can be recovered.
         KeyboardInterrupt: Ctrl-C; whole frames stay.
     """
-    _check(settings)
     if settings["threads"] is not None:
         torch.set_num_threads(settings["threads"])
         files.set_opencv_threads(settings["threads"])
@@ -181,15 +181,18 @@ def _looked_at(recording: Recording) -> int:
     if len(recording) < 2:
         help = "a second view from another place is needed for what the sensor lacks"
         raise NothingToDo(f"{recording.name}: {_count(len(recording), 'frame')}; {help}")
-    order = coarse_to_fine(len(recording))[:TRIED]
-    causes = {k: _unreadable(recording, k) for k in order}
-    readable = [k for k, cause in causes.items() if not cause]
-    if not readable:
-        raise NothingToDo(f"{recording.name}: no frame can be read: {causes[order[0]]}")
-    if 0 in recording[readable[0]].hw:
-        what = "depth only, nothing to track: it needs its pictures (rgb.mp4, or a folder of them)"
-        raise NothingToDo(f"{recording.name}: {what}")
-    return readable[0]
+    causes = []
+    for k in coarse_to_fine(len(recording))[:TRIED]:
+        try:
+            hw = recording[k].hw
+        except FormatError as error:
+            causes.append(str(error))
+            continue
+        if 0 in hw:
+            what = "depth only, nothing to track: it needs its pictures (rgb.mp4, or a folder of them)"
+            raise NothingToDo(f"{recording.name}: {what}")
+        return k
+    raise NothingToDo(f"{recording.name}: no frame can be read: {causes[0]}")
 
 
 def _count(n: int, word: str) -> str:
@@ -203,7 +206,7 @@ def _one(
     recording: Recording,
     folder: Path,
     settings: Mapping[str, Any],
-    method: Any,
+    method: Method,
     until: float | None,
     progress: Progress,
 ) -> list[str]:
@@ -241,20 +244,11 @@ def _make(task: Task, until: float | None, progress: Progress) -> Made:
                 return
             yield i
 
-    try:
+    with complete.closing(task):
         for i in progress(in_time(), f"{task.scene.name}: frames", len(todo)):
             if _tried(made, i) and first:
                 _overview(task, i)
                 first = False
-    except KeyboardInterrupt:
-        complete.close(task)
-        n = len(made.frames)
-        stay = f"{n} of {len(task.frames)} frames in {task.folder} are whole and stay"
-        raise KeyboardInterrupt(f"{stay}; the same command goes on") from None
-    except Exception:
-        complete.close(task)
-        raise
-    complete.close(task)
     return made
 
 
@@ -274,9 +268,6 @@ def _tried(made: Made, i: int) -> bool:
                 others[:] = [k for k in others if k not in broken]  # type: ignore[index]
         else:
             made.frames.append(i)
-            task.done[task.name(i)] = storage.loads(
-                task.layout.file(task.folder, "meta", task.name(i)).read_text(encoding="utf-8")
-            )
             return True
     return False
 
@@ -314,20 +305,11 @@ def _mapped(made: Made, settings: Mapping[str, Any], progress: Progress) -> list
     surface, up = join(task.recording, frames, read, voxel=voxel, meshed=meshed(settings["mesh"]), progress=progress)
     if not len(surface.xyz):
         return []
-    rgb, score = surface.features[:, :3], surface.features[:, 3]
-    codes = ", ".join(f"{code} {words(name)}" for code, name in names(Source).items())
     world = "world" if task.recording.poses is not None else "camera"
-    said = [
-        f"metres; axes of {task.scene.name}'s {world}",
-        f"up {' '.join(f'{v:.6f}' for v in up)}",
-        f"source: {codes}",
-    ]
-    about = {"sigma": surface.sigma, "score": score, "source": surface.source}
     ply = task.folder / "map.ply"
-    export.write_ply(ply, surface.xyz, rgb, normal=surface.normal, face=surface.face, comments=said, **about)
-    shape = export.Shape(
-        "map", surface.xyz, rgb, surface.normal, surface.face, values={k: about[k] for k in ("sigma", "source")}
-    )
+    write_surface(ply, surface, f"{task.scene.name}'s {world}", up)
+    values = {"sigma": surface.sigma, "source": surface.source}
+    shape = export.Shape("map", surface.xyz, surface.features[:, :3], surface.normal, surface.face, values=values)
     export.write_glb(task.folder / "map.glb", [shape], up=up)
     html.write(task.folder / "view.html", replace(points.read(ply), name=task.scene.name))
     return ["map.ply", "map.glb", "view.html"]
@@ -408,13 +390,3 @@ def _middle(made: Made) -> float:
     maps, source = complete.maps_of(made.task, made.frames[0])
     near = maps["depth"][(source == Source.SENSOR) & (maps["depth"] > 0)]
     return float(np.median(near)) if len(near) else 2.0
-
-
-def _check(settings: Mapping[str, Any]) -> None:
-    for name in ("minutes", "voxel"):
-        value = settings[name]
-        if value is not None and (isinstance(value, bool) or not isinstance(value, int | float) or not value > 0):
-            raise ValueError(f"{name}: found {value!r}, expected a number above 0, or null")
-    value = settings["recordings"]
-    if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
-        raise ValueError(f"recordings: found {value!r}, expected a whole number of at least 1, or null")

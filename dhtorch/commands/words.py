@@ -88,6 +88,8 @@ RULES: dict[str, Rule] = {
     "min_correlation": ((lambda v: _is_number(v) and -1 <= v <= 1), "a number from -1 to 1"),
     "max_sigma_rel": above_zero(),
     "unit": or_null(above_zero()),
+    "minutes": or_null(above_zero()),
+    "recordings": or_null(whole(1)),
 }
 
 #: Names, and ends of names, of numbers that functions take → least value.

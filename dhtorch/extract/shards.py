@@ -7,7 +7,6 @@ own: its number, and how many of its frames had which problem. No time is noted:
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import islice
@@ -50,21 +49,16 @@ def write(
     problems = shared["codes"]["problem"]
     counts: Counter[str] = Counter()
     unfinished = folder / f".{shard.name}{_UNFINISHED}"
-    try:
-        with storage.naming(folder / shard.name), unfinished.open("wb") as file:
-            with parquet.ParquetWriter(file, layout, compression="zstd") as writer:
-                for group in _groups(rows, group_rows(wanted)):
-                    counts.update(problems[str(int(row["problem"]))].lower() for row in group)
-                    writer.write_table(table(group, wanted, layout))
-                counts["skipped"] = len(shard.rows) - counts.total()
-                own = {"number": shard.number, "of": shard.of, "counts": dict(sorted(counts.items()))}
-                writer.add_key_value_metadata({OWN: storage.dumps(own)})
-            file.flush()
-            os.fsync(file.fileno())
-        unfinished.replace(folder / shard.name)
-    except BaseException:
-        unfinished.unlink(missing_ok=True)
-        raise
+    with (
+        storage.whole(folder / shard.name, unfinished) as file,
+        parquet.ParquetWriter(file, layout, compression="zstd") as writer,
+    ):
+        for group in _groups(rows, group_rows(wanted)):
+            counts.update(problems[str(int(row["problem"]))].lower() for row in group)
+            writer.write_table(table(group, wanted, layout))
+        counts["skipped"] = len(shard.rows) - counts.total()
+        own = {"number": shard.number, "of": shard.of, "counts": dict(sorted(counts.items()))}
+        writer.add_key_value_metadata({OWN: storage.dumps(own)})
     return counts
 
 

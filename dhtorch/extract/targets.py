@@ -6,7 +6,6 @@ file, whose metadata say what all rows together amount to. Who is killed begins 
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -209,30 +208,22 @@ class RobotTarget:
         seen: dict[int, None] = {}
         clean = self.file(k)
         clean.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = clean.with_name(f".{clean.name}.tmp")
         length, writer = 0, None
-        try:
-            with unfinished.open("wb") as sink:
-                for table in self._joined(k, start, parts, tallies):
-                    if writer is None:
-                        layout = lerobot.schema(self.features(table.column_names), _types(table), {})
-                        writer = parquet.ParquetWriter(sink, layout, compression="zstd")
-                    writer.write_table(table.select(layout.names).cast(layout))
-                    length += table.num_rows
-                    seen |= dict.fromkeys(table.column("task_index").to_pylist())
-                    _add_moments(moments, table)
+        with storage.whole(clean, clean.with_name(f".{clean.name}.tmp")) as sink:
+            for table in self._joined(k, start, parts, tallies):
                 if writer is None:
-                    raise ValueError(f"episode {self.numbers[k]}: found no frame that can be read, expected one")
-                own = self._summary(k, start, length, seen, moments, tallies)
-                writer.add_key_value_metadata({OWN: storage.dumps(own)})
-                writer.close()
-                sink.flush()
-                os.fsync(sink.fileno())
+                    layout = lerobot.schema(self.features(table.column_names), _types(table), {})
+                    writer = parquet.ParquetWriter(sink, layout, compression="zstd")
+                writer.write_table(table.select(layout.names).cast(layout))
+                length += table.num_rows
+                seen |= dict.fromkeys(table.column("task_index").to_pylist())
+                _add_moments(moments, table)
+            if writer is None:
+                raise ValueError(f"episode {self.numbers[k]}: found no frame that can be read, expected one")
+            own = self._summary(k, start, length, seen, moments, tallies)
+            writer.add_key_value_metadata({OWN: storage.dumps(own)})
+            writer.close()
             self._copy_videos(k, length)
-            unfinished.replace(clean)
-        except BaseException:
-            unfinished.unlink(missing_ok=True)
-            raise
         return own
 
     def _joined(

@@ -86,7 +86,13 @@ def resize(camera: Camera, hw: tuple[int, int], new_hw: tuple[int, int]) -> Came
     kornia's ``PinholeCamera.scale`` multiplies c alone, which puts the centre of the first pixel at its corner.
     """
     s = torch.as_tensor([new_hw[1] / hw[1], new_hw[0] / hw[0]]).to(camera.f)
-    return camera.replace(f=camera.f * s, c=(camera.c + 0.5) * s - 0.5)
+    return camera.replace(f=camera.f * s, c=resize_pixels(camera.c, hw, new_hw))
+
+
+def resize_pixels(uv: Tensor, hw: tuple[int, int], new_hw: tuple[int, int]) -> Tensor:
+    """Where pixels (…, 2) of an image lie in the image resampled from ``hw`` to ``new_hw``. Gradient: to uv."""
+    s = torch.as_tensor([new_hw[1] / hw[1], new_hw[0] / hw[0]]).to(uv)
+    return (uv + 0.5) * s - 0.5
 
 
 def project(
@@ -182,8 +188,7 @@ def depth_pixels(
         return _seen(depth_camera, _normalised(camera, undistort(camera, uv)))
     if depth_hw == hw:
         return uv
-    s = torch.as_tensor([depth_hw[1] / hw[1], depth_hw[0] / hw[0]]).to(uv)
-    return (uv + 0.5) * s - 0.5
+    return resize_pixels(uv, hw, depth_hw)
 
 
 def undistort_jacobian(camera: Camera, uv_ideal: Tensor) -> Tensor:

@@ -188,17 +188,8 @@ def _covered(points: Mapping[str, integrate.Surface], voxel: float) -> Row:
 def write(folder: Path, scene: MappedScene, settings: Mapping[str, Any]) -> list[Path]:
     """The files of one scene; returns what was written."""
     surface, voxel, up = scene.surface, scene.volume.voxel, scene.up
-    rgb, score = surface.features[:, :3], surface.features[:, 3]
-    about = {"sigma": surface.sigma, "score": score, "source": surface.source}
-    codes = ", ".join(f"{code} {words(name)}" for code, name in names(Source).items())
-    said = [
-        f"metres; axes of {scene.recording.name}'s world",
-        f"up {' '.join(f'{v:.6f}' for v in up)}",
-        f"source: {codes}",
-    ]
-    export.write_ply(
-        folder / "map.ply", surface.xyz, rgb, normal=surface.normal, face=surface.face, comments=said, **about
-    )
+    rgb = surface.features[:, :3]
+    said = write_surface(folder / "map.ply", surface, f"{scene.recording.name}'s world", up)
     cloud = _cloud(scene)
     recovered = cloud["source"] == Source.RECOVERED
     named = {"sigma": surface.sigma, "source": surface.source}
@@ -215,6 +206,16 @@ def write(folder: Path, scene: MappedScene, settings: Mapping[str, Any]) -> list
     files = ["map.ply", "map.glb", "points.ply", "map.png"]
     files += [f"colmap/{name}" for name in ("cameras.txt", "images.txt", "points3D.txt")]
     return [folder / name for name in files]
+
+
+def write_surface(path: Path, surface: integrate.Surface, axes: str, up: Sequence[float]) -> list[str]:
+    """Write a surface as PLY, in the axes of what ``axes`` names; its comments, for other files of the same map."""
+    rgb, score = surface.features[:, :3], surface.features[:, 3]
+    codes = ", ".join(f"{code} {words(name)}" for code, name in names(Source).items())
+    said = [f"metres; axes of {axes}", f"up {' '.join(f'{v:.6f}' for v in up)}", f"source: {codes}"]
+    about = {"sigma": surface.sigma, "score": score, "source": surface.source}
+    export.write_ply(path, surface.xyz, rgb, normal=surface.normal, face=surface.face, comments=said, **about)
+    return said
 
 
 def _cloud(scene: MappedScene) -> dict[str, Tensor]:

@@ -13,7 +13,7 @@ from torch.utils.data import get_worker_info
 from dhtorch.codes import Gate, Source
 from dhtorch.geometry import camera as cam
 from dhtorch.method import Method, networks
-from dhtorch.methods import METHODS
+from dhtorch.methods import chosen
 from dhtorch.pair import merge
 from dhtorch.records import NO_HINT, DepthMap, Estimate, PoseFit, Samples, TrackHint
 from dhtorch.transform import given, maps
@@ -95,8 +95,7 @@ class ExtendDepth(torch.nn.Module):
         **views: Any,
     ) -> None:
         super().__init__()
-        if method not in METHODS if isinstance(method, str) else not isinstance(method, Method):
-            raise ValueError(f"method is {method!r}, expected one of {sorted(METHODS)} or a Method")
+        method = chosen(method, n)
         if on_error not in ON_ERROR or (batched and on_error == "skip"):
             expected = ("raise", "flag") if batched else ON_ERROR
             raise ValueError(f"on_error is {on_error!r}, expected one of {', '.join(expected)}")
@@ -105,8 +104,7 @@ class ExtendDepth(torch.nn.Module):
         grid((max(patch, 1),) * 2, patch=patch, tokens_hw=tokens_hw)  # raises where no patch fits
         self.views = Views(**views)
         self.maps = maps.Maps.asked(dense)
-        method = METHODS[method] if isinstance(method, str) else method
-        self.method, self.hint = method if n is None else method.replace(n=n), hint
+        self.method, self.hint = method, hint
         self.learned = torch.nn.ModuleList(networks(self.method))  # so that .to() and .parameters() find them
         self.seed, self.index_key = seed, index_key
         self.patch, self.tokens_hw, self.fit = patch, tokens_hw, fit

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dhtorch.codes import State
 from dhtorch.method import Method
-from dhtorch.methods import METHODS
+from dhtorch.methods import chosen
 from dhtorch.records import NO_HINT, Frame, TrackHint, Verdict
 from dhtorch.transform.leaves import Leaves, SampleError
 from dhtorch.transform.views import Views
@@ -69,17 +69,14 @@ class JudgeDepth(torch.nn.Module):
         **views: Any,
     ) -> None:
         super().__init__()
-        if method not in METHODS if isinstance(method, str) else not isinstance(method, Method):
-            raise ValueError(f"method is {method!r}, expected one of {sorted(METHODS)} or a Method")
+        method = chosen(method, n)
         known = ("views", "partners", "size", "tolerance")
         if unknown := [name for name in judging or {} if name not in known]:
             raise ValueError(f"judging: found {', '.join(unknown)}, expected some of {', '.join(known)}")
         if not map_unit > 0:
             raise ValueError(f"map_unit is {map_unit!r}, expected a positive number of metres")
         self.views = Views(**views)
-        chosen = METHODS[method] if isinstance(method, str) else method
-        self.method = chosen if n is None else chosen.replace(n=n)
-        self.map, self.map_unit, self.judging = map, map_unit, dict(judging or {})
+        self.method, self.map, self.map_unit, self.judging = method, map, map_unit, dict(judging or {})
         self.hint, self.seed, self.batched, self.prefix = hint, seed, batched, prefix
 
     def forward(self, sample: Mapping[str, Any]) -> dict[str, Any]:
