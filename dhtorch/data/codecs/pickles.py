@@ -8,6 +8,7 @@ believed before the bytes for it are there. Protocols 2 to 5, the module paths o
 
 from __future__ import annotations
 
+import gc
 import re
 import struct
 from collections.abc import Callable
@@ -60,6 +61,8 @@ def loads(data: bytes, file: Path) -> Any:
     Raises:
         FormatError: anything that is not plain data, or too large, too deep, truncated.
     """
+    collects = gc.isenabled()
+    gc.disable()  # it looks at every new container again and again, and finds no cycle: most of the time went there
     try:
         return _Machine(data, file).run()
     except FormatError:
@@ -67,6 +70,9 @@ def loads(data: bytes, file: Path) -> Any:
     except (IndexError, KeyError, TypeError, ValueError, AttributeError, OverflowError, struct.error) as error:
         found = f"{type(error).__name__} {error}"
         raise FormatError(file, "pickle", found, "a whole pickle of arrays and plain containers") from None
+    finally:
+        if collects:
+            gc.enable()
 
 
 class _Machine:
