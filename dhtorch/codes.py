@@ -74,7 +74,7 @@ class PoseCode:
     OK: Final = 0
     TOO_FEW: Final = 1  #: fewer usable correspondences or inliers than the minimum
     DEGENERATE: Final = 2  #: the points do not determine a pose (collinear, coincident)
-    NO_BASELINE: Final = 3  #: a pose, but its translation is not significant
+    NO_BASELINE: Final = 3  #: the camera did not translate significantly, or stood still
     KEPT_PNP: Final = 4  #: refinement did not improve the fit; the PnP pose was kept
     REFUTED: Final = 5  #: a pose was given, and the near returns contradict it
 

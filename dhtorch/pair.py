@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dhtorch.codes import Gate, Source
+from dhtorch.codes import Gate, PoseCode, Source
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.shapes import check, is_transformed
 from dhtorch.geometry.small import product
@@ -32,6 +32,10 @@ from dhtorch.tree import in_pieces
 
 #: Pairs tracked at once: more are no faster, and their pyramids cost memory.
 PAIRS = 8
+
+#: The camera stood still where more than this share of at least so many tracks moved by fewer pixels. What moves in
+#: front of it is not the background, and without near returns nothing else can tell.
+STILL_SHARE, STILL_TRACKS, STILL_PX = 0.7, 16, 0.25
 
 #: Residual of near returns that a pose may leave from which a search only starts, of a ray with z = 1.
 START_MISS = 0.04
@@ -101,11 +105,22 @@ def under_pose(
         draws = uniform_draws(seed, camera_0.f.shape[0], method.hypotheses).to(camera_0.f)
         found = method.pose(samples, usable, camera_0, camera_1, draws)
         fit = found if fit is None else _held(fit, found, samples, usable, camera_0, camera_1)
+        fit = fit.replace(code=torch.where(_still(fit, usable), PoseCode.NO_BASELINE, fit.code).to(fit.code.dtype))
     clock("pose", fit)
     estimate = clock("triangulate", method.triangulate(samples, usable, fit, camera_0, camera_1))
     untextured = (estimate.gate == Gate.NO_TRACK) & tracks.valid & ~textured
     gate = torch.where(untextured, torch.full_like(estimate.gate, Gate.NO_TEXTURE), estimate.gate)
     return estimate.replace(gate=gate), usable, fit
+
+
+def _still(fit: PoseFit, tracks: Tracks) -> Tensor:
+    """Whether (B,) a pose is missing and most of the picture stayed where it was: the camera stood still."""
+    with torch.no_grad():
+        way = (tracks.uv_1 - tracks.uv_0).square().sum(-1)
+        stayed = (tracks.valid & (way < STILL_PX**2)).sum(-1)
+        seen = tracks.valid.sum(-1)
+        lost = (fit.code == PoseCode.TOO_FEW) | (fit.code == PoseCode.DEGENERATE)
+        return lost & (seen >= STILL_TRACKS) & (stayed > STILL_SHARE * seen)
 
 
 def _held(

@@ -21,6 +21,7 @@ import test_lerobot
 import test_pickle
 import test_record3d
 import test_rh20t
+import test_rlds
 import test_stray
 import torch
 from box import walk
@@ -103,6 +104,8 @@ SAMPLES: dict[str, Sample] = {
             "stray_old": test_stray.hostile_old,
             "lerobot_v3": test_lerobot.hostile_v3,
             "lerobot_v2": test_lerobot.hostile_v2,
+            "rlds": test_rlds.hostile_sample,
+            "rlds_array": test_rlds.hostile_array,
             **test_focal_stacks.HOSTILE,
         }.items()
     },

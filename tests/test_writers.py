@@ -104,6 +104,8 @@ WRITERS: dict[str, Callable[[Path, Lay], None]] = {
     "record3d_exr": lambda root, lay: writers.write_record3d_exr(root, shots(lay)),
     "record3d_mp4": lambda root, lay: writers.write_record3d_mp4(root / "a.mp4", shots(lay)),
     "rh20t": lambda root, lay: writers.write_rh20t(root, {"036422060909": shots(lay)}),
+    "rlds": lambda root, lay: writers.write_rlds(root, [shots(lay)]),
+    "rlds array": lambda root, lay: writers.write_rlds(root, [shots(lay)], depth="array"),
     "stray": lambda root, lay: writers.write_stray(root, shots(lay)),
     "stray npy": lambda root, lay: writers.write_stray(root, shots(lay), depth_format="npy", confidence_channels=3),
     "tum": lambda root, lay: writers.write_tum(root, shots(lay)),

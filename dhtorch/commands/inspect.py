@@ -23,7 +23,8 @@ from torch import Tensor
 
 from dhtorch import data
 from dhtorch.console import EPILOG, markup, progress, terminal
-from dhtorch.data import FormatError, files, lerobot
+from dhtorch.data import FormatError, files, lerobot, rlds
+from dhtorch.data.convert import NoIntrinsics
 from dhtorch.data.recording import Recording
 from dhtorch.data.survey import Survey, survey_pictures, survey_recording
 from dhtorch.drawing.colours import DEPTH, GREY, INK, OTHERS, SCORE, SILENT
@@ -32,6 +33,7 @@ from dhtorch.studies.focal.survey import survey_stacks
 
 _LEVELS = 2  # folders below the path
 _MOST = 12  # recordings that are shown of one capture
+_SIZES = {"lerobot": lerobot.picture_hw, "rlds": rlds.picture_hw}  # of formats that may lack a K
 _NO_K = "no intrinsics: nothing can be measured in it before data.K says them"
 _SPARSE = 0.1  # share of returns below which they are drawn larger
 _ARCHIVES = (".r3d", ".mp4", ".mov", ".tar", ".h5", ".hdf5")  # files that may be a whole capture
@@ -175,9 +177,9 @@ def _seen(capture: Found, recordings: Sequence[Recording], warning: list[str]) -
     """The recordings; where nobody says K with one that serves to look at them, and a warning."""
     try:
         _ = recordings[0]
-    except lerobot.NoIntrinsics:
+    except NoIntrinsics:
         warning.append(_NO_K)
-        h, w = lerobot.picture_hw(capture.path)
+        h, w = _SIZES[capture.format](capture.path)
         stand_in = (float(w), float(w), w / 2, h / 2)
         return data.open_all(capture.path, capture.format, follow_links=capture.follow_links, K=stand_in)
     return recordings

@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from dhtorch.data import arkitscenes, ca1m, driving, frames_dir, lerobot, record3d, rectified, rh20t, stray, tum
+from dhtorch.data import arkitscenes, ca1m, driving, frames_dir, lerobot, record3d, rectified, rh20t, rlds, stray, tum
 from dhtorch.data.files import FormatError, inside
 from dhtorch.data.recording import Recording, Recordings
 from dhtorch.data.scene import Given, Scene, Scenes, scenes_of
@@ -61,6 +61,7 @@ FORMATS: Final[dict[str, Reader]] = {
     "ca1m": ca1m,
     "rh20t": rh20t,
     "lerobot": lerobot,
+    "rlds": rlds,
     "stray": stray,
     "frames_dir": frames_dir,
 }

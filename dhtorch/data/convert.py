@@ -32,6 +32,10 @@ _MAX_DISTORTION = 1e4
 _GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
+class NoIntrinsics(FormatError):
+    """Nobody says K of a camera: nothing can be measured in it, though it can be looked at."""
+
+
 def to_camera(
     K: object,  # 3×3 numbers
     hw: tuple[int, int],
@@ -55,6 +59,57 @@ def to_camera(
         raise FormatError(file, f"{field} principal point", c.tolist(), f"a place near the {hw[1]}x{hw[0]} image")
     lens = None if distortion is None else _distortion(distortion, file)
     return Camera(_float32(f)[None], _float32(c)[None], None if lens is None else _float32(lens)[None])
+
+
+def wide(K: Sequence[float] | None, fov: float | None, hw: tuple[int, int], root: Path) -> Sequence[float] | None:
+    """fx, fy, cx, cy as given, or of a picture that sees ``fov`` degrees from side to side.
+
+    Raises:
+        FormatError: both, or no angle that a picture can see.
+    """
+    if fov is None:
+        return K
+    if K is not None or isinstance(fov, bool) or not isinstance(fov, int | float) or not 1 <= fov < 179:
+        found = "K as well" if K is not None else fov
+        raise FormatError(root, "option fov", found, "1 to 179 degrees from side to side, where no K is given")
+    h, w = hw
+    f = w / 2 / np.tan(np.radians(fov) / 2)
+    return float(f), float(f), (w - 1) / 2, (h - 1) / 2
+
+
+def K_of(values: Sequence[float], root: Path, field: str) -> np.ndarray:
+    """K of an option's fx, fy, cx, cy."""
+    return matrix_of(*to_array(values, (4,), root, field))
+
+
+def to_cameras(values: np.ndarray, hw: tuple[int, int], file: Path, field: str, lens: object) -> Camera:
+    """Cameras of rows of 4 (fx fy cx cy) or 9 numbers: one for all if they are equal.
+
+    Raises:
+        FormatError: another number of numbers, or as :func:`to_camera`.
+    """
+    flat = values.reshape(len(values), -1).astype(np.float64)
+    if flat.shape[1] not in (4, 9):
+        raise FormatError(file, field, f"{flat.shape[1]} numbers", "4 (fx fy cx cy) or 9")
+    if (flat == flat[:1]).all():
+        flat = flat[:1]
+    made = [to_camera(matrix_of(*k) if len(k) == 4 else k.reshape(3, 3), hw, file, field, lens) for k in flat]
+    distortion = None if made[0].distortion is None else made[0].distortion.expand(len(made), -1)
+    return Camera(torch.cat([m.f for m in made]), torch.cat([m.c for m in made]), distortion)
+
+
+def to_poses_of(values: np.ndarray, file: Path, field: str) -> Pose:
+    """Poses of rows of 16 (4×4 by rows) or 7 numbers (x y z qx qy qz qw).
+
+    Raises:
+        FormatError: another number of numbers, or as :func:`to_poses` and :func:`to_c2w`.
+    """
+    flat = values.reshape(len(values), -1).astype(np.float64)
+    if flat.shape[1] == 7:
+        return to_poses(to_c2w(flat[:, 3:], flat[:, :3], file, field), file, field)
+    if flat.shape[1] != 16:
+        raise FormatError(file, field, f"{flat.shape[1]} numbers", "16 (4x4 by rows) or 7 (x y z qx qy qz qw)")
+    return to_poses(flat.reshape(-1, 4, 4), file, field)
 
 
 def matrix_of(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:

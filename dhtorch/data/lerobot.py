@@ -27,12 +27,7 @@ from dhtorch.data.lerobot_depth import decode_codes, decode_picture, depth_of
 from dhtorch.data.lerobot_meta import Episode, Episodes, Feature, Meta, colour_keys, inside, read_episodes, read_meta
 from dhtorch.data.lerobot_rows import episode_rows, read_table
 from dhtorch.data.recording import Recording, Recordings
-from dhtorch.records import Camera, Frame, Pose
-
-
-class NoIntrinsics(FormatError):
-    """Nobody says K of a camera: nothing can be measured in it, though it can be looked at."""
-
+from dhtorch.records import Camera, Frame
 
 _UNITS = {"m": 1.0, "mm": 1000.0}
 
@@ -108,7 +103,7 @@ def read(
             meta,
             key,
             depth,
-            _wide(K, fov, meta, key),
+            convert.wide(K, fov, meta.features[key].hw, meta.root),
             K_depth,
             distortion,
             intrinsics,
@@ -279,7 +274,7 @@ class _Rig:
         cameras, depth_camera = self._cameras(table, rows, depth)
         poses = None
         if self.pose_key is not None:
-            poses = _poses(table[self.pose_key][rows], episode.data, self.pose_key)
+            poses = convert.to_poses_of(table[self.pose_key][rows], episode.data, self.pose_key)
         load = _Load(
             data=episode.data,
             root=meta.root,
@@ -318,55 +313,15 @@ class _Rig:
         lens = self.distortion if self.distortion is not None else entry.get("dist")
         of_depth = None
         if depth is not None and (self.K_depth is not None or entry.get("K_depth") is not None):
-            value = _matrix(self.K_depth, root, "option K_depth") if self.K_depth is not None else entry["K_depth"]
+            value = convert.K_of(self.K_depth, root, "option K_depth") if self.K_depth is not None else entry["K_depth"]
             of_depth = convert.to_camera(value, depth.hw, side, "K_depth")
         if self.K is not None:
-            return convert.to_camera(_matrix(self.K, root, "option K"), hw, root, "option K", lens), of_depth
+            return convert.to_camera(convert.K_of(self.K, root, "option K"), hw, root, "option K", lens), of_depth
         if self.K_key is not None:
             values = table[self.K_key][rows]
-            return _cameras_of(values, hw, root / "data", self.K_key, lens), of_depth
+            return convert.to_cameras(values, hw, root / "data", self.K_key, lens), of_depth
         if "K" not in entry:
             found = "no K in option, feature or side-car"
             expected = f"option K, a feature such as {self.key}.intrinsics (option intrinsics), or meta/intrinsics.json"
-            raise NoIntrinsics(side, self.key, found, expected)
+            raise convert.NoIntrinsics(side, self.key, found, expected)
         return convert.to_camera(entry["K"], hw, side, f"{self.key} K", lens), of_depth
-
-
-def _wide(K: Sequence[float] | None, fov: float | None, meta: Meta, key: str) -> Sequence[float] | None:
-    """K as given, or of a picture that sees ``fov`` degrees from side to side."""
-    if fov is None:
-        return K
-    if K is not None or isinstance(fov, bool) or not isinstance(fov, int | float) or not 1 <= fov < 179:
-        found = "K as well" if K is not None else fov
-        raise FormatError(meta.root, "option fov", found, "1 to 179 degrees from side to side, where no K is given")
-    h, w = meta.features[key].hw
-    f = w / 2 / np.tan(np.radians(fov) / 2)
-    return float(f), float(f), (w - 1) / 2, (h - 1) / 2
-
-
-def _matrix(values: Sequence[float], root: Path, field: str) -> np.ndarray:
-    return convert.matrix_of(*files.to_array(values, (4,), root, field))
-
-
-def _cameras_of(values: np.ndarray, hw: tuple[int, int], file: Path, field: str, lens: object) -> Camera:
-    """Cameras of a feature's rows: one for all if they are equal."""
-    flat = values.reshape(len(values), -1).astype(np.float64)
-    if flat.shape[1] not in (4, 9):
-        raise FormatError(file, field, f"{flat.shape[1]} numbers", "4 (fx fy cx cy) or 9")
-    if (flat == flat[:1]).all():
-        flat = flat[:1]
-    made = [
-        convert.to_camera(convert.matrix_of(*k) if len(k) == 4 else k.reshape(3, 3), hw, file, field, lens)
-        for k in flat
-    ]
-    distortion = None if made[0].distortion is None else made[0].distortion.expand(len(made), -1)
-    return Camera(torch.cat([m.f for m in made]), torch.cat([m.c for m in made]), distortion)
-
-
-def _poses(values: np.ndarray, file: Path, field: str) -> Pose:
-    flat = values.reshape(len(values), -1).astype(np.float64)
-    if flat.shape[1] == 7:
-        return convert.to_poses(convert.to_c2w(flat[:, 3:], flat[:, :3], file, field), file, field)
-    if flat.shape[1] != 16:
-        raise FormatError(file, field, f"{flat.shape[1]} numbers", "16 (4x4 by rows) or 7 (x y z qx qy qz qw)")
-    return convert.to_poses(flat.reshape(-1, 4, 4), file, field)

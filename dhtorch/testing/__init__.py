@@ -18,6 +18,7 @@ from dhtorch.testing.layouts import (
 from dhtorch.testing.lerobot import write_lerobot
 from dhtorch.testing.record3d import write_r3d, write_record3d_exr, write_record3d_mp4
 from dhtorch.testing.rh20t import write_rh20t
+from dhtorch.testing.rlds import write_rlds
 from dhtorch.testing.stray import write_stray
 
 __all__ = [
@@ -33,6 +34,7 @@ __all__ = [
     "write_record3d_exr",
     "write_record3d_mp4",
     "write_rh20t",
+    "write_rlds",
     "write_stray",
     "write_tum",
 ]

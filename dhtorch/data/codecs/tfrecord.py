@@ -1,0 +1,274 @@
+"""TFRecord files and the ``tf.train.Example`` messages in them, read without TensorFlow.
+
+A file is a row of records: length (8 bytes, little end first), a check sum of these, the bytes, a check sum of them.
+Check sums are CRC-32C (Castagnoli), *masked*: turned right by 15 bits, plus a constant. A message is a protocol buffer:
+``Example{1: Features{1: map<text, Feature>}}``, a feature being a list of bytes (1), floats (2) or whole numbers (3).
+
+Alphabet: a span is (offset, length) of bytes in the file.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from dhtorch.data.files import MAX_BYTES, FormatError, opened, unreadable
+
+MAX_RECORDS = 10_000_000
+MAX_FIELDS = 2_000_000  # of one record: names, pictures, runs of numbers
+
+_HEAD, _TAIL = 12, 4  # bytes around a record
+_POLYNOMIAL, _MASK = 0x82F63B78, 0xA282EAD8  # bits reflected
+_BLOCK = 512  # bytes whose check sum is made beside those of all other blocks
+_PIECE = 4 << 20  # bytes of which blocks are made at once
+_KINDS = {1: "bytes", 2: "float", 3: "int64"}
+
+
+class Span(NamedTuple):
+    """Some bytes of a file."""
+
+    offset: int
+    length: int
+
+
+class Feature(NamedTuple):
+    """One feature of a record, not yet decoded."""
+
+    kind: str  # "bytes", "float" or "int64"
+    spans: tuple[Span, ...]  # of bytes: each value's; of numbers: runs of them, packed
+
+
+def record_spans(file: Path) -> list[Span]:
+    """Where the records of a file lie; only their lengths are read, and held against their check sums.
+
+    Raises:
+        FormatError: unreadable, a wrong check sum, a file that ends inside a record, or no record at all.
+    """
+    found: list[Span] = []
+    try:
+        with opened(file) as stream:
+            total, at = os.fstat(stream.fileno()).st_size, 0
+            while at < total:
+                head = os.pread(stream.fileno(), _HEAD, at)
+                length = _length(file, head, at)
+                if at + _HEAD + length + _TAIL > total:
+                    raise FormatError(file, f"record {len(found)}", f"{total - at} bytes", f"{length} and 16 more")
+                found.append(Span(at + _HEAD, length))
+                at += _HEAD + length + _TAIL
+                if len(found) > MAX_RECORDS:
+                    raise FormatError(file, "records", "more", f"at most {MAX_RECORDS}")
+    except OSError as error:
+        raise unreadable(file, error) from None
+    if not found:
+        raise FormatError(file, "records", "none", "at least one")
+    return found
+
+
+def read_record(file: Path, span: Span) -> bytes:
+    """The bytes of a record, held against their check sum.
+
+    Raises:
+        FormatError: unreadable, too long, cut off, or another check sum.
+    """
+    data = read_span(file, Span(span.offset, span.length + _TAIL))
+    body, stored = data[: span.length], int.from_bytes(data[span.length :], "little")
+    if masked(crc32c(body)) != stored:
+        found = f"check sum {masked(crc32c(body)):08x}"
+        raise FormatError(file, f"record at byte {span.offset}", found, f"{stored:08x}")
+    return body
+
+
+def read_span(file: Path, span: Span) -> bytes:
+    """Bytes of a file.
+
+    Raises:
+        FormatError: unreadable, too long, or cut off.
+    """
+    if span.length > MAX_BYTES:
+        raise FormatError(file, f"record at byte {span.offset}", f"{span.length} bytes", f"at most {MAX_BYTES}")
+    try:
+        with opened(file) as stream:
+            data = os.pread(stream.fileno(), span.length, span.offset)
+    except OSError as error:
+        raise unreadable(file, error) from None
+    if len(data) != span.length:
+        raise FormatError(file, f"record at byte {span.offset}", f"{len(data)} bytes", f"{span.length} bytes")
+    return data
+
+
+def example(body: bytes, file: Path, start: int) -> dict[str, Feature]:
+    """Name → feature of an ``Example``; spans count in the file, in which the message begins at ``start``.
+
+    Raises:
+        FormatError: no such message.
+    """
+    return _Message(body, file, start).features()
+
+
+def numbers(file: Path, name: str, feature: Feature, most: int) -> np.ndarray:
+    """The numbers of a feature: float64 of floats, int64 of whole numbers.
+
+    Raises:
+        FormatError: bytes, or more than ``most`` numbers.
+    """
+    if feature.kind == "bytes":
+        raise FormatError(file, name, "bytes", "numbers")
+    size = sum(span.length for span in feature.spans)
+    least = 4 if feature.kind == "float" else 1
+    if size > least * most * (1 if least == 4 else 10):
+        raise FormatError(file, name, f"{size} bytes of numbers", f"at most {most} numbers")
+    if not feature.spans:
+        return np.zeros(0)
+    first, last = feature.spans[0].offset, feature.spans[-1].offset + feature.spans[-1].length
+    data = read_span(file, Span(first, last - first))
+    runs = [data[at - first : at - first + length] for at, length in feature.spans]
+    if feature.kind == "float":
+        data = b"".join(runs)
+        if len(data) % 4:
+            raise FormatError(file, name, f"{len(data)} bytes", "floats of 4 bytes")
+        return np.frombuffer(data, "<f4").astype(np.float64)
+    return np.concatenate([np.zeros(0, np.int64), *(_whole(run, file, name) for run in runs)])
+
+
+def masked(crc: int) -> int:
+    """A check sum as it is stored."""
+    return (((crc >> 15) | (crc << 17)) + _MASK) & 0xFFFFFFFF
+
+
+def crc32c(data: bytes) -> int:
+    """CRC-32C. The sums of many blocks are made side by side and then joined: the sum is linear in its bits."""
+    state, table = 0xFFFFFFFF, _table()
+    head = len(data) % _BLOCK
+    for byte in data[:head]:
+        state = int(table[(state ^ byte) & 0xFF]) ^ (state >> 8)
+    ahead = [t.tolist() for t in _ahead()]
+    for at in range(head, len(data), _PIECE // _BLOCK * _BLOCK):
+        piece = np.frombuffer(data, np.uint8, min(_PIECE // _BLOCK * _BLOCK, len(data) - at), at)
+        columns = np.ascontiguousarray(piece.reshape(-1, _BLOCK).T)
+        sums = np.zeros(columns.shape[1], np.uint32)
+        for column in columns:
+            sums = table[(sums ^ column) & 0xFF] ^ (sums >> 8)
+        for block in sums.tolist():
+            a, b, c, d = ahead
+            state = a[state & 0xFF] ^ b[(state >> 8) & 0xFF] ^ c[(state >> 16) & 0xFF] ^ d[state >> 24] ^ block
+    return state ^ 0xFFFFFFFF
+
+
+@cache
+def _table() -> np.ndarray:
+    """What one byte does to the state (256,)."""
+    state = np.arange(256, dtype=np.uint32)
+    for _ in range(8):
+        state = np.where(state & 1, (state >> 1) ^ np.uint32(_POLYNOMIAL), state >> 1)
+    return state
+
+
+@cache
+def _ahead() -> np.ndarray:
+    """What a block of zeros does to each byte of the state (4, 256)."""
+    state = (np.arange(256, dtype=np.uint32)[None] << (8 * np.arange(4, dtype=np.uint32))[:, None]).astype(np.uint32)
+    for _ in range(_BLOCK):
+        state = _table()[state & 0xFF] ^ (state >> 8)
+    return state
+
+
+def _length(file: Path, head: bytes, at: int) -> int:
+    if len(head) < _HEAD:
+        raise FormatError(file, f"record at byte {at}", f"{len(head)} bytes", "a TFRecord header of 12")
+    length, stored = struct.unpack("<QI", head)
+    if masked(crc32c(head[:8])) != stored:
+        raise FormatError(file, f"record at byte {at}", "a wrong check sum of its length", "a TFRecord")
+    return length
+
+
+class _Message:
+    """A protocol buffer, taken apart field by field; only so many, for each costs more than its bytes."""
+
+    def __init__(self, body: bytes, file: Path, start: int) -> None:
+        self.body, self.file, self.start = body, file, start
+        self.left = MAX_FIELDS
+
+    def features(self) -> dict[str, Feature]:
+        """Name → feature, the last of a name."""
+        found: dict[str, Feature] = {}
+        for _, features in self._inner((0, len(self.body)), 1):
+            for _, entry in self._inner(features, 1):
+                name, feature = "", None
+                for number, span in self._inner(entry, 1, 2):
+                    if number == 1:
+                        name = self._text(span)
+                    else:
+                        feature = self._feature(span)
+                if feature is not None:
+                    found[name] = feature
+        return found
+
+    def _feature(self, within: tuple[int, int]) -> Feature | None:
+        for number, inner in self._inner(within, *_KINDS):
+            spans = (Span(self.start + at, size) for field, _, (at, size) in self._fields(inner) if field == 1)
+            return Feature(_KINDS[number], tuple(spans))
+        return None
+
+    def _inner(self, within: tuple[int, int], *numbers: int) -> Iterator[tuple[int, tuple[int, int]]]:
+        """Fields that hold bytes, texts and messages, of these numbers."""
+        return ((n, span) for n, wire, span in self._fields(within) if wire == 2 and n in numbers)
+
+    def _fields(self, within: tuple[int, int]) -> Iterator[tuple[int, int, tuple[int, int]]]:
+        """(field number, wire type, where its bytes are) of a message."""
+        at, end = within[0], within[0] + within[1]
+        while at < end:
+            self.left -= 1
+            if self.left < 0:
+                raise FormatError(self.file, "message", "more fields", f"at most {MAX_FIELDS} in a record")
+            tag, at = self._varint(at, end)
+            wire, size = tag & 7, 0
+            if wire == 2:
+                size, at = self._varint(at, end)
+            elif wire == 0:
+                size = self._varint(at, end)[1] - at
+            elif wire in (1, 5):
+                size = 8 if wire == 1 else 4
+            else:
+                raise FormatError(self.file, "message", f"wire type {wire}", "a tf.train.Example")
+            if at + size > end:
+                raise FormatError(self.file, "message", f"a field of {size} bytes in {end - at}", "a tf.train.Example")
+            yield tag >> 3, wire, (at, size)
+            at += size
+
+    def _varint(self, at: int, end: int) -> tuple[int, int]:
+        value = 0
+        for shift in range(0, 70, 7):
+            if at >= end:
+                break
+            byte, at = self.body[at], at + 1
+            value |= (byte & 0x7F) << shift
+            if byte < 0x80:
+                return value, at
+        raise FormatError(self.file, "message", f"a number that does not end by byte {at}", "a tf.train.Example")
+
+    def _text(self, span: tuple[int, int]) -> str:
+        try:
+            return self.body[span[0] : span[0] + span[1]].decode()
+        except UnicodeDecodeError as error:
+            raise FormatError(self.file, "name of a feature", error.reason, "UTF-8") from None
+
+
+def _whole(run: bytes, file: Path, name: str) -> np.ndarray:
+    """Packed varints of 64 bits, two's complement."""
+    raw = np.frombuffer(run, np.uint8)
+    ends = np.flatnonzero(raw < 0x80)
+    if len(raw) and (not len(ends) or ends[-1] != len(raw) - 1):
+        raise FormatError(file, name, "a whole number that does not end", "packed whole numbers")
+    starts = np.concatenate([[0], ends[:-1] + 1]).astype(np.int64) if len(ends) else np.zeros(0, np.int64)
+    if len(ends) and int((ends - starts).max()) >= 10:
+        raise FormatError(file, name, "a whole number of more than 10 bytes", "packed whole numbers")
+    place = (np.arange(len(raw)) - np.repeat(starts, np.diff(np.append(starts, len(raw))))).astype(np.uint64)
+    parts = (raw & 0x7F).astype(np.uint64) << (np.uint64(7) * place)
+    summed = np.bitwise_or.reduceat(parts, starts) if len(starts) else np.zeros(0, np.uint64)
+    return summed.view(np.int64)

@@ -1,0 +1,140 @@
+"""Writer of RLDS data sets: TFRecord files and the two JSON files that TFDS puts beside them."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from dhtorch.data.codecs.tfrecord import crc32c, masked
+from dhtorch.records import Frame
+from dhtorch.testing.parts import K_matrix, depth_codes, pixels, png, pose_matrix, write
+
+_CLASS = "tensorflow_datasets.core.features"
+
+
+def write_rlds(
+    root: Path,
+    episodes: Sequence[Sequence[Frame]],
+    *,
+    split: str = "train",
+    camera: str = "image_0",
+    depth: Literal["png", "array"] | None = "png",
+    intrinsics: bool = True,
+    poses: bool = True,
+    shards: int = 1,
+    said: bool = True,
+) -> None:
+    """A set of one camera; step by step ``observation/<camera>``, an action, and what else is asked for.
+
+    Args:
+        root: folder of the set's version.
+        episodes: frames of each.
+        split: its name.
+        camera: name of the colour feature.
+        depth: ``"png"`` (mm) or ``"array"`` (float32, m) under ``depth`` in the place of ``image``; None = none.
+        intrinsics: write ``observation/<camera>_intrinsics``, 9 numbers.
+        poses: write ``observation/<camera>_T_world_from_cam``, 16 numbers.
+        shards: number of files.
+        said: features say the size of pictures.
+    """
+    first = episodes[0][0]
+    of_depth = camera.replace("image", "depth")
+    observation: dict[str, Any] = {camera: _picture((*first.hw, 3) if said else (-1, -1, 3), "uint8")}
+    if depth == "png":
+        observation[of_depth] = _picture((*first.depth.shape[1:], 1), "uint16")
+    elif depth == "array":
+        observation[of_depth] = _tensor(tuple(first.depth.shape[1:]), "float32")
+    observation |= {f"{camera}_intrinsics": _tensor((9,), "float32")} if intrinsics else {}
+    observation |= {f"{camera}_T_world_from_cam": _tensor((16,), "float32")} if poses else {}
+    step = {"observation": _dict(observation), "action": _tensor((7,), "float32"), "is_last": _tensor((), "bool")}
+    steps = {"pythonClassName": f"{_CLASS}.Dataset", "sequence": {"feature": _dict(step), "length": "-1"}}
+    write(root / "features.json", json.dumps(_dict({"steps": steps})))
+    counts = [len(part) for part in np.array_split(np.arange(len(episodes)), shards)]
+    said_of = {"name": split, "shardLengths": [str(count) for count in counts]}
+    write(root / "dataset_info.json", json.dumps({"name": "tiny_robot", "version": "1.0.0", "splits": [said_of]}))
+    records = [_record(_episode(frames, camera, of_depth, depth, intrinsics, poses)) for frames in episodes]
+    for shard, count in enumerate(counts):
+        name = f"tiny_robot-{split}.tfrecord-{shard:05d}-of-{shards:05d}"
+        write(root / name, b"".join(records[sum(counts[:shard]) : sum(counts[:shard]) + count]))
+
+
+def _episode(
+    frames: Sequence[Frame], camera: str, of_depth: str, depth: str | None, intrinsics: bool, poses: bool
+) -> bytes:
+    """One record's message."""
+    n = len(frames)
+    features = {
+        f"steps/observation/{camera}": _bytes([png(pixels(frame)) for frame in frames]),
+        "steps/action": _floats(np.arange(7 * n)),
+        "steps/is_last": _wholes([int(i == n - 1) for i in range(n)]),
+        "episode_metadata/episode_id": _wholes([-1]),
+    }
+    if depth == "png":
+        features[f"steps/observation/{of_depth}"] = _bytes([png(depth_codes(frame.depth, 1000)) for frame in frames])
+    elif depth == "array":
+        features[f"steps/observation/{of_depth}"] = _floats(np.stack([frame.depth[0].numpy() for frame in frames]))
+    if intrinsics:
+        features[f"steps/observation/{camera}_intrinsics"] = _floats(
+            np.stack([K_matrix(frame.camera) for frame in frames])
+        )
+    if poses:
+        features[f"steps/observation/{camera}_T_world_from_cam"] = _floats(
+            np.stack([pose_matrix(frame) for frame in frames])
+        )
+    entries = (_field(1, _field(1, name.encode()) + _field(2, value)) for name, value in features.items())
+    return _field(1, b"".join(entries))
+
+
+def _record(body: bytes) -> bytes:
+    length = struct.pack("<Q", len(body))
+    return length + struct.pack("<I", masked(crc32c(length))) + body + struct.pack("<I", masked(crc32c(body)))
+
+
+def _field(number: int, content: bytes) -> bytes:
+    return _varint(number << 3 | 2) + _varint(len(content)) + content
+
+
+def _varint(value: int) -> bytes:
+    value &= (1 << 64) - 1
+    out = bytearray()
+    while value > 0x7F:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    return bytes([*out, value])
+
+
+def _bytes(values: Sequence[bytes]) -> bytes:
+    return _field(1, b"".join(_field(1, value) for value in values))
+
+
+def _floats(values: np.ndarray) -> bytes:
+    return _field(2, _field(1, np.ascontiguousarray(values, "<f4").tobytes()))
+
+
+def _wholes(values: Sequence[int]) -> bytes:
+    return _field(3, _field(1, b"".join(_varint(value) for value in values)))
+
+
+def _dict(features: dict[str, Any]) -> dict[str, Any]:
+    return {"pythonClassName": f"{_CLASS}.FeaturesDict", "featuresDict": {"features": features}}
+
+
+def _shape(shape: tuple[int, ...]) -> dict[str, Any]:
+    return {"dimensions": [str(size) for size in shape]} if shape else {}
+
+
+def _picture(shape: tuple[int, ...], dtype: str) -> dict[str, Any]:
+    image = {"shape": _shape(shape), "dtype": dtype, "encodingFormat": "png"}
+    return {"pythonClassName": f"{_CLASS}.Image", "image": image}
+
+
+def _tensor(shape: tuple[int, ...], dtype: str) -> dict[str, Any]:
+    return {
+        "pythonClassName": f"{_CLASS}.Tensor",
+        "tensor": {"shape": _shape(shape), "dtype": dtype, "encoding": "none"},
+    }
