@@ -18,7 +18,7 @@ LEVELS = [
     {"stages", "data", "evaluate", "export", "synthetic", "testing", "calibration"},
     {"method"},
     {"pair", "window", "methods", "first_release", "views", "offers"},
-    {"stream", "dense", "metric"},
+    {"stream", "dense", "rig", "metric"},
     {"evidence", "causes"},
     {"verdict"},
     {"transform", "integrate", "viewer"},

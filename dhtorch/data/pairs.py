@@ -12,6 +12,7 @@ from typing import NamedTuple
 import torch
 
 from dhtorch.data.recording import Recording
+from dhtorch.data.rig import Rig
 from dhtorch.data.scene import Given, Scene
 
 #: From this many frames on, neighbouring anchors are nearly the same picture: take every other one.
@@ -154,6 +155,49 @@ def by_baseline(scene: Given, metres: float, tolerance: float | None = None, str
     return _some(pairs, recording, f"{metres} m ± {tolerance:g} m")
 
 
+def by_cameras(
+    scene: Given,
+    instants: Sequence[int] = (0,),
+    anchor: str | None = None,
+    stride: int | None = None,
+    past: bool = False,
+) -> list[Pair]:
+    """Every anchor of a rig with what its other cameras saw: at the same instant, and ``instants`` away.
+
+    Where one is not 0 the anchor's own camera is offered, too: views in space and in time. One frame alone is a
+    fixed pair, several are offered to the method.
+
+    Args:
+        scene: its recording is a :class:`dhtorch.data.rig.Rig`.
+        instants: how many instants from the anchor to those offered; 0 = the same.
+        anchor: name of the camera whose depth is extended. None = all.
+        stride: step from anchor to anchor, in instants. None = 2 where there are 25 or more, else 1.
+        past: only instants up to the anchor's.
+
+    Raises:
+        ValueError: one camera alone, an unknown one, instants below 0, or no pair.
+    """
+    recording = Scene.of(scene).recording
+    if not isinstance(recording, Rig):
+        expected = "several cameras as one recording (data=rig, dhtorch.data.rig.joined)"
+        raise ValueError(f"pairs=cameras: {recording.name} is one camera, expected {expected}")
+    if anchor is not None and anchor not in recording.cameras:
+        raise ValueError(f"pairs.anchor: found {anchor}, expected one of {', '.join(recording.cameras)}")
+    if not instants or any(isinstance(s, bool) or int(s) != s or s < 0 for s in instants):
+        raise ValueError(f"pairs.instants: found {list(instants)}, expected whole numbers of at least 0")
+    C, n = len(recording.cameras), len(recording) // len(recording.cameras)
+    chosen = range(C) if anchor is None else [recording.cameras.index(anchor)]
+    every = (2 if n >= _MANY else 1) if stride is None else _positive_int("pairs.stride", stride)
+    pairs = []
+    for k in range(0, n, every):
+        near = {k + way * s for s in instants for way in ((-1,) if past else (-1, 1)) if 0 <= k + way * s < n}
+        for c in chosen:
+            offered = sorted(q * C + d for q in near for d in range(C) if (q, d) != (k, c))
+            if offered:
+                pairs.append(Pair(k * C + c, offered[0] if len(offered) == 1 else tuple(offered)))
+    return _some(pairs, recording, f"instants {list(instants)}")
+
+
 def by_scaled_gap(scene: Given, factor: float, stride: int | None = None) -> list[Pair]:
     """Pairs at ``factor`` times the scene's own gap, rounded, at least one frame; none where it is too short.
 
@@ -196,8 +240,10 @@ def between(i: int, j: int, views: int) -> list[int]:
     """``views`` different positions spread evenly over the way from ``i`` to ``j``: ``j`` is the last, ``i`` no part.
 
     Raises:
-        ValueError: there are not that many.
+        ValueError: there are not that many. One alone is ``j``, wherever it lies.
     """
+    if views == 1 and i != j:
+        return [j]
     if not 1 <= views <= j - i:
         raise ValueError(f"views: found {views} for frames {i} to {j}, expected 1 to {j - i}")
     return [i + round((j - i) * (k + 1) / views) for k in range(views)]

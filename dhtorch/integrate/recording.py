@@ -105,7 +105,7 @@ def ask(
     shelf = Shelf() if shelf is None else shelf
     for i, j in pairs:
         offered = () if isinstance(j, int) else j
-        seen = between(i, j, min(method.views, j - i)) if isinstance(j, int) else offered
+        seen = between(i, j, max(1, min(method.views, j - i))) if isinstance(j, int) else offered
         shown = [range_split(recording[k].to(dtype).to(device), cutoff) for k in (i, *seen)]
         asked = choosing(method) if offered else method
         trace: dict[str, Any] = {}

@@ -260,7 +260,7 @@ def _looks(near: _Near, readings: Pose, camera: Camera, rigid: Tensor, miss_px: 
     camera = camera.map(lambda x: x.repeat_interleave(K, 0))
     square = _square(fewer, flat, camera, miss_px.repeat_interleave(K, 0), None).clamp(max=BEND**2).nan_to_num(BEND**2)
     missed = torch.where(fewer.used, square, 0.0).sum(-1).view(B, K) / (BEND**2 * count.clamp_min(1))[:, None]
-    best = missed.argmin(-1)
+    best = (missed <= missed.amin(-1, keepdim=True) + 0.05).int().argmax(-1)  # the simplest of those that fit alike
     fits = (missed.gather(-1, best[:, None])[:, 0] < 0.5) & (count > 0)
     return torch.where(fits, best, 0).to(torch.int32)
 

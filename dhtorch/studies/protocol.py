@@ -490,7 +490,7 @@ class _Collected:
 
 def _load(recording: Recording, pairs: list[Pair], protocol: Protocol, settings: Settings) -> DataLoader[Loaded]:
     wanted = max((v.method.views for v in protocol.variants.values() if v.offers is None), default=1)
-    views = min([wanted, *(j - i for i, j in pairs if isinstance(j, int))])  # a short gap holds fewer frames
+    views = min([wanted, *(max(1, j - i) for i, j in pairs if isinstance(j, int))])  # a short gap holds fewer frames
     return DataLoader(
         PairData(recording, pairs, settings.dtype, views, protocol.offers),
         batch_size=protocol.batch(settings, pairs),

@@ -171,7 +171,7 @@ class ExtendDepth(torch.nn.Module):
             "hole": samples.hole,
             "gate": estimate.gate,
             **_pose(fit, paired, found.depth),
-            **({} if self.views.pose is None else given.keys(fit, paired, self.views.pose)),
+            **({} if self.views.pose is None else given.keys(fit, paired, given.name_of(self.views.pose))),
             "tokens": tokens,
             "tokens_valid": known,
             **({} if dense is None else maps.as_keys(dense)),

@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,8 +23,32 @@ from dhtorch.tree import stack
 #: What a pose in a sample maps.
 KINDS = ("world_from_cam", "1_from_0")
 
+#: A motion itself: 3x4 or 4x4 numbers.
+Matrix = Sequence[Sequence[float]]
+
 #: How far a stored rotation may be from one.
 MAX_OFF = 0.01
+
+
+def name_of(pose: str | Matrix) -> str:
+    """What messages call it."""
+    return pose if isinstance(pose, str) else "pose"
+
+
+def check_constant(pose: Matrix, kind: str) -> None:
+    """A motion that is the same for all samples.
+
+    Raises:
+        ValueError: no 3x4 or 4x4 finite numbers, or poses in a world.
+    """
+    try:
+        shape = np.asarray(pose, dtype=np.float64).shape
+        fine = shape in ((3, 4), (4, 4)) and bool(np.isfinite(np.asarray(pose, dtype=np.float64)).all())
+    except (TypeError, ValueError):
+        fine = False
+    if not fine or kind != "1_from_0":
+        found = f"pose_kind {kind}" if fine else repr(pose)[:60]
+        raise ValueError(f"pose: found {found}, expected a key, or with pose_kind='1_from_0' 3x4 or 4x4 finite numbers")
 
 
 def sigmas(cov: str | Sequence[float] | None) -> tuple[float, float] | None:
@@ -45,7 +70,7 @@ def motions(
     T: tuple[int, int],
     checks: list[Any],
     *,
-    keys: tuple[str, str | None],
+    keys: tuple[str | Matrix, str | None],
     cov: str | Sequence[float] | None,
     kind: str,
     axes: str,
@@ -59,7 +84,7 @@ def motions(
         at: the anchor's place along time, and those of the V other views.
         T: frames along time of the anchor's images and of the others'.
         checks: gets what contradicts that these are poses: mask, value and text.
-        keys: of the pose, and of the other views' where it is another.
+        keys: of the pose, or the matrix of all; and of the other views' where it is another.
         cov, kind, axes, unit, refine: see :class:`dhtorch.transform.Views`.
 
     Raises:
@@ -99,8 +124,12 @@ def keys(fit: PoseFit | None, paired: Tensor, name: str) -> dict[str, Tensor]:
     return {"pose_looks": looks}
 
 
-def _along(leaves: Leaves, key: str, T: int, at: int, tail: tuple[tuple[int, ...], int]) -> Tensor:
-    """(B, rows, columns) in float64 of one matrix per sample, or one per frame."""
+def _along(leaves: Leaves, key: str | Matrix, T: int, at: int, tail: tuple[tuple[int, ...], int]) -> Tensor:
+    """(B, rows, columns) in float64 of one matrix per sample, or one per frame; or of one for all."""
+    if not isinstance(key, str):
+        assert leaves.like is not None
+        one = torch.as_tensor(np.asarray(key), dtype=torch.float64, device=leaves.like.device)
+        return one.expand(leaves.like.shape[0], *one.shape)
     x = leaves.get(key)
     rows, columns = tail
     shape = tuple(x.shape[1:])
@@ -116,8 +145,9 @@ def _cov(leaves: Leaves, key: str, T: int, at: int) -> Tensor:
     return _along(leaves, key, T, at, ((6,), 6))
 
 
-def _pose(leaves: Leaves, key: str, T: int, at: int, unit: float, checks: list[Any]) -> Pose:
-    x = _along(leaves, key, T, at, ((3, 4), 4))
+def _pose(leaves: Leaves, source: str | Matrix, T: int, at: int, unit: float, checks: list[Any]) -> Pose:
+    key = name_of(source)
+    x = _along(leaves, source, T, at, ((3, 4), 4))
     R = x[:, :3, :3]
     with torch.no_grad():
         known = x.isfinite().flatten(1).all(1)  # a pose that is not known is no mistake: its pair is not answered

@@ -74,7 +74,8 @@ class Views:
     sparse: bool = False  # the depth map is a projected LiDAR sweep, mostly empty between returns
     at: int = -1  # the anchor's place along time
     other_at: int | Sequence[int] = 0  # the other view's; several are for a method of many views
-    pose: str | None = None  # key of a pose from elsewhere, 4x4 or 3x4; NaN where it is not known
+    pose: str | given.Matrix | None = None  # key of a pose from elsewhere, 4x4 or 3x4, NaN where it is not
+    # known; or, with "1_from_0", the matrix itself: two cameras of a rig
     pose_kind: str = "world_from_cam"  # of each frame; or "1_from_0": maps points of the anchor into the other view
     pose_cov: Numbers | None = None  # of each such pose: key of 6x6 (left perturbation, rad and m); or two standard
     # deviations (rad, m) of the relative pose; None = not stated, the near returns then tell
@@ -204,6 +205,8 @@ class Views:
             raise ValueError(f"pose_axes is {self.pose_axes!r}, expected {' or '.join(conventions.STATED)}")
         if not (unit in UNITS or (isinstance(unit, float | int) and 0 < unit < float("inf"))):
             raise ValueError(f"pose_unit is {unit!r}, expected one of {sorted(UNITS)} or metres per unit")
+        if not isinstance(self.pose, str | None):
+            given.check_constant(self.pose, self.pose_kind)
         between_two = self.other_image is not None and self.pose_kind == "world_from_cam"
         if self.pose is not None and between_two and self.other_pose is None:
             raise ValueError("found pose and other_image, expected other_pose: the other view's pose")

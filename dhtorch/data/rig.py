@@ -1,0 +1,186 @@
+"""Several cameras that see one scene at the same instants, as one recording: pairs may then lie in space and in time.
+
+Frames stand instant by instant, and in each by camera, every one with its own intrinsics. Which position is whose say
+``camera`` and ``instant``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from dhtorch.data.files import FormatError
+from dhtorch.data.recording import Recording, Recordings, TruthRecording
+from dhtorch.data.scene import Scene, Scenes
+from dhtorch.records import Frame, Pose
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Rig(Recording):
+    """The frames of several cameras."""
+
+    cameras: tuple[str, ...] = field(kw_only=True)  # their names
+    camera: Tensor = field(kw_only=True)  # (n,) int64, which of them took a frame
+    instant: Tensor = field(kw_only=True)  # (n,) int64, place of its instant among those of the rig
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class TruthRig(Rig, TruthRecording):
+    """A rig all of whose cameras know what is really there."""
+
+    def truth(self, index: int) -> dict[str, Tensor]:
+        """As :meth:`TruthRecording.truth`, of the camera that took the frame."""
+        i = self._position(index)
+        assert isinstance(self.load, _Load)
+        found = self.load.recordings[int(self.camera[i])]
+        assert isinstance(found, TruthRecording)
+        return found.truth(int(self.load.places[i]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Load:
+    """Position → frame."""
+
+    recordings: tuple[Recording, ...]
+    camera: Tensor  # (n,)
+    places: Tensor  # (n,) in the recording of that camera
+
+    def __call__(self, i: int) -> Frame:
+        return self.recordings[int(self.camera[i])][int(self.places[i])]
+
+
+def joined(recordings: Sequence[Recording], *, tolerance: float | None = None, name: str | None = None) -> Rig:
+    """The cameras of a rig as one recording of the instants that all of them saw.
+
+    Args:
+        recordings: one for each camera. Where all have time stamps frames of one instant are those nearest in time to
+            the first camera's; else those with the same number.
+        tolerance: s, between stamps of one instant. None = half the shortest median step.
+        name: of the rig. None = what the recordings' names have in common.
+
+    Raises:
+        FormatError: fewer than two cameras, or no instant that all of them saw.
+    """
+    where = recordings[0].root or Path(recordings[0].name) if recordings else Path("rig")
+    names = [r.name.rpartition("/")[2] for r in recordings]
+    if len(recordings) < 2 or len(set(names)) < len(names):
+        raise FormatError(where, "cameras", ", ".join(names) or "none", "two or more cameras of different names")
+    places = _instants(recordings, tolerance)
+    if not len(places):
+        found = "no instant that all cameras saw"
+        raise FormatError(where, ", ".join(names), found, "frames of the same times or numbers")
+    n, C = places.shape
+    camera, flat = torch.arange(C).repeat(n), places.flatten()
+    first = recordings[0].number[places[:, 0]]
+    truth = all(isinstance(r, TruthRecording) for r in recordings)
+    left = [f"{r.name}: {len(r) - n} frames without their instant: left out" for r in recordings if len(r) > n]
+    make = TruthRig if truth else Rig
+    return make(
+        name=name or recordings[0].name.rpartition("/")[0] or recordings[0].name,
+        format=recordings[0].format,
+        load=_Load(tuple(recordings), camera, flat),
+        number=(first[:, None] * C + torch.arange(C)).flatten(),
+        root=recordings[0].root,
+        times=_along([r.times for r in recordings], camera, flat),
+        poses=_poses(recordings, camera, flat),
+        rate_hz=recordings[0].rate_hz,
+        sparse=all(r.sparse for r in recordings),
+        episode=recordings[0].episode,
+        report=tuple(dict.fromkeys([line for r in recordings for line in r.report] + left)),
+        cameras=tuple(names),
+        camera=camera,
+        instant=torch.arange(n).repeat_interleave(C),
+    )
+
+
+def open_rig(
+    root: str | Path,
+    format: str = "auto",
+    *,
+    tolerance: float | None = None,
+    near: float | None = None,
+    gap: int | None = None,
+    levels: int | None = None,
+    room: str | None = None,
+    role: str | None = None,
+    follow_links: bool = False,
+    **options: object,
+) -> Scenes:
+    """The cameras at ``root`` as rigs, one for each scene or episode, opened lazily; notes as of ``open_capture``.
+
+    Args:
+        root, format, follow_links, options: as :func:`dhtorch.data.open_all`; an option of the reader chooses cameras.
+        tolerance: as :func:`joined`.
+        near, gap, levels, room, role: notes of the :class:`Scene`.
+
+    Raises:
+        FormatError: as there, or no scene with two cameras.
+    """
+    from dhtorch.data import open_all  # noqa: PLC0415  (which knows all readers, this one's users among them)
+
+    found = open_all(root, format, follow_links=follow_links, **options)
+    names = found.names if isinstance(found, Recordings) else [r.name for r in found]
+    groups: dict[str, list[int]] = {}
+    for i, name in enumerate(names):
+        groups.setdefault(name.rpartition("/")[0], []).append(i)
+    rigs = {scene: places for scene, places in groups.items() if scene and len(places) > 1}
+    if not rigs:
+        shown = ", ".join(names[:4])
+        raise FormatError(root, "cameras", f"{len(names)} recordings: {shown}", "two cameras or more of one scene")
+    made = Recordings(list(rigs), _Make(found, tuple(map(tuple, rigs.values())), tolerance))
+    return Scenes(made, partial(Scene, near=near, gap=gap, levels=levels, room=room, role=role))
+
+
+@dataclass(frozen=True, eq=False)
+class _Make:
+    """Position → rig."""
+
+    recordings: Sequence[Recording]
+    groups: tuple[tuple[int, ...], ...]
+    tolerance: float | None
+
+    def __call__(self, i: int) -> Rig:
+        return joined([self.recordings[place] for place in self.groups[i]], tolerance=self.tolerance)
+
+
+def _instants(recordings: Sequence[Recording], tolerance: float | None) -> Tensor:
+    """(instants, cameras) positions of the frames of each instant."""
+    times = [r.times for r in recordings]
+    first = recordings[0]
+    columns = [torch.arange(len(first))]
+    good = torch.ones(len(first), dtype=torch.bool)
+    stamps = [t for t in times if t is not None]
+    if len(stamps) == len(times):
+        steps = [float(t.diff().median()) for t in stamps if len(t) > 1]
+        limit = tolerance if tolerance is not None else 0.5 * min(steps, default=1.0)
+        for other in stamps[1:]:
+            miss = (other[None] - stamps[0][:, None]).abs()
+            least, at = miss.min(1)
+            columns.append(at)
+            good &= (least <= limit) & (miss.argmin(0)[at] == columns[0])  # nearest to each other: one instant a frame
+    else:
+        for r in recordings[1:]:
+            at = torch.searchsorted(r.number, first.number).clamp(max=len(r) - 1)
+            columns.append(at)
+            good &= r.number[at] == first.number
+    return torch.stack(columns, 1)[good]
+
+
+def _along(values: Sequence[Tensor | None], camera: Tensor, places: Tensor) -> Tensor | None:
+    """What every frame has, from each camera's own."""
+    known = [v for v in values if v is not None]
+    if len(known) < len(values):
+        return None
+    return torch.stack([known[c][p] for c, p in zip(camera.tolist(), places.tolist(), strict=True)])
+
+
+def _poses(recordings: Sequence[Recording], camera: Tensor, places: Tensor) -> Pose | None:
+    R, t = (
+        _along([None if r.poses is None else getattr(r.poses, k) for r in recordings], camera, places) for k in "Rt"
+    )
+    return None if R is None or t is None else Pose(R, t)
