@@ -143,10 +143,12 @@ def test_every_seat_gets_what_those_before_it_found():
         assert torch.equal(camera.f, of.camera.f) and camera.distortion is None
     assert torch.equal(draws, uniform_draws(3, 2, 7)) and draws.dtype == torch.float64
     args = seats.seen["triangulate"][0]
-    assert args[0] is classified and args[1] is usable and args[2] is seats.fit
+    fit = args[2]
+    assert args[0] is classified and args[1] is usable and fit.T_1_from_0 is seats.fit.T_1_from_0
+    assert torch.equal(fit.code, seats.fit.code)
     assert args[3] is camera_0 and args[4] is camera_1
-    assert seats.seen["score"][0][1:] == (classified, usable, seats.fit)
-    assert trace["tracks"] is seats.tracks and trace["tracks_ideal"] is usable and trace["fit"] is seats.fit
+    assert seats.seen["score"][0][1:] == (classified, usable, fit)
+    assert trace["tracks"] is seats.tracks and trace["tracks_ideal"] is usable and trace["fit"] is fit
     assert trace["samples"] is classified and trace["estimate"] is estimate
 
 

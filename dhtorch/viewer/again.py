@@ -20,8 +20,9 @@ from dhtorch import archive
 #: Group of the settings → modules whose public functions it may name.
 NAMED = {
     "data": (
-        *("dhtorch.data", "dhtorch.data.rh20t_set", "dhtorch.studies.focal.formats", "dhtorch.stages.sample"),
-        *(f"dhtorch.synthetic.{name}" for name in ("recording", "stress", "viewpoints", "robot")),
+        *("dhtorch.data", "dhtorch.data.rh20t_set", "dhtorch.data.rig"),
+        *("dhtorch.studies.focal.formats", "dhtorch.stages.sample"),
+        *(f"dhtorch.synthetic.{name}" for name in ("recording", "stress", "viewpoints", "robot", "two_cameras")),
     ),
     "pairs": ("dhtorch.data.pairs",),
     "method": (
