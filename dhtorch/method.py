@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dhtorch import tree
+from dhtorch.frames import agreed
 from dhtorch.records import NO_HINT, Choice, Estimate, Frame, GivenPose, PoseFit, Samples, TrackHint, Tracks
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.fuse import inverse_variance
@@ -91,11 +91,12 @@ class Method:
 
         Returns:
             Estimate for the B × n samples, silent ones with their reason; in the dtype of the intrinsics, float32
-            where these are half precision. Images and depth may be of any floating dtype.
+            where these are half precision. Images and depth may be of any floating dtype, each frame's
+            of its own (:func:`dhtorch.frames.agreed`).
 
         Raises:
-            ValueError: wrong shapes, different batch sizes, no other view.
-            TypeError: no such seat or option.
+            ValueError: wrong shapes, different batch sizes or devices, nothing to see, no other view.
+            TypeError: no such seat or option, or no frame.
 
         Memory: grows with the answers; pyramids are held of eight pairs at most, unless a graph keeps them.
         Gradient: recovered depth to all images, to the near depth and to intrinsics; choices (flags, inliers, gates)
@@ -108,10 +109,7 @@ class Method:
         from dhtorch.window import ask_window  # noqa: PLC0415
 
         method = self.replace(**changes) if changes else self
-        if not isinstance(others, Frame):
-            if not others:
-                raise ValueError("method: found no other view, expected at least one")
-            others = tree.stack(others)
+        anchor, others = agreed(anchor, others)
         if fit is None and method.given is not None:
             fit = method.given(anchor, others)
         ask = ask_pair if others.image.dim() == 4 else ask_window

@@ -16,7 +16,7 @@ LEVELS = [
     {"geometry"},
     {"records", "drawing"},
     {"stages", "data", "evaluate", "export", "synthetic", "testing", "calibration"},
-    {"method"},
+    {"method", "frames"},
     {"pair", "window", "methods", "first_release", "views", "offers"},
     {"stream", "dense", "rig", "metric"},
     {"evidence", "causes"},
@@ -36,6 +36,7 @@ SIDEWAYS = {
     ("testing", "data"),
     ("testing", "export"),
     ("calibration", "evaluate"),
+    ("method", "frames"),
     ("method", "pair"),  # when it is called
     ("method", "window"),
     ("window", "pair"),

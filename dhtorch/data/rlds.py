@@ -108,7 +108,9 @@ def read(
         )
         rigs.append(rig)
     episodes = _episodes(root, split, episode)
-    names = [f"{_set_name(root)}/{e.split}_{e.number:06d}/{rig.image.rpartition('/')[2]}" for e in episodes for rig in rigs]
+    names = [
+        f"{_set_name(root)}/{e.split}_{e.number:06d}/{rig.image.rpartition('/')[2]}" for e in episodes for rig in rigs
+    ]
     return Recordings(names, _Make(tuple(names), tuple(episodes), tuple(rigs)))
 
 
