@@ -2,16 +2,19 @@
 
     python benchmarks/kills.py --times 50 --json benchmarks/results/kills.json
 
-Every fault hits ``dhtorch extract`` on a small set at a moment drawn from the seed. Afterwards the same command is run
-undisturbed, and its rows are held against those of a run that nobody disturbed: ``lost``, ``doubled`` and ``changed``
-rows, and files ``left`` behind (processes too), each of which must be 0.
+Every fault hits ``dhtorch extract`` and ``dhtorch enrich`` on a small set, with two workers, at a moment drawn from the
+seed. Afterwards the same command is run undisturbed, and its files are held against those of a run that nobody
+disturbed: ``lost``, ``doubled`` and ``changed`` files, and hidden files and processes ``left`` behind, each of which
+must be 0.
 """
 
 from __future__ import annotations
 
 import argparse
 import hashlib
+import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -23,8 +26,12 @@ from pathlib import Path
 
 from dhtorch import storage
 
-COMMAND = (sys.executable, "-m", "dhtorch", "extract", "data=synthetic", "data.n_frames=6", "method.n=64")
-OPTIONS = ("extract.gap=0", "extract.shard_rows=1", "extract.columns=[depth]")
+ROOM = ("data=synthetic", "data.n_frames=6", "data.hw=[96,128]", "data.depth_hw=[48,64]", "method.n=64", "workers=2")
+COMMANDS = {
+    "extract": (*ROOM, "extract.gap=1", "extract.shard_rows=1", "extract.columns=[depth]"),
+    "enrich": (*ROOM, "shard_rows=1", "report=false"),
+}
+PATIENCE_S = 5  # after which a process that lives on is left behind
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -34,61 +41,91 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(argv)
-    draw, found = random.Random(options.seed), dict[str, dict[str, int]]()
+    found: dict[str, dict[str, int]] = {}
     with tempfile.TemporaryDirectory(prefix="dhtorch-kills-") as place:
-        whole = Path(place) / "whole"
-        began = time.monotonic()
-        start(whole).wait()
-        took, want = time.monotonic() - began, contents(whole)
-        for name, fault in FAULTS.items():
-            counts = Counter(lost=0, doubled=0, changed=0, left=0)
-            for number in range(options.times):
-                folder = Path(place) / f"{name}-{number}"
-                fault(folder, draw.uniform(0.3, 1.0) * took)
-                start(folder).wait()
-                counts.update(difference(want, contents(folder)))
-                counts["left"] += sum(file.name.startswith(".") for file in folder.iterdir())
-            found[name] = dict(counts)
-            print(f"{name:10} {options.times} times: {found[name]}", flush=True)
+        for command in COMMANDS:
+            found |= suffered(command, Path(place) / command, options)
+    print(f"{sum(sum(counts.values()) for counts in found.values())} lost, doubled, changed or left")
     if options.json:
         words = " ".join(["python benchmarks/kills.py", *(argv if argv is not None else sys.argv[1:])])
         storage.write_json(options.json, {"command": words, "times": options.times, "faults": found})
     return int(any(any(counts.values()) for counts in found.values()))
 
 
-def start(folder: Path, limit: int | None = None) -> subprocess.Popen[bytes]:
-    """The command in a process of its own; ``limit``: blocks of 512 or 1024 bytes that a file of it may have."""
-    words = [*COMMAND, *OPTIONS, f"out={folder}"]
+def suffered(command: str, place: Path, options: argparse.Namespace) -> dict[str, dict[str, int]]:
+    """What every fault, so many times, costs one command."""
+    draw, found, began = random.Random(options.seed), {}, time.monotonic()
+    if start(command, place / "whole").wait():
+        raise SystemExit(f"dhtorch {command}: fails undisturbed")
+    took, want = time.monotonic() - began, contents(place / "whole")
+    for name, fault in FAULTS.items():
+        counts = Counter(lost=0, doubled=0, changed=0, left=0)
+        for number in range(options.times):
+            folder = place / f"{name}-{number}"
+            counts["left"] += fault(command, folder, draw.uniform(0.0, 1.0) * took)
+            start(command, folder).wait()
+            counts.update(difference(want, contents(folder)))
+            counts["left"] += sum(file.name.startswith(".") for file in folder.rglob("*"))
+            shutil.rmtree(folder)
+        found[f"{command}, {name}"] = dict(counts)
+        print(f"{command}, {name}: {options.times} times: {dict(counts)}", flush=True)
+    return found
+
+
+def start(command: str, folder: Path, limit: int | None = None) -> subprocess.Popen[bytes]:
+    """The command in a process group of its own; ``limit``: blocks of 512 or 1024 bytes that a file of it may have."""
+    words = [sys.executable, "-m", "dhtorch", command, *COMMANDS[command], f"out={folder}"]
     if limit is not None:
         words = ["sh", "-c", f'ulimit -f {limit} && exec "$@"', "sh", *words]
-    return subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    return subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
 
 
-def _signalled(number: int) -> Callable[[Path, float], None]:
-    def fault(folder: Path, after: float) -> None:
-        process = start(folder)
+def ended(*processes: subprocess.Popen[bytes]) -> int:
+    """Waits for processes; how many of their groups live on, which are then killed."""
+    left = 0
+    for process in processes:
+        process.wait()
+        end = time.monotonic() + PATIENCE_S
+        while alive := _alive(process.pid):
+            if time.monotonic() > end:
+                os.killpg(process.pid, signal.SIGKILL)
+                break
+            time.sleep(0.05)
+        left += alive
+    return left
+
+
+def _alive(group: int) -> bool:
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def _signalled(number: int) -> Callable[[str, Path, float], int]:
+    def fault(command: str, folder: Path, after: float) -> int:
+        process = start(command, folder)
         time.sleep(after)
         process.send_signal(number)
-        process.wait()
+        return ended(process)
 
     return fault
 
 
-def _raced(folder: Path, after: float) -> None:
+def _raced(command: str, folder: Path, after: float) -> int:
     """A second one in the same folder."""
-    first = start(folder)
+    first = start(command, folder)
     time.sleep(after / 4)
-    second = start(folder)
-    first.wait()
-    second.wait()
+    return ended(first, start(command, folder))
 
 
-def _full(folder: Path, after: float) -> None:
-    """No file may grow beyond some bytes."""
-    start(folder, limit=1 + int(after)).wait()
+def _full(command: str, folder: Path, after: float) -> int:
+    """No file may grow beyond some kilobytes."""
+    return ended(start(command, folder, limit=1 + int(2 * after)))
 
 
-FAULTS: dict[str, Callable[[Path, float], None]] = {
+FAULTS: dict[str, Callable[[str, Path, float], int]] = {
     "kill": _signalled(signal.SIGKILL),
     "terminate": _signalled(signal.SIGTERM),
     "race": _raced,
@@ -97,12 +134,13 @@ FAULTS: dict[str, Callable[[Path, float], None]] = {
 
 
 def contents(folder: Path) -> dict[str, str]:
-    """Name → digest of the shards."""
-    return {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in folder.glob("*.parquet")}
+    """Name → digest of the files."""
+    files = [file for file in folder.rglob("*") if file.is_file()]
+    return {str(f.relative_to(folder)): hashlib.sha256(f.read_bytes()).hexdigest() for f in files}
 
 
 def difference(want: dict[str, str], have: dict[str, str]) -> dict[str, int]:
-    """Shards that are missing, too many, or other than they should be."""
+    """Files that are missing, too many, or other than they should be."""
     changed = sum(have[name] != want[name] for name in have.keys() & want.keys())
     return {"lost": len(want.keys() - have.keys()), "doubled": len(have.keys() - want.keys()), "changed": changed}
 

@@ -142,6 +142,12 @@ def clear(path: str | Path) -> None:
         left.unlink(missing_ok=True)
 
 
+def filled(folder: Path) -> bool:
+    """Whether a file lies in a folder or below; what an interrupted write left of one does not count."""
+    inside = (entry for entry in folder.rglob("*") if entry.is_symlink() or not entry.is_dir())
+    return any(not (f.name.startswith(".") and f.name.endswith(_UNFINISHED)) for f in inside)
+
+
 def _refuse_constant(word: str) -> None:
     raise ValueError(f"the constant {word}")
 

@@ -198,3 +198,12 @@ def test_a_table_without_frame_index_counts_its_rows(shots, tmp_path):
     assert main(["enrich", str(source), str(out), *ASKED]) == 0
     found = rows(out)
     assert found[0]["timestamp"] == 0 and found[0]["source.timestamp"] == pytest.approx(0.05)
+
+
+def test_a_write_that_failed_at_the_first_file_is_no_other_set(robot, enriched, tmp_path):
+    """As a full disk or a kill leaves the folder: no file, or half of the first."""
+    out = tmp_path / "set"
+    (out / "meta").mkdir(parents=True)
+    (out / "meta" / ".dhtorch.json.x1.tmp").write_text("{")
+    assert main(["enrich", str(robot), str(out), *ASKED]) == 0
+    assert tree(out) == tree(enriched)

@@ -208,7 +208,7 @@ def take_up(task: Task) -> None:
     if folder.exists() and not folder.is_dir():
         raise NotADirectoryError(f"out: {folder} is a file, expected a folder, or a place for one")
     storage.clear(about)
-    if not folder.is_dir() or not any(folder.iterdir()):
+    if not storage.filled(folder):
         return
     if not about.is_file():
         raise FileExistsError(f"out: {folder} holds other files, expected an empty folder, or one that this word made")

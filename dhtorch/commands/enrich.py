@@ -252,7 +252,7 @@ def _take_up(work: Work) -> None:
         if other["key"] != work.shared["key"]:
             what = archive.difference(other, work.shared)
             raise FileExistsError(f"{work.out}: found another enriched set ({what}), expected another folder for out")
-    elif work.out.is_dir() and any(work.out.iterdir()):
+    elif storage.filled(work.out):
         raise FileExistsError(f"{work.out}: found a folder that holds something else, expected an empty or a new one")
     else:
         storage.write_json(about, work.shared)
