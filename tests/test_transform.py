@@ -20,6 +20,7 @@ from dhtorch.records import Frame
 from dhtorch.stages import score
 from dhtorch.transform import (
     ExtendDepth,
+    JudgeDepth,
     ExtendedDataset,
     SampleError,
     SampleProblem,
@@ -442,3 +443,26 @@ def test_tokens_stand_beside_dinov2_and_both_learn():
     assert recovered.sum() > 20
     out["dhtorch.depth"][recovered].sum().backward()
     assert K.grad.abs().max() > 0
+
+
+@pytest.mark.parametrize("transform", [ExtendDepth, JudgeDepth])
+@pytest.mark.parametrize(
+    "sample", [None, torch.zeros(3, 8, 8), "frame", [1, 2]], ids=["none", "tensor", "text", "list"]
+)
+def test_what_is_no_sample_is_named(transform, sample):
+    said = f"sample: found a {type(sample).__name__}, expected a dict with the key image"
+    with pytest.raises(SampleError, match=said):
+        transform(depth_unit="m")(sample)
+
+
+def test_no_sample_is_skipped_but_cannot_be_flagged():
+    with pytest.warns(UserWarning, match="skipped: sample: found a NoneType"):
+        assert ExtendDepth(depth_unit="m", on_error="skip")(None) is None
+    with pytest.raises(SampleError, match="found a NoneType"):
+        ExtendDepth(depth_unit="m", on_error="flag")(None)
+
+
+@pytest.mark.parametrize("transform", [ExtendDepth, JudgeDepth])
+def test_a_transform_without_a_unit_says_which_there_are(transform):
+    with pytest.raises(ValueError, match=r"depth_unit is '', expected one of \['m', 'mm'\] or metres per unit"):
+        transform()

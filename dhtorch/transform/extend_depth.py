@@ -141,6 +141,8 @@ class ExtendDepth(torch.nn.Module):
         Raises:
             SampleError: it is to be flagged, and nothing tells the size of its image.
         """
+        if not isinstance(sample, Mapping) and self.on_error == "flag":
+            raise error
         hw = (None if self.maps else self.tokens_hw) or self.views.image_hw(sample) or self._seen_hw
         if self.on_error == "flag" and hw is None:
             missing = "maps" if self.maps else "tokens: give tokens_hw"

@@ -62,7 +62,7 @@ class Views:
         ValueError: an option that cannot be.
     """
 
-    depth_unit: str | float  # "m", "mm", or metres per unit; there is no default
+    depth_unit: str | float = ""  # "m", "mm", or metres per unit; must be said
     image: str = "image"  # key of the anchor's image
     depth: str = "depth"  # key of the anchor's depth map
     intrinsics: Numbers = "intrinsics"  # 3×3, or fx fy cx cy, px of the image
@@ -91,8 +91,8 @@ class Views:
     max_offset: float = 0.2  # share of the image size by which the principal point may lie off the centre
 
     def __post_init__(self) -> None:
-        unit, numeric = self.depth_unit, isinstance(self.depth_unit, float | int)
-        if not (unit in UNITS or (numeric and float(unit) > 0)):
+        unit = self.depth_unit
+        if not (unit in UNITS or (isinstance(unit, float | int) and unit > 0)):
             raise ValueError(f"depth_unit is {unit!r}, expected one of {sorted(UNITS)} or metres per unit")
         if self.layout not in (None, "hwc", "chw"):
             raise ValueError(f"layout is {self.layout!r}, expected hwc, chw or None")
