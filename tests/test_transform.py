@@ -20,8 +20,8 @@ from dhtorch.records import Frame
 from dhtorch.stages import score
 from dhtorch.transform import (
     ExtendDepth,
-    JudgeDepth,
     ExtendedDataset,
+    JudgeDepth,
     SampleError,
     SampleProblem,
     Views,
