@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +27,10 @@ SHORT = ("minutes=0.5", "recordings=2")
 ASIDE = ("Wrote ", "Next: ")
 
 
-def row(path: Path, folder: Path) -> dict[str, Any]:
-    """What the command makes of one capture."""
+def row(path: Path, folder: Path, asked: Sequence[str] = SHORT) -> dict[str, Any]:
+    """What the command makes of one capture, with the options ``asked``."""
     out, began, first = folder / path.name, time.perf_counter(), None
-    words = [sys.executable, "-m", "dhtorch", str(path), f"out={out}", *SHORT]
+    words = [sys.executable, "-m", "dhtorch", str(path), f"out={out}", *asked]
     with subprocess.Popen(words, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         while process.poll() is None:
             if first is None and (any(out.glob("overview.png")) or any(out.glob("*/overview.png"))):
