@@ -19,7 +19,7 @@ from dhtorch import archive, storage
 from dhtorch.synthetic import SyntheticRoom
 from dhtorch.testing.stray import write_stray
 
-#: Size of a picture held upright, and the way from frame to frame (a third of a metre a second, ten frames kept), the reach.
+#: Size of a picture held upright, the way from frame to frame (0.3 m/s at ten frames a second), the reach.
 HW, STEP_M, RANGE_M = (1920, 1440), 0.03, 3.0
 
 

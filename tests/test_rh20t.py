@@ -347,3 +347,10 @@ def hostile_sample(root: Path) -> Path:
 def read_all(root: Path) -> None:
     hostile.read_all(root)
     rh20t.streams(root)
+
+
+def test_a_large_array_where_a_pose_is_expected_is_named_by_its_shape(tmp_path):
+    file = tmp_path / "tcp.npy"
+    np.save(file, np.zeros((5000, 5000), np.uint8))
+    with pytest.raises(FormatError, match=r"tcp: found an array of shape \(5000, 5000\), expected 7 finite numbers"):
+        rh20t_robot.calibration_tcp(file, rh20t_robot.Arm("ur5", (), *[np.eye(4)] * 3))

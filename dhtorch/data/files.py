@@ -33,6 +33,8 @@ import numpy as np
 MAX_PIXELS = 64_000_000
 MAX_BYTES = 256_000_000  # of an array or a file
 MAX_TEXT_BYTES = 64_000_000  # of a table or a JSON document
+#: Numbers that an error message shows.
+LISTED = 64
 
 #: What opening a capture or reading one frame may take: so many bytes, or so many times what was asked for.
 MAX_MEMORY, GROWTH = 256 << 20, 8
@@ -323,12 +325,15 @@ def to_array(value: Any, shape: tuple[int, ...], file: Path, field: str) -> np.n
     expected = f"{'x'.join(map(str, shape))} finite numbers" if shape else "a finite number"
     if value is None:
         raise FormatError(file, field, "nothing", expected)
+    if isinstance(value, np.ndarray) and value.shape != shape:  # before a large one grows eightfold
+        raise FormatError(file, field, f"an array of shape {value.shape}", expected)
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         raise FormatError(file, field, repr(value), expected) from None
     if array.shape != shape or not np.isfinite(array).all():
-        raise FormatError(file, field, array.tolist(), expected)
+        found = array.tolist() if array.size <= LISTED else f"numbers of shape {array.shape}"
+        raise FormatError(file, field, found, expected)
     return array
 
 

@@ -172,6 +172,11 @@ def cut(text: str, width: float, size: float) -> str:
     return text if len(text) <= most else text[: most - 1] + "…"
 
 
+def headed(words: str, title: str) -> str:
+    """What a figure shows, behind the scene that it shows."""
+    return f"{title}: {words[0].lower()}{words[1:]}" if title else words
+
+
 def save(figure: Any, path: Any) -> None:
     """Write a figure with what lies around its axes."""
     with warnings.catch_warnings():

@@ -14,7 +14,7 @@ import numpy as np
 from dhtorch.codes import Source
 from dhtorch.drawing import colours
 from dhtorch.drawing.axis import Axis
-from dhtorch.drawing.canvas import SMALL, Canvas, save
+from dhtorch.drawing.canvas import SMALL, Canvas, headed, save
 from dhtorch.drawing.colours import INK, Stroke
 
 #: Width of a picture, between two of them, and the heights of a title and of a scale with its numbers, points.
@@ -50,7 +50,7 @@ def draw_completed(
     rows = SCALE, SCALE + height + TITLE
     ratio = np.where(known, s / np.where(known, z, 1), 1)
     shown = [
-        (_title("Picture", title), rows[1], rgb_of(image)),
+        (headed("Picture", title), rows[1], rgb_of(image)),
         (f"Sensor: {_percent(sensed)}", rows[1], coloured(z, sensed, metres, colours.DEPTH)),
         (f"Completed: {_percent(known)}, the rest is silent", rows[0], coloured(z, known, metres, colours.DEPTH)),
         ("Sigma / depth", rows[0], coloured(ratio, known, share, colours.ERROR)),
@@ -100,10 +100,6 @@ def _scale(canvas: Canvas, axis: Axis, kind: str, left: float) -> None:
 
 def _percent(mask: np.ndarray) -> str:
     return f"{100 * mask.mean():.0f} %"
-
-
-def _title(word: str, title: str) -> str:
-    return f"{title}: {word.lower()}" if title else word
 
 
 def rgb_of(image: Any) -> np.ndarray:

@@ -14,7 +14,7 @@ import numpy as np
 from dhtorch.codes import ROUTE_OF_HOLE, Gate, Hole, Route, Source, names, words
 from dhtorch.drawing import colours
 from dhtorch.drawing.axis import Axis, spanning
-from dhtorch.drawing.canvas import Canvas, Key, save
+from dhtorch.drawing.canvas import Canvas, Key, headed, save
 from dhtorch.drawing.colours import FAINT, GATES, HOLES, INK, RECOVERED, SENSOR, Stroke, series
 from dhtorch.drawing.panel import Panel
 
@@ -96,7 +96,7 @@ def draw_samples(
         ("sensor", source == Source.SENSOR, SENSOR, "sensor"),
         ("recovered", source == Source.RECOVERED, RECOVERED, "answer"),
     ]
-    _overlay(path, image, uv, layers, title or "What became of the samples")
+    _overlay(path, image, uv, layers, headed("What became of the samples", title))
 
 
 def draw_holes(
@@ -115,7 +115,7 @@ def draw_holes(
         if code != Hole.NONE:
             label = f"{words(name)} → {words(routes[ROUTE_OF_HOLE[code]])}"
             layers.append((label, hole == code, HOLES[code], "answer"))
-    _overlay(path, image, uv, layers, title or "Why there is no return")
+    _overlay(path, image, uv, layers, headed("Why there is no return", title))
 
 
 def draw_depth(
@@ -136,7 +136,7 @@ def draw_depth(
     true, found = true[good], found[good]
     low, high = (true.min() / 1.5, true.max() * 1.5) if len(true) else (1.0, 10.0)
     x, y = (Axis(float(low), float(high), f"{kind} depth, m", log=True) for kind in ("true", "recovered"))
-    panel = Panel(title or "Recovered against true depth", x, y, size=(380, 386))
+    panel = Panel(headed("Recovered against true", title), x, y, size=(380, 386))
     corners = ((low, low / 0.9, high, high, high / 1.1, low), (low, low, 0.9 * high, high, high, 1.1 * low))
     panel.fill(*corners, FAINT)
     panel.line([low, high], [low, high], Stroke(INK, 1))
@@ -187,7 +187,7 @@ def draw_risk_coverage(
     top = spanning([0.12, *(y for _, r in drawn.values() for y in r)], "", low=0.0).high
     x = Axis(0.0, min(1.0, right), "answered share of the candidates, %", percent=True)
     y = Axis(0.0, min(1.0, top), "mean relative error (at most 1), %", percent=True)
-    panel = Panel(title or "Error of the surest answers", x, y, size=(400, 290))
+    panel = Panel(headed("Error of the surest", title), x, y, size=(400, 290))
     for level in (0.05, 0.1):
         panel.line([x.low, x.high], [level, level], Stroke(colours.SILENT, 0.8))
     keys = [Key(name, strokes[name].colour, stroke=strokes[name]) for name in drawn]

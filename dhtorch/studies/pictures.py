@@ -5,8 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from dhtorch.codes import Source
-from dhtorch.drawing import draw_depth, draw_holes, draw_risk_coverage, draw_samples
+from dhtorch.drawing import draw_completed, draw_depth, draw_holes, draw_risk_coverage, draw_samples
 from dhtorch.drawing.colours import of_source
 from dhtorch.evaluate import errors
 from dhtorch.evaluate.risk import risk_coverage
@@ -26,14 +28,21 @@ def draw_example(folder: str | Path, example: Any) -> list[Path]:
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     whole, image, uv = merge(e.samples, e.estimate), e.frame.image[0], e.samples.uv[0]
-    draw_samples(folder / "samples.png", image, uv, whole.source[0], e.estimate.gate[0])
-    draw_holes(folder / "holes.png", image, uv, e.samples.hole[0])
+    draw_samples(folder / "samples.png", image, uv, whole.source[0], e.estimate.gate[0], title=e.place)
+    draw_holes(folder / "holes.png", image, uv, e.samples.hole[0], title=e.place)
     written = ["samples.png", "holes.png", "points.ply"]
+    if e.complete is not None:
+        with torch.no_grad():
+            maps = e.complete().to("cpu")[0]
+        draw_completed(folder / "completed.png", image, maps.depth, maps.sigma, maps.source, title=e.place)
+        written.append("completed.png")
     pooled = errors.select(e.estimate, e.truth)
     if pooled.keep.any():
-        draw_depth(folder / "depth.png", pooled.true_depth, pooled.depth, pooled.score)
+        draw_depth(folder / "depth.png", pooled.true_depth, pooled.depth, pooled.score, title=e.place)
         curves = {e.method: risk_coverage(pooled)}
-        draw_risk_coverage(folder / "risk_coverage.png", curves, oracle=risk_coverage(pooled, oracle=True))
+        draw_risk_coverage(
+            folder / "risk_coverage.png", curves, oracle=risk_coverage(pooled, oracle=True), title=e.place
+        )
         written += ["depth.png", "risk_coverage.png"]
     filled = whole.source[0] != Source.NONE
     xyz = unproject(e.frame.camera, whole.uv, whole.depth)[0][filled]

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from dhtorch import tree
+from dhtorch import dense, tree
 from dhtorch.codes import Gate, Hole, names
 from dhtorch.data.files import set_opencv_threads
 from dhtorch.data.pairs import Pair, between, fixed
@@ -28,7 +28,7 @@ from dhtorch.geometry.lookup import nearest, patches, round_half_up
 from dhtorch.leash import follow_parent
 from dhtorch.method import Method, Trace
 from dhtorch.offers import Picked, choosing, picked
-from dhtorch.records import NO_HINT, Estimate, Frame, PoseFit, Samples, TrackHint, Tracks
+from dhtorch.records import NO_HINT, DepthMap, Estimate, Frame, PoseFit, Samples, TrackHint, Tracks
 from dhtorch.studies.rows import Row, overlay, scene_row, summarise
 from dhtorch.studies.shared_tracks import SharedTracks
 
@@ -230,6 +230,14 @@ class Example:
     samples: Samples
     estimate: Estimate
     truth: holdout.Truth
+    pair: str = ""  # the anchor and the views that were used, as numbers of the recording
+    cutoff: float | None = None  # m
+    complete: Callable[[], DepthMap] | None = None  # every pixel of it; None where the method was not simply asked
+
+    @property
+    def place(self) -> str:
+        """Which pair this is, in words."""
+        return f"{self.scene} {self.pair}" + ("" if self.cutoff is None else f", cutoff {self.cutoff:g} m")
 
     def cpu(self) -> Example:
         """The same on the CPU, for figures."""
@@ -390,9 +398,26 @@ class _Collected:
                 if counts:
                     self._note(one, choice)
             if not self.examples:
-                first = answer.one(0)
-                records = (near[:1], first.samples, first.estimate, first.truths[self.last])
-                self.examples.append(Example(self.scene.name, name, *records))
+                self.examples.append(self._example(answer.one(0), near[:1], seen[which]))
+
+    def _example(self, first: Answer, near: Frame, seen: Frame | None) -> Example:
+        variant, (anchor, other) = self.protocol.variants[first.variant], first.batch.pairs[0]
+        choice = self._picked(first)
+        views = choice.views if choice is not None else (other,)
+        complete = None
+        if seen is not None and variant.ask is None and variant.fit is None:
+            ways = seen[:, :1] if seen.image.dim() == 5 else seen[:1]
+            told: dict[str, Any] = {"method": variant.method, "seed": self.settings.seed, "hint": self.scene.hint}
+            complete = partial(dense.complete, near, ways, calibration=dense.shipped(), **told)
+        return Example(
+            self.scene.name,
+            first.variant,
+            near,
+            *(first.samples, first.estimate, first.truths[self.last]),
+            pair=f"{anchor} → {', '.join(map(str, views))}",
+            cutoff=self.cutoff,
+            complete=complete,
+        )
 
     def rows(self) -> list[Row]:
         """One row per pair, variant and cohort, then one per variant and cohort for the scene (pair null)."""

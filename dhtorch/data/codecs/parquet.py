@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from dhtorch.data.codecs import thrift
 from dhtorch.data.files import (
     GROWTH,
     MAX_BYTES,
@@ -73,7 +74,7 @@ def read_columns(
     wanted = [i for i, (low, high) in enumerate(spans) if low < end and high > first]
     pyarrow = need("pyarrow")
     try:
-        _check_pages(file, table, columns, wanted)
+        _check_pages(file, columns, wanted)
         got = table.read_row_groups(wanted, columns=list(columns), use_threads=False)
         start = first - (spans[wanted[0]][0] if wanted else 0)
         if wanted and got.num_rows != spans[wanted[-1]][1] - spans[wanted[0]][0]:
@@ -177,129 +178,114 @@ def _array(column: Any, file: Path, name: str) -> np.ndarray | list[Any]:
 # ------------------------------------------------------------------------------------------------------------ pages
 
 
-def _check_pages(file: Path, table: Any, columns: Sequence[str], groups: Sequence[int]) -> None:
+class _Chunk(NamedTuple):
+    """One column of one row group, as the footer tells of it."""
+
+    path: str
+    kind: int  # index of TYPES
+    codec: int  # index of CODECS
+    values: int
+    unpacked: int  # bytes, with page headers
+    packed: int
+    start: int  # of the first page
+
+
+#: Physical types and codecs by their numbers in a footer.
+TYPES = ("BOOLEAN", "INT32", "INT64", "INT96", "FLOAT", "DOUBLE", "BYTE_ARRAY", "FIXED_LEN_BYTE_ARRAY")
+CODECS = ("UNCOMPRESSED", "SNAPPY", "GZIP", "LZO", "BROTLI", "LZ4", "ZSTD", "LZ4_RAW")
+_WIDTH = {"INT32": 4, "FLOAT": 4, "INT96": 12, "BOOLEAN": 1}
+_TEXTS = ("BYTE_ARRAY", "FIXED_LEN_BYTE_ARRAY")
+
+
+def _check_pages(file: Path, columns: Sequence[str], groups: Sequence[int]) -> None:
     """Refuse a chunk whose pages, by their own headers, unpack into more than the footer says or than the limit."""
-    meta = table.metadata
     total = 0
+    chunks = _chunks(file, frozenset(groups))
     with opened(file) as stream:
         most = max(_MAX_UNPACKED, GROWTH * stream.seek(0, 2))
-        for g in groups:
-            group = meta.row_group(g)
-            for i in range(group.num_columns):
-                chunk = group.column(i)
-                if not any(
-                    chunk.path_in_schema == name or chunk.path_in_schema.startswith(f"{name}.") for name in columns
-                ):
-                    continue
+        for chunk in chunks:
+            if any(chunk.path == name or chunk.path.startswith(f"{name}.") for name in columns):
                 total += _chunk_bytes(file, stream, chunk)
-                if total > most:
-                    raise FormatError(file, chunk.path_in_schema, f"{total} bytes", f"at most {most}")
+            if total > most:
+                raise FormatError(file, chunk.path, f"{total} bytes", f"at most {most}")
 
 
-def _chunk_bytes(file: Path, stream: Any, chunk: Any) -> int:
+def _chunks(file: Path, groups: frozenset[int]) -> list[_Chunk]:
+    """The chunks of some row groups. Arrow is not asked: it ends the process where what it finds there is damaged."""
+    key = (file, last_change(file), groups)
+    if key in _told:
+        return _told[key]
+    size = _footer_size(file)
+    with opened(file) as stream:
+        stream.seek(-8 - size, 2)
+        footer = stream.read(size)
+    try:
+        every = enumerate(thrift.items(footer, 0, 4))
+        found = [_chunk(column[3]) for g, group in every if g in groups for column in group[1]]
+    except (IndexError, KeyError, TypeError, ValueError, AttributeError) as error:
+        raise FormatError(file, "footer", error, "a whole parquet file") from None
+    while len(_told) >= _MAX_HELD:
+        _told.popitem(last=False)
+    _told[key] = found
+    return found
+
+
+#: Chunks by file, time of change and row groups.
+_told: OrderedDict[tuple[Path, int, frozenset[int]], list[_Chunk]] = OrderedDict()
+
+
+def _chunk(said: dict[int, Any]) -> _Chunk:
+    path = b".".join(said[3]).decode("utf-8", "replace")
+    start, dictionary = int(said[9]), int(said.get(11) or 0)
+    start = dictionary if 0 < dictionary < start else start
+    numbers = [int(said[k]) for k in (1, 4, 5, 6, 7)]
+    if not (0 <= numbers[0] < len(TYPES) and 0 <= numbers[1] < len(CODECS)):
+        raise ValueError(f"type {numbers[0]} and codec {numbers[1]} of {path}")
+    return _Chunk(path, numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], start)
+
+
+def _chunk_bytes(file: Path, stream: Any, chunk: _Chunk) -> int:
     """Bytes that the pages of one column chunk unpack into."""
-    start = chunk.data_page_offset
-    if chunk.has_dictionary_page and 0 < (chunk.dictionary_page_offset or 0) < start:
-        start = chunk.dictionary_page_offset
-    size, values, unpacked = chunk.total_compressed_size, 0, 0
-    width = {"INT32": 4, "FLOAT": 4, "INT96": 12, "BOOLEAN": 1}.get(chunk.physical_type, 8)
-    if start < 4 or not 0 <= size <= MAX_BYTES:
-        raise FormatError(file, chunk.path_in_schema, f"{size} bytes at {start}", "a column inside the file")
-    stream.seek(start)
-    data = stream.read(size)
-    at = 0
-    while at < len(data) and values < chunk.num_values:
+    values = unpacked = at = 0
+    width = _WIDTH.get(TYPES[chunk.kind], 8)
+    if chunk.start < 4 or not 0 <= chunk.packed <= MAX_BYTES:
+        raise FormatError(file, chunk.path, f"{chunk.packed} bytes at {chunk.start}", "a column inside the file")
+    stream.seek(chunk.start)
+    data = stream.read(chunk.packed)
+    while at < len(data) and values < chunk.values:
         try:
-            page, at = _thrift(data, at)
+            page, at = thrift.fields(data, at)
             full, packed = int(page[2]), int(page[3])
             inner = page.get(5) or page.get(8) or {}
             count, entries = int(inner.get(1, 0)), int((page.get(7) or {}).get(1, 0))
         except (IndexError, KeyError, TypeError, ValueError, AttributeError) as error:
-            raise FormatError(file, chunk.path_in_schema, f"a page header: {error}", "a whole page") from None
-        if min(full, packed, count) < 0 or packed > len(data) - at or full > chunk.total_uncompressed_size:
+            raise FormatError(file, chunk.path, f"a page header: {error}", "a whole page") from None
+        if min(full, packed, count) < 0 or packed > len(data) - at or full > chunk.unpacked:
             found = f"a page of {packed} bytes that unpack into {full}"
-            raise FormatError(file, chunk.path_in_schema, found, f"at most {chunk.total_uncompressed_size}")
+            raise FormatError(file, chunk.path, found, f"at most {chunk.unpacked}")
         values += count
-        if entries and chunk.physical_type in _TEXTS:
+        if entries and TYPES[chunk.kind] in _TEXTS:
             width = max(width, _longest(file, chunk, data[at : at + packed], full))
         unpacked += max(full, width * max(count, entries))
         at += packed
-    if values != chunk.num_values:
-        raise FormatError(file, chunk.path_in_schema, f"pages of {values} values", chunk.num_values)
+    if values != chunk.values:
+        raise FormatError(file, chunk.path, f"pages of {values} values", chunk.values)
     return unpacked
 
 
-#: Types whose values have a length each.
-_TEXTS = ("BYTE_ARRAY", "FIXED_LEN_BYTE_ARRAY")
-
-
-def _longest(file: Path, chunk: Any, packed: bytes, full: int) -> int:
+def _longest(file: Path, chunk: _Chunk, packed: bytes, full: int) -> int:
     """Bytes of the longest entry of a dictionary: a row costs some bits in the file and an entry in memory."""
     pyarrow = need("pyarrow")
-    if full > _MAX_UNPACKED or chunk.physical_type != "BYTE_ARRAY":
+    if full > _MAX_UNPACKED or TYPES[chunk.kind] != "BYTE_ARRAY":
         return full  # a fixed length is at most all of it
     try:
         plain = packed
-        if chunk.compression != "UNCOMPRESSED":
-            plain = pyarrow.Codec(chunk.compression.lower()).decompress(packed, full, asbytes=True)
+        if CODECS[chunk.codec] != "UNCOMPRESSED":
+            plain = pyarrow.Codec(CODECS[chunk.codec].lower()).decompress(packed, full, asbytes=True)
     except (pyarrow.ArrowException, OSError, ValueError, TypeError) as error:
-        raise FormatError(file, chunk.path_in_schema, error, "a dictionary that unpacks") from None
+        raise FormatError(file, chunk.path, error, "a dictionary that unpacks") from None
     at = longest = 0
     while at + 4 <= len(plain):
         length = int.from_bytes(plain[at : at + 4], "little")
         at, longest = at + 4 + length, max(longest, length)
     return longest
-
-
-def _thrift(data: bytes, at: int, depth: int = 0) -> tuple[dict[int, Any], int]:
-    """A structure in Thrift's compact protocol: field number → value (structures nested), and where it ends."""
-    if depth > 8:
-        raise ValueError("structures nested too deep")
-    fields: dict[int, Any] = {}
-    number = 0
-    while True:
-        head = data[at]
-        at += 1
-        if head == 0:
-            return fields, at
-        kind, step = head & 15, head >> 4
-        if step:
-            number += step
-        else:
-            number, at = _zigzag(data, at)
-        fields[number], at = _thrift_value(data, at, kind, depth)
-
-
-def _thrift_value(data: bytes, at: int, kind: int, depth: int) -> tuple[Any, int]:
-    if kind in (1, 2):  # true and false have no bytes of their own
-        return kind == 1, at
-    if kind == 3:
-        return data[at], at + 1
-    if kind in (4, 5, 6):
-        return _zigzag(data, at)
-    if kind == 7:
-        return None, at + 8
-    if kind == 8:
-        length, at = _varint(data, at)
-        if length > len(data) - at:
-            raise ValueError("a text beyond the end")
-        return data[at : at + length], at + length
-    if kind == 12:
-        return _thrift(data, at, depth + 1)
-    raise ValueError(f"a field of type {kind}")
-
-
-def _varint(data: bytes, at: int) -> tuple[int, int]:
-    value = 0
-    for shift in range(0, 70, 7):
-        byte = data[at]
-        at += 1
-        value |= (byte & 127) << shift
-        if byte < 128:
-            return value, at
-    raise ValueError("an endless number")
-
-
-def _zigzag(data: bytes, at: int) -> tuple[int, int]:
-    value, at = _varint(data, at)
-    return (value >> 1) ^ -(value & 1), at

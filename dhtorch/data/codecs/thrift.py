@@ -1,0 +1,120 @@
+"""Thrift's compact protocol, as far as Parquet writes it: structures as dicts from field numbers to values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+#: Structures and lists inside one another; in a Parquet footer they are nine deep.
+MAX_DEPTH = 12
+
+
+def fields(data: bytes, at: int, depth: int = 0) -> tuple[dict[int, Any], int]:
+    """A structure, field number → value, and where it ends.
+
+    Raises:
+        ValueError, IndexError: it is damaged.
+    """
+    found: dict[int, Any] = {}
+    number = 0
+    while True:
+        number, kind, at = _head(data, at, number)
+        if kind == 0:
+            return found, at
+        found[number], at = _value(data, at, kind, depth)
+
+
+def items(data: bytes, at: int, wanted: int) -> Iterator[dict[int, Any]]:
+    """The structures in the list that is field ``wanted`` of a structure, one after the other.
+
+    Raises:
+        ValueError, IndexError: it is damaged, or there is no such list.
+    """
+    number = 0
+    while True:
+        number, kind, at = _head(data, at, number)
+        if number == wanted and kind == 9:
+            count, kind, at = _list(data, at)
+            if kind != 12:
+                raise ValueError(f"a list of type {kind}")
+            for _ in range(count):
+                item, at = fields(data, at, 1)
+                yield item
+            return
+        if kind == 0:
+            raise ValueError(f"no list in field {wanted}")
+        _, at = _value(data, at, kind, 0)
+
+
+def _head(data: bytes, at: int, number: int) -> tuple[int, int, int]:
+    """Number and type of the next field (type 0: there is none), and where its value begins."""
+    head = data[at]
+    kind, step = head & 15, head >> 4
+    if head == 0:
+        return number, 0, at + 1
+    if step:
+        return number + step, kind, at + 1
+    number, at = zigzag(data, at + 1)
+    return number, kind, at
+
+
+def _value(data: bytes, at: int, kind: int, depth: int) -> tuple[Any, int]:
+    if depth > MAX_DEPTH:
+        raise ValueError("structures nested too deep")
+    if kind in (1, 2):  # true and false have no bytes of their own
+        return kind == 1, at
+    if kind in (4, 5, 6):
+        return zigzag(data, at)
+    if kind in (3, 7):  # a byte, or a number with a point, which nobody asks for
+        return (data[at], at + 1) if kind == 3 else (None, at + 8)
+    if kind == 8:
+        length, at = varint(data, at)
+        if length > len(data) - at:
+            raise ValueError("a text beyond the end")
+        return data[at : at + length], at + length
+    if kind in (9, 10):
+        return _values(data, at, depth + 1)
+    if kind == 12:
+        return fields(data, at, depth + 1)
+    raise ValueError(f"a field of type {kind}")
+
+
+def _values(data: bytes, at: int, depth: int) -> tuple[list[Any], int]:
+    count, kind, at = _list(data, at)
+    found = []
+    for _ in range(count):
+        if kind in (1, 2):  # in a list a truth value has a byte
+            item, at = data[at] == 1, at + 1
+        else:
+            item, at = _value(data, at, kind, depth)
+        found.append(item)
+    return found, at
+
+
+def _list(data: bytes, at: int) -> tuple[int, int, int]:
+    """Length and type of a list, and where its first value begins."""
+    count, kind = data[at] >> 4, data[at] & 15
+    at += 1
+    if count == 15:
+        count, at = varint(data, at)
+    if count > len(data) - at:  # every value has a byte at least
+        raise ValueError(f"a list of {count} values in {len(data) - at} bytes")
+    return count, kind, at
+
+
+def varint(data: bytes, at: int) -> tuple[int, int]:
+    """A whole number without sign, and where it ends."""
+    number = 0
+    for shift in range(0, 70, 7):
+        byte = data[at]
+        at += 1
+        number |= (byte & 127) << shift
+        if byte < 128:
+            return number, at
+    raise ValueError("an endless number")
+
+
+def zigzag(data: bytes, at: int) -> tuple[int, int]:
+    """A whole number with a sign, and where it ends."""
+    number, at = varint(data, at)
+    return (number >> 1) ^ -(number & 1), at
