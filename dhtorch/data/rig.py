@@ -171,6 +171,14 @@ def _instants(recordings: Sequence[Recording], tolerance: float | None) -> Tenso
     return torch.stack(columns, 1)[good]
 
 
+def at_instants(recording: Recording, other: Recording) -> list[int]:
+    """Position in ``other`` of the frame of the instant of each frame of a recording; -1 = there is none."""
+    found = [-1] * len(recording)
+    for i, k in _instants([recording, other], None).tolist():
+        found[i] = k
+    return found
+
+
 def _along(values: Sequence[Tensor | None], camera: Tensor, places: Tensor) -> Tensor | None:
     """What every frame has, from each camera's own."""
     known = [v for v in values if v is not None]
