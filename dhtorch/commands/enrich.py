@@ -313,12 +313,13 @@ def _take_up(work: Work) -> None:
     if work.out.exists() and not work.out.is_dir():
         raise NotADirectoryError(f"out: {work.out} is a file, expected a folder, or a place for one")
     about = work.out / "meta" / _SHARED
+    storage.clear(about)  # who was killed while it was written left nothing else
     if about.is_file():
         other = storage.loads(about.read_text(encoding="utf-8"))
         if other["key"] != work.shared["key"]:
             what = archive.difference(other, work.shared)
             raise FileExistsError(f"{work.out}: found another enriched set ({what}), expected another folder for out")
-    elif work.out.is_dir() and any(work.out.iterdir()):
+    elif any(path.is_file() or path.is_symlink() for path in work.out.rglob("*")):
         raise FileExistsError(f"{work.out}: found a folder that holds something else, expected an empty or a new one")
     else:
         storage.write_json(about, work.shared)

@@ -16,7 +16,7 @@ from dhtorch.data.recording import Recording
 from dhtorch.export import lerobot as out
 
 #: Rows that are held together.
-GROUP_ROWS = 32
+GROUP_ROWS = 8
 
 #: Frames a second where nothing tells.
 NO_RATE = 30.0

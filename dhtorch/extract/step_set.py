@@ -54,12 +54,16 @@ class StepSet:
             if described.kind == "image":
                 content = steps.values(name, range(1))[0]
                 hw = files.decode_image_header(content, steps.place.file).hw
-                found[_column(name, picture=True)] = out.picture(hw, abs(described.shape[-1]) if described.shape else 3)
+                more = {} if described.dtype == "uint8" else {"is_depth_map": True, "depth_unit": "mm"}
+                channels = abs(described.shape[-1]) if described.shape else 3
+                found[_column(name, picture=True)] = out.picture(hw, channels, **more)
             elif described.kind == "text" and name != steps.instruction:
                 found[_column(name)] = {"dtype": "string", "shape": [1], "names": None}
             elif described.kind == "tensor":
-                more = {"info": {"shape": list(described.shape)}} if len(described.shape) > 1 else {}
-                found[_column(name)] = out.numbers(described.dtype, int(np.prod(described.shape))) | more
+                feature = out.numbers(described.dtype, int(np.prod(described.shape)))
+                found[_column(name)] = (
+                    feature | {"info": {"shape": list(described.shape)}} if len(described.shape) > 1 else feature
+                )
         return found
 
     @property
