@@ -43,7 +43,6 @@ TARGETS = {"lerobot v3.0": "lerobot", "lerobot v2.1": "v2.1", "nerfstudio": "ner
 #: Sources in DHTORCH_DATA: name → what the command is told beside the path.
 REAL = {
     "tum_fr1_desk9": (),
-    "7s_redkitchen_200": (),
     "holo_a": (),
     "r3d_door": (),
     "dgp_drive6cam": (),
@@ -236,8 +235,10 @@ def main() -> int:
         folder = Path(place)
         sources = {name: (home / name, told) for name, told in REAL.items() if (home / name).exists()}
         sources |= {name: (path, ()) for name, path in written(folder / "written").items()}
-        for name, (path, told) in sources.items():
-            for target in TARGETS if options.only is None or options.only in name else ():
+        for target in TARGETS:
+            for name, (path, told) in sources.items():
+                if options.only is not None and options.only not in name:
+                    continue
                 found = row(name, path, told, target, folder)
                 found |= {"processor": archive.processor(), "cores": os.cpu_count()}
                 rows.append(found)

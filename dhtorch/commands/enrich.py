@@ -287,6 +287,7 @@ def _described(settings: Mapping[str, Any], whole: plan.Plan, wanted: Mapping[st
     digest = archive.data_digest(files)
     made = archive.meta(device="cpu", dtype="float32", threads=1, seed=settings["seed"])
     name = settings["choices"]["data"]
+    source = whole.roots[0].resolve().name if whole.roots else name
     found: Row = storage.strict(
         {
             "format": FORMAT,
@@ -295,7 +296,7 @@ def _described(settings: Mapping[str, Any], whole: plan.Plan, wanted: Mapping[st
             "key": archive.result_key({**config, "name": name, "files": FORMAT}, digest, roots=[MapRows.__module__]),
             "config": archive.portable(config),
             "method": settings["choices"]["method"],
-            "data": {"name": name, "digest": digest, "frames": len(whole)},
+            "data": {"name": name, "source": source, "digest": digest, "frames": len(whole)},
             "step_m": settings["step"],
             "columns": {k: c._asdict() for k, c in wanted.items()},
             "codes": {**columns.code_tables(), "source": names(Source), "gate": names(Gate)},

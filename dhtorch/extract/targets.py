@@ -66,12 +66,13 @@ class Tally:
     def summary(self) -> Row:
         """Pixels by source and by reason, in all and along time."""
         pixels = np.array(self.pixels).reshape(len(self.pixels), -1)
-        silent = np.array(self.silent)
+        silent = np.array(self.silent).reshape(len(self.silent), -1)
         if not len(pixels):
-            return {"pixels": [], "silent": [], "over_time": [], "unread": self.unread}
-        pieces = np.array_split(pixels, min(PARTS, len(pixels)))
-        along = [piece.sum(0) / max(1, piece.sum()) for piece in pieces]
-        return {"pixels": pixels.sum(0), "silent": silent.sum(0), "over_time": along, "unread": self.unread}
+            return {"pixels": [], "silent": [], "over_time": [], "silent_over_time": [], "unread": self.unread}
+        parts = np.array_split(np.arange(len(pixels)), min(PARTS, len(pixels)))
+        along, why = ([x[at].sum(0) / max(1, pixels[at].sum()) for at in parts] for x in (pixels, silent))
+        found = {"over_time": along, "silent_over_time": why, "unread": self.unread}
+        return {"pixels": pixels.sum(0), "silent": silent.sum(0), **found}
 
     def of_maps(self) -> tuple[Moments, Moments, Moments] | None:
         """Of depth, sigma and the picture; None where no frame could be read."""
