@@ -72,7 +72,7 @@ class Recording(Sequence[Frame]):
         return frame.replace(
             time=None if self.times is None else self.times[i : i + 1],
             T_world_from_cam=None if self.poses is None else self.poses[i : i + 1],
-            sparse=torch.tensor([True]) if self.sparse else None,
+            sparse=torch.tensor([True]) if self.sparse else frame.sparse,
         )
 
     def __repr__(self) -> str:
