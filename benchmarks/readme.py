@@ -324,6 +324,44 @@ def captures() -> str:
     return f"{grid}\n\n{found['processor']}, {found['cores']} cores, beside other work."
 
 
+def enriched() -> str:
+    """What ``dhtorch enrich`` made of each source in each format, and the loaders of others that opened it."""
+    file = RESULTS / "enrich.json"
+    if not file.is_file():
+        return "Not measured yet: `benchmarks/results/enrich.json` is not there."
+    others = json.loads((RESULTS.parent / "clients" / "results.json").read_text())
+    rows = []
+    for found in sorted(json.loads(file.read_text()), key=lambda found: (found["source"], found["data"])):
+        name = f"`{found['data']}`" if found["made"] == "real" else "written"
+        if "refused" in found:
+            rows.append([found["refused"], found["source"], name, found["target"], "refused", "", "", ""])
+            continue
+        weight = "" if found["mb_per_minute"] is None else f"{found['mb_per_minute']:.1f}"
+        same = f"{found['compared']:,} values" if found["source_untouched"] and found["done_again"] else "no"
+        opened = [each for each in others if (each["source"], each["target"]) == (found["source"], found["target"])]
+        loaders = [
+            f"{each['loader'].partition(',')[0]}{', a training step' * bool(each.get('act_step'))}"
+            for each in opened
+            if each.get("opened") and each["data"] == found["data"]
+        ]
+        row = [same, f"{found['s_per_frame']:.2f}", weight, "; ".join(loaders)]
+        rows.append(["; ".join(found["said"]), found["source"], name, found["target"], *row])
+    head = [
+        "what came out",
+        "source",
+        "data",
+        "target",
+        "opened again, the same",
+        "s a frame",
+        "MB a minute",
+        "loaders",
+    ]
+    grid = text.grid(Table("", head, rows))
+    first = json.loads(file.read_text())[0]
+    options = "`frames=3 'dense={size: 160}'`"
+    return f"{grid}\n\n{options}; processor time of {first['processor']}, {first['cores']} cores, beside other work."
+
+
 #: What the judge is to find, in words, and its bars.
 FOUND = {
     "scale_found": ("metre off by a tenth: found, anchors with a baseline", "≥ 0.95"),
@@ -376,7 +414,14 @@ TABLES |= {"judge": judge}
 TABLES |= {"every pixel": partial(every_pixel, "dense", "dense_streams")}
 TABLES |= {"pixels by scene": partial(pixels_by_scene, "dense")}
 TABLES |= {"speed": speed_tables.stages, "mutants": caught} | speed_tables.TABLES | kornia_tables.TABLES
-TABLES |= {"how good": how_good, "sweep": swept, "captures": captures, "loader": loader_times, "questions": questions}
+TABLES |= {
+    "how good": how_good,
+    "sweep": swept,
+    "captures": captures,
+    "enriched": enriched,
+    "loader": loader_times,
+    "questions": questions,
+}
 
 #: Numbers of the method comparison in words, and on which side of its bar each belongs.
 NUMBER = {

@@ -82,6 +82,7 @@ SCRIPTS |= {
     "xfeat_noise": "",
     "sweep": "",
     "captures": "",
+    "enrich": "",
 }
 
 #: Scripts of another name than their result: ``kornia.py`` would be imported instead of the library.

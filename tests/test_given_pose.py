@@ -84,7 +84,10 @@ def test_a_covariance_that_is_not_stated_is_taken_from_the_near_returns(pairs):
     assert (spread(off) > 1.5 * spread(right)).all() and (z.abs() < 2).float().mean() > 0.6
     dark = pairs[0].replace(depth=torch.zeros_like(pairs[0].depth))
     _, fit, *_ = asked((dark, *pairs[1:]), given.stated(T))
-    assert fit.ok.all() and (fit.cov == 0).all() and fit.t_snr.isinf().all(), "nothing speaks for or against it"
+    want = torch.tensor([0.01**2] * 3 + [0.02**2] * 3)
+    assert fit.ok.all() and torch.allclose(fit.cov.diagonal(dim1=1, dim2=2).float(), want), "what is assumed"
+    _, fit, *_ = asked((dark, *pairs[1:]), given.stated(T, sigma=(0.0, 0.0)))
+    assert fit.ok.all() and (fit.cov == 0).all() and fit.t_snr.isinf().all(), "exact because it is said"
 
 
 WRONG = {

@@ -15,16 +15,19 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from dhtorch import archive, dense, storage
+from dhtorch import archive, dense, lock, storage
 from dhtorch.codes import Gate, Source, names, words
 from dhtorch.commands import enrich_page
 from dhtorch.data.files import need
+from dhtorch.data.rig import Rig
 from dhtorch.data.scene import Scene, scenes_of
-from dhtorch.extract import columns, engines, plan, shards
+from dhtorch.extract import columns, cut, engines, plan, shards
 from dhtorch.extract.enriched import MapRows, View, camera_key
 from dhtorch.extract.enriched import columns as map_columns
-from dhtorch.extract.origin import RobotSet, rate
+from dhtorch.extract.origin import NO_RATE, Origin, RobotSet, knows_rate, rate
+from dhtorch.extract.step_set import StepSet
 from dhtorch.extract.targets import NerfTarget, RobotTarget, Target
+from dhtorch.transform import given
 
 Progress = Callable[..., Iterable[Any]]
 Row = dict[str, Any]
@@ -36,7 +39,8 @@ FORMAT = 1
 FORMATS: dict[str, int | None] = {"lerobot": 3, "v3.0": 3, "lerobot_v2.1": 2, "v2.1": 2, "nerfstudio": None}
 
 #: Options that decide what is written.
-KEYED = ("data", "method", "seed", "format", "dense", "causal", "gap", "step", "fps", "task", "on_error")
+KEYED = ("data", "method", "seed", "format", "dense", "causal", "gap", "cameras", "pose", "pose_sigma", "frames",
+         "step", "fps", "task", "on_error")  # fmt: skip
 
 #: Where the maps of episodes wait that are not whole; and what all share.
 _WAITING, _SHARED = ".dhtorch", "dhtorch.json"
@@ -45,6 +49,12 @@ _WAITING, _SHARED = ".dhtorch", "dhtorch.json"
 _SIZE = 640
 
 _SHOWN = 3
+
+#: What the system says where nothing more can be written.
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+#: Where the motion to another view comes from.
+POSES = ("near", "device", "start")
 
 
 @dataclass(frozen=True)
@@ -58,6 +68,7 @@ class Work:
     target: Target
     shared: Row
     rows: MapRows
+    notes: Sequence[str] = ()
 
     @property
     def waiting(self) -> Path:
@@ -84,18 +95,20 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     need("pyarrow.parquet", extra="scale")
     _check(settings)
     work = _work(settings, parts)
+    home = work.out.absolute()
+    rest = "what is whole stays; the same command does the rest"
     try:
-        before, complaints = _make(work, settings, progress)
+        with lock.held(home.parent / f".{home.name}.lock", f"out: {work.out}"):
+            before, complaints = _make(work, settings, progress)
+            owns = [own for k in range(len(_episodes(work.whole))) if (own := work.target.own(k)) is not None]
+            if settings["report"]:
+                enrich_page.write(_report(work), work.shared, owns)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"what is whole in {work.out} stays; the same command does the rest") from None
     except OSError as error:
-        if error.errno != errno.ENOSPC:
+        if error.errno not in _FULL:
             raise
-        rest = "what is whole stays; the same command does the rest"
-        raise OSError(error.errno, f"no space left on the disk of {work.out}: {rest}") from None
-    owns = [own for k in range(len(_episodes(work.whole))) if (own := work.target.own(k)) is not None]
-    if settings["report"]:
-        enrich_page.write(_report(work), work.shared, owns)
+        raise OSError(error.errno, f"{error.strerror}: {error.filename or work.out}; {rest}") from None
     print("\n".join(_said(work, owns, before, complaints)))
     return 0
 
@@ -131,19 +144,21 @@ def _make(work: Work, settings: Mapping[str, Any], progress: Progress) -> tuple[
 
 
 def _work(settings: Mapping[str, Any], parts: Mapping[str, Any]) -> Work:
-    scenes, method = scenes_of(parts["data"]), parts["method"]
+    scenes, method = cut.cut(scenes_of(parts["data"]), settings["frames"]), parts["method"]
     whole = plan.make(scenes, settings["gap"], method.views, rigs=True)
     out = Path(str(settings["out"])).expanduser()
     for root in whole.roots:
         if out.resolve().is_relative_to(root.resolve()) or (root.is_file() and out.resolve() == root.resolve()):
             raise ValueError(f"out: found {out} inside the source {root}, which is only read; expected another folder")
     asked = dense.options(settings["dense"], "dense")
-    first = _episodes(whole)[0]
+    first = [scenes[whole.order[n]] for n in _episodes(whole)[0]]
     size = _SIZE if asked is None else asked["size"]
-    views = {v.key: v for v in (View.of(scenes[whole.order[n]], size) for n in first)}
-    kinds = {scenes[k].recording.format for k in whole.order[: len(first)]}
-    format = _format(settings["format"], kinds, scenes[whole.order[0]])
-    wanted = map_columns(pictures=kinds != {"lerobot"} or FORMATS[format] is None)
+    views = {v.key: v for v in (View.of(scene, size) for scene in first)}
+    _check_views(settings, first, views)
+    format = _format(settings["format"], first)
+    found = scenes, whole, views
+    origin = None if FORMATS[format] is None else _origin(settings, found)
+    wanted = map_columns(pictures=origin is None)
     shared = _described(settings, whole, wanted)
     rows = MapRows(
         scenes,
@@ -152,13 +167,55 @@ def _work(settings: Mapping[str, Any], parts: Mapping[str, Any]) -> Work:
         method=method,
         gap=settings["gap"],
         past=settings["causal"],
+        beside=settings["cameras"],
         step=settings["step"],
         views=views,
         seed=settings["seed"],
         dense=settings["dense"],
+        **_pose_options(settings),
     )
-    target = _target(settings, (scenes, whole, views), out, format, shared["key"])
-    return Work(out=out, scenes=scenes, whole=whole, views=views, target=target, shared=shared, rows=rows)
+    target = _target(settings, found, out, format, shared["key"], origin)
+    notes = []
+    if FORMATS[format] is not None and settings["fps"] is None and not knows_rate(first[0].recording):
+        notes.append(f"no frame rate is known: time stamps are for {NO_RATE:g} frames a second (fps=N tells)")
+    return Work(out=out, scenes=scenes, whole=whole, views=views, target=target, shared=shared, rows=rows, notes=notes)
+
+
+def _check_views(settings: Mapping[str, Any], first: Sequence[Scene], views: Mapping[str, View]) -> None:
+    """Raises ValueError for what the cameras of an episode cannot be asked."""
+    names = ", ".join(scene.name for scene in first)
+    if len(views) < len(first):
+        raise ValueError(f"data: found several recordings of one camera in one episode ({names}), expected one each")
+    if any(isinstance(scene.recording, Rig) for scene in first):
+        raise ValueError(f"data: found a rig ({names}), expected its cameras apart (cameras=true joins them)")
+    sizes = {view.hw for view in views.values()}
+    if settings["cameras"] and (len(views) < 2 or len(sizes) > 1 or settings["gap"] != plan.CHOICE):
+        seen = " and ".join(f"{w}x{h}" for h, w in sorted(sizes))
+        found = f"{len(views)} of {seen} pixels, gap={settings['gap']}"
+        raise ValueError(f"cameras: found {found}, expected two or more of one size in an episode, and gap=auto")
+    unposed = [view.name for view in views.values() if not view.posed]
+    if settings["pose"] != "near" and unposed:
+        raise ValueError(f"pose: found none of {', '.join(unposed)}, expected a posed recording, or pose=near")
+
+
+def _pose_options(settings: Mapping[str, Any]) -> Row:
+    """Of :class:`dhtorch.transform.ExtendDepth`."""
+    if settings["pose"] == "near":
+        return {}
+    return {"pose": "pose", "pose_cov": settings["pose_sigma"], "refine": settings["pose"] == "start"}
+
+
+def _origin(settings: Mapping[str, Any], found: tuple[Sequence[Scene], plan.Plan, dict[str, View]]) -> Origin | None:
+    """The data set with columns of its own that the recordings are of."""
+    scenes, whole, _ = found
+    groups = _episodes(whole)
+    recording, numbers = scenes[whole.order[0]].recording, [whole.episodes[group[0]] for group in groups]
+    if recording.format == "lerobot" and recording.root is not None:
+        return RobotSet.open(recording.root, numbers, limit=settings["frames"], bounds=recording.bounds)
+    if recording.format == "rlds":
+        each = cut.Chosen(scenes, tuple(whole.order[group[0]] for group in groups))
+        return StepSet(each, numbers, settings["fps"] or rate(recording), settings["frames"])
+    return None
 
 
 def _target(
@@ -167,6 +224,7 @@ def _target(
     out: Path,
     format: str,
     key: str,
+    origin: Origin | None,
 ) -> Target:
     scenes, whole, views = found
     version, of_episode = FORMATS[format], _episodes(whole)
@@ -174,32 +232,41 @@ def _target(
         unposed = [v.name for v in views.values() if not v.posed]
         if unposed:
             raise ValueError(f"format=nerfstudio: found no poses of {', '.join(unposed)}, expected a posed recording")
-        alone = len(whole.order) == 1
-        names_of = [
-            {camera_key(scenes[whole.order[n]].recording): "" if alone else scenes[whole.order[n]].name for n in group}
-            for group in of_episode
-        ]
-        return NerfTarget(out, views, names_of, key)
+        return NerfTarget(out, views, _folders(scenes, whole, of_episode), key)
     recording = scenes[whole.order[0]].recording
-    numbers = [whole.episodes[group[0]] for group in of_episode]
-    origin = None
-    if recording.format == "lerobot" and recording.root is not None:
-        origin = RobotSet.open(recording.root, numbers)
-    fps = rate(recording) if origin is None else origin.meta.fps
+    fps = rate(recording) if origin is None else origin.fps
     return RobotTarget(
         out,
         version,
         views,
         origin=origin,
-        numbers=numbers,
+        numbers=[whole.episodes[group[0]] for group in of_episode],
         step=settings["step"],
         fps=settings["fps"] or fps,
         task=settings["task"],
         key=key,
+        cut=settings["frames"] is not None,
     )
 
 
-def _format(asked: str, kinds: set[str], first: Scene) -> str:
+def _folders(scenes: Sequence[Scene], whole: plan.Plan, groups: Sequence[Sequence[int]]) -> list[dict[str, str]]:
+    """Name of the folder of each recording, by episode and then by camera; of the only one empty."""
+    found: list[dict[str, str]] = []
+    seen: set[str] = set()
+    for group in groups:
+        named = {}
+        for n in group:
+            scene = scenes[whole.order[n]]
+            parts = [part for part in scene.name.split("/") if part not in ("", ".", "..")]
+            named[camera_key(scene.recording)] = name = "" if len(whole.order) == 1 else "/".join(parts)
+            if name in seen:
+                raise ValueError(f"data: found two recordings called {name}, expected different names")
+            seen.add(name)
+        found.append(named)
+    return found
+
+
+def _format(asked: str, first: Sequence[Scene]) -> str:
     """The format to write.
 
     Raises:
@@ -207,11 +274,10 @@ def _format(asked: str, kinds: set[str], first: Scene) -> str:
     """
     if asked != "same":
         return asked
-    root = first.root
-    if kinds != {"lerobot"} or root is None:
-        writers = ", ".join(FORMATS)
-        raise ValueError(f"format=same: found {', '.join(sorted(kinds))}, which has no writer here; expected {writers}")
-    return "v2.1" if RobotSet.open(root, [first.recording.episode or 0]).meta.version == 2 else "lerobot"
+    kind, root = first[0].recording.format, first[0].root
+    if kind != "lerobot" or root is None:
+        raise ValueError(f"format=same: found {kind}, which has no writer here; expected {', '.join(FORMATS)}")
+    return "v2.1" if RobotSet.open(root, [first[0].recording.episode or 0]).meta.version == 2 else "lerobot"
 
 
 def _described(settings: Mapping[str, Any], whole: plan.Plan, wanted: Mapping[str, columns.Column]) -> Row:
@@ -221,6 +287,7 @@ def _described(settings: Mapping[str, Any], whole: plan.Plan, wanted: Mapping[st
     digest = archive.data_digest(files)
     made = archive.meta(device="cpu", dtype="float32", threads=1, seed=settings["seed"])
     name = settings["choices"]["data"]
+    source = whole.roots[0].resolve().name if whole.roots else name
     found: Row = storage.strict(
         {
             "format": FORMAT,
@@ -229,7 +296,7 @@ def _described(settings: Mapping[str, Any], whole: plan.Plan, wanted: Mapping[st
             "key": archive.result_key({**config, "name": name, "files": FORMAT}, digest, roots=[MapRows.__module__]),
             "config": archive.portable(config),
             "method": settings["choices"]["method"],
-            "data": {"name": name, "digest": digest, "frames": len(whole)},
+            "data": {"name": name, "source": source, "digest": digest, "frames": len(whole)},
             "step_m": settings["step"],
             "columns": {k: c._asdict() for k, c in wanted.items()},
             "codes": {**columns.code_tables(), "source": names(Source), "gate": names(Gate)},
@@ -247,6 +314,7 @@ def _take_up(work: Work) -> None:
     if work.out.exists() and not work.out.is_dir():
         raise NotADirectoryError(f"out: {work.out} is a file, expected a folder, or a place for one")
     about = work.out / "meta" / _SHARED
+    storage.clear(about)  # who was killed while it was written left nothing else
     if about.is_file():
         other = storage.loads(about.read_text(encoding="utf-8"))
         if other["key"] != work.shared["key"]:
@@ -296,6 +364,7 @@ def _said(work: Work, owns: Sequence[Row], before: int, complaints: Sequence[str
         kinds = ", ".join(f"{kind} {share:.1%}" for kind, share in shares.items())
         why = ", ".join(f"{words(gate)} {share:.1%}" for gate, share in reasons.items())
         lines.append(f"  {name}: {kinds}" + (f" ({why})" if why else ""))
+    lines += [f"  {line}" for line in work.notes]
     lines += [f"  {complaint}" for complaint in complaints[:_SHOWN]]
     lines += [f"  and {len(complaints) - _SHOWN} more frames"] if len(complaints) > _SHOWN else []
     return lines
@@ -303,11 +372,11 @@ def _said(work: Work, owns: Sequence[Row], before: int, complaints: Sequence[str
 
 def _check(settings: Mapping[str, Any]) -> None:
     """Options that would only fail after minutes."""
-    known = {"format": (*FORMATS, "same"), "engine": engines.ENGINES, "on_error": ("raise", "flag")}
+    known = {"format": (*FORMATS, "same"), "engine": engines.ENGINES, "on_error": ("raise", "flag"), "pose": POSES}
     for name, among in known.items():
         if settings[name] not in among:
             raise ValueError(f"{name}: found {settings[name]!r}, expected one of {', '.join(among)}")
-    for name in ("causal", "report"):
+    for name in ("causal", "report", "cameras"):
         if not isinstance(settings[name], bool):
             raise ValueError(f"{name}: found {settings[name]!r}, expected true or false")
     for name, low in (("workers", 0), ("shard_rows", 1), ("gap", 0)):
@@ -315,8 +384,14 @@ def _check(settings: Mapping[str, Any]) -> None:
         whole = isinstance(value, int) and not isinstance(value, bool) and value >= low
         if not whole and not (name == "gap" and value == plan.CHOICE):
             raise ValueError(f"{name}: found {value!r}, expected a whole number of at least {low}")
+    if settings["frames"] is not None and not (isinstance(settings["frames"], int) and settings["frames"] >= 1):
+        raise ValueError(f"frames: found {settings['frames']!r}, expected a whole number of at least 1, or null")
+    if settings["pose_sigma"] is not None and settings["pose"] == "near":
+        raise ValueError(f"pose_sigma: found {settings['pose_sigma']} with pose=near, expected pose=device or start")
+    given.sigmas(settings["pose_sigma"], "pose_sigma")
     for name, high in (("step", 1.0), ("fps", 1e4)):
         value = settings[name]
-        number = isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value <= high
+        least = 0.0 if name == "step" else 1e-4
+        number = isinstance(value, int | float) and not isinstance(value, bool) and least <= value <= high
         if not number and not (name == "fps" and value is None):
-            raise ValueError(f"{name}: found {value!r}, expected a number from 0 to {high:g}")
+            raise ValueError(f"{name}: found {value!r}, expected a number from {least:g} to {high:g}")

@@ -11,7 +11,7 @@ import numpy as np
 from dhtorch import storage
 from dhtorch.codes import Gate, Source, names, words
 from dhtorch.drawing import Axis, Key, Panel
-from dhtorch.drawing.colours import RECOVERED, SENSOR, SILENT, Stroke, style_sheet
+from dhtorch.drawing.colours import GATES, RECOVERED, SENSOR, SILENT, Stroke, style_sheet
 from dhtorch.studies.report.figure import Figure
 from dhtorch.studies.report.markup import Markup, tag
 from dhtorch.studies.report.page import STYLE, figure_markup, table_markup
@@ -21,6 +21,9 @@ Row = Mapping[str, Any]
 
 #: Episodes that are listed, those with least depth first.
 WORST = 10
+
+#: Reasons of silence that are drawn, the most frequent.
+REASONS = 4
 
 #: Kind of a pixel → its codes.
 KINDS = {"sensor": (Source.SENSOR,), "recovered": (Source.RECOVERED, Source.SWEPT), "silent": (Source.NONE,)}
@@ -45,16 +48,17 @@ def page(about: Row, owns: Sequence[Row]) -> str:
         about: what all episodes share.
         owns: what each amounts to, as :class:`dhtorch.extract.targets.Target` notes it.
     """
-    title = f"{about['data']['name']}: what it was enriched with"
+    title = f"{about['data']['source']}: what became of its pixels"
     style = Markup(style_sheet() + STYLE.read_text(encoding="utf-8"))
     metas = ({"charset": "utf-8"}, {"name": "viewport", "content": "width=device-width, initial-scale=1"})
     head = tag("head", *(tag("meta", **m) for m in metas), tag("title", title), tag("style", style))
     frames = sum(own["length"] for own in owns)
     step = f"depth in steps of {1e3 * about['step_m']:.3g} mm" if about["step_m"] else "depth as it was found"
-    lead = f"{len(owns)} episodes, {frames} frames; {step}; dhtorch {about['version']}, method {about['method']}"
+    episodes = f"{len(owns)} episode{'s' * (len(owns) != 1)}, {frames} frames"
+    lead = f"{episodes}; {step}; dhtorch {about['version']}, method {about['method']}"
     tables = [_cameras(owns), _worst(owns)]
-    figure = _along(owns)
-    parts = [*(table_markup(t) for t in tables), *([figure_markup(figure)] if figure else [])]
+    figures = [figure for figure in (_along(owns), _why(owns)) if figure is not None]
+    parts = [*(table_markup(t) for t in tables), *(figure_markup(figure) for figure in figures)]
     body = tag("body", tag("header", tag("h1", title), tag("p", lead, class_="lead")), tag("main", *parts))
     return "<!doctype html>\n" + tag("html", head, body, lang="en") + "\n"
 
@@ -74,8 +78,8 @@ def _cameras(owns: Sequence[Row]) -> Table:
     rows = []
     for name, kinds, reasons in by_camera(owns):
         why = ", ".join(f"{words(gate)} {share:.1%}" for gate, share in reasons.items())
-        rows.append([name, *(f"{share:.1%}" for share in kinds.values()), why or "—"])
-    return Table("Pixels by camera", ["camera", *KINDS, "silent because"], rows)
+        rows.append([name, why or "—", *(f"{share:.1%}" for share in kinds.values())])
+    return Table("Pixels by camera", ["camera", "silent because", *KINDS], rows, n_label=2)
 
 
 def _worst(owns: Sequence[Row]) -> Table:
@@ -87,16 +91,43 @@ def _worst(owns: Sequence[Row]) -> Table:
     rows = []
     for _, number, name, kinds, reasons, unread in sorted(found, key=lambda x: (-x[0], x[1], x[2]))[:WORST]:
         why = next((words(gate) for gate in reasons), "—")
-        rows.append([str(number), name, *(f"{share:.1%}" for share in kinds.values()), why, str(unread)])
-    head = ["episode", "camera", *KINDS, "most often because", "frames not read"]
-    return Table("Episodes with least depth first", head, rows)
+        rows.append([str(number), name, why, *(f"{share:.1%}" for share in kinds.values()), str(unread)])
+    head = ["episode", "camera", "silent most often because", *KINDS, "frames not read"]
+    return Table("Episodes with least depth first", head, rows, n_label=3)
 
 
 def _along(owns: Sequence[Row]) -> Figure | None:
     """Shares along the episodes, mean over them."""
     panels = []
+    for name, mean in _means(owns, "over_time"):
+        panel = _panel(name)
+        for kind, codes in KINDS.items():
+            _draw(panel, sum(mean[code] for code in codes), _COLOURS[kind])
+        panels.append(panel)
+    keys = [Key(kind, colour, "line") for kind, colour in _COLOURS.items()]
+    return Figure("Along time", "Mean over the episodes, by camera.", panels, keys) if panels else None
+
+
+def _why(owns: Sequence[Row]) -> Figure | None:
+    """The reasons of silence that are most frequent, along the episodes."""
+    found = _means(owns, "silent_over_time")
+    gates = [gate for gate in GATES if any(mean[gate].max() > 0 for _, mean in found)]
+    gates = sorted(gates, key=lambda gate: -max(float(mean[gate].mean()) for _, mean in found))[:REASONS]
+    panels = []
+    for name, mean in found if gates else []:
+        panel = _panel(name)
+        for gate in gates:
+            _draw(panel, mean[gate], GATES[gate])
+        panels.append(panel)
+    keys = [Key(words(names(Gate)[gate]), GATES[gate], "line") for gate in gates]
+    return Figure("Why silent, along time", "Share of all pixels, by camera.", panels, keys) if panels else None
+
+
+def _means(owns: Sequence[Row], column: str) -> list[tuple[str, np.ndarray]]:
+    """Camera and what a column is along time (codes, parts), mean over the episodes; those with two parts at least."""
+    found = []
     for name in dict.fromkeys(name for own in owns for name in own["cameras"]):
-        shares = [np.array(own["cameras"][name]["over_time"]) for own in owns if name in own["cameras"]]
+        shares = [np.array(own["cameras"][name][column]) for own in owns if name in own["cameras"]]
         longest = max((len(x) for x in shares if len(x)), default=0)
         if longest < 2:
             continue
@@ -104,10 +135,13 @@ def _along(owns: Sequence[Row]) -> Figure | None:
         spread = [
             [np.interp(at, np.linspace(0, 1, len(x)), x[:, c]) for c in range(x.shape[1])] for x in shares if len(x)
         ]
-        mean = np.mean(spread, 0)
-        panel = Panel(name, Axis(0, 1, "part of the episode, %", percent=True), Axis(0, 1, "pixels, %", percent=True))
-        for kind, codes in KINDS.items():
-            panel.line(at.tolist(), sum(mean[code] for code in codes).tolist(), Stroke(_COLOURS[kind], 1.8))
-        panels.append(panel)
-    keys = [Key(kind, colour, "line") for kind, colour in _COLOURS.items()]
-    return Figure("Along time", "Mean over the episodes, by camera.", panels, keys) if panels else None
+        found.append((name, np.mean(spread, 0)))
+    return found
+
+
+def _panel(name: str) -> Panel:
+    return Panel(name, Axis(0, 1, "part of the episode, %", percent=True), Axis(0, 1, "pixels, %", percent=True))
+
+
+def _draw(panel: Panel, shares: Any, colour: str) -> None:
+    panel.line(np.linspace(0, 1, len(shares)).tolist(), shares.tolist(), Stroke(colour, 1.8))

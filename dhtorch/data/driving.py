@@ -133,6 +133,7 @@ def _recording(scene: Path, name: str, shots: list[_Shot], report: list[str], **
         rate_hz=float(1 / times.diff().median()) if len(whole) > 1 else None,
         sparse=True,
         report=tuple(report),
+        camera_name=name,
     )
 
 

@@ -300,6 +300,7 @@ class _Rig:
             rate_hz=meta.fps,
             report=tuple(report),
             episode=episode.number,
+            camera_name=self.key,
         )
 
     def _cameras(

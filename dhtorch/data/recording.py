@@ -26,8 +26,8 @@ class Recording(Sequence[Frame]):
     A reader must give ``name``, ``format``, ``load``, which decodes image, depth and cameras of position ``i``, and
     ``number``, the place of every frame in the capture: where a frame was skipped the numbers have a gap, so that pairs
     never shift silently. It may give ``root``, ``times``, ``poses`` with their ``pose_axes``, ``rate_hz``, ``sparse``,
-    ``episode`` and ``report``, where the capture says so; the recording adds time, pose and ``sparse`` to its frames.
-    What a benchmark makes of a recording is no property of it: see :class:`dhtorch.data.scene.Scene`.
+    ``episode``, ``camera_name`` and ``report``, where the capture says so; the recording adds time, pose and ``sparse``
+    to its frames. What a benchmark makes of a recording is no property of it: see :class:`dhtorch.data.scene.Scene`.
 
     Raises:
         ValueError: no frame, or fields of unequal length.
@@ -45,6 +45,7 @@ class Recording(Sequence[Frame]):
     sparse: bool = False  # depth is a projected LiDAR sweep: mostly empty between returns
     episode: int | None = None  # its number in the data set, where episodes have one
     report: tuple[str, ...] = ()  # what was left out, and why
+    camera_name: str | None = None  # as the data set calls it, where several cameras see an episode
     bounds: Path | None = None  # no link below it may lead out of it; None = links are followed
 
     def __post_init__(self) -> None:
@@ -71,7 +72,7 @@ class Recording(Sequence[Frame]):
         return frame.replace(
             time=None if self.times is None else self.times[i : i + 1],
             T_world_from_cam=None if self.poses is None else self.poses[i : i + 1],
-            sparse=torch.tensor([True]) if self.sparse else None,
+            sparse=torch.tensor([True]) if self.sparse else frame.sparse,
         )
 
     def __repr__(self) -> str:

@@ -159,16 +159,33 @@ def _instants(recordings: Sequence[Recording], tolerance: float | None) -> Tenso
         steps = [float(t.diff().median()) for t in stamps if len(t) > 1]
         limit = tolerance if tolerance is not None else 0.5 * min(steps, default=1.0)
         for other in stamps[1:]:
-            miss = (other[None] - stamps[0][:, None]).abs()
-            least, at = miss.min(1)
+            at = _nearest(stamps[0], other)
             columns.append(at)
-            good &= (least <= limit) & (miss.argmin(0)[at] == columns[0])  # nearest to each other: one instant a frame
+            good &= (other[at] - stamps[0]).abs() <= limit
+            good &= _nearest(other, stamps[0])[at] == columns[0]  # nearest to each other: one instant a frame
     else:
         for r in recordings[1:]:
             at = torch.searchsorted(r.number, first.number).clamp(max=len(r) - 1)
             columns.append(at)
             good &= r.number[at] == first.number
     return torch.stack(columns, 1)[good]
+
+
+def _nearest(stamps: Tensor, among: Tensor) -> Tensor:
+    """Position (n,) of the stamp nearest to each of ``stamps``, the earlier of two; (m,) ``among`` in any order."""
+    order = among.argsort(stable=True)
+    known = among[order]
+    right = torch.searchsorted(known, stamps).clamp(max=len(known) - 1)
+    left = (right - 1).clamp_min(0)
+    return order[torch.where((stamps - known[left]).abs() <= (known[right] - stamps).abs(), left, right)]
+
+
+def at_instants(recording: Recording, other: Recording) -> list[int]:
+    """Position in ``other`` of the frame of the instant of each frame of a recording; -1 = there is none."""
+    found = [-1] * len(recording)
+    for i, k in _instants([recording, other], None).tolist():
+        found[i] = k
+    return found
 
 
 def _along(values: Sequence[Tensor | None], camera: Tensor, places: Tensor) -> Tensor | None:

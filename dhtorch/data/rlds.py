@@ -229,16 +229,17 @@ def _known(root: Path, features: dict[str, Described], name: str | None, option:
 
 
 @dataclass(frozen=True)
-class _Episode:
-    """Where an episode lies."""
+class Place:
+    """Where an episode lies: one record of a file."""
 
     split: str
-    number: int
+    number: int  # in its split
+    place: int  # among all of the splits that are opened
     file: Path
     span: tfrecord.Span
 
 
-def _episodes(root: Path, split: str | None, wanted: int | Sequence[int] | None) -> list[_Episode]:
+def _episodes(root: Path, split: str | None, wanted: int | Sequence[int] | None) -> list[Place]:
     shards: dict[str, list[Path]] = {}
     for file in sorted(root.iterdir(), key=files.natural):
         if match := _SHARD.match(file.name):
@@ -246,12 +247,14 @@ def _episodes(root: Path, split: str | None, wanted: int | Sequence[int] | None)
     if split is not None and split not in shards:
         raise FormatError(root, "option split", split, f"one of {', '.join(sorted(shards))}")
     chosen = None if wanted is None else {wanted} if isinstance(wanted, int) else {int(each) for each in wanted}
-    found: list[_Episode] = []
+    found: list[Place] = []
+    before = 0
     for name in sorted(shards) if split is None else [split]:
         places = [(file, span) for file in shards[name] for span in tfrecord.record_spans(file)]
         if chosen is not None and (missing := chosen - set(range(len(places)))):
             raise FormatError(root, "option episode", min(missing), f"0 to {len(places) - 1} in {name}")
-        found += [_Episode(name, i, *at) for i, at in enumerate(places) if chosen is None or i in chosen]
+        found += [Place(name, i, before + i, *at) for i, at in enumerate(places) if chosen is None or i in chosen]
+        before += len(places)
     if not found:
         raise FormatError(root, "records", "none", "TFRecord files named <set>-<split>.tfrecord-<shard>-of-<shards>")
     return found
@@ -262,7 +265,7 @@ class _Make:
     """Position → recording: the cameras of the first episode, then those of the second, …"""
 
     names: tuple[str, ...]
-    episodes: tuple[_Episode, ...]
+    episodes: tuple[Place, ...]
     rigs: tuple[_Rig, ...]
 
     def __call__(self, i: int) -> Recording:
@@ -273,7 +276,7 @@ class _Make:
 
 
 @dataclass(frozen=True, eq=False)
-class _Load:
+class Load:
     """Position → frame."""
 
     file: Path
@@ -284,8 +287,11 @@ class _Load:
     cameras: Camera  # (n), or (1) for all
     depth_camera: Camera | None
     unit: str | None
+    place: Place
+    features: dict[str, Described]  # of a step
 
     def __call__(self, i: int) -> Frame:
+        """Frame ``i``."""
         image = files.decode_image(tfrecord.read_span(self.file, self.images[i]), self.file, self.hw)
         camera = self.cameras[i : i + 1] if self.cameras.f.shape[0] > 1 else self.cameras
         depth = torch.zeros(self.hw) if self.depth is None else self._depth(i, self.depth)
@@ -319,7 +325,7 @@ class _Rig:
     unit: str | None
     rate_hz: float | None
 
-    def recording(self, name: str, episode: _Episode, found: dict[str, tfrecord.Feature]) -> Recording:
+    def recording(self, name: str, episode: Place, found: dict[str, tfrecord.Feature]) -> Recording:
         """The recording of an episode whose features are known."""
         file = episode.file
         images = self._pictures(file, found, self.image)
@@ -328,7 +334,7 @@ class _Rig:
             raise FormatError(file, self.image, f"{n} steps", f"1 to {MAX_STEPS}")
         depths = () if self.depth is None else self._depths(file, found, self.depth, n)
         cameras, depth_camera = self._cameras(file, found, n)
-        load = _Load(
+        load = Load(
             file=file,
             images=images,
             hw=self.hw,
@@ -337,6 +343,8 @@ class _Rig:
             cameras=cameras,
             depth_camera=depth_camera,
             unit=self.unit,
+            place=episode,
+            features=self.features,
         )
         return Recording(
             name=name,
@@ -348,7 +356,8 @@ class _Rig:
             poses=None if self.pose is None else self._poses(file, found, self.pose, n),
             rate_hz=self.rate_hz,
             report=() if self.depth is not None else (f"{self.image}: no depth feature: depth is empty",),
-            episode=episode.number,
+            episode=episode.place,
+            camera_name=self.image,
         )
 
     def _pictures(self, file: Path, found: dict[str, tfrecord.Feature], key: str) -> tuple[tfrecord.Span, ...]:

@@ -12,10 +12,12 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from dhtorch.data.recording import Recording
+from dhtorch.data.rig import at_instants
 from dhtorch.data.scene import Scene
 from dhtorch.extract.columns import PLACE, Column, Row
 from dhtorch.extract.plan import Plan, offers, steps_back
 from dhtorch.geometry import camera as cam
+from dhtorch.geometry import se3
 from dhtorch.method import Method
 from dhtorch.offers import choosing
 from dhtorch.records import Camera, Frame
@@ -53,6 +55,7 @@ class Rows(Dataset[Extracted]):
         gap: ``auto`` = the method chooses among earlier frames; a number of frames back to the other view, 0 = none;
             None = the scene's own.
         past: among earlier frames alone; else also among later ones of the same recording.
+        beside: also among the frames of the episode's other cameras at the same instant; with a ``gap`` of auto.
         options: of :class:`dhtorch.transform.ExtendDepth`.
     """
 
@@ -65,10 +68,12 @@ class Rows(Dataset[Extracted]):
         method: Method,
         gap: int | str | None,
         past: bool = True,
+        beside: bool = False,
         **options: Any,
     ) -> None:
         self.scenes, self.plan, self.wanted = scenes, plan, wanted
         self.method, self.gap, self.past, self.options = method, gap, past, options
+        self.beside = beside
         self._opened: tuple[int, Opened] | None = None
 
     def __len__(self) -> int:
@@ -77,7 +82,8 @@ class Rows(Dataset[Extracted]):
     def __getitem__(self, position: int) -> Extracted:
         k, episode, i = self.plan.place(position)
         if self._opened is None or self._opened[0] != k:
-            self._opened = (k, Opened(self.scenes[k], self.method, self.gap, self.past, self.options))
+            beside = [self.scenes[i].recording for i in self.plan.beside(k)] if self.beside else []
+            self._opened = (k, Opened(self.scenes[k], self.method, self.gap, self.past, self.options, beside))
         opened = self._opened[1]
         recording = opened.recording
         stamp = np.nan if recording.times is None else float(recording.times[i])
@@ -106,7 +112,13 @@ class Opened:
     """One recording, and the transforms that fit its frames."""
 
     def __init__(
-        self, scene: Scene, method: Method, gap: int | str | None, past: bool, options: dict[str, Any]
+        self,
+        scene: Scene,
+        method: Method,
+        gap: int | str | None,
+        past: bool,
+        options: dict[str, Any],
+        beside: Sequence[Recording] = (),
     ) -> None:
         self.scene, self.recording, self.options = scene, scene.recording, options
         self.offers = offers(scene, past) if isinstance(gap, str) else None
@@ -115,6 +127,7 @@ class Opened:
         self.position = {int(number): i for i, number in enumerate(self.recording.number)} if self.steps else {}
         self.transforms: dict[tuple[Any, ...], ExtendDepth] = {}
         self.held: OrderedDict[int, Frame | None] = OrderedDict()
+        self.beside = [(other, at_instants(self.recording, other)) for other in beside]
 
     def frame(self, i: int) -> Frame:
         """Frame ``i``, which is likely to be asked for again as another view of those behind it."""
@@ -138,8 +151,11 @@ class Opened:
         if self.offers is None:
             number = int(self.recording.number[i])
             return [self._frame(self.position.get(number - step)) for step in self.steps]
-        readable: list[Frame | None] = [f for k in self.offers.get(i, ()) if (f := self._frame(k)) is not None]
-        return readable or [None]
+        found: list[Frame | None] = [f for k in self.offers.get(i, ()) if (f := self._frame(k)) is not None]
+        for other, places in self.beside:
+            frame = None if places[i] < 0 else readable(other, places[i])
+            found += [] if frame is None else [frame]
+        return found or [None]
 
     def _frame(self, at: int | None) -> Frame | None:
         if at is not None and at not in self.held:
@@ -219,12 +235,19 @@ def _sample(anchor: Frame, others: Sequence[Frame | None]) -> dict[str, Any]:
     }
     if anchor.conf is not None:
         sample["confidence"] = anchor.conf
-    if anchor.camera.distortion is not None:
-        sample["distortion"] = torch.cat([_distortion(camera, anchor.camera.distortion) for camera in cameras])
+    lenses = [camera.distortion for camera in cameras if camera.distortion is not None]
+    if lenses:
+        size = max(lens.shape[-1] for lens in lenses)
+        sample["distortion"] = torch.cat([_distortion(camera, lenses[0], size) for camera in cameras])
     if anchor.depth_camera is not None:
         sample["depth_intrinsics"] = cam.to_matrix(anchor.depth_camera)[0]
+    poses = [frame.T_world_from_cam for frame in frames]
+    if all(pose is not None for pose in poses):
+        sample["pose"] = torch.cat([se3.to_matrix(pose) for pose in poses if pose is not None])
     return sample
 
 
-def _distortion(camera: Camera, like: Tensor) -> Tensor:
-    return torch.zeros_like(like) if camera.distortion is None else camera.distortion
+def _distortion(camera: Camera, like: Tensor, size: int) -> Tensor:
+    """Numbers of the lens, zeros where there is none or another has more."""
+    lens = like.new_zeros(1, 0) if camera.distortion is None else camera.distortion
+    return torch.nn.functional.pad(lens, (0, size - lens.shape[-1]))

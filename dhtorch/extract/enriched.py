@@ -65,20 +65,27 @@ class View:
         if frame is None or 0 in frame.hw:
             recording[0]  # says what is wrong with it
             raise ValueError(f"{recording.name}: found no frame with a picture, expected one")
-        lens = frame.camera.distortion
-        return cls(
-            camera_key(recording),
-            frame.hw,
-            dense.map_hw(frame.hw, size),
-            recording.poses is not None,
-            () if lens is None else tuple(lens[0].tolist()),
-        )
+        map_hw = dense.map_hw(frame.hw, size)
+        return cls(camera_key(recording), frame.hw, map_hw, recording.poses is not None, lens_of(frame))
+
+
+def lens_of(frame: Frame) -> tuple[float, ...]:
+    """Distortion of the picture, OpenCV's order; none is empty."""
+    lens = frame.camera.distortion
+    return () if lens is None else tuple(lens[0].tolist())
 
 
 def camera_key(recording: Recording) -> str:
     """The LeRobot feature of a recording's pictures."""
-    feature = getattr(recording.load, "image", None) if recording.format == "lerobot" else None
-    return "observation.images.camera" if feature is None else str(feature.key)
+    name = recording.camera_name
+    if name is None or recording.format == "lerobot":
+        return name or "observation.images.camera"
+    return camera_feature(name)
+
+
+def camera_feature(name: str) -> str:
+    """The LeRobot feature of pictures that another format calls ``name``."""
+    return "observation.images." + name.removeprefix("observation/").removeprefix("images/").replace("/", "_")
 
 
 def columns(pictures: bool) -> dict[str, Column]:
@@ -125,6 +132,9 @@ class MapRows(Rows):
         view = self.views[camera_key(recording)]
         if anchor.hw != view.hw:
             raise SampleError(f"picture of {_size(anchor.hw)}, expected {_size(view.hw)} as of the first frame")
+        if lens_of(anchor) != view.lens:
+            expected = list(view.lens) or "none"
+            raise SampleError(f"lens {list(lens_of(anchor)) or 'none'}, expected {expected} as of the first frame")
         added = opened.answer(anchor, i)
         depth, sigma, source, gate = _maps(added, view)
         depth = _stepped(depth, self.step)

@@ -5,43 +5,124 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from dhtorch.data import files
 from dhtorch.data.files import FormatError, need
-from dhtorch.data.lerobot_meta import Episode, Episodes, Meta, read_episodes, read_meta
+from dhtorch.data.lerobot_meta import Episodes, Meta, read_episodes, read_meta
 from dhtorch.data.recording import Recording
 from dhtorch.export import lerobot as out
 
 #: Rows that are held together.
-GROUP_ROWS = 32
+GROUP_ROWS = 8
+
+#: Frames a second where nothing tells.
+NO_RATE = 30.0
 
 #: Files of ``meta/`` that are written anew.
 _META = ("info.json", "stats.json", "tasks.parquet", "tasks.jsonl", "episodes.jsonl", "episodes_stats.jsonl",
          "intrinsics.json")  # fmt: skip
 
 
+class Origin(Protocol):
+    """A data set with episodes: what it holds beside the depth that is to be added."""
+
+    @property
+    def version(self) -> int | None:
+        """Of LeRobot's format; None = another."""
+
+    @property
+    def tasks(self) -> tuple[str, ...] | None:
+        """Texts by ``task_index``; None = numbered as they come."""
+
+    @property
+    def features(self) -> dict[str, out.Feature]:
+        """Of its columns and videos, as LeRobot describes them."""
+
+    @property
+    def fps(self) -> float:
+        """Rows a second."""
+
+    @property
+    def robot(self) -> str:
+        """Its name."""
+
+    @property
+    def splits(self) -> dict[str, list[int]]:
+        """Name of a split → numbers of its episodes."""
+
+    @property
+    def more(self) -> dict[str, Path]:
+        """Other files of the set: relative name → file."""
+
+    def batches(self, i: int, tasks: list[str]) -> Iterator[Any]:
+        """The rows of an episode in their order, as Arrow tables of few; texts not among the ``tasks`` join them."""
+
+    def clips(self, i: int, length: int) -> dict[str, tuple[Path, out.Clip]]:
+        """Video key → its file and place, of episode ``i`` of those that were opened."""
+
+    def words(self, i: int) -> list[str] | None:
+        """The tasks that are noted for an episode; None = those of its rows."""
+
+    def about(self, i: int) -> dict[str, Any]:
+        """What else is said of an episode."""
+
+
 @dataclass(frozen=True, eq=False)
 class RobotSet:
-    """A LeRobot data set: what it holds beside the depth that is to be added."""
+    """A LeRobot data set: see :class:`Origin`."""
 
     meta: Meta
     info: dict[str, Any]
     episodes: Episodes
     tasks: tuple[str, ...]
+    limit: int | None = None
+    bounds: Path | None = None  # no link below it may lead out of it; None = links are followed
 
     @classmethod
-    def open(cls, root: Path, numbers: Sequence[int]) -> RobotSet:
-        """The set at ``root`` with those of its episodes.
+    def open(
+        cls, root: Path, numbers: Sequence[int], *, limit: int | None = None, bounds: Path | None = None
+    ) -> RobotSet:
+        """The set at ``root`` with those of its episodes, ``limit`` rows of each at most.
 
         Raises:
             FormatError: damaged metadata.
         """
         meta = read_meta(root)
         info = files.read_json(root / "meta" / "info.json")
-        return cls(meta, info, read_episodes(meta, numbers), tuple(_tasks(meta)))
+        return cls(meta, info, read_episodes(meta, numbers), tuple(_tasks(meta)), limit, bounds)
+
+    @property
+    def version(self) -> int:
+        """Of the format."""
+        return self.meta.version
+
+    @property
+    def fps(self) -> float:
+        """Rows a second."""
+        return self.meta.fps
+
+    @property
+    def robot(self) -> str:
+        """Its name."""
+        return str(self.info.get("robot_type") or "unknown")
+
+    @property
+    def splits(self) -> dict[str, list[int]]:
+        """Name → numbers of the episodes that were opened; none where the info does not say it as LeRobot does."""
+        found: dict[str, list[int]] = {}
+        said = self.info.get("splits")
+        for name, span in said.items() if isinstance(said, dict) else ():
+            first, colon, last = str(span).partition(":")
+            if colon and first.isdigit() and last.isdigit():
+                found[str(name)] = [k for k in map(int, self.episodes.numbers) if int(first) <= k < int(last)]
+        return {name: numbers for name, numbers in found.items() if numbers}
+
+    def about(self, i: int) -> dict[str, Any]:
+        """What else is said of an episode: nothing that is not copied."""
+        return {}
 
     @property
     def features(self) -> dict[str, out.Feature]:
@@ -61,6 +142,8 @@ class RobotSet:
             file, start = episode.videos[key]
             if not file.is_file():
                 raise FormatError(file, key, "no such file", f"the video of episode {episode.number}")
+            if not self._stays(file):
+                raise FormatError(file, key, "a link that leads out of the data set", "a file inside, or follow_links")
             chunk, number = divmod(episode.number, out.CHUNK)
             if self.meta.version == 3:
                 places = (self.episodes.columns[f"videos/{key}/{name}"][i] for name in ("chunk_index", "file_index"))
@@ -68,8 +151,11 @@ class RobotSet:
             found[key] = file, out.Clip(chunk, number, float(start), float(start) + length / self.meta.fps)
         return found
 
-    def batches(self, i: int) -> Iterator[Any]:
-        """The rows of an episode in their order, few at a time; ``frame_index`` and what else is missing is added."""
+    def _stays(self, path: Path) -> bool:
+        return self.bounds is None or path.resolve().is_relative_to(self.bounds.resolve())
+
+    def batches(self, i: int, tasks: list[str]) -> Iterator[Any]:
+        """As :meth:`Origin.batches`; ``frame_index`` and ``task_index`` are added where they are missing."""
         pyarrow, dataset = need("pyarrow", extra="scale"), need("pyarrow.dataset", extra="scale")
         episode = self.episodes[i]
         table = dataset.dataset(str(episode.data), format="parquet")
@@ -78,14 +164,15 @@ class RobotSet:
         scan = table.scanner(filter=rows, batch_size=GROUP_ROWS, use_threads=False, batch_readahead=1)
         done, first = 0, 0.0
         for batch in scan.to_batches():
-            if not batch.num_rows:
+            if not batch.num_rows or done == self.limit:
                 continue
             part = pyarrow.Table.from_batches([batch])
+            part = part if self.limit is None else part.slice(0, self.limit - done)
             if "frame_index" not in part.column_names:
                 first = part.column("timestamp")[0].as_py() if not done else first
                 part = _numbered(part, done, first)
-            yield _completed(part, episode, done)
-            done += batch.num_rows
+            yield _completed(part)
+            done += part.num_rows
 
     def words(self, i: int) -> list[str] | None:
         """The tasks that ``meta/`` notes for an episode; None = none noted."""
@@ -97,7 +184,8 @@ class RobotSet:
         """Other files of the set: relative name → file."""
         root = self.meta.root
         found = [*(p for p in root.iterdir() if p.is_file()), *(root / "meta").iterdir()]
-        return {str(p.relative_to(root)): p for p in sorted(found) if p.is_file() and p.name not in _META}
+        kept = (p for p in sorted(found) if p.is_file() and p.name not in _META and self._stays(p))
+        return {str(p.relative_to(root)): p for p in kept}
 
 
 def _numbered(part: Any, done: int, first: float) -> Any:
@@ -112,15 +200,12 @@ def _numbered(part: Any, done: int, first: float) -> Any:
     return part.set_column(place, "timestamp", pyarrow.array((stamp - first).astype(stamp.dtype)))
 
 
-def _completed(part: Any, episode: Episode, done: int) -> Any:
-    """Rows with every column that LeRobot's loader asks for."""
+def _completed(part: Any) -> Any:
+    """Rows with the number of their task; the first where none is noted."""
     pyarrow = need("pyarrow", extra="scale")
-    n = part.num_rows
-    missing = {"episode_index": np.full(n, episode.number), "index": done + np.arange(n), "task_index": np.zeros(n)}
-    for name, values in missing.items():
-        if name not in part.column_names:
-            part = part.append_column(name, pyarrow.array(values.astype(np.int64)))
-    return part
+    if "task_index" in part.column_names:
+        return part
+    return part.append_column("task_index", pyarrow.array(np.zeros(part.num_rows, np.int64)))
 
 
 def _tasks(meta: Meta) -> list[str]:
@@ -161,12 +246,17 @@ def _episode_tasks(meta: Meta) -> dict[int, list[str]]:
     return found
 
 
+def knows_rate(recording: Recording) -> bool:
+    """Whether a recording tells how often it has a frame."""
+    return recording.rate_hz is not None or (recording.times is not None and len(recording) > 1)
+
+
 def rate(recording: Recording) -> float:
-    """Frames a second: nominal, else by the median step between time stamps, else 30."""
+    """Frames a second: nominal, else by the median step between time stamps, else :data:`NO_RATE`."""
     if recording.rate_hz is not None:
         return recording.rate_hz
     if recording.times is None or len(recording) < 2:
-        return 30.0
+        return NO_RATE
     steps = recording.times.diff() / recording.number.diff()
     step = float(steps.median())
-    return round(1 / step, 3) if step > 0 else 30.0
+    return round(1 / step, 3) if step > 0 else NO_RATE

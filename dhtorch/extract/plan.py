@@ -44,6 +44,11 @@ class Plan:
         k = bisect_right(self.ends, position)
         return self.order[k], self.episodes[k], position - (self.ends[k - 1] if k else 0)
 
+    def beside(self, k: int) -> list[int]:
+        """Places in the data set of the other recordings of the episode that recording ``k`` belongs to."""
+        number = self.episodes[self.order.index(k)]
+        return [other for other, its in zip(self.order, self.episodes, strict=True) if its == number and other != k]
+
     @property
     def spans(self) -> list[range]:
         """The positions of each recording, in order."""
@@ -95,12 +100,15 @@ def make(scenes: Sequence[Scene], gap: int | str | None, views: int, *, rigs: bo
     """
     found: dict[tuple[int, int], tuple[int, str, int]] = {}
     cameras: Counter[int] = Counter()
+    together: dict[str, int] = {}
     roots: dict[Path, None] = {}
     for k, scene in enumerate(scenes):
         recording = scene.recording
         if not isinstance(gap, str):
             steps_back(scene, gap, views)
         number = recording.episode
+        if number is None and rigs and recording.camera_name is not None:  # several cameras, no episodes
+            number = together.setdefault(recording.name.rpartition("/")[0], k)
         number = k if number is None else number
         if cameras[number] and not rigs:
             both = f"{found[number, 0][1]} and {recording.name}"

@@ -19,7 +19,7 @@ from dhtorch.data.files import need
 from dhtorch.export import lerobot, nerfstudio, png
 from dhtorch.export.lerobot import Feature, Moments
 from dhtorch.extract.enriched import SIGMA_STEPS, View, blank
-from dhtorch.extract.origin import GROUP_ROWS, RobotSet
+from dhtorch.extract.origin import GROUP_ROWS, Origin, RobotSet
 
 Row = dict[str, Any]
 
@@ -66,12 +66,13 @@ class Tally:
     def summary(self) -> Row:
         """Pixels by source and by reason, in all and along time."""
         pixels = np.array(self.pixels).reshape(len(self.pixels), -1)
-        silent = np.array(self.silent)
+        silent = np.array(self.silent).reshape(len(self.silent), -1)
         if not len(pixels):
-            return {"pixels": [], "silent": [], "over_time": [], "unread": self.unread}
-        pieces = np.array_split(pixels, min(PARTS, len(pixels)))
-        along = [piece.sum(0) / max(1, piece.sum()) for piece in pieces]
-        return {"pixels": pixels.sum(0), "silent": silent.sum(0), "over_time": along, "unread": self.unread}
+            return {"pixels": [], "silent": [], "over_time": [], "silent_over_time": [], "unread": self.unread}
+        parts = np.array_split(np.arange(len(pixels)), min(PARTS, len(pixels)))
+        along, why = ([x[at].sum(0) / max(1, pixels[at].sum()) for at in parts] for x in (pixels, silent))
+        found = {"over_time": along, "silent_over_time": why, "unread": self.unread}
+        return {"pixels": pixels.sum(0), "silent": silent.sum(0), **found}
 
     def of_maps(self) -> tuple[Moments, Moments, Moments] | None:
         """Of depth, sigma and the picture; None where no frame could be read."""
@@ -100,15 +101,17 @@ class RobotTarget:
         root: of the new set.
         version: 3, or 2 for v2.1.
         views: its cameras.
-        origin: the LeRobot set it comes from; None = a recording, whose pictures are in the shards.
+        origin: the data set it comes from; None = recordings, whose pictures are in the shards.
         numbers: of the episodes at their source.
         step: m, of the depth maps.
         fps: of a recording.
         task: of a recording.
         key: of the settings and data, which every table notes.
+        cut: some rows of the origin are left out, so that others have another index.
 
     Raises:
-        ValueError: columns that the source has already, or videos that this version would have to cut.
+        ValueError: columns that the source has already, names that are no file's, or videos that this version would
+            have to cut.
     """
 
     def __init__(
@@ -117,21 +120,25 @@ class RobotTarget:
         version: int,
         views: Mapping[str, View],
         *,
-        origin: RobotSet | None,
+        origin: Origin | None,
         numbers: Sequence[int],
         step: float,
         fps: float,
         task: str | None,
         key: str,
+        cut: bool = False,
     ) -> None:
         self.root, self.version, self.views = root, version, views
         self.origin, self.numbers, self.step, self.fps = origin, numbers, step, fps
         self.tasks = origin.tasks if origin is not None else (task or _TASK,)
-        self.key = key
+        self.key, self.cut = key, cut
         self.given: dict[str, Feature] = {} if origin is None else origin.features
         self.keys = {view.key: self._keys(view) for view in views.values()}
-        self.renumbered = version == 3 and list(numbers) != list(range(len(numbers)))
-        if origin is not None and version == 2 and origin.meta.version == 3:
+        self.renumbered = version == 3 and (cut or list(numbers) != list(range(len(numbers))))
+        for name in (*self.given, *views):
+            if not name or any(mark in name for mark in ("/", "\\", "..", "\0")):
+                raise ValueError(f"data: found a feature called {name!r}, expected a name without / and ..")
+        if version == 2 and isinstance(origin, RobotSet) and origin.version == 3:
             _refuse_shared_videos(origin)
 
     # -------------------------------------------------------------------------------------------------- the columns
@@ -175,7 +182,7 @@ class RobotTarget:
             if name not in found and name not in self.added():
                 whole = name.removeprefix("source.") != "timestamp" and name != "observation.time"
                 found[name] = lerobot.numbers("int64" if whole else "float64")
-        if self.origin is None:
+        if "timestamp" not in self.given:
             found["timestamp"] = lerobot.numbers("float32")
         return found | self.added()
 
@@ -206,11 +213,12 @@ class RobotTarget:
         tallies = {key: Tally() for key in self.views}
         moments: dict[str, Moments] = {}
         seen: dict[int, None] = {}
+        tasks = self._tasks(before)
         clean = self.file(k)
         clean.parent.mkdir(parents=True, exist_ok=True)
         length, writer = 0, None
         with storage.whole(clean, clean.with_name(f".{clean.name}.tmp")) as sink:
-            for table in self._joined(k, start, parts, tallies):
+            for table in self._joined(k, start, parts, tallies, tasks):
                 if writer is None:
                     layout = lerobot.schema(self.features(table.column_names), _types(table), {})
                     writer = parquet.ParquetWriter(sink, layout, compression="zstd")
@@ -220,62 +228,78 @@ class RobotTarget:
                 _add_moments(moments, table)
             if writer is None:
                 raise ValueError(f"episode {self.numbers[k]}: found no frame that can be read, expected one")
-            own = self._summary(k, start, length, seen, moments, tallies)
+            said = [tasks[i] for i in seen if i is not None and 0 <= i < len(tasks)]
+            own = self._summary(k, start, length, said, moments, tallies)
             writer.add_key_value_metadata({OWN: storage.dumps(own)})
             writer.close()
             self._copy_videos(k, length)
         return own
 
+    def _tasks(self, owns: Sequence[Row]) -> list[str]:
+        """Texts by ``task_index``, where they are numbered as they come those of the episodes ``owns``."""
+        if self.tasks is not None:
+            return list(self.tasks)
+        return list(dict.fromkeys(task for own in owns for task in own["tasks"]))
+
     def _joined(
-        self, k: int, start: int, parts: Mapping[str, Sequence[Path]], tallies: Mapping[str, Tally]
+        self,
+        k: int,
+        start: int,
+        parts: Mapping[str, Sequence[Path]],
+        tallies: Mapping[str, Tally],
+        tasks: list[str],
     ) -> Iterator[Any]:
         """The rows of an episode with what is added, as Arrow tables of few rows."""
         made = {key: _Next(rows_of(files)) for key, files in parts.items()}
         if self.origin is None:
-            [(key, rows)] = made.items()
-            yield from self._plain(k, start, key, rows, tallies[key])
+            yield from self._plain(k, start, made, tallies)
             return
         done = 0
-        for part in self.origin.batches(k):
+        for part in self.origin.batches(k, tasks):
             table, n = part, part.num_rows
             numbers = part.column("frame_index").to_pylist()
             for key, rows in made.items():
                 found = [rows.take(i) for i in numbers]
                 for row in found:
                     tallies[key].add(row)
-                cells = self._cells(key, found, done)
-                for column, values in cells.items():
+                for column, values in self._cells(key, found, done).items():
                     table = table.append_column(column, values)
             yield self._renumbered(table, k, start + done)
             done += n
 
-    def _plain(self, k: int, start: int, key: str, rows: _Next, tally: Tally) -> Iterator[Any]:
-        """The rows of a recording, without frames that could not be read."""
+    def _plain(self, k: int, start: int, made: Mapping[str, _Next], tallies: Mapping[str, Tally]) -> Iterator[Any]:
+        """The rows of recordings, without instants of which a frame could not be read."""
         pyarrow = need("pyarrow", extra="scale")
         done = 0
-        for group in _groups(rows):
-            for row in group:
-                tally.add(row)
-            kept = [row for row in group if row["picture"]]
+        for group in _groups(_together(made)):
+            for shots in group:
+                for key, row in shots.items():
+                    tallies[key].add(row)
+            kept = [shots for shots in group if all(row["picture"] for row in shots.values())]
+            if not kept:
+                continue
             at = done + np.arange(len(kept))
-            pictures = [
-                {"bytes": row["picture"], "path": f"frame-{i:06d}.png"} for row, i in zip(kept, at, strict=True)
-            ]
-            columns = {
-                key: pictures,
-                "timestamp": (at / self.fps).astype(np.float32),
-                "frame_index": at,
-                "episode_index": np.full(len(kept), self.number(k)),
-                "index": start + at,
-                "task_index": np.zeros(len(kept), np.int64),
-                "observation.frame_number": [row["frame_index"] for row in kept],
-                "observation.time": np.array([row["timestamp"] for row in kept], np.float64),
-            }
-            if kept:
-                table = pyarrow.table(columns)
-                for column, values in self._cells(key, kept, done).items():
+            first = [next(iter(shots.values())) for shots in kept]
+            table = pyarrow.table(
+                {
+                    "timestamp": (at / self.fps).astype(np.float32),
+                    "frame_index": at,
+                    "episode_index": np.full(len(kept), self.number(k)),
+                    "index": start + at,
+                    "task_index": np.zeros(len(kept), np.int64),
+                    "observation.frame_number": [row["frame_index"] for row in first],
+                    "observation.time": np.array([row["timestamp"] for row in first], np.float64),
+                }
+            )
+            for key in made:
+                rows = [shots[key] for shots in kept]
+                pictures = [
+                    {"bytes": row["picture"], "path": f"frame-{i:06d}.png"} for row, i in zip(rows, at, strict=True)
+                ]
+                cells = {key: pyarrow.array(pictures), **self._cells(key, rows, done)}
+                for column, values in cells.items():
                     table = table.append_column(column, values)
-                yield table
+            yield table
             done += len(kept)
 
     def _cells(self, key: str, found: Sequence[Row | None], done: int) -> dict[str, Any]:
@@ -295,17 +319,19 @@ class RobotTarget:
         return cells
 
     def _renumbered(self, table: Any, k: int, start: int) -> Any:
-        """Episodes from 0 and rows one after another, where the loader of this version counts so."""
+        """Episodes from 0 and rows one after another, where the loader of this version counts so or nobody did."""
         pyarrow = need("pyarrow", extra="scale")
-        if self.version == 2:
-            return table
         n = table.num_rows
         news = {"episode_index": np.full(n, self.number(k)), "index": start + np.arange(n)}
         for name, values in news.items():
-            place = table.column_names.index(name)
-            if self.renumbered:
-                table = table.append_column(f"source.{name}", table.column(name))
-            table = table.set_column(place, name, pyarrow.array(values.astype(np.int64)))
+            mine = pyarrow.array(values.astype(np.int64))
+            if name not in table.column_names:
+                table = table.append_column(name, mine)
+            elif self.version == 3:
+                place = table.column_names.index(name)
+                if self.renumbered:
+                    table = table.append_column(f"source.{name}", table.column(name))
+                table = table.set_column(place, name, mine)
         return table
 
     def _summary(
@@ -313,7 +339,7 @@ class RobotTarget:
         k: int,
         start: int,
         length: int,
-        seen: Iterable[int],
+        tasks: Sequence[str],
         moments: dict[str, Moments],
         tallies: Mapping[str, Tally],
     ) -> Row:
@@ -322,14 +348,14 @@ class RobotTarget:
             if maps is not None:
                 moments |= {self.keys[key]["depth"]: maps[0], self.keys[key]["sigma"]: maps[1], key: maps[2]}
         said = None if self.origin is None else self.origin.words(k)
-        tasks = [self.tasks[i] for i in seen if i is not None and 0 <= i < len(self.tasks)]
         found: Row = storage.strict(
             {
                 "key": self.key,
                 "number": self.numbers[k],
                 "start": start,
                 "length": length,
-                "tasks": tasks if said is None else said,
+                "tasks": list(tasks) if said is None else said,
+                "about": {} if self.origin is None else self.origin.about(k),
                 "cameras": {self.views[key].name: tally.summary() for key, tally in tallies.items()},
             }
         )
@@ -344,7 +370,7 @@ class RobotTarget:
         if self.origin is None:
             return {}
         found = self.origin.clips(k, length)
-        if self.origin.meta.version == 3:
+        if self.origin.version == 3:
             return found
         chunk, file = divmod(self.number(k), lerobot.CHUNK)
         return {key: (path, clip._replace(chunk=chunk, file=file)) for key, (path, clip) in found.items()}
@@ -356,6 +382,8 @@ class RobotTarget:
         parquet = need("pyarrow.parquet", extra="scale")
         features = self.features(parquet.read_schema(self.file(0)).names)
         self._write_lenses()
+        self._write_about(owns)
+        tasks = self._tasks(owns)
         for name, file in ({} if self.origin is None else self.origin.more).items():
             storage.copy_file(file, self.root / name)
         episodes = [
@@ -374,10 +402,11 @@ class RobotTarget:
             features,
             episodes,
             fps=self.fps,
-            n_tasks=len(self.tasks),
-            robot="unknown" if self.origin is None else self.origin.info.get("robot_type") or "unknown",
+            n_tasks=len(tasks),
+            robot="unknown" if self.origin is None else self.origin.robot,
         )
-        lerobot.write_meta(self.root, self.version, about, episodes, self.tasks, self._stats(owns, features))
+        about["splits"] |= self._splits()
+        lerobot.write_meta(self.root, self.version, about, episodes, tasks, self._stats(owns, features))
 
     def _stats(self, owns: Sequence[Row], features: Mapping[str, Feature]) -> dict[str, Any]:
         """Of every column of numbers, and of the pictures and maps that were looked at."""
@@ -395,6 +424,22 @@ class RobotTarget:
             if entry is not None:
                 found[name] = entry
         return found
+
+    def _splits(self) -> dict[str, str]:
+        """The origin's splits in this set's numbers, where the episodes of each follow one another."""
+        found = {}
+        for name, numbers in ({} if self.origin is None else self.origin.splits).items():
+            places = [self.number(k) for k, number in enumerate(self.numbers) if number in set(numbers)]
+            if places and places == list(range(places[0], places[-1] + 1)):
+                found[name] = f"{places[0]}:{places[-1] + 1}"
+        return found
+
+    def _write_about(self, owns: Sequence[Row]) -> None:
+        """What an origin says of its episodes and the format has no place for."""
+        if any(own["about"] for own in owns):
+            rows = [{"episode_index": self.number(k), **own["about"]} for k, own in enumerate(owns)]
+            text = "".join(storage.dumps(row) + "\n" for row in rows)
+            storage.replace_file(self.root / "meta" / "source_episodes.jsonl", text.encode())
 
     def _write_lenses(self) -> None:
         """Lenses, which no feature of the format holds, in the side-car that the reader knows."""
@@ -478,10 +523,20 @@ class _Next:
         self.row = next(self.rows, None)
         return row
 
-    def __iter__(self) -> Iterator[Row]:
-        while self.row is not None:
-            row, self.row = self.row, next(self.rows, None)
-            yield row
+    def drop(self) -> None:
+        """Pass over the next row."""
+        self.row = next(self.rows, None)
+
+
+def _together(made: Mapping[str, _Next]) -> Iterator[dict[str, Row]]:
+    """The rows of one instant of all cameras; those without their instant are passed over."""
+    while all(rows.row is not None for rows in made.values()):
+        latest = max(rows.row["frame_index"] for rows in made.values() if rows.row is not None)
+        for rows in made.values():
+            while rows.row is not None and rows.row["frame_index"] < latest:
+                rows.drop()
+        if all(rows.row is not None and rows.row["frame_index"] == latest for rows in made.values()):
+            yield {key: row for key, rows in made.items() if (row := rows.take(latest)) is not None}
 
 
 def _groups(rows: Iterable[Row]) -> Iterator[list[Row]]:

@@ -56,7 +56,8 @@ def hold(
     max_miss: float = 0.01,
     min_near: int = 8,
     min_explained: float = 0.5,
-    max_deviation: float = 6.0,
+    max_deviation: float = 4.74,
+    assumed: tuple[float, float] = (0.01, 0.02),
 ) -> PoseFit:
     """A pose from elsewhere as seat 5's answer, or the reason why it is not used.
 
@@ -66,7 +67,8 @@ def hold(
     that no rigid motion explains, or too few of them, refute nothing.
 
     A covariance that is not stated is taken from the near returns: their own, and the square of how far they say the
-    pose is off. Where they have no pose of their own either it is zero, and sigma then knows nothing of the pose.
+    pose is off. Where they have no pose of their own either, nobody knows it: it is ``assumed``. Exact is a pose only
+    where that is stated, as a covariance of zero.
 
     Args:
         given: B poses.
@@ -75,7 +77,9 @@ def hold(
         max_miss: residual of a near return that is forgiven in any case, of a ray with z = 1; a pixel at least.
         min_near: fewer near returns refute nothing.
         min_explained: share of them that a pose must explain.
-        max_deviation: length of xi in standard deviations, those of ``found`` counted threefold.
+        max_deviation: length of xi in standard deviations, those of ``found`` counted threefold; as it is, one right
+            pose in a thousand is refuted.
+        assumed: standard deviations (rad, m) of a pose of which neither is known.
 
     Returns:
         PoseFit with the given pose. Codes: TOO_FEW: not a finite pose; REFUTED, and ``looks`` then tells in which of
@@ -111,7 +115,8 @@ def hold(
         enough = rigid.sum(-1) >= min_near
         refuted = enough & ((explained & rigid).sum(-1) < min_explained * rigid.sum(-1))
         if stated is None:
-            cov = own_cov + xi[:, :, None] * xi[:, None]
+            spread = torch.tensor([assumed[0] ** 2] * 3 + [assumed[1] ** 2] * 3).to(T.t)
+            cov = torch.where(found.ok[:, None, None], own_cov + xi[:, :, None] * xi[:, None], torch.diag(spread))
         else:
             cov = stated
             far = covariance.mahalanobis(xi, stated + DOUBT**2 * own_cov) > max_deviation

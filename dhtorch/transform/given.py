@@ -51,8 +51,8 @@ def check_constant(pose: Matrix, kind: str) -> None:
         raise ValueError(f"pose: found {found}, expected a key, or with pose_kind='1_from_0' 3x4 or 4x4 finite numbers")
 
 
-def sigmas(cov: str | Sequence[float] | None) -> tuple[float, float] | None:
-    """The standard deviations (rad, m) of a relative pose that are stated as two numbers.
+def sigmas(cov: str | Sequence[float] | None, name: str = "pose_cov") -> tuple[float, float] | None:
+    """The standard deviations (rad, m) of a relative pose that are stated as two numbers; ``name`` of the option.
 
     Raises:
         ValueError: not two numbers of at least 0.
@@ -60,7 +60,7 @@ def sigmas(cov: str | Sequence[float] | None) -> tuple[float, float] | None:
     if cov is None or isinstance(cov, str):
         return None
     if len(cov) != 2 or not all(0 <= s < float("inf") for s in cov):
-        raise ValueError(f"pose_cov is {cov!r}, expected a key, or two standard deviations of at least 0: rad and m")
+        raise ValueError(f"{name} is {cov!r}, expected a key, or two standard deviations of at least 0: rad and m")
     return float(cov[0]), float(cov[1])
 
 
