@@ -203,7 +203,7 @@ def swept(
     index, wanted = worthiest(asked, partners)
     base = sweep.base(*resized(anchor, size))
     partner = [partner_of(asked, k, size, use, base.image) for k, use in zip(index, wanted, strict=True)]
-    q = torch.linspace(0, 1, planes).to(base.ray) / _nearest(asked.samples)[:, None].to(base.ray)
+    q = torch.linspace(0, 1, planes).to(base.ray) / _nearest(asked.samples, anchor.sparse)[:, None].to(base.ray)
     start = _best_planes(base, partner, q)
     found = _fitted(base, partner, start, q, refinements)
     beyond = start.q >= q[:, -1, None, None] * (1 - 1e-6)
@@ -319,12 +319,19 @@ def partner_of(asked: Asked, index: Tensor, size: int, use: Tensor, like: Tensor
     return Partner(sweep.View(image, camera, Pose(R, t), turn), sweep.with_gradients(image), fit, use)
 
 
-def _nearest(samples: Samples) -> Tensor:
-    """Depth (B,) in m at which the sweep ends; 1 where the sensor sees nothing."""
+def _nearest(samples: Samples, sparse: Tensor | None = None) -> Tensor:
+    """Depth (B,) in m at which the sweep ends; 1 where the sensor sees nothing.
+
+    A map without holes has none nearer than its reach, so that is where the sweep ends. Between the returns of a
+    ``sparse`` one (B,) are holes at every depth: there it ends where hardly a return is nearer.
+    """
     depth = torch.where(samples.usable, samples.depth, torch.inf).detach().sort(-1).values
     n = samples.usable.sum(-1)
-    last = depth.gather(-1, (REACH * (n - 1).clamp_min(0)).long()[:, None])[:, 0]
-    return torch.where(n > 0, OVERLAP * last, torch.ones_like(last))
+    last = (REACH * (n - 1).clamp_min(0)).long()
+    if sparse is not None:
+        last = torch.where(sparse, ((1 - REACH) * n).long(), last)
+    found = depth.gather(-1, last[:, None])[:, 0]
+    return torch.where(n > 0, OVERLAP * found, torch.ones_like(found))
 
 
 class Found(NamedTuple):
