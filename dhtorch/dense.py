@@ -20,7 +20,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dhtorch import tree
+from dhtorch import native, tree
 from dhtorch.calibration import available, load
 from dhtorch.codes import Gate, PoseCode, Source, first_reason
 from dhtorch.evaluate.score_calibration import Calibration
@@ -356,7 +356,11 @@ def _best_planes(base: sweep.Base, partners: list[Partner], q: Tensor) -> Found:
 
 def _costs(base: sweep.Base, partners: list[Partner], q: Tensor) -> Tensor:
     """How badly every pixel fits all views at every plane, (B, h, w, D) uint8."""
-    C = torch.zeros(len(q), q.shape[1], *base.hw, dtype=torch.uint8, device=q.device)
+    shape, planes = base.hw, q.shape[1]
+    if native.serves(q):  # compiled code goes from pixel to pixel, torch from plane to plane
+        C = torch.zeros(len(q), *shape, planes, dtype=torch.uint8).movedim(-1, 1)
+    else:
+        C = torch.zeros(len(q), planes, *shape, dtype=torch.uint8, device=q.device)
     for view, _, _, use in partners:
         if is_static(use) or bool(use.any()):
             sweep.add_costs(C, base, view, q, use)

@@ -20,6 +20,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from dhtorch import native
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.camera import Camera
@@ -204,10 +205,16 @@ def add_costs(
 ) -> None:
     """Add to C how badly every pixel fits a view at every plane.
 
-    At most :data:`VIEWS` views fit into a byte. Memory: pictures of view 0's size, whatever D. Gradient: none.
+    At most :data:`VIEWS` views fit into a byte. C may lie in memory with its planes last, as compiled code wants it
+    (:mod:`dhtorch.native`). Memory: pictures of view 0's size, whatever D. Gradient: none.
     """
     go = travel(base, view)
     seen = level(base, view, wanted)
+    given = base.code.flatten(1), seen.code, go.a, go.b[..., 0].contiguous(), go.c[:, 0].contiguous(), q.contiguous()
+    last = C.movedim(1, -1)
+    if native.serves(last, *given):
+        torch.ops.dhtorch.add_costs(last, *given, *seen.hw, seen.margin, UNSEEN)
+        return
     for k in range(q.shape[1]):
         C[:, k] += misfit(base, seen, go, q[:, k, None]).to(torch.uint8).unflatten(-1, base.hw)
 
@@ -226,6 +233,10 @@ def aggregate(
     """
     check("aggregate", C=(C, "B h w D"))
     price = torch.as_tensor(views, dtype=torch.int16, device=C.device).reshape(-1, 1, 1)
+    if native.serves(C) and C.dtype == torch.uint8:
+        S = torch.empty_like(C, dtype=torch.int16)
+        torch.ops.dhtorch.aggregate(C, S, *(x.expand(len(C), 1, 1).contiguous() for x in (price * step, price * jump)))
+        return S
     S = torch.zeros_like(C, dtype=torch.int16)
     for dim in (1, 2):
         _both_ways(C, S, dim, price * step, price * jump)
@@ -261,6 +272,11 @@ class Winner(NamedTuple):
 def winner(S: Tensor) -> Winner:
     """The plane of least cost S (B, h, w, D), the first of equals, and the parabola through its neighbours' costs."""
     check("winner", S=(S, "B h w D"))
+    if native.serves(S) and S.dtype == torch.int16:
+        types = torch.int64, torch.float32, torch.int16
+        found = Winner(*(torch.empty(S.shape[:-1], dtype=dtype) for dtype in types))
+        torch.ops.dhtorch.winner(S.flatten(0, 2), *found)
+        return found
     return Winner(*(torch.cat(part, 1) for part in zip(*map(_winner, S.split(ROWS, 1)), strict=True)))
 
 
@@ -282,6 +298,11 @@ def rivals(S: Tensor, best: Winner, reach: Tensor) -> Tensor:
 
     Asked at every other pixel, both ways; its neighbours have its answer. Gradient: none.
     """
+    if native.serves(S, best.plane) and S.dtype == torch.int16:
+        more = torch.empty(len(S), *((n + 1) // 2 for n in S.shape[1:3]), dtype=S.dtype)
+        for b, far in enumerate(reach.tolist()):
+            torch.ops.dhtorch.elsewhere(S[b], best.plane[b], more[b], int(far))
+        return _for_all(more - best.cost[:, ::2, ::2], best.cost)
     places = torch.arange(S.shape[-1], dtype=torch.int16, device=S.device)
     reach, found = reach.to(torch.int16)[:, None, None, None], []
     for first in range(0, S.shape[1], ROWS):  # some rows at once, as the winner is read
@@ -290,8 +311,12 @@ def rivals(S: Tensor, best: Winner, reach: Tensor) -> Tensor:
         near = (places - plane).abs() <= reach
         others = S[:, rows, ::2].masked_fill(near, torch.iinfo(S.dtype).max)
         found.append((others.amin(-1, keepdim=True) - cost)[..., 0])
-    more = torch.cat(found, 1).repeat_interleave(2, 1).repeat_interleave(2, 2)
-    return more[:, : S.shape[1], : S.shape[2]]
+    return _for_all(torch.cat(found, 1), best.cost)
+
+
+def _for_all(x: Tensor, like: Tensor) -> Tensor:
+    """What was asked at every other pixel, both ways, also for its neighbours."""
+    return x.repeat_interleave(2, 1).repeat_interleave(2, 2)[:, : like.shape[1], : like.shape[2]]
 
 
 class Fit(NamedTuple):
