@@ -25,7 +25,7 @@ from dhtorch.calibration import available, load
 from dhtorch.codes import Gate, PoseCode, Source, first_reason
 from dhtorch.evaluate.score_calibration import Calibration
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry import epipolar, se3, sweep
+from dhtorch.geometry import se3, sweep
 from dhtorch.geometry.covariance import median
 from dhtorch.geometry.filters import grey
 from dhtorch.geometry.se3 import Pose
@@ -372,8 +372,8 @@ def _elsewhere(base: sweep.Base, partners: list[Partner], q: Tensor, step: Tenso
     moved = []
     for view, _, _, use in partners:
         go = sweep.travel(base, view)
-        here, there = (go.at(q.flatten(1) + k * step[:, None]) for k in (0, 1))
-        length = (torch.stack(there) - torch.stack(here)).norm(dim=0).median(-1).values
+        (u_0, v_0), (u_1, v_1) = (go.at(q.flatten(1) + k * step[:, None]) for k in (0, 1))
+        length = torch.hypot(u_1 - u_0, v_1 - v_0).median(-1).values
         moved.append(torch.where(use, length, 0.0))
     return (ELSEWHERE_PX / torch.stack(moved).amax(0).clamp_min(1e-3)).ceil().clamp(2, 1e4)
 
@@ -435,16 +435,26 @@ def _joined(
 def pose_variance(base: sweep.Base, view: sweep.View, fit: PoseFit, q: Tensor, motion: Tensor) -> Tensor:
     """Variance (B, h, w) of q, 1/m², by the motion's covariance."""
     flat = q.flatten(1).clamp_min(1e-6)
-    X = se3.rotate(view.T_1_from_0.R, base.ray) / flat[..., None] + view.T_1_from_0.t[:, None]
-    _, J = epipolar.point_jacobians(view.camera, X)
+    x, y, z = (se3.rotate(view.T_1_from_0.R, base.ray) / flat[..., None] + view.T_1_from_0.t[:, None]).unbind(-1)
     cov = fit.cov if fit.shutter is None else fit.shutter.cov
+    cov = torch.where(fit.ok[:, None, None], cov, 0.0).nan_to_num().to(z)
+    du, dv = motion.flatten(1, 2).unbind(-1)
+    share = 1 / (du * du + dv * dv).clamp_min(1e-12)
+    # what a shift of the point does along the motion, as epipolar.point_jacobians, one number a tensor
+    inv_z = 1 / torch.where(z.abs() < 1e-9, torch.full_like(z, 1e-9), z)
+    gx, gy = (f[:, None] * inv_z * d * share for f, d in zip(view.camera.f.unbind(-1), (du, dv), strict=True))
+    gz = -(gx * x + gy * y) * inv_z
+    turned = y * gz - z * gy, z * gx - x * gz, x * gy - y * gx
+    row = [*turned, gx, gy, gz]
     if fit.shutter is not None:
-        J = torch.cat((J, J[..., :3] * base.ray[..., 1, None, None]), -1)
-    cov = torch.where(fit.ok[:, None, None], cov, 0.0).nan_to_num().to(J)
-    along = motion.flatten(1, 2)
-    row = (along[..., None] * J).sum(-2) / along.square().sum(-1, keepdim=True).clamp_min(1e-12)
-    carried = sum(row[..., k, None] * cov[:, None, k] for k in range(cov.shape[-1]))  # bmm differs with the batch
-    return (carried * row).sum(-1).clamp_min(0).unflatten(-1, base.hw)
+        row += [r * base.ray[..., 1] for r in turned]
+    total = torch.zeros_like(z)
+    for i, r in enumerate(row):  # written out: a matrix product differs with the batch
+        carried = row[0] * cov[:, i, 0, None]
+        for j in range(1, len(row)):
+            carried = torch.addcmul(carried, row[j], cov[:, i, j, None])
+        total = torch.addcmul(total, carried, r)
+    return total.clamp_min(0).unflatten(-1, base.hw)
 
 
 def _silent_pairs(asked: Asked, wanted: Tensor) -> Tensor:

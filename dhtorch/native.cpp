@@ -1,11 +1,12 @@
-// The whole-number part of a plane sweep as three operators on torch's stable ABI: what dhtorch/geometry/sweep.py does
-// in torch, and bit for bit the same (-ffp-contract=off: no product is fused with a sum). One thread. Callers check
-// shapes, types and that everything is contiguous; see dhtorch/native.py.
+// What dhtorch/geometry/sweep.py does in torch as operators on torch's stable ABI, bit for bit the same: whole numbers,
+// and sums of products in torch's order (-ffp-contract=off: none is fused). One thread, no gradient. Callers check shapes,
+// types and that everything is contiguous; see dhtorch/native.py.
 
 #include <torch/csrc/stable/library.h>
 #include <torch/csrc/stable/tensor.h>
 
 #include <algorithm>
+#include <cmath>
 #include <cstdint>
 #include <cstring>
 #include <limits>
@@ -179,6 +180,112 @@ void elsewhere(Tensor S, Tensor plane, Tensor cost, int64_t reach) {
   }
 }
 
+// Codes (B, h, w) int32 of grey (B, h, w) float32: of each of n neighbours, offsets (n, 2) int64 down and right,
+// whether it is darker than the middle. Beyond the border is the border.
+void census(Tensor grey, Tensor offsets, Tensor code) {
+  const int64_t B = grey.size(0), h = grey.size(1), w = grey.size(2), n = offsets.size(0), margin = 8;
+  const int64_t* step = data<int64_t>(offsets);
+  const int64_t wide = w + 2 * margin;
+  std::vector<float> padded((h + 2 * margin) * wide);
+  for (int64_t k = 0; k < B; ++k) {
+    const float* image = data<float>(grey) + k * h * w;
+    for (int64_t y = 0; y < h + 2 * margin; ++y) {
+      const float* row = image + std::clamp<int64_t>(y - margin, 0, h - 1) * w;
+      float* to = padded.data() + y * wide;
+      std::fill(to, to + margin, row[0]);
+      std::copy(row, row + w, to + margin);
+      std::fill(to + margin + w, to + wide, row[w - 1]);
+    }
+    for (int64_t y = 0; y < h; ++y) {
+      int32_t* __restrict found = data<int32_t>(code) + (k * h + y) * w;
+      std::fill(found, found + w, 0);
+      const float* __restrict middle = padded.data() + (y + margin) * wide + margin;
+      for (int64_t i = 0; i < n; ++i) {
+        const float* __restrict beside = middle + step[2 * i] * wide + step[2 * i + 1];
+        const int32_t bit = static_cast<int32_t>(1u << i);
+        for (int64_t x = 0; x < w; ++x) found[x] |= beside[x] < middle[x] ? bit : 0;
+      }
+    }
+  }
+}
+
+// Where a view without a lens sees points on rays (B, N, 3) at q (B, N): uv (B, N, 2) and whether before it (B, N) bool.
+// R (B, 9), t, turn (B, 3), f, c (B, 2).
+void seen_at(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor turn, Tensor f, Tensor c, Tensor uv, Tensor front) {
+  const int64_t B = q.size(0), N = q.size(1);
+  for (int64_t k = 0; k < B; ++k) {
+    const float *m = data<float>(R) + 9 * k, *tk = data<float>(t) + 3 * k, *w = data<float>(turn) + 3 * k;
+    const float *fk = data<float>(f) + 2 * k, *ck = data<float>(c) + 2 * k, *qk = data<float>(q) + N * k;
+    const float* r = data<float>(ray) + 3 * N * k;
+    float* __restrict to = data<float>(uv) + 2 * N * k;
+    bool* __restrict before = data<bool>(front) + N * k;
+    for (int64_t n = 0; n < N; ++n) {
+      const float a = r[3 * n], b = r[3 * n + 1], d = r[3 * n + 2];
+      float x = (a * m[0] + b * m[1] + d * m[2]) + qk[n] * tk[0];
+      float y = (a * m[3] + b * m[4] + d * m[5]) + qk[n] * tk[1];
+      float z = (a * m[6] + b * m[7] + d * m[8]) + qk[n] * tk[2];
+      const float p = w[0] * b, o = w[1] * b, s = w[2] * b;
+      const float dx = o * z - s * y, dy = s * x - p * z, dz = p * y - o * x;
+      x = x + dx;
+      y = y + dy;
+      z = z + dz;
+      before[n] = z > 1e-3f;
+      to[2 * n] = z > 1e-3f ? x / z * fk[0] + ck[0] : 1.0f * fk[0] + ck[0];
+      to[2 * n + 1] = z > 1e-3f ? y / z * fk[1] + ck[1] : 1.0f * fk[1] + ck[1];
+    }
+  }
+}
+
+void smooth_rows(const float* q, float* out, int64_t h, int64_t w, float near, int64_t radius) {  // along h
+  std::vector<float> total(w), count(w);
+  for (int64_t y = 0; y < h; ++y) {
+    const float* __restrict middle = q + y * w;
+    float *__restrict sum = total.data(), *__restrict n = count.data();
+    std::copy(middle, middle + w, sum);
+    std::fill(n, n + w, 1.0f);
+    for (int64_t k = 1; k <= radius; ++k) {
+      if (y < k || y + k >= h) continue;
+      const float *__restrict before = middle - k * w, *__restrict after = middle + k * w;
+      for (int64_t x = 0; x < w; ++x) {
+        const bool fine = (std::abs(before[x] - middle[x]) <= near) & (std::abs(after[x] - middle[x]) <= near);
+        sum[x] += fine ? before[x] + after[x] : 0.0f;
+        n[x] += fine ? 2.0f : 0.0f;
+      }
+    }
+    for (int64_t x = 0; x < w; ++x) out[y * w + x] = sum[x] / n[x];
+  }
+}
+
+void smooth_columns(const float* q, float* out, int64_t h, int64_t w, float near, int64_t radius) {  // along w
+  std::vector<float> total(w), count(w);
+  for (int64_t y = 0; y < h; ++y) {
+    const float* __restrict middle = q + y * w;
+    float *__restrict sum = total.data(), *__restrict n = count.data();
+    std::copy(middle, middle + w, sum);
+    std::fill(n, n + w, 1.0f);
+    for (int64_t k = 1; k <= radius; ++k) {
+      for (int64_t x = k; x < w - k; ++x) {
+        const float before = middle[x - k], after = middle[x + k];
+        const bool fine = (std::abs(before - middle[x]) <= near) & (std::abs(after - middle[x]) <= near);
+        sum[x] += fine ? before + after : 0.0f;
+        n[x] += fine ? 2.0f : 0.0f;
+      }
+    }
+    for (int64_t x = 0; x < w; ++x) out[y * w + x] = sum[x] / n[x];
+  }
+}
+
+// out (B, h, w) float32: q, each the mean of those near it along its column, then along its row; tolerance (B).
+void smooth(Tensor q, Tensor tolerance, Tensor out, int64_t radius) {
+  const int64_t B = q.size(0), h = q.size(1), w = q.size(2);
+  std::vector<float> between(h * w);
+  for (int64_t k = 0; k < B; ++k) {
+    const float near = data<float>(tolerance)[k];
+    smooth_rows(data<float>(q) + k * h * w, between.data(), h, w, near, radius);
+    smooth_columns(between.data(), data<float>(out) + k * h * w, h, w, near, radius);
+  }
+}
+
 }  // namespace
 
 STABLE_TORCH_LIBRARY(dhtorch, m) {
@@ -187,6 +294,11 @@ STABLE_TORCH_LIBRARY(dhtorch, m) {
       "int columns, int margin, int unseen) -> ()");
   m.def("aggregate(Tensor C, Tensor(a!) S, Tensor step, Tensor jump) -> ()");
   m.def("winner(Tensor S, Tensor(a!) plane, Tensor(b!) shift, Tensor(c!) cost) -> ()");
+  m.def("census(Tensor grey, Tensor offsets, Tensor(a!) code) -> ()");
+  m.def(
+      "seen_at(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor turn, Tensor f, Tensor c, Tensor(a!) uv, "
+      "Tensor(b!) front) -> ()");
+  m.def("smooth(Tensor q, Tensor tolerance, Tensor(a!) out, int radius) -> ()");
   m.def("elsewhere(Tensor S, Tensor plane, Tensor(a!) cost, int reach) -> ()");
 }
 
@@ -194,5 +306,8 @@ STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) {
   m.impl("add_costs", TORCH_BOX(&add_costs));
   m.impl("aggregate", TORCH_BOX(&aggregate));
   m.impl("winner", TORCH_BOX(&winner));
+  m.impl("census", TORCH_BOX(&census));
+  m.impl("seen_at", TORCH_BOX(&seen_at));
+  m.impl("smooth", TORCH_BOX(&smooth));
   m.impl("elsewhere", TORCH_BOX(&elsewhere));
 }

@@ -1,10 +1,10 @@
-"""The whole-number part of a sweep as compiled code, for those who ask for it; nothing needs it.
+"""The sweep's inner loops as compiled code, for those who ask for it; nothing needs it.
 
     python -m dhtorch.native            compile ``native.cpp``, with the system's C++ compiler, into the user's cache
-    DHTORCH_NATIVE=1 python …           use it; or dhtorch.native.load() in a program
+    DHTORCH_NATIVE=1 python …           use it, in loader workers as well; or dhtorch.native.load() in a program
 
 ``dhtorch.geometry.sweep`` asks here whether tensors may be handed over; where not (nothing was loaded, another device
-or type, under vmap, a compiler or a graph) it does the same in torch, which is the reference: both answers are equal bit
+or type, under vmap, a compiler or a graph) it does the same in torch, which is the reference: both answer alike, bit
 for bit. Nothing is ever compiled or downloaded without the command above. The file in the cache is named after its
 source, torch's version and the processor, whose widest vectors it uses.
 """
@@ -93,7 +93,7 @@ def load() -> None:
 
 def serves(*tensors: Tensor) -> bool:
     """Whether tensors may be handed to the compiled code: it is loaded, or DHTORCH_NATIVE=1 asks for that, and they are
-    contiguous ones of the CPU, in whole numbers or single precision, that nobody transforms or differentiates.
+    contiguous ones of the CPU, in whole numbers or single precision, and nobody transforms or differentiates them.
 
     Raises:
         FileNotFoundError: DHTORCH_NATIVE=1 asks for what was not compiled.

@@ -92,6 +92,28 @@ def test_costs_are_equal_also_where_a_place_lies_behind_the_other_view(loaded, m
 
 
 @needs_compiler
+@pytest.mark.parametrize("turning", [False, True])
+def test_places_codes_and_smooth_maps_are_equal(loaded, monkeypatch, turning):
+    g = torch.Generator().manual_seed(1)
+    picture = torch.rand(2, 1, 6, 21, generator=g).mul(9).round() / 9  # equal neighbours are not darker
+    assert torch.equal(*both_ways(lambda: sweep.census(picture), monkeypatch))
+    ray = torch.rand(2, 500, 3, generator=g) - 0.5
+    camera = Camera(torch.tensor([[40.0, 41.0], [35.0, 35.0]]), torch.tensor([[19.5, 14.0], [21.0, 15.5]]))
+    motion = se3.exp(0.5 * torch.randn(2, 6, generator=g))
+    view = sweep.View(
+        torch.zeros(2, 1, 4, 4), camera, motion, 0.1 * torch.randn(2, 3, generator=g) if turning else None
+    )
+    found, expected = both_ways(
+        lambda: sweep.seen_at(view, ray, torch.rand(2, 500, generator=g.manual_seed(2))), monkeypatch
+    )
+    assert torch.equal(found[0], expected[0]) and torch.equal(found[1], expected[1]) and not bool(found[1].all())
+    for shape in ((2, 30, 17), (2, 3, 5), (2, 1, 1)):
+        q = torch.rand(*shape, generator=g)
+        smooth = both_ways(lambda q=q: sweep.smooth(q, torch.tensor([0.2, 0.5])), monkeypatch)
+        assert torch.equal(*smooth)
+
+
+@needs_compiler
 def test_what_compiled_code_cannot_do_is_left_to_torch(loaded, monkeypatch):
     x = torch.zeros(2, 3, 4, 5)
     assert native.serves(x, x.to(torch.uint8))
