@@ -10,14 +10,16 @@ pictures to disparities, without reading them back into the view. Frames of the 
 
 from __future__ import annotations
 
+import os
 from typing import Any
+from unittest import mock
 
 import cv2
 import harness
 import numpy as np
 import torch
 
-from dhtorch import MAP, dense
+from dhtorch import MAP, dense, native
 from dhtorch.evaluate.holdout import range_split
 from dhtorch.records import Frame
 from dhtorch.studies.baselines import stereo
@@ -27,8 +29,8 @@ from dhtorch.synthetic import SyntheticRoom
 SIZES, VIEWS, NEAR = ((480, 640), (1440, 1920)), (1, 9), 2.0
 
 
-def measure(hw: tuple[int, int], threads: int, options: Any) -> dict[str, Any]:
-    """One row: the sweep beside its peer."""
+def measure(hw: tuple[int, int], threads: int, options: Any) -> list[dict[str, Any]]:
+    """The sweep beside its peer: in torch, and with compiled code."""
     harness.set_threads(threads)
     room = SyntheticRoom(n_frames=max(VIEWS) + 1, hw=hw, depth_hw=(192, 256))
     anchor, other = (range_split(room[k], NEAR) for k in VIEWS)
@@ -51,8 +53,18 @@ def measure(hw: tuple[int, int], threads: int, options: Any) -> dict[str, Any]:
         views = (small[0], cameras[0]), (small[1], cameras[1])
         stereo.matched(stereo.rectify(*views, trace["fit"].T_1_from_0, nearest_m=0.7 * NEAR).pictures)
 
-    a, b = harness.in_turn([ours, peer], repeats=options.repeats, clock=options.clock)
-    return harness.row(f"sweep_{hw[1]}x{hw[0]}", a, "rectify + SGBM", b, n=size[0] * size[1], bar=True)
+    def compiled() -> None:
+        with mock.patch.dict(os.environ, DHTORCH_NATIVE="1"):
+            ours()
+        native._loaded.clear()  # the next call is torch's again
+
+    a, b, c = harness.in_turn([ours, peer, compiled], repeats=options.repeats, clock=options.clock)
+    more: dict[str, Any] = {"n": size[0] * size[1], "bar": True}
+    name, other_side = f"sweep_{hw[1]}x{hw[0]}", "rectify + SGBM"
+    return [
+        harness.row(name, a, other_side, b, **more),
+        harness.row(name, c, other_side, b, mode="native", **more),
+    ]
 
 
 def _bytes(frame: Frame) -> np.ndarray:
@@ -71,7 +83,8 @@ def _float(frame: Frame) -> torch.Tensor:
 def main() -> None:
     """Print the table; write it with ``--json``."""
     options = harness.arguments(__doc__ or "").parse_args()
-    rows = [measure(hw, threads, options) for threads in (1, 2) for hw in SIZES]
+    native.build()
+    rows = [row for hw in SIZES for row in measure(hw, 1, options)]
     print(f"milliseconds, medians of {options.repeats}")
     harness.report(rows, options.json)
 

@@ -32,6 +32,7 @@ from dhtorch.records import Frame
 from dhtorch.stages.pose import pnp_ransac
 
 N, CPU_BATCH = 2048, 8
+SIZES, ALL_SIZES = (1, 64, 1024), (1, 8, 64, 256, 1024)
 Call = Callable[[], Any]
 
 
@@ -73,7 +74,7 @@ def measure(device: str, options: Any) -> list[dict[str, Any]]:
     errors = {f"pair_{m}": (error(m, device, one), error(m, "cpu", one)) for m in METHODS}
     rows = []
     alive = set(many)
-    for batch in (1, 8, 64, 256, 1024) if options.full else (1, 64, 1024):
+    for batch in ALL_SIZES if options.full else SIZES:
         for name, call in calls(batch, device, one).items():
             if name not in alive:
                 continue

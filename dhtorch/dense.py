@@ -20,12 +20,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dhtorch import tree
+from dhtorch import native, tree
 from dhtorch.calibration import available, load
 from dhtorch.codes import Gate, PoseCode, Source, first_reason
 from dhtorch.evaluate.score_calibration import Calibration
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry import epipolar, se3, sweep
+from dhtorch.geometry import se3, sweep
 from dhtorch.geometry.covariance import median
 from dhtorch.geometry.filters import grey
 from dhtorch.geometry.se3 import Pose
@@ -203,7 +203,7 @@ def swept(
     index, wanted = worthiest(asked, partners)
     base = sweep.base(*resized(anchor, size))
     partner = [partner_of(asked, k, size, use, base.image) for k, use in zip(index, wanted, strict=True)]
-    q = torch.linspace(0, 1, planes).to(base.ray) / _nearest(asked.samples)[:, None].to(base.ray)
+    q = torch.linspace(0, 1, planes).to(base.ray) / _nearest(asked.samples, anchor.sparse)[:, None].to(base.ray)
     start = _best_planes(base, partner, q)
     found = _fitted(base, partner, start, q, refinements)
     beyond = start.q >= q[:, -1, None, None] * (1 - 1e-6)
@@ -319,12 +319,19 @@ def partner_of(asked: Asked, index: Tensor, size: int, use: Tensor, like: Tensor
     return Partner(sweep.View(image, camera, Pose(R, t), turn), sweep.with_gradients(image), fit, use)
 
 
-def _nearest(samples: Samples) -> Tensor:
-    """Depth (B,) in m at which the sweep ends; 1 where the sensor sees nothing."""
+def _nearest(samples: Samples, sparse: Tensor | None = None) -> Tensor:
+    """Depth (B,) in m at which the sweep ends; 1 where the sensor sees nothing.
+
+    A map without holes has none nearer than its reach, so that is where the sweep ends. Between the returns of a
+    ``sparse`` one (B,) are holes at every depth: there it ends where hardly a return is nearer.
+    """
     depth = torch.where(samples.usable, samples.depth, torch.inf).detach().sort(-1).values
     n = samples.usable.sum(-1)
-    last = depth.gather(-1, (REACH * (n - 1).clamp_min(0)).long()[:, None])[:, 0]
-    return torch.where(n > 0, OVERLAP * last, torch.ones_like(last))
+    last = (REACH * (n - 1).clamp_min(0)).long()
+    if sparse is not None:
+        last = torch.where(sparse, ((1 - REACH) * n).long(), last)
+    found = depth.gather(-1, last[:, None])[:, 0]
+    return torch.where(n > 0, OVERLAP * found, torch.ones_like(found))
 
 
 class Found(NamedTuple):
@@ -349,7 +356,11 @@ def _best_planes(base: sweep.Base, partners: list[Partner], q: Tensor) -> Found:
 
 def _costs(base: sweep.Base, partners: list[Partner], q: Tensor) -> Tensor:
     """How badly every pixel fits all views at every plane, (B, h, w, D) uint8."""
-    C = torch.zeros(len(q), q.shape[1], *base.hw, dtype=torch.uint8, device=q.device)
+    shape, planes = base.hw, q.shape[1]
+    if native.serves(q):  # compiled code goes from pixel to pixel, torch from plane to plane
+        C = torch.zeros(len(q), *shape, planes, dtype=torch.uint8).movedim(-1, 1)
+    else:
+        C = torch.zeros(len(q), planes, *shape, dtype=torch.uint8, device=q.device)
     for view, _, _, use in partners:
         if is_static(use) or bool(use.any()):
             sweep.add_costs(C, base, view, q, use)
@@ -361,8 +372,8 @@ def _elsewhere(base: sweep.Base, partners: list[Partner], q: Tensor, step: Tenso
     moved = []
     for view, _, _, use in partners:
         go = sweep.travel(base, view)
-        here, there = (go.at(q.flatten(1) + k * step[:, None]) for k in (0, 1))
-        length = (torch.stack(there) - torch.stack(here)).norm(dim=0).median(-1).values
+        (u_0, v_0), (u_1, v_1) = (go.at(q.flatten(1) + k * step[:, None]) for k in (0, 1))
+        length = torch.hypot(u_1 - u_0, v_1 - v_0).median(-1).values
         moved.append(torch.where(use, length, 0.0))
     return (ELSEWHERE_PX / torch.stack(moved).amax(0).clamp_min(1e-3)).ceil().clamp(2, 1e4)
 
@@ -424,16 +435,26 @@ def _joined(
 def pose_variance(base: sweep.Base, view: sweep.View, fit: PoseFit, q: Tensor, motion: Tensor) -> Tensor:
     """Variance (B, h, w) of q, 1/m², by the motion's covariance."""
     flat = q.flatten(1).clamp_min(1e-6)
-    X = se3.rotate(view.T_1_from_0.R, base.ray) / flat[..., None] + view.T_1_from_0.t[:, None]
-    _, J = epipolar.point_jacobians(view.camera, X)
+    x, y, z = (se3.rotate(view.T_1_from_0.R, base.ray) / flat[..., None] + view.T_1_from_0.t[:, None]).unbind(-1)
     cov = fit.cov if fit.shutter is None else fit.shutter.cov
+    cov = torch.where(fit.ok[:, None, None], cov, 0.0).nan_to_num().to(z)
+    du, dv = motion.flatten(1, 2).unbind(-1)
+    share = 1 / (du * du + dv * dv).clamp_min(1e-12)
+    # what a shift of the point does along the motion, as epipolar.point_jacobians, one number a tensor
+    inv_z = 1 / torch.where(z.abs() < 1e-9, torch.full_like(z, 1e-9), z)
+    gx, gy = (f[:, None] * inv_z * d * share for f, d in zip(view.camera.f.unbind(-1), (du, dv), strict=True))
+    gz = -(gx * x + gy * y) * inv_z
+    turned = y * gz - z * gy, z * gx - x * gz, x * gy - y * gx
+    row = [*turned, gx, gy, gz]
     if fit.shutter is not None:
-        J = torch.cat((J, J[..., :3] * base.ray[..., 1, None, None]), -1)
-    cov = torch.where(fit.ok[:, None, None], cov, 0.0).nan_to_num().to(J)
-    along = motion.flatten(1, 2)
-    row = (along[..., None] * J).sum(-2) / along.square().sum(-1, keepdim=True).clamp_min(1e-12)
-    carried = sum(row[..., k, None] * cov[:, None, k] for k in range(cov.shape[-1]))  # bmm differs with the batch
-    return (carried * row).sum(-1).clamp_min(0).unflatten(-1, base.hw)
+        row += [r * base.ray[..., 1] for r in turned]
+    total = torch.zeros_like(z)
+    for i, r in enumerate(row):  # written out: a matrix product differs with the batch
+        carried = row[0] * cov[:, i, 0, None]
+        for j in range(1, len(row)):
+            carried = torch.addcmul(carried, row[j], cov[:, i, j, None])
+        total = torch.addcmul(total, carried, r)
+    return total.clamp_min(0).unflatten(-1, base.hw)
 
 
 def _silent_pairs(asked: Asked, wanted: Tensor) -> Tensor:

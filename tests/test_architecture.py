@@ -12,7 +12,7 @@ import dhtorch
 
 ROOT = Path(dhtorch.__file__).parent
 LEVELS = [
-    {"tree", "codes", "storage", "closure", "archive", "console", "leash", "lock"},
+    {"tree", "codes", "storage", "closure", "archive", "console", "leash", "lock", "native"},
     {"geometry"},
     {"records", "drawing"},
     {"stages", "data", "evaluate", "export", "synthetic", "testing", "calibration"},
@@ -31,6 +31,7 @@ SIDEWAYS = {
     ("archive", "closure"),
     ("archive", "storage"),
     ("lock", "storage"),
+    ("native", "archive"),
     ("synthetic", "data"),
     ("synthetic", "testing"),
     ("testing", "data"),

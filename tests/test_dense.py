@@ -198,6 +198,23 @@ def test_half_precision_goes_in_and_single_comes_out(views, found):
     assert float(((got.depth - found.depth).abs() / depth)[swept].median()) < 0.01
 
 
+def test_between_the_returns_of_a_sparse_sensor_places_are_swept_as_near_as_they_are(room):
+    """Returns at every depth, 2 % of the pixels."""
+    told = torch.rand(room[3].depth.shape, generator=torch.Generator().manual_seed(0)) < 0.02
+    anchor = room[3].replace(depth=torch.where(told, room[3].depth, 0.0), sparse=torch.tensor([True]))
+    fit = exact(room, 3, 11, n=512)
+    with torch.no_grad():
+        swept_near, dense_sensor = (
+            complete(one, room[11], fit=fit, **FAST) for one in (anchor, anchor.replace(sparse=None))
+        )
+    near = (room[3].depth < 0.6 * room[3].depth.amax()) & ~told
+    found, missed = (near & (one.source == Source.SWEPT) for one in (swept_near, dense_sensor))
+    assert float(found.sum()) > 2 * float(missed.sum())
+    error = ((swept_near.depth - room[3].depth).abs() / room[3].depth)[found]
+    assert float(found.sum()) > 0.2 * float((near & (swept_near.source != Source.SENSOR)).sum())
+    assert float(error.median()) < 0.02 and float((error > 0.2).float().mean()) < 0.1
+
+
 def test_a_large_picture_is_swept_at_the_size_asked(views):
     picture, camera = resized(views[0], 160)
     assert picture.shape == (1, 1, 120, 160)

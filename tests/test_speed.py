@@ -18,6 +18,8 @@ import gpu
 import harness
 import scaling
 
+from dhtorch.methods import METHODS
+
 
 def two_views(n):
     g = torch.Generator().manual_seed(0)
@@ -110,3 +112,59 @@ def test_without_an_accelerator_its_benchmark_says_so(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["gpu.py"])
     assert gpu.main() == 0
     assert "skipped" in capsys.readouterr().out
+
+
+class Clock:
+    """Events of a device that is not there: each knows when it was recorded."""
+
+    now = 0.0
+
+    def __init__(self, enable_timing):
+        assert enable_timing
+
+    def record(self):
+        Clock.now += 1.0
+        self.at = Clock.now
+
+    def elapsed_time(self, end):
+        return end.at - self.at
+
+
+def test_its_benchmark_runs_through_with_a_device_that_is_played(monkeypatch, capsys, tmp_path):
+    """Everything but the device: records moved, events recorded, a series that ends where memory does, rows written."""
+    moved, waited = [], []
+    to, paper = torch.Tensor.to, METHODS["paper"]
+
+    def played(x, *args, **options):
+        if args and str(args[0]) == "cuda":
+            moved.append(x.dtype)
+            return to(x, *args[1:]).clone()
+        return to(x, *args, **options)
+
+    def until_full(near, other, **options):
+        if len(near.image) == 3:
+            raise torch.cuda.OutOfMemoryError
+        return paper(near, other, **options)
+
+    monkeypatch.setattr(torch.Tensor, "to", played)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda: waited.append(1))
+    monkeypatch.setattr(torch.cuda, "Event", Clock)
+    for name, value in {"CPU_BATCH": 2, "N": 64, "SIZES": (1, 3, 4), "METHODS": {"paper": until_full}}.items():
+        monkeypatch.setattr(gpu, name, value)
+    monkeypatch.delenv("DHTORCH_DATA", raising=False)
+    monkeypatch.setattr(sys, "argv", ["gpu.py", "--repeats", "2", "--json", str(tmp_path / "gpu.json")])
+    precision = torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32
+    try:
+        assert gpu.main() == 0
+    finally:
+        torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32 = precision
+    rows = {(r["name"], r["batch"]): r for r in json.loads((tmp_path / "gpu.json").read_text())}
+    alive = [(f"gpu_{name}_b{b}", b) for b in (1, 3, 4) for name in ("frontend", "pnp_n500", "triangulate")]
+    assert set(rows) == {*alive, ("gpu_pair_paper_b1", 1)}
+    assert "3 pairs do not fit" in capsys.readouterr().out
+    for (_, batch), r in rows.items():
+        assert r["device"] == "cuda" and r["peer"] == "cpu_b2" and r["ours_ms"] == pytest.approx(1 / batch)
+    pair = rows["gpu_pair_paper_b1", 1]
+    assert pair["ours_error"] == pair["peer_error"], "the same numbers here"
+    assert torch.float32 in moved and len(waited) == 2 * (1 + 2) * len(rows)  # one to find the count

@@ -1,6 +1,9 @@
 """Adapters around data sets of a few pixels: which item is the other view, what is left out, what a loader gets."""
 
+import os
 import pickle
+import subprocess
+import sys
 
 import cv2
 import numpy as np
@@ -214,6 +217,25 @@ def test_one_thread_is_one_of_torch_and_of_opencv():
     finally:
         torch.set_num_threads(before[0])
         cv2.setNumThreads(before[1])
+
+
+FORKED = """
+import os, cv2, numpy as np
+from dhtorch.transform import one_thread
+cv2.setNumThreads(2)
+cv2.GaussianBlur(np.ones((999, 999), np.float32), (31, 31), 5)
+pid = os.fork()
+if pid == 0:
+    one_thread()
+    os._exit(cv2.getNumThreads())
+print(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
+def test_a_worker_forked_beside_opencvs_threads_does_not_wait_for_them():
+    said = subprocess.run([sys.executable, "-c", FORKED], capture_output=True, text=True, check=True, timeout=60)
+    assert said.stdout.strip() == "1"
 
 
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")

@@ -104,7 +104,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("NumpyTransform.__call__", "if k.startswith(self.transform.prefix) else v", "if torch.is_tensor(v) else v"),
         ("AddedCollate.__call__", "k.startswith(self.prefix)", 'k.startswith("dhtorch.")'),
         ("collate_kept", "len(samples) - len(kept)", "len(kept)"),
-        ("one_thread", "opencv.setNumThreads(1)", "opencv.setNumThreads(0)", "both tell OpenCV to use no threads"),
+        ("one_thread", "opencv.setNumThreads(0)", "opencv.setNumThreads(1)"),
         ("_zero", "return type(value)()", "return value"),
     ],
     "transform.tokens": [

@@ -20,6 +20,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from dhtorch import native
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.camera import Camera
@@ -125,11 +126,24 @@ def seen_at(view: View, ray: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
     """Where view 1 sees the points on rays (B, N, 3) at inverse depths q (B, N): pixels (B, N, 2) of its picture, and
     whether they lie before it (B, N). Gradient: to everything."""
     check("seen_at", ray=(ray, "B N 3"), q=(q, "B N"), t=(view.T_1_from_0.t, "B 3"))
+    given = view.T_1_from_0.R, view.T_1_from_0.t, view.camera.f, view.camera.c
+    turn = torch.zeros_like(view.T_1_from_0.t) if view.turn is None else view.turn
+    if view.camera.distortion is None and native.serves(ray, q, turn, *given):
+        R, t, f, c = given
+        uv, front = q.new_empty(*q.shape, 2), torch.empty_like(q, dtype=torch.bool)
+        torch.ops.dhtorch.seen_at(ray, q, R, t, turn, f, c, uv, front)
+        return uv, front
     x = se3.rotate(view.T_1_from_0.R, ray) + q[..., None] * view.T_1_from_0.t[:, None]
     if view.turn is not None:
-        x = x + torch.linalg.cross(view.turn[:, None] * ray[..., 1:2], x, dim=-1)
+        x = x + _cross(view.turn[:, None] * ray[..., 1:2], x)
     front = x[..., 2] > 1e-3
     return cam.project(view.camera, torch.where(front[..., None], x, torch.ones_like(x))), front
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    """Cross products (…, 3); torch's own take several times as long on so many."""
+    (a0, a1, a2), (b0, b1, b2) = a.unbind(-1), b.unbind(-1)
+    return torch.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], -1)
 
 
 def bilinear(image: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
@@ -154,6 +168,10 @@ def census(grey: Tensor) -> Tensor:
     """Codes (B, h, w) int32 of pictures (B, 1, h, w): of each of 31 neighbours whether it is darker than the middle."""
     check("census", grey=(grey, "B 1 h w"))
     h, w = grey.shape[-2:]
+    if native.serves(grey) and grey.dtype == torch.float32:
+        code = torch.empty_like(grey[:, 0], dtype=torch.int32)
+        torch.ops.dhtorch.census(grey[:, 0], torch.tensor(OFFSETS), code)
+        return code
     padded, middle = F.pad(grey, (4, 4, 3, 3), mode="replicate")[:, 0], grey[:, 0]
     code = torch.zeros_like(middle, dtype=torch.int32)
     for first in range(0, len(OFFSETS), 8):  # a byte at a time is a quarter of the memory
@@ -204,10 +222,16 @@ def add_costs(
 ) -> None:
     """Add to C how badly every pixel fits a view at every plane.
 
-    At most :data:`VIEWS` views fit into a byte. Memory: pictures of view 0's size, whatever D. Gradient: none.
+    At most :data:`VIEWS` views fit into a byte. C may lie in memory with its planes last, as compiled code wants it
+    (:mod:`dhtorch.native`). Memory: pictures of view 0's size, whatever D. Gradient: none.
     """
     go = travel(base, view)
     seen = level(base, view, wanted)
+    given = base.code.flatten(1), seen.code, go.a, go.b[..., 0].contiguous(), go.c[:, 0].contiguous(), q.contiguous()
+    last = C.movedim(1, -1)
+    if native.serves(last, *given):
+        torch.ops.dhtorch.add_costs(last, *given, *seen.hw, seen.margin, UNSEEN)
+        return
     for k in range(q.shape[1]):
         C[:, k] += misfit(base, seen, go, q[:, k, None]).to(torch.uint8).unflatten(-1, base.hw)
 
@@ -226,6 +250,10 @@ def aggregate(
     """
     check("aggregate", C=(C, "B h w D"))
     price = torch.as_tensor(views, dtype=torch.int16, device=C.device).reshape(-1, 1, 1)
+    if native.serves(C) and C.dtype == torch.uint8:
+        S = torch.empty_like(C, dtype=torch.int16)
+        torch.ops.dhtorch.aggregate(C, S, *(x.expand(len(C), 1, 1).contiguous() for x in (price * step, price * jump)))
+        return S
     S = torch.zeros_like(C, dtype=torch.int16)
     for dim in (1, 2):
         _both_ways(C, S, dim, price * step, price * jump)
@@ -261,6 +289,11 @@ class Winner(NamedTuple):
 def winner(S: Tensor) -> Winner:
     """The plane of least cost S (B, h, w, D), the first of equals, and the parabola through its neighbours' costs."""
     check("winner", S=(S, "B h w D"))
+    if native.serves(S) and S.dtype == torch.int16:
+        types = torch.int64, torch.float32, torch.int16
+        found = Winner(*(torch.empty(S.shape[:-1], dtype=dtype) for dtype in types))
+        torch.ops.dhtorch.winner(S.flatten(0, 2), *found)
+        return found
     return Winner(*(torch.cat(part, 1) for part in zip(*map(_winner, S.split(ROWS, 1)), strict=True)))
 
 
@@ -282,6 +315,11 @@ def rivals(S: Tensor, best: Winner, reach: Tensor) -> Tensor:
 
     Asked at every other pixel, both ways; its neighbours have its answer. Gradient: none.
     """
+    if native.serves(S, best.plane) and S.dtype == torch.int16:
+        more = torch.empty(len(S), *((n + 1) // 2 for n in S.shape[1:3]), dtype=S.dtype)
+        for b, far in enumerate(reach.tolist()):
+            torch.ops.dhtorch.elsewhere(S[b], best.plane[b], more[b], int(far))
+        return _for_all(more - best.cost[:, ::2, ::2], best.cost)
     places = torch.arange(S.shape[-1], dtype=torch.int16, device=S.device)
     reach, found = reach.to(torch.int16)[:, None, None, None], []
     for first in range(0, S.shape[1], ROWS):  # some rows at once, as the winner is read
@@ -290,8 +328,12 @@ def rivals(S: Tensor, best: Winner, reach: Tensor) -> Tensor:
         near = (places - plane).abs() <= reach
         others = S[:, rows, ::2].masked_fill(near, torch.iinfo(S.dtype).max)
         found.append((others.amin(-1, keepdim=True) - cost)[..., 0])
-    more = torch.cat(found, 1).repeat_interleave(2, 1).repeat_interleave(2, 2)
-    return more[:, : S.shape[1], : S.shape[2]]
+    return _for_all(torch.cat(found, 1), best.cost)
+
+
+def _for_all(x: Tensor, like: Tensor) -> Tensor:
+    """What was asked at every other pixel, both ways, also for its neighbours."""
+    return x.repeat_interleave(2, 1).repeat_interleave(2, 2)[:, : like.shape[1], : like.shape[2]]
 
 
 class Fit(NamedTuple):
@@ -359,6 +401,10 @@ def smooth(q: Tensor, tolerance: Tensor, *, radius: int = 4) -> Tensor:
     A window cannot see how its pixels scatter about their mean, so what is fitted by windows must be smooth within
     them. Gradient: to q.
     """
+    if native.serves(q, tolerance) and q.dtype == tolerance.dtype == torch.float32:
+        out = torch.empty_like(q)
+        torch.ops.dhtorch.smooth(q, tolerance, out, radius)
+        return out
     near = tolerance[:, None, None]
     for dim in (1, 2):
         n = q.shape[dim]

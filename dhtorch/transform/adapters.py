@@ -188,7 +188,7 @@ def one_thread(worker: int = 0) -> None:
     torch.set_num_threads(1)
     opencv = sys.modules.get("cv2")
     if opencv is not None:
-        opencv.setNumThreads(1)
+        opencv.setNumThreads(0)  # 1 would wait for the threads of the pool, which a forked worker does not have
 
 
 def _zero(value: Any) -> Any:

@@ -1,0 +1,313 @@
+// What dhtorch/geometry/sweep.py does in torch as operators on torch's stable ABI, bit for bit the same: whole numbers,
+// and sums of products in torch's order (-ffp-contract=off: none is fused). One thread, no gradient. Callers check shapes,
+// types and that everything is contiguous; see dhtorch/native.py.
+
+#include <torch/csrc/stable/library.h>
+#include <torch/csrc/stable/tensor.h>
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <limits>
+#include <vector>
+
+using torch::stable::Tensor;
+
+namespace {
+
+constexpr int16_t NOWHERE = std::numeric_limits<int16_t>::max() / 2;
+
+template <typename T>
+T* data(const Tensor& x) {
+  return static_cast<T*>(x.data_ptr());
+}
+
+inline int32_t bits(int32_t code) {  // of the lower 31, as count_bits: vectors have no such instruction everywhere
+  uint32_t x = static_cast<uint32_t>(code);
+  x = x - ((x >> 1) & 0x55555555u);
+  x = (x & 0x33333333u) + ((x >> 2) & 0x33333333u);
+  x = (x + (x >> 4)) & 0x0F0F0F0Fu;
+  return static_cast<int32_t>((x * 0x01010101u) >> 24);
+}
+
+// Add to C (B, h, w, D) uint8 how badly each pixel fits at every plane. code_0 (B, N) and code_1 (B, rows * columns)
+// int32; a (B, 2, N), b (B, 2), c (B) and q (B, D) float32: pixels are seen at (a + q b) / (1 + q c), margin further in.
+void add_costs(Tensor C, Tensor code_0, Tensor code_1, Tensor a, Tensor b, Tensor c, Tensor q, int64_t rows,
+               int64_t columns, int64_t margin, int64_t unseen) {
+  const int64_t B = q.size(0), D = q.size(1), N = code_0.size(1), M = code_1.size(1);
+  const float inside = static_cast<float>(margin + 0.5), right = static_cast<float>(columns - 1),
+              down = static_cast<float>(rows - 1);
+  const int32_t width = static_cast<int32_t>(columns), none = static_cast<int32_t>(unseen);
+  std::vector<float> scale(D), along(D), across(D);
+  std::vector<int32_t> cell(D);
+  for (int64_t k = 0; k < B; ++k) {
+    const float *bk = data<float>(b) + 2 * k, *qk = data<float>(q) + D * k, *ak = data<float>(a) + 2 * N * k;
+    for (int64_t d = 0; d < D; ++d) {
+      const float z = 1.0f + qk[d] * data<float>(c)[k];
+      scale[d] = z > 1e-3f ? 1.0f / z : 1e9f;
+      along[d] = qk[d] * bk[0];
+      across[d] = qk[d] * bk[1];
+    }
+    const int32_t *here = data<int32_t>(code_0) + N * k, *there = data<int32_t>(code_1) + M * k;
+    uint8_t* cost = data<uint8_t>(C) + N * D * k;
+    const float *s = scale.data(), *u_step = along.data(), *v_step = across.data();
+    int32_t* at = cell.data();
+    for (int64_t n = 0; n < N; ++n, cost += D) {
+      const float u0 = ak[n], v0 = ak[N + n];
+      const int32_t own = here[n];
+#pragma GCC ivdep
+      for (int64_t d = 0; d < D; ++d) {
+        float u = (u0 + u_step[d]) * s[d] + inside, v = (v0 + v_step[d]) * s[d] + inside;
+        u = u > 0.0f ? u : 0.0f;
+        v = v > 0.0f ? v : 0.0f;
+        u = u < right ? u : right;
+        v = v < down ? v : down;
+        at[d] = static_cast<int32_t>(v) * width + static_cast<int32_t>(u);
+      }
+#pragma GCC ivdep
+      for (int64_t d = 0; d < D; ++d) {
+        const int32_t code = there[at[d]];
+        at[d] = code < 0 ? none : bits(code ^ own);
+      }
+#pragma GCC ivdep
+      for (int64_t d = 0; d < D; ++d) cost[d] = static_cast<uint8_t>(cost[d] + at[d]);
+    }
+  }
+}
+
+// One step of a path: the costs of the best paths that end at the pixel before, in place, become those at this one.
+// `path` has a place before and one behind its D planes. Returns the least of them.
+inline int16_t step_on(int16_t* __restrict path, int16_t* __restrict next, const uint8_t* __restrict cost, int64_t D,
+                       int16_t low, int16_t step, int16_t jump) {
+  const int16_t far = static_cast<int16_t>(low + jump);
+  int16_t least = std::numeric_limits<int16_t>::max();
+#pragma GCC ivdep
+  for (int64_t d = 0; d < D; ++d) {
+    int16_t best = std::min(path[d], path[d + 2]);
+    best = static_cast<int16_t>(best + step);
+    best = std::min(best, path[d + 1]);
+    best = std::min(best, far);
+    best = static_cast<int16_t>(best - low + cost[d]);
+    next[d + 1] = best;
+    least = std::min(least, best);
+  }
+  return least;
+}
+
+inline int16_t begin(int16_t* next, const uint8_t* cost, int64_t D) {
+  int16_t least = std::numeric_limits<int16_t>::max();
+  for (int64_t d = 0; d < D; ++d) {
+    next[d + 1] = cost[d];
+    least = std::min(least, next[d + 1]);
+  }
+  return least;
+}
+
+// S (B, h, w, D) int16 of C (B, h, w, D) uint8: the sum of the best paths from four sides; step and jump (B) int16.
+// Twice through the picture: from its first pixel on with the paths from the left and from above, and back.
+void aggregate(Tensor C, Tensor S, Tensor step, Tensor jump) {
+  const int64_t B = C.size(0), h = C.size(1), w = C.size(2), D = C.size(3), wide = D + 2;
+  std::vector<int16_t> columns(w * wide), other(wide), row(wide), row_next(wide), low(w);
+  for (int64_t k = 0; k < B; ++k) {
+    const int16_t one = data<int16_t>(step)[k], more = data<int16_t>(jump)[k];
+    for (int back = 0; back < 2; ++back) {
+      std::fill(columns.begin(), columns.end(), NOWHERE);
+      std::fill(other.begin(), other.end(), NOWHERE);
+      std::fill(row.begin(), row.end(), NOWHERE);
+      std::fill(row_next.begin(), row_next.end(), NOWHERE);
+      for (int64_t i = 0; i < h; ++i) {
+        const int64_t y = back ? h - 1 - i : i;
+        int16_t row_low = 0;
+        for (int64_t j = 0; j < w; ++j) {
+          const int64_t x = back ? w - 1 - j : j, place = ((k * h + y) * w + x) * D;
+          const uint8_t* cost = data<uint8_t>(C) + place;
+          int16_t* column = columns.data() + x * wide;
+          row_low = j ? step_on(row.data(), row_next.data(), cost, D, row_low, one, more)
+                      : begin(row_next.data(), cost, D);
+          std::swap(row, row_next);
+          low[x] = i ? step_on(column, other.data(), cost, D, low[x], one, more) : begin(other.data(), cost, D);
+          std::memcpy(column + 1, other.data() + 1, D * sizeof(int16_t));
+          int16_t* __restrict sum = data<int16_t>(S) + place;
+          const int16_t *__restrict p = row.data() + 1, *__restrict r = column + 1;
+          if (back) {
+            for (int64_t d = 0; d < D; ++d) sum[d] = static_cast<int16_t>(sum[d] + p[d] + r[d]);
+          } else {
+            for (int64_t d = 0; d < D; ++d) sum[d] = static_cast<int16_t>(p[d] + r[d]);
+          }
+        }
+      }
+    }
+  }
+}
+
+// Of S (N, D) int16: the first plane of least cost (N) int64, where between its neighbours a parabola is least (N)
+// float32, and that cost (N) int16.
+void winner(Tensor S, Tensor plane, Tensor shift, Tensor cost) {
+  const int64_t N = S.size(0), D = S.size(1);
+  const int16_t* s = data<int16_t>(S);
+  for (int64_t n = 0; n < N; ++n, s += D) {
+    int16_t low = s[0];
+    for (int64_t d = 1; d < D; ++d) low = std::min(low, s[d]);
+    int64_t d = 0;
+    while (s[d] != low) ++d;
+    float between = 0.0f;
+    if (d > 0 && d < D - 1) {
+      const float before = s[d - 1], here = s[d], after = s[d + 1], bend = before + after - 2.0f * here;
+      if (bend > 0.0f) between = std::clamp(0.5f * (before - after) / std::max(bend, 1e-6f), -0.5f, 0.5f);
+    }
+    data<int16_t>(cost)[n] = low;
+    data<int64_t>(plane)[n] = d;
+    data<float>(shift)[n] = between;
+  }
+}
+
+// Of S (h, w, D) int16, at every other pixel both ways: the least cost further than `reach` planes from `plane` (h, w)
+// int64; the type's most where there is none.
+void elsewhere(Tensor S, Tensor plane, Tensor cost, int64_t reach) {
+  const int64_t h = S.size(0), w = S.size(1), D = S.size(2);
+  int16_t* found = data<int16_t>(cost);
+  for (int64_t y = 0; y < h; y += 2) {
+    for (int64_t x = 0; x < w; x += 2) {
+      const int16_t* s = data<int16_t>(S) + (y * w + x) * D;
+      const int64_t at = data<int64_t>(plane)[y * w + x];
+      const int64_t before = std::max<int64_t>(at - reach, 0), after = std::min<int64_t>(at + reach + 1, D);
+      int16_t low = std::numeric_limits<int16_t>::max();
+      for (int64_t d = 0; d < before; ++d) low = std::min(low, s[d]);
+      for (int64_t d = after; d < D; ++d) low = std::min(low, s[d]);
+      *found++ = low;
+    }
+  }
+}
+
+// Codes (B, h, w) int32 of grey (B, h, w) float32: of each of n neighbours, offsets (n, 2) int64 down and right,
+// whether it is darker than the middle. Beyond the border is the border.
+void census(Tensor grey, Tensor offsets, Tensor code) {
+  const int64_t B = grey.size(0), h = grey.size(1), w = grey.size(2), n = offsets.size(0), margin = 8;
+  const int64_t* step = data<int64_t>(offsets);
+  const int64_t wide = w + 2 * margin;
+  std::vector<float> padded((h + 2 * margin) * wide);
+  for (int64_t k = 0; k < B; ++k) {
+    const float* image = data<float>(grey) + k * h * w;
+    for (int64_t y = 0; y < h + 2 * margin; ++y) {
+      const float* row = image + std::clamp<int64_t>(y - margin, 0, h - 1) * w;
+      float* to = padded.data() + y * wide;
+      std::fill(to, to + margin, row[0]);
+      std::copy(row, row + w, to + margin);
+      std::fill(to + margin + w, to + wide, row[w - 1]);
+    }
+    for (int64_t y = 0; y < h; ++y) {
+      int32_t* __restrict found = data<int32_t>(code) + (k * h + y) * w;
+      std::fill(found, found + w, 0);
+      const float* __restrict middle = padded.data() + (y + margin) * wide + margin;
+      for (int64_t i = 0; i < n; ++i) {
+        const float* __restrict beside = middle + step[2 * i] * wide + step[2 * i + 1];
+        const int32_t bit = static_cast<int32_t>(1u << i);
+        for (int64_t x = 0; x < w; ++x) found[x] |= beside[x] < middle[x] ? bit : 0;
+      }
+    }
+  }
+}
+
+// Where a view without a lens sees points on rays (B, N, 3) at q (B, N): uv (B, N, 2) and whether before it (B, N) bool.
+// R (B, 9), t, turn (B, 3), f, c (B, 2).
+void seen_at(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor turn, Tensor f, Tensor c, Tensor uv, Tensor front) {
+  const int64_t B = q.size(0), N = q.size(1);
+  for (int64_t k = 0; k < B; ++k) {
+    const float *m = data<float>(R) + 9 * k, *tk = data<float>(t) + 3 * k, *w = data<float>(turn) + 3 * k;
+    const float *fk = data<float>(f) + 2 * k, *ck = data<float>(c) + 2 * k, *qk = data<float>(q) + N * k;
+    const float* r = data<float>(ray) + 3 * N * k;
+    float* __restrict to = data<float>(uv) + 2 * N * k;
+    bool* __restrict before = data<bool>(front) + N * k;
+    for (int64_t n = 0; n < N; ++n) {
+      const float a = r[3 * n], b = r[3 * n + 1], d = r[3 * n + 2];
+      float x = (a * m[0] + b * m[1] + d * m[2]) + qk[n] * tk[0];
+      float y = (a * m[3] + b * m[4] + d * m[5]) + qk[n] * tk[1];
+      float z = (a * m[6] + b * m[7] + d * m[8]) + qk[n] * tk[2];
+      const float p = w[0] * b, o = w[1] * b, s = w[2] * b;
+      const float dx = o * z - s * y, dy = s * x - p * z, dz = p * y - o * x;
+      x = x + dx;
+      y = y + dy;
+      z = z + dz;
+      before[n] = z > 1e-3f;
+      to[2 * n] = z > 1e-3f ? x / z * fk[0] + ck[0] : 1.0f * fk[0] + ck[0];
+      to[2 * n + 1] = z > 1e-3f ? y / z * fk[1] + ck[1] : 1.0f * fk[1] + ck[1];
+    }
+  }
+}
+
+void smooth_rows(const float* q, float* out, int64_t h, int64_t w, float near, int64_t radius) {  // along h
+  std::vector<float> total(w), count(w);
+  for (int64_t y = 0; y < h; ++y) {
+    const float* __restrict middle = q + y * w;
+    float *__restrict sum = total.data(), *__restrict n = count.data();
+    std::copy(middle, middle + w, sum);
+    std::fill(n, n + w, 1.0f);
+    for (int64_t k = 1; k <= radius; ++k) {
+      if (y < k || y + k >= h) continue;
+      const float *__restrict before = middle - k * w, *__restrict after = middle + k * w;
+      for (int64_t x = 0; x < w; ++x) {
+        const bool fine = (std::abs(before[x] - middle[x]) <= near) & (std::abs(after[x] - middle[x]) <= near);
+        sum[x] += fine ? before[x] + after[x] : 0.0f;
+        n[x] += fine ? 2.0f : 0.0f;
+      }
+    }
+    for (int64_t x = 0; x < w; ++x) out[y * w + x] = sum[x] / n[x];
+  }
+}
+
+void smooth_columns(const float* q, float* out, int64_t h, int64_t w, float near, int64_t radius) {  // along w
+  std::vector<float> total(w), count(w);
+  for (int64_t y = 0; y < h; ++y) {
+    const float* __restrict middle = q + y * w;
+    float *__restrict sum = total.data(), *__restrict n = count.data();
+    std::copy(middle, middle + w, sum);
+    std::fill(n, n + w, 1.0f);
+    for (int64_t k = 1; k <= radius; ++k) {
+      for (int64_t x = k; x < w - k; ++x) {
+        const float before = middle[x - k], after = middle[x + k];
+        const bool fine = (std::abs(before - middle[x]) <= near) & (std::abs(after - middle[x]) <= near);
+        sum[x] += fine ? before + after : 0.0f;
+        n[x] += fine ? 2.0f : 0.0f;
+      }
+    }
+    for (int64_t x = 0; x < w; ++x) out[y * w + x] = sum[x] / n[x];
+  }
+}
+
+// out (B, h, w) float32: q, each the mean of those near it along its column, then along its row; tolerance (B).
+void smooth(Tensor q, Tensor tolerance, Tensor out, int64_t radius) {
+  const int64_t B = q.size(0), h = q.size(1), w = q.size(2);
+  std::vector<float> between(h * w);
+  for (int64_t k = 0; k < B; ++k) {
+    const float near = data<float>(tolerance)[k];
+    smooth_rows(data<float>(q) + k * h * w, between.data(), h, w, near, radius);
+    smooth_columns(between.data(), data<float>(out) + k * h * w, h, w, near, radius);
+  }
+}
+
+}  // namespace
+
+STABLE_TORCH_LIBRARY(dhtorch, m) {
+  m.def(
+      "add_costs(Tensor(a!) C, Tensor code_0, Tensor code_1, Tensor a, Tensor b, Tensor c, Tensor q, int rows, "
+      "int columns, int margin, int unseen) -> ()");
+  m.def("aggregate(Tensor C, Tensor(a!) S, Tensor step, Tensor jump) -> ()");
+  m.def("winner(Tensor S, Tensor(a!) plane, Tensor(b!) shift, Tensor(c!) cost) -> ()");
+  m.def("census(Tensor grey, Tensor offsets, Tensor(a!) code) -> ()");
+  m.def(
+      "seen_at(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor turn, Tensor f, Tensor c, Tensor(a!) uv, "
+      "Tensor(b!) front) -> ()");
+  m.def("smooth(Tensor q, Tensor tolerance, Tensor(a!) out, int radius) -> ()");
+  m.def("elsewhere(Tensor S, Tensor plane, Tensor(a!) cost, int reach) -> ()");
+}
+
+STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) {
+  m.impl("add_costs", TORCH_BOX(&add_costs));
+  m.impl("aggregate", TORCH_BOX(&aggregate));
+  m.impl("winner", TORCH_BOX(&winner));
+  m.impl("census", TORCH_BOX(&census));
+  m.impl("seen_at", TORCH_BOX(&seen_at));
+  m.impl("smooth", TORCH_BOX(&smooth));
+  m.impl("elsewhere", TORCH_BOX(&elsewhere));
+}

@@ -1,0 +1,147 @@
+"""The sweep's inner loops as compiled code, for those who ask for it; nothing needs it.
+
+    python -m dhtorch.native            compile ``native.cpp``, with the system's C++ compiler, into the user's cache
+    DHTORCH_NATIVE=1 python …           use it, in loader workers as well; or dhtorch.native.load() in a program
+
+``dhtorch.geometry.sweep`` asks here whether tensors may be handed over; where not (nothing was loaded, another device
+or type, under vmap, a compiler or a graph) it does the same in torch, which is the reference: both answer alike, bit
+for bit. Nothing is ever compiled or downloaded without the command above. The file in the cache is named after its
+source, torch's version and the processor, whose widest vectors it uses.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from dhtorch.archive import processor
+
+SOURCE = Path(__file__).with_name("native.cpp")
+
+#: A product that is fused with a sum would round once where torch rounds twice.
+FLAGS = ("-O3", "-std=c++20", "-fPIC", "-shared", "-ffp-contract=off")
+
+#: The command that makes the file, as errors tell it.
+COMMAND = "python -m dhtorch.native"
+
+_loaded: list[Path] = []
+
+
+def cache() -> Path:
+    """The folder of compiled files: DHTORCH_CACHE, else ``dhtorch`` in the user's cache."""
+    own = os.environ.get("DHTORCH_CACHE")
+    if own:
+        return Path(own)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dhtorch"
+
+
+def library() -> Path:
+    """Where the compiled file of this source, torch and processor is or would be."""
+    flags = (*FLAGS, *_vectors())
+    key = "\n".join((SOURCE.read_text(encoding="utf-8"), torch.__version__, processor(), platform.machine(), *flags))
+    return cache() / f"sweep-{hashlib.sha256(key.encode()).hexdigest()[:16]}.so"
+
+
+def build() -> Path:
+    """Compile the source, unless that was done; returns the file.
+
+    Raises:
+        OSError: no compiler (CXX, else c++, g++ or clang++), one that fails (its words are in the message), or no
+            right to write.
+    """
+    path = library()
+    if path.is_file():
+        return path
+    compiler = _compiler()
+    home = Path(torch.__file__).parent
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        unfinished = Path(folder) / path.name
+        words = [*compiler, *FLAGS, *_vectors(), f"-I{home / 'include'}", str(SOURCE), "-o", str(unfinished)]
+        words += ["-undefined", "dynamic_lookup"] if sys.platform == "darwin" else [f"-L{home / 'lib'}", "-ltorch_cpu"]
+        done = subprocess.run(words, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise OSError(f"{shlex.join(words)}: exit code {done.returncode}\n{done.stderr.strip()}")
+        unfinished.replace(path)
+    return path
+
+
+def load() -> None:
+    """Use the compiled file from now on, in this process.
+
+    Raises:
+        FileNotFoundError: there is none for this source, torch and processor.
+    """
+    if _loaded:
+        return
+    path = library()
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: not compiled for this torch and processor; {COMMAND} does it")
+    torch.ops.load_library(str(path))
+    _loaded.append(path)
+
+
+def serves(*tensors: Tensor) -> bool:
+    """Whether tensors may be handed to the compiled code: it is loaded, or DHTORCH_NATIVE=1 asks for that, and they are
+    contiguous ones of the CPU, in whole numbers or single precision, and nobody transforms or differentiates them.
+
+    Raises:
+        FileNotFoundError: DHTORCH_NATIVE=1 asks for what was not compiled.
+    """
+    if torch.compiler.is_compiling():
+        return False
+    if not _loaded:
+        if os.environ.get("DHTORCH_NATIVE", "") in ("", "0"):
+            return False
+        load()
+    return all(_plain(x) for x in tensors)
+
+
+def _plain(x: Tensor) -> bool:
+    if type(x) is not Tensor or torch._C._functorch.is_functorch_wrapped_tensor(x):
+        return False
+    told = x.dtype == torch.float32 or not (x.is_floating_point() or x.is_complex())
+    graph = x.requires_grad and torch.is_grad_enabled()
+    return told and not graph and x.device.type == "cpu" and x.is_contiguous() and not x.is_neg()
+
+
+def _vectors() -> tuple[str, ...]:
+    """What tells the compiler to use all that this processor has; nothing where that is another word."""
+    return ("-march=native",) if platform.machine().lower() in ("x86_64", "amd64") else ()
+
+
+def _compiler() -> list[str]:
+    own = shlex.split(os.environ.get("CXX", ""))
+    found = own or [name for name in ("c++", "g++", "clang++") if shutil.which(name)][:1]
+    if not found or shutil.which(found[0]) is None:
+        raise OSError(f"{' '.join(own) or 'c++, g++, clang++'}: no such C++ compiler; CXX names another")
+    return found
+
+
+def main() -> int:
+    """Compile, and say where the file is; exit code 2 where that cannot be done."""
+    if sys.argv[1:]:
+        print(
+            __doc__ if {"-h", "--help"} & set(sys.argv[1:]) else f"found {sys.argv[1]!r}, expected nothing: {COMMAND}"
+        )
+        return 0 if {"-h", "--help"} & set(sys.argv[1:]) else 2
+    try:
+        print(build())
+    except OSError as error:
+        print(f"dhtorch.native: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

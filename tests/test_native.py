@@ -1,0 +1,165 @@
+"""Compiled code answers as torch does, bit for bit; nothing is compiled, loaded or used that nobody asked for."""
+
+import shutil
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from dhtorch import native
+from dhtorch.geometry import se3, sweep
+from dhtorch.geometry.camera import Camera
+from dhtorch.geometry.filters import gaussian
+
+COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
+needs_compiler = pytest.mark.skipif(COMPILER is None or sys.platform == "win32", reason="no C++ compiler here")
+
+
+@pytest.fixture(autouse=True)
+def unused(monkeypatch):
+    """Every test begins and ends without compiled code."""
+    monkeypatch.delenv("DHTORCH_NATIVE", raising=False)
+    monkeypatch.setattr(native, "_loaded", [])
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    """A folder with the compiled file."""
+    folder = tmp_path_factory.mktemp("cache")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DHTORCH_CACHE", str(folder))
+        native.build()
+    return folder
+
+
+@pytest.fixture
+def loaded(cache, monkeypatch):
+    monkeypatch.setenv("DHTORCH_CACHE", str(cache))
+    native.load()
+
+
+def volume(*shape, most, seed=0):
+    return torch.randint(0, most, shape, generator=torch.Generator().manual_seed(seed), dtype=torch.uint8)
+
+
+def both_ways(call, monkeypatch):
+    """What compiled code answers, and torch."""
+    assert native._loaded
+    found = call()
+    with monkeypatch.context() as patch:
+        patch.setattr(native, "_loaded", [])
+        return found, call()
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("shape", "views", "most"),
+    [((2, 7, 5, 48), (1, 3), 31), ((1, 1, 9, 3), (8,), 249), ((1, 6, 1, 4), (2,), 2), ((3, 5, 4, 130), (1, 2, 8), 255)],
+)
+def test_surfaces_winners_and_rivals_are_equal(loaded, monkeypatch, shape, views, most):
+    C, views = volume(*shape, most=most), torch.tensor(views)
+    S, expected = both_ways(lambda: sweep.aggregate(C, views), monkeypatch)
+    assert torch.equal(S, expected) and S.dtype == expected.dtype
+    (found, expected) = both_ways(lambda: sweep.winner(S), monkeypatch)
+    for a, b in zip(found, expected, strict=True):
+        assert torch.equal(a, b) and a.dtype == b.dtype
+    for reach in (0.0, 2.0, 1e4):
+        far = torch.full((len(C),), reach)
+        a, b = both_ways(lambda far=far: sweep.rivals(S, found, far), monkeypatch)
+        assert torch.equal(a, b)
+
+
+@needs_compiler
+def test_costs_are_equal_also_where_a_place_lies_behind_the_other_view(loaded, monkeypatch):
+    """One pair sideways and turned, one straight ahead through what it sees; a view that only one of them wants."""
+    pictures = gaussian(torch.rand(2, 2, 30, 41, generator=torch.Generator().manual_seed(0)), 1.0)
+    camera = Camera(torch.tensor([[40.0, 41.0], [35.0, 35.0]]), torch.tensor([[19.5, 14.0], [21.0, 15.5]]))
+    motion = torch.tensor([[0.02, -0.1, 0.2, -0.3, 0.1, 0.05], [0.0, 0.0, 0.0, 0.1, 0.0, -1.4]])
+    base = sweep.base(pictures[:, :1], camera)
+    view = sweep.View(pictures[:, 1:], camera, se3.exp(motion))
+    q = torch.linspace(0, 1, 37).square() * torch.tensor([[1.0], [0.9]])
+
+    def costs():
+        C = torch.zeros(2, *base.hw, 37, dtype=torch.uint8).movedim(-1, 1)
+        for wanted in ([True, False], [True, True]):
+            sweep.add_costs(C, base, view, q, torch.tensor(wanted))
+        return C
+
+    assert bool((sweep.travel(base, view).c * q < -1).any()), "behind the other view"
+    found, expected = both_ways(costs, monkeypatch)
+    assert torch.equal(found, expected) and len(found.unique()) > 20
+
+
+@needs_compiler
+@pytest.mark.parametrize("turning", [False, True])
+def test_places_codes_and_smooth_maps_are_equal(loaded, monkeypatch, turning):
+    g = torch.Generator().manual_seed(1)
+    picture = torch.rand(2, 1, 6, 21, generator=g).mul(9).round() / 9  # equal neighbours are not darker
+    assert torch.equal(*both_ways(lambda: sweep.census(picture), monkeypatch))
+    ray = torch.rand(2, 500, 3, generator=g) - 0.5
+    camera = Camera(torch.tensor([[40.0, 41.0], [35.0, 35.0]]), torch.tensor([[19.5, 14.0], [21.0, 15.5]]))
+    motion = se3.exp(0.5 * torch.randn(2, 6, generator=g))
+    view = sweep.View(
+        torch.zeros(2, 1, 4, 4), camera, motion, 0.1 * torch.randn(2, 3, generator=g) if turning else None
+    )
+    found, expected = both_ways(
+        lambda: sweep.seen_at(view, ray, torch.rand(2, 500, generator=g.manual_seed(2))), monkeypatch
+    )
+    assert torch.equal(found[0], expected[0]) and torch.equal(found[1], expected[1]) and not bool(found[1].all())
+    for shape in ((2, 30, 17), (2, 3, 5), (2, 1, 1)):
+        q = torch.rand(*shape, generator=g)
+        smooth = both_ways(lambda q=q: sweep.smooth(q, torch.tensor([0.2, 0.5])), monkeypatch)
+        assert torch.equal(*smooth)
+
+
+@needs_compiler
+def test_what_compiled_code_cannot_do_is_left_to_torch(loaded, monkeypatch):
+    x = torch.zeros(2, 3, 4, 5)
+    assert native.serves(x, x.to(torch.uint8))
+    assert not native.serves(x.double()) and not native.serves(x.half()) and not native.serves(x.mT)
+    assert not native.serves(x.to("meta")) and not native.serves(torch.nn.Parameter(x))
+    with torch.no_grad():
+        assert not native.serves(torch.nn.Parameter(x)), "no plain tensor"
+        assert native.serves(x.clone().requires_grad_())
+    told = []
+    torch.vmap(lambda y: (told.append(native.serves(y)), y)[1])(x)
+    assert told == [False]
+    C = volume(2, 4, 5, 6, most=31)
+    assert torch.equal(sweep.aggregate(C.int()), sweep.aggregate(C)), "other whole numbers"
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
+    assert not native.serves(x)
+
+
+@needs_compiler
+def test_the_environment_asks_for_it(cache, monkeypatch):
+    monkeypatch.setenv("DHTORCH_CACHE", str(cache))
+    assert not native.serves(torch.zeros(1))
+    monkeypatch.setenv("DHTORCH_NATIVE", "0")
+    assert not native.serves(torch.zeros(1)) and not native._loaded
+    monkeypatch.setenv("DHTORCH_NATIVE", "1")
+    assert native.serves(torch.zeros(1)) and native._loaded == [native.library()]
+    assert list(cache.iterdir()) == [native.library()], "nothing unfinished stays"
+    monkeypatch.setattr(native, "processor", lambda: "another one")
+    assert not native.library().exists()
+
+
+def test_nothing_is_compiled_silently(tmp_path, monkeypatch):
+    monkeypatch.setenv("DHTORCH_CACHE", str(tmp_path / "none"))
+    monkeypatch.setenv("DHTORCH_NATIVE", "1")
+    with pytest.raises(FileNotFoundError, match=f"not compiled .*; {native.COMMAND} does it"):
+        sweep.aggregate(volume(1, 2, 2, 3, most=31))
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_compiler_that_is_missing_or_fails_is_told(tmp_path, monkeypatch):
+    monkeypatch.setenv("DHTORCH_CACHE", str(tmp_path))
+    monkeypatch.setenv("CXX", "no-such-compiler-7")
+    asked = [sys.executable, "-m", "dhtorch.native"]
+    said = subprocess.run(asked, capture_output=True, text=True, check=False)
+    assert said.returncode == 2 and "no-such-compiler-7: no such C++ compiler" in said.stderr
+    if shutil.which("false"):
+        monkeypatch.setenv("CXX", "false --kind")
+        with pytest.raises(OSError, match=r"false --kind .*exit code 1"):
+            native.build()
+        assert not list(tmp_path.iterdir())
