@@ -9,7 +9,7 @@ matplotlib is imported when something is drawn.
 from __future__ import annotations
 
 from dhtorch.drawing.axis import Axis, spanning
-from dhtorch.drawing.canvas import Canvas, Key, Mark, save
+from dhtorch.drawing.canvas import Canvas, Key, Mark, headed, save
 from dhtorch.drawing.colours import Stroke, series
 from dhtorch.drawing.maps import draw_completed
 from dhtorch.drawing.panel import Panel
@@ -33,6 +33,7 @@ __all__ = [
     "draw_risk_coverage",
     "draw_samples",
     "draw_verdict",
+    "headed",
     "inline",
     "save",
     "series",

@@ -124,7 +124,7 @@ def make(scene: Scene, method: Method, pairs: Pairs, settings: Mapping[str, Any]
     *_, last = points.values()
     surface = integrate.mesh(volume, min_weight=settings["min_weight"]) if meshed(settings["mesh"]) else last
     row: Row = {"scene": recording.name, "pair": None, "method": _name(settings), "truth": settings["poses"]}
-    row |= {"role": scene.role, "n_pairs": len(chosen), "n_frames": len(places.poses)}
+    row |= {"role": scene.role, "cutoff_m": settings["cutoff"], "n_pairs": len(chosen), "n_frames": len(places.poses)}
     row |= {"n_fragments": places.n_fragments, "n_unplaced": places.n_unplaced, "n_recovered": _n_recovered(answers)}
     row |= {} if sweep is None else {"n_swept": sum(a.swept.n for a in answers if a.swept is not None)}
     row |= _covered(points, settings["voxel"])
@@ -202,7 +202,9 @@ def write(folder: Path, scene: MappedScene, settings: Mapping[str, Any]) -> list
     columns = {k: cloud[k] for k in ("sigma", "score", "hole", "source")}
     export.write_ply(folder / "points.ply", cloud["xyz"], cloud["rgb"], comments=said, **columns)
     _write_colmap(folder / "colmap", scene)
-    draw_map(folder / "map.png", surface, list(scene.places.poses.values()), up, voxel=voxel)
+    cutoff = scene.row["cutoff_m"]
+    title = scene.recording.name + ("" if cutoff is None else f", cutoff {cutoff:g} m")
+    draw_map(folder / "map.png", surface, list(scene.places.poses.values()), up, voxel=voxel, title=title)
     files = ["map.ply", "map.glb", "points.ply", "map.png"]
     files += [f"colmap/{name}" for name in ("cameras.txt", "images.txt", "points3D.txt")]
     return [folder / name for name in files]

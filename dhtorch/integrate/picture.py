@@ -10,13 +10,16 @@ import torch
 from torch import Tensor
 
 from dhtorch.codes import Source, names, words
-from dhtorch.drawing import Canvas, Key, Stroke, colours, save
+from dhtorch.drawing import Canvas, Key, Stroke, colours, headed, save
 from dhtorch.drawing.colours import INK, of_source
 from dhtorch.geometry import se3
 from dhtorch.geometry.camera import project
 from dhtorch.integrate.surface import Surface
 from dhtorch.integrate.volume import SOURCES, splat
 from dhtorch.records import Camera, Pose
+
+#: Lengths that a scale bar may have, m.
+LENGTHS = tuple(m * 10.0**e for e in range(-3, 4) for m in (1, 2, 5))
 
 
 def draw_map(
@@ -26,9 +29,13 @@ def draw_map(
     up: Sequence[float],  # in the world
     *,
     voxel: float,
+    title: str = "",
     hw: tuple[int, int] = (600, 800),
 ) -> None:
-    """Draw a map from outside, walls that face away left out: in its own colours, and by where it comes from."""
+    """Draw a map from outside, walls that face away left out: in its own colours, and by where it comes from.
+
+    The bar is a length at the distance of the map's middle, in front of which things look larger and behind smaller.
+    """
     T = _viewpoint(surface, cameras, up)
     light = se3.rotate(T.R.mT, surface.normal[None].double())[0] @ torch.tensor([0.3, -0.5, -0.8]).double()
     shade = 0.35 + 0.65 * light.abs().nan_to_num(0.5).clamp(0, 1)[:, None]
@@ -47,9 +54,10 @@ def draw_map(
     counts = {code: int((surface.source == code).sum()) for code in SOURCES}
     shown = {code: n for code, n in counts.items() if n or code != Source.SWEPT}
     *first, last = (words(names(Source)[code]) for code in shown)
-    title = f"{', '.join(first)} and {last}".capitalize()
-    pictures = {f"Map of {len(cameras)} views": picture[..., :3], title: picture[..., 3:]}
-    _side_by_side(path, pictures, dots, shown)
+    sources = f"{', '.join(first)} and {last}".capitalize()
+    pictures = {headed(f"Map of {len(cameras)} views", title): picture[..., :3], sources: picture[..., 3:]}
+    metre = float(lens.f[0, 0] / depth[depth > 0].median()) if bool((depth > 0).any()) else None
+    _side_by_side(path, pictures, dots, shown, metre)
 
 
 def _side_by_side(
@@ -57,8 +65,9 @@ def _side_by_side(
     pictures: Mapping[str, np.ndarray],  # title → (H, W, 3) in [0, 1]
     way: np.ndarray,  # (V, 2) px: where the cameras were
     counts: Mapping[int, int],  # codes.Source → points
+    metre: float | None,  # px
 ) -> None:
-    """Draw pictures of one size with the cameras' way on each, and a legend of the sources."""
+    """Draw pictures of one size with the cameras' way and a length on each, and a legend of the sources."""
     width, gap = 346.0, 10.0
     H, W = next(iter(pictures.values())).shape[:2]
     scale = width / W
@@ -72,8 +81,18 @@ def _side_by_side(
         inside = [(u, v) for u, v in places if left <= u <= left + width and 0 <= v <= height]
         canvas.lines([inside] if inside else [], Stroke(INK, 0.8))
         canvas.dots(inside, Stroke(INK, 1.5))
+        if metre is not None:
+            _scale_bar(canvas, left, width, metre * scale)
     keys = [Key(f"{words(names(Source)[code])}  {n}", colours.SOURCES[code], "box") for code, n in counts.items()]
     save(canvas.finished(keys), path)
+
+
+def _scale_bar(canvas: Canvas, left: float, width: float, metre: float) -> None:
+    """A round length, at most a fifth of the picture, in its lower left corner; ``metre`` in points."""
+    length = max((x for x in LENGTHS if x * metre <= width / 5), default=LENGTHS[0])
+    start, end, tick = left + 6, left + 6 + length * metre, 2.5
+    canvas.lines([((start, 6), (end, 6)), *(((x, 6 - tick), (x, 6 + tick)) for x in (start, end))], Stroke(INK, 1.2))
+    canvas.text(f"{length:g} m", start, 11)
 
 
 def _viewpoint(surface: Surface, cameras: Sequence[Pose], up: Sequence[float]) -> Pose:
