@@ -1,4 +1,4 @@
-"""What asks for no graph is worked out without the book-keeping for one: a tenth to a fifth of the time of small rows.
+"""What asks for no graph is worked out without the book-keeping for one, which every small operation pays for.
 
 ``torch.no_grad`` still counts versions and walks the dispatcher's autograd layer at every operation;
 ``torch.inference_mode`` does neither, but its tensors may enter no graph ever after. So they stay inside, and what

@@ -24,7 +24,6 @@ from torch import Tensor
 
 from dhtorch.geometry import small as closed
 from dhtorch.geometry.filters import grey
-from dhtorch.geometry.graphless import spared
 from dhtorch.geometry.shapes import check, is_static
 from dhtorch.tree import Record, record
 
@@ -124,7 +123,7 @@ def coarse_flow(
         rivals = torch.stack([plain, found], 1) if some else plain[:, None]
     else:
         rivals = linear.to(a)[:, None] / larger
-    centre, offset, fit, total = spared(_match, a, b, rivals, reach, window=WINDOW, step=STEP)
+    centre, offset, fit, total = _match(a, b, rivals, reach, WINDOW, STEP)
     first = torch.arange(rivals.shape[1], device=a.device) == 0
     pick = torch.arange(len(a), device=a.device), torch.where(first, total + BETTER, total).argmax(1)
     offset, fit, linear = offset[pick], fit[pick], rivals[pick]

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from dhtorch.codes import Flag, Hole
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry.graphless import spared
 from dhtorch.geometry.lookup import fits, luma, nearest_index, patches, pixels, summarise
 from dhtorch.geometry.shapes import check
 from dhtorch.records import Frame, Samples
@@ -74,11 +73,11 @@ def backproject(
     if uv.dim() == 2:
         uv = uv.expand(sizes["B"], *uv.shape)
     check("backproject", uv=(uv, "B N 2"), f=(frame.camera.f, "B 2"))
-    depth, level, edge = spared(_read_depth, frame, uv, search_px or 0, edge_rel)
+    depth, level, edge = _read_depth(frame, uv, search_px or 0, edge_rel)
     if search_px is None and frame.sparse is not None:
         found = zip(_read_depth(frame, uv, SPARSE_SEARCH_PX, edge_rel), (depth, level, edge), strict=True)
         depth, level, edge = (torch.where(frame.sparse[:, None], a, b) for a, b in found)
-    border, dim, white, shine = spared(_appearance, frame.image, uv, dark, saturated, highlight)
+    border, dim, white, shine = _appearance(frame.image, uv, dark, saturated, highlight)
     returned = depth > 0
     beyond = torch.zeros_like(returned) if near_limit is None else depth > near_limit
     unsure = returned & (level < min_conf)

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from dhtorch.codes import ROUTE_OF_HOLE, Flag, Hole, first_reason
-from dhtorch.geometry.graphless import spared
 from dhtorch.geometry.lookup import pixels, summarise
 from dhtorch.geometry.shapes import check
 from dhtorch.geometry.small import eigenvalues
@@ -47,7 +46,7 @@ def classify(
     Source: paper, "Hole taxonomy"; J. Shi, C. Tomasi, "Good features to track", 1994.
     """
     check("classify", image=(frame.image, "B C H W"), uv=(samples.uv, "B N 2"), flag=(samples.flag, "B N"))
-    trackability = spared(min_eigenvalue, frame.image, samples.uv, block=block)
+    trackability = min_eigenvalue(frame.image, samples.uv, block=block)
     hole = first_reason(
         (samples.usable, Hole.NONE),
         ((samples.flag & Flag.BORDER).bool(), Hole.AT_BORDER),
