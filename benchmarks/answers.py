@@ -27,8 +27,8 @@ def main() -> None:
     torch.set_num_threads(1)
     found = {}
     for name, near, gap in SCENES:
-        recording = data.open(Path(os.environ["DHTORCH_DATA"]) / name, near=near, gap=gap)
-        pairs = by_gap(recording)
+        recording = data.open(Path(os.environ["DHTORCH_DATA"]) / name)
+        pairs = by_gap(recording, gap)
         for i, j in pairs[:: max(len(pairs) // PAIRS, 1)][:PAIRS]:
             anchor, other = (holdout.range_split(recording[k], near) for k in (i, j))
             for method, ask in (("paper", PAPER), ("map", MAP)):

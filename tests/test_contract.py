@@ -492,6 +492,7 @@ ROWS = [
 #: tested where they are at home (test_front_end.py, test_pose.py, test_evaluate.py, test_integrate.py).
 ELSEWHERE = {
     "dhtorch.stages.given.from_frames",
+    "dhtorch.geometry.graphless.spared",
     *(f"dhtorch.stages.sample.{name}" for name in ("spiral", "vogel", "grid")),
     *(f"dhtorch.geometry.shapes.{name}" for name in ("check", "is_static", "is_transformed")),
     *(f"dhtorch.geometry.reference.{name}" for name in ("patch", "nearest", "luma", "offsets", "levels")),

@@ -25,6 +25,7 @@ from torch import Tensor
 
 from dhtorch.geometry import small
 from dhtorch.geometry.exact import CHUNK
+from dhtorch.geometry.graphless import spared
 from dhtorch.geometry.least_squares import MIN_PIVOT, solve_spd
 from dhtorch.geometry.lookup import QUANTISATION, round_half_up
 from dhtorch.geometry.lucas_kanade import for_some
@@ -144,7 +145,8 @@ def register(
         begin = _still(there)
         if linear is not None:
             begin = linear.to(there).permute(2, 1, 0).repeat_interleave(N, -1)
-        answer = for_some(usable, partial(_register, views), _nothing(there), (here, there, begin, batch))
+        register = partial(_register, views)
+        answer = spared(for_some, usable, register, _nothing(there), (here, there, begin, batch))
 
     def grid(y: Tensor) -> Tensor:  # (..., M) -> (B, N, ...)
         y = y.unflatten(-1, (B, N)).movedim((-2, -1), (0, 1))

@@ -14,6 +14,7 @@ from dhtorch.codes import PoseCode, first_reason
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import covariance, near_far, ransac, se3
 from dhtorch.geometry.exact import PRODUCT_LANES, SUM_LANES, filled
+from dhtorch.geometry.graphless import spared
 from dhtorch.geometry.least_squares import (
     MIN_DEPTH,
     Normal,
@@ -141,7 +142,7 @@ def pnp_ransac(
         kernel_px=kernel_px,
     )
     inputs = (samples.xyz, tracks.uv_1, tracks.valid, cam.ideal(camera_1), draws.to(samples.xyz))
-    return in_pieces(partial(_fit, options), PAIRS, *inputs)
+    return in_pieces(partial(spared, _fit, options), PAIRS, *inputs)
 
 
 @dataclass(frozen=True)
@@ -372,8 +373,8 @@ def map_pose(
         near_steps=near_steps,
         steps=steps,
     )
-    problem = _near_far(samples, tracks, camera_0, camera_1, isotropic)
-    return in_pieces(partial(_fit_all, options, threshold_px), MAP_PAIRS, first, problem, tracks)
+    problem = spared(_near_far, samples, tracks, camera_0, camera_1, isotropic)
+    return in_pieces(partial(spared, _fit_all, options, threshold_px), MAP_PAIRS, first, problem, tracks)
 
 
 def _fit_all(o: FitOptions, threshold_px: float, first: PoseFit, problem: Problem, tracks: Tracks) -> PoseFit:

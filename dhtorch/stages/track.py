@@ -17,6 +17,7 @@ from torch import Tensor
 from dhtorch.geometry import affine
 from dhtorch.geometry import lucas_kanade as lk
 from dhtorch.geometry.exact import filled
+from dhtorch.geometry.graphless import spared
 from dhtorch.geometry.pyramid import Pyramid, Pyramids, build_pyramid
 from dhtorch.geometry.shapes import check, is_static
 from dhtorch.geometry.small import product
@@ -114,7 +115,8 @@ def lucas_kanade(
         flows = coarse(image_0, image_1, hint, start)
         view = None if flows is None else _Upright(image_1, flows)
         target = build_pyramid(image_1 if view is None else view.image, levels, window)
-        tracks = _there_and_back(
+        tracks = spared(
+            _there_and_back,
             source,
             target,
             uv_0.detach(),
