@@ -60,7 +60,7 @@ def stated(
     if isinstance(value, str):
         return Stated(feature=value)
     if isinstance(value, int | float) and name != "K":
-        numbers = wide(float(value), hw, root, name)
+        numbers = wide(value, hw, root, name)
         report = f"{GUESSED} from a field of view of {value:g}° (data.{name}): depth and sigma hold as far as it does"
         warnings.warn(f"{root.resolve().name}: {report}", stacklevel=2)
         return Stated(numbers, report=(report,))

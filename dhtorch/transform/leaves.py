@@ -84,6 +84,8 @@ def check_sample(sample: Any, image: str, intrinsics: Numbers, batched: bool | N
     except SampleError:
         return  # said where it is read
     n = len(images) if getattr(images, "ndim", 0) == 4 else 1
+    if tuple(getattr(sample.get(f"{image}_is_pad"), "shape", ())) == (n,):
+        return  # LeRobot's delta_timestamps: time
     keys: tuple[Any, ...] = () if n < 2 else (intrinsics, *_COUNTED, *sample)
     for key in keys:
         value = sample.get(key) if isinstance(key, str) else None
