@@ -157,10 +157,15 @@ def leave_the_pipe() -> None:
 
 @contextlib.contextmanager
 def hushed() -> Iterator[None]:
-    """:func:`hush`, for as long as a call of the command takes."""
+    """:func:`hush`, for as long as a call of the command takes; what is heard is one line, as errors are."""
+    usual = warnings.formatwarning
     with warnings.catch_warnings():
         hush()
-        yield
+        warnings.formatwarning = lambda message, *where, **more: f"dhtorch: warning: {message}\n"
+        try:
+            yield
+        finally:
+            warnings.formatwarning = usual
 
 
 def hush() -> None:

@@ -184,6 +184,18 @@ def test_a_frame_hidden_by_an_edit_list_is_there_for_who_asks(tmp_path: Path, co
     assert got == list(range(N))
 
 
+@pytest.mark.parametrize("hidden", [False, True])
+def test_a_decoder_that_shows_no_index_counts_the_same(tmp_path: Path, hidden: bool, monkeypatch) -> None:
+    """PyAV before 17."""
+    file = film(tmp_path / "a.mp4", hide_first=hidden)
+    said = [codec_video.video_header(file, all_frames=every) for every in (False, True)]
+    codec_video.close_videos()
+    monkeypatch.setattr(codec_video, "_index", lambda stream: ())
+    assert [codec_video.video_header(file, all_frames=every) for every in (False, True)] == said
+    assert [header.n for header in said] == [N - hidden, N]
+    codec_video.close_videos()
+
+
 def test_a_damaged_frame_never_shifts_the_others(tmp_path: Path) -> None:
     file = film(tmp_path / "a.mp4", key_every=10, b_frames=0)
     with av.open(str(file)) as container:

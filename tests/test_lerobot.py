@@ -225,7 +225,7 @@ def edit(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
 def test_K_must_come_from_somewhere(tmp_path: Path) -> None:
     write_lerobot(tmp_path, episodes(), intrinsics=None)
     with pytest.raises(
-        FormatError, match=r"meta/intrinsics.json: observation.images.front: .*option K, a feature such"
+        FormatError, match=r"observation.images.front: found no intrinsics, expected data.fov=69 .*meta/intrinsics.json"
     ):
         data.open(tmp_path, episode=0)
     camera = data.open(tmp_path, episode=0, K=[61.5, 58.25, 33.5, 21.75], distortion=[0.1, 0, 0, 0])[0].camera
@@ -238,6 +238,37 @@ def test_K_must_come_from_somewhere(tmp_path: Path) -> None:
     assert data.open(tmp_path, episode=0, K_depth=[71, 66, 31, 23])[0].depth_camera.f.tolist() == [[71, 66]]
     with pytest.raises(FormatError, match=r"option intrinsics: found x, expected one of"):
         data.open(tmp_path, episode=0, intrinsics="x")
+    with pytest.raises(FormatError, match=r"options: found data.K and data.fov, expected one of them"):
+        data.open(tmp_path, episode=0, K=[1, 1, 1, 1], fov=60)
+
+
+def test_one_option_says_K_in_three_ways(tmp_path: Path) -> None:
+    write_lerobot(tmp_path, episodes(), intrinsics=None)
+    four = data.open(tmp_path, episode=0, intrinsics=[61.5, 58.25, 33.5, 21.75])
+    assert torch.equal(four[0].camera.f, CAMERA.f) and not any("guess" in line for line in four.report)
+    with pytest.warns(UserWarning, match="are a guess"):
+        wide = data.open(tmp_path, episode=0, intrinsics=90)
+    assert float(wide[0].camera.f[0, 0]) == pytest.approx(HW[1] / 2) and any("guess" in line for line in wide.report)
+    for bad in (0, 179, True):
+        with pytest.raises(FormatError, match="1 to 179 degrees"):
+            data.open(tmp_path, episode=0, fov=bad)
+
+
+def test_two_cameras_by_name_are_told_apart(tmp_path: Path) -> None:
+    write_lerobot(tmp_path, [episodes()[0]], version=2)
+    info = tmp_path / "meta" / "info.json"
+    said = json.loads(info.read_text())
+    for ending in ("", ".intrinsics"):
+        if KEY + ending in said["features"]:
+            said["features"]["observation.images.left" + ending] = said["features"][KEY + ending]
+    info.write_text(json.dumps(said))
+    (film,) = (tmp_path / "videos").rglob(f"*{KEY}/*.mp4")
+    copy = film.parent.parent / "observation.images.left" / film.name
+    copy.parent.mkdir()
+    copy.write_bytes(film.read_bytes())
+    both = data.open_all(tmp_path, camera=["observation.images.left", KEY], K=[60, 60, 30, 20])
+    assert [r.name.rpartition("/")[2] for r in both] == ["left", "front"]
+    assert torch.equal(both[0][0].image, both[1][0].image)
 
 
 def test_K_may_change_from_frame_to_frame(tmp_path: Path) -> None:

@@ -18,8 +18,8 @@ from dhtorch.codes import Gate, PoseCode
 from dhtorch.commands import inspect
 from dhtorch.data import rlds
 from dhtorch.data.codecs import tfrecord
-from dhtorch.data.convert import NoIntrinsics
 from dhtorch.data.files import FormatError
+from dhtorch.data.intrinsics import NoIntrinsics
 from dhtorch.methods import METHODS
 from dhtorch.records import Frame
 from dhtorch.synthetic import SyntheticRoom
@@ -81,7 +81,7 @@ def test_options(tmp_path: Path) -> None:
     assert torch.allclose(mm[0].depth * 1000, wide[0].depth, atol=1e-4)
     again = pickle.loads(pickle.dumps(one))
     assert torch.equal(again[1].image, one[1].image)
-    with pytest.raises(NoIntrinsics, match="option K, fov, or a feature"):
+    with pytest.raises(NoIntrinsics, match=r"data\.fov=69"):
         data.open(tmp_path, episode=0)
     for options, said in (
         ({"episode": 3}, "found 3, expected 0 to 2 in train"),
@@ -91,7 +91,7 @@ def test_options(tmp_path: Path) -> None:
         ({"intrinsics": "K"}, "option intrinsics"),
         ({"depth_unit": "inch"}, "expected m or mm"),
         ({"rate_hz": 0}, "option rate_hz"),
-        ({"fov": 90.0, "K": [1, 1, 1, 1]}, "K as well"),
+        ({"fov": 90.0, "K": [1, 1, 1, 1]}, "found data.K and data.fov, expected one of them"),
         ({"intrinsics": "action"}, "found 7 numbers a step, expected 4 or 9"),
         ({"fov": 90.0, "pose": "is_last"}, "expected 7 or 16"),
     ):

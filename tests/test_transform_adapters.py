@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import torch
 from sample_dicts import GAP, SIDE, Frames, Stream, frames
+from tiny_dicts import sample as tiny_sample
+from tiny_dicts import tiny
 from torch.utils.data import DataLoader, default_collate
 
 from dhtorch.codes import Source
@@ -14,6 +16,7 @@ from dhtorch.transform import (
     ExtendDepth,
     ExtendedDataset,
     ExtendedStream,
+    JudgeDepth,
     NumpyTransform,
     RldsBatchTransform,
     SampleError,
@@ -282,3 +285,50 @@ def test_torchvision_pipeline(items):
     assert sensed.sum() > 20 and torch.allclose(xyz[:, :2] / xyz[:, 2:], x, atol=1e-5)
     with pytest.raises(SampleError, match=r"principal point.*another size"):
         Compose([halve, ExtendDepth(depth_unit="mm", other_image="before", n=N)])(sample)
+
+
+# ----------------------------------------------------------------------------------------- samples and batches
+
+
+def test_a_batch_is_not_taken_for_time():
+    one, two = tiny_sample(0), tiny_sample(1)
+    batch = default_collate([{**x, "task": "lift"} for x in (one, two)])
+    for left_out in ((), ("task",), ("task", "index")):
+        shown = {k: v for k, v in batch.items() if k not in left_out}
+        if left_out == ("task", "index"):
+            shown["intrinsics"] = torch.eye(3).expand(2, 3, 3)
+        with pytest.raises(SampleError, match=r"beside 2 pictures, expected one sample; batched=True reads 2 samples"):
+            tiny()(shown)
+    whole = tiny(batched=True)(batch)
+    assert whole["dhtorch.uv"].shape[0] == 2
+    judge = JudgeDepth(depth_unit="mm", other_image="before")
+    with pytest.raises(SampleError, match="batched=True"):
+        judge(batch)
+
+
+@pytest.mark.parametrize("what", [torch.zeros(3, 8, 8), None])
+def test_a_picture_is_no_sample(what):
+    """What LeRobot's image_transforms hands over."""
+    with pytest.raises(SampleError, match=r"wrap the data set instead, ExtendedDataset\(dataset, transform\)"):
+        tiny(on_error="skip")(what)
+
+
+def test_a_loader_extends_whole_batches_and_the_bits_are_the_same(items):
+    source, options = LeRobot(items[GAP:]), {"other_image": "earlier"}
+    single = ExtendedDataset(source, wrist(items, **options), gap=1)
+    whole = ExtendedDataset(source, wrist(items, **options, batched=True), gap=1, by_batch=True)
+    a = next(iter(DataLoader(single, batch_size=2)))
+    b = next(iter(DataLoader(whole, batch_size=2, collate_fn=whole.collate)))
+    assert a.keys() == b.keys() and "earlier" not in b
+    assert all(torch.equal(a[k], b[k]) for k in a if isinstance(a[k], torch.Tensor))
+    with pytest.raises(ValueError, match="expected one for single samples, or by_batch=True"):
+        ExtendedDataset(source, whole.transform)
+    with pytest.raises(ValueError, match=r"expected ExtendDepth\(batched=True\)"):
+        ExtendedDataset(source, single.transform, by_batch=True)
+
+
+def test_the_prefix_that_lerobots_processors_keep():
+    """They keep what begins with "observation." and the action; everything else is gone behind them."""
+    out = tiny(prefix="observation.dh_")(tiny_sample())
+    kept = {k for k in out if k.startswith("observation.")}
+    assert len(kept) == len(tiny()(tiny_sample()).keys() - tiny_sample().keys()) == 17

@@ -143,7 +143,11 @@ def test_bad_tum(tmp_path: Path) -> None:
     (tmp_path / "groundtruth.txt").write_text("# freiburg1\n1 2 3\n")
     fails(r"groundtruth.txt: line 2: found 3 columns, expected 8 numbers", tmp_path)
     (tmp_path / "groundtruth.txt").unlink()
-    fails(r"camera: found an unknown one, expected freiburg1, 2 or 3 in the folder's name, option camera", tmp_path)
+    fails(r"K: found no intrinsics, expected data.fov=69 .*data.camera=1, 2 or 3 \(freiburg\)", tmp_path)
+    with pytest.warns(UserWarning, match="intrinsics are a guess from a field of view of 90°"):
+        (guess,) = data.open_all(tmp_path, fov=90)
+    assert float(guess[0].camera.f[0, 0]) == pytest.approx(guess[0].hw[1] / 2) and "are a guess" in guess.report[-1]
+    assert data.open(tmp_path, intrinsics=[40, 41, 30, 20])[0].camera.f.tolist() == [[40, 41]]
     assert data.open(tmp_path, camera=2).poses is None
     fails(r"option camera: found 4, expected 1, 2 or 3", tmp_path, camera=4)
     fails(r"option intrinsics: found default, expected camera or ros", tmp_path, intrinsics="default")

@@ -7,11 +7,13 @@ recording, a focal stack, and loose pictures that belong to no format are all sh
 from __future__ import annotations
 
 import argparse
+import contextlib
 import inspect
 import re
 import sys
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from itertools import islice
 from pathlib import Path
@@ -23,8 +25,8 @@ from torch import Tensor
 
 from dhtorch import data
 from dhtorch.console import EPILOG, markup, progress, terminal
-from dhtorch.data import FormatError, files, lerobot, rlds
-from dhtorch.data.convert import NoIntrinsics
+from dhtorch.data import FormatError, files
+from dhtorch.data import intrinsics as told
 from dhtorch.data.recording import Recording
 from dhtorch.data.survey import Survey, survey_pictures, survey_recording
 from dhtorch.drawing.colours import DEPTH, GREY, INK, OTHERS, SCORE, SILENT
@@ -33,8 +35,8 @@ from dhtorch.studies.focal.survey import survey_stacks
 
 _LEVELS = 2  # folders below the path
 _MOST = 12  # recordings that are shown of one capture
-_SIZES = {"lerobot": lerobot.picture_hw, "rlds": rlds.picture_hw}  # of formats that may lack a K
-_NO_K = "no intrinsics: nothing can be measured in it before data.K says them"
+_NO_K = "no intrinsics: nothing can be measured in it before data.K=[fx,fy,cx,cy] or data.fov=DEGREES says them"
+_STAND_IN = 60.0  # degrees, to look at what has no K
 _SPARSE = 0.1  # share of returns below which they are drawn larger
 _ARCHIVES = (".r3d", ".mp4", ".mov", ".tar", ".h5", ".hdf5")  # files that may be a whole capture
 _PICTURES = (".png", ".jpg", ".jpeg")
@@ -49,6 +51,7 @@ class Found:
     format: str
     evidence: str
     follow_links: bool = False
+    options: Mapping[str, Any] = field(default_factory=dict)  # of its reader
 
 
 def main(argv: Sequence[str]) -> int:
@@ -62,17 +65,20 @@ def main(argv: Sequence[str]) -> int:
         prog="dhtorch inspect", description="What a capture holds, and a contact sheet.", epilog=EPILOG
     )
     parser.add_argument("path", type=Path, help="a capture: a folder, up to two folders above it, or a file")
+    about = "option of the reader as data.NAME=VALUE: data.fov=69, data.K=[600,600,320,240], data.camera=[a,b]"
+    parser.add_argument("options", nargs="*", default=[], metavar="data.NAME=VALUE", help=about)
     parser.add_argument("--out", type=Path, help="folder of the contact sheet (default: outputs/<date>/<time>)")
     parser.add_argument("--format", default="auto", help="name of the format, where it is not to be recognised")
     parser.add_argument("--frames", type=int, default=8, help="frames to decode and show (default: 8)")
     parser.add_argument("--follow-links", action="store_true", help="links may lead out of a capture")
     parser.add_argument("--traceback", action="store_true", help="show where an error came from")
-    options = parser.parse_args(argv)
+    options = parser.parse_intermixed_args(argv)
     if options.frames < 1:
         raise ValueError(f"--frames: found {options.frames}, expected at least 1")
     auto = options.format == "auto"
     found = find(options.path, options.follow_links) if auto else [_named(options.path, options.format)]
-    found = [replace(capture, follow_links=options.follow_links) for capture in found]
+    reading = reader_options(options.options)
+    found = [replace(capture, follow_links=options.follow_links, options=reading) for capture in found]
     now = datetime.now()
     out = options.out or Path("outputs") / f"{now:%Y-%m-%d}" / f"{now:%H-%M-%S}"
     sheets: list[Path] = []
@@ -124,6 +130,29 @@ def surveys(capture: Found, frames: int = 8) -> Iterator[Survey]:
         yield survey
 
 
+def reader_options(said: Sequence[str]) -> dict[str, Any]:
+    """Options of a reader, of words ``data.NAME=VALUE``; a list is written a,b or [a,b].
+
+    Raises:
+        ValueError: another word.
+    """
+    options: dict[str, Any] = {}
+    for word in said:
+        name, sign, text = word.partition("=")
+        if not (sign and name.startswith("data.") and name.removeprefix("data.").isidentifier()):
+            raise ValueError(f"{word}: found a word that says nothing here, expected data.NAME=VALUE, as data.fov=69")
+        items = [_value(item.strip()) for item in text.removeprefix("[").removesuffix("]").split(",")]
+        options[name.removeprefix("data.")] = items if text.startswith("[") or len(items) > 1 else items[0]
+    return options
+
+
+def _value(text: str) -> Any:
+    for kind in (int, float):
+        with contextlib.suppress(ValueError):
+            return kind(text)
+    return {"true": True, "false": False, "null": None}.get(text, text)
+
+
 # ------------------------------------------------------------------------------------------------------------- finding
 
 
@@ -154,9 +183,10 @@ def _recognised(path: Path, follow_links: bool) -> Found | None:
 
 def _recordings(capture: Found, frames: int) -> Iterator[Survey]:
     """Each recording; without its pictures where these are missing and the reader can do so."""
-    warning, links = [], capture.follow_links
+    warning: list[str] = []
+    links = capture.follow_links
     try:
-        recordings = data.open_all(capture.path, capture.format, follow_links=links)
+        recordings = _seen(capture, warning)
     except FormatError as error:
         if "images" not in inspect.signature(data.FORMATS[capture.format].read).parameters:
             raise
@@ -164,24 +194,26 @@ def _recordings(capture: Found, frames: int) -> Iterator[Survey]:
         warning = [f"no pictures: {error}"]
     if len(recordings) > _MOST:
         warning.append(f"{len(recordings)} recordings in this capture: the first {_MOST} are shown")
-    shown = _seen(capture, recordings, warning)
-    for recording in islice(shown, _MOST):
+    for recording in islice(recordings, _MOST):
         survey = survey_recording(recording, frames, progress=progress)
         if _NO_K in warning:
             survey.facts = [(what, text) for what, text in survey.facts if what != "intrinsics"]
+            survey.warnings = [line for line in survey.warnings if told.guessed([line]) is None]
         survey.warnings.extend(warning)
         yield survey
 
 
-def _seen(capture: Found, recordings: Sequence[Recording], warning: list[str]) -> Sequence[Recording]:
+def _seen(capture: Found, warning: list[str]) -> Sequence[Recording]:
     """The recordings; where nobody says K with one that serves to look at them, and a warning."""
+    how = {"follow_links": capture.follow_links, **capture.options}
     try:
+        recordings = data.open_all(capture.path, capture.format, **how)
         _ = recordings[0]
-    except NoIntrinsics:
+    except told.NoIntrinsics:
         warning.append(_NO_K)
-        h, w = _SIZES[capture.format](capture.path)
-        stand_in = (float(w), float(w), w / 2, h / 2)
-        return data.open_all(capture.path, capture.format, follow_links=capture.follow_links, K=stand_in)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return data.open_all(capture.path, capture.format, **{**how, "fov": _STAND_IN})
     return recordings
 
 

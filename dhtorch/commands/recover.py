@@ -23,6 +23,7 @@ from dhtorch.commands import complete
 from dhtorch.commands.complete import Progress, Row, Task
 from dhtorch.commands.inspect import Found, classified, find
 from dhtorch.data import FORMATS, FormatError, files, open_all
+from dhtorch.data import intrinsics as told
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
 from dhtorch.drawing import draw_completed
@@ -74,7 +75,8 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         torch.set_num_threads(settings["threads"])
         files.set_opencv_threads(settings["threads"])
     path = Path(str(settings["path"])).expanduser()
-    found = captured(path, settings["format"])
+    reading = {name: value for name, value in settings["data"].items() if value is not None}
+    found = [replace(capture, options=reading) for capture in captured(path, settings["format"])]
     out = _place(path, settings["out"])
     recordings = [r for capture in found for r in opened(capture)]
     chosen = recordings[: settings["recordings"]]
@@ -136,7 +138,7 @@ def opened(capture: Found) -> Sequence[Recording]:
         FormatError: it cannot be read.
     """
     try:
-        return open_all(capture.path, capture.format)
+        return open_all(capture.path, capture.format, **capture.options)
     except FormatError as error:
         known = inspect.signature(FORMATS[capture.format].read).parameters
         if "images" not in known:
@@ -181,17 +183,22 @@ def _looked_at(recording: Recording) -> int:
     if len(recording) < 2:
         help = "a second view from another place is needed for what the sensor lacks"
         raise NothingToDo(f"{recording.name}: {_count(len(recording), 'frame')}; {help}")
-    causes = []
+    causes, blank = [], 0
     for k in coarse_to_fine(len(recording))[:TRIED]:
         try:
-            hw = recording[k].hw
+            frame = recording[k]
         except FormatError as error:
             causes.append(str(error))
             continue
-        if 0 in hw:
+        if 0 in frame.hw:
             what = "depth only, nothing to track: it needs its pictures (rgb.mp4, or a folder of them)"
             raise NothingToDo(f"{recording.name}: {what}")
-        return k
+        if bool((frame.depth > 0).any()):
+            return k
+        blank += 1
+    if blank:
+        what = f"{_count(len(recording), 'frame')}, of {blank} looked at none has depth"
+        raise NothingToDo(f"{recording.name}: {what}; a sensor's depth of what is near is needed, it gives the metre")
     raise NothingToDo(f"{recording.name}: no frame can be read: {causes[0]}")
 
 
@@ -211,7 +218,9 @@ def _one(
     progress: Progress,
 ) -> list[str]:
     """Everything of one recording; what to say of it."""
-    own = {**OWN, **settings, "out": str(folder), "data": {"path": str(settings["path"]), "format": recording.format}}
+    read = {"path": str(settings["path"]), "format": recording.format}
+    read |= {name: value for name, value in settings["data"].items() if value is not None}
+    own = {**OWN, **settings, "out": str(folder), "data": read}
     own["choices"] = {**settings["choices"], "data": recording.format}
     scene = Scene.of(recording)
     first = _looked_at(recording)
@@ -325,7 +334,8 @@ def _said(made: Made, rows: Sequence[Row]) -> list[str]:
     h, w = recording[made.frames[0]].hw
     kind = f"{task.scene.name}: a {recording.format} capture, {len(recording)} frames of {w}x{h}"
     share = np.mean([row["pixels"].get("sensor", 0) / sum(row["pixels"].values()) for row in rows])
-    what = f"{kind}; the sensor answers {share:.0%} of the pixels."
+    guess = told.guessed(recording.report)
+    what = f"{kind}; the sensor answers {share:.0%} of the pixels{f'; its {guess}' if guess else ''}."
     depth, ratio = _recovered(task, made.frames)
     n = sum(row["pixels"].get("swept", 0) for row in rows) / len(rows)
     if len(depth):
@@ -381,7 +391,9 @@ def _next(made: Made) -> str:
     if made.left:
         more = f"the same command does more of the {made.left} frames left (minutes=null: all)"
         return f"Next: open view.html; {more}.{broken}"
-    judged = f"dhtorch run data=auto data.root={made.task.settings['path']} holdout.cutoff={_middle(made):.2g}"
+    read = {name: value for name, value in made.task.settings["data"].items() if name in told.OPTIONS}
+    also = "".join(f" data.{name}={str(value).replace(' ', '')}" for name, value in read.items())
+    judged = f"dhtorch run data=auto data.root={made.task.settings['path']}{also} holdout.cutoff={_middle(made):.2g}"
     return f"Next: open view.html; {judged} says how good it is on yours.{broken}"
 
 

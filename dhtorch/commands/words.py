@@ -22,6 +22,9 @@ from typing import Any
 #: Options whose value is a place: whatever stands in it, it is one text.
 PLACES = ("output", "out", "html", "save", "result", "root", "data.root", "path")
 
+#: Options whose value is a list: outside a sweep it needs no brackets.
+LISTS_OF = ("data.K", "data.K_depth", "data.intrinsics", "data.camera", "data.episode", "data.distortion")
+
 #: Words that others' commands have → ours.
 USUAL = {"help": "--help", "version": "--version", "-h": "--help", "-V": "--version", "show": "view"}
 
@@ -142,6 +145,9 @@ def quoted(argv: Sequence[str], sweep: bool = False) -> list[str]:
             listed = "," in value and not value.startswith(("'", '"'))
             if key in PLACES and listed and (not sweep or key == "output" or Path(value).exists()):
                 found.append(f"{key}={quote(value)}")
+                continue
+            if key.lstrip("+") in LISTS_OF and listed and not sweep and not value.startswith(("[", "{")):
+                found.append(f"{key}=[{value}]")
                 continue
             try:
                 parser.parse_override(word)

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from dhtorch.data import arkitscenes, ca1m, driving, frames_dir, lerobot, record3d, rectified, rh20t, rlds, stray, tum
+from dhtorch.data import intrinsics as told
 from dhtorch.data.files import FormatError, inside
 from dhtorch.data.recording import Recording, Recordings
 from dhtorch.data.scene import Given, Scene, Scenes, scenes_of
@@ -69,6 +70,8 @@ FORMATS: Final[dict[str, Reader]] = {
 #: The variable that says where a collection of scenes lies.
 ROOT_VARIABLE: Final = "DHTORCH_DATA"
 
+_UNSAID = [(name, None) for name in told.OPTIONS]  # as settings that serve all formats have them
+
 _SHOWN = 4  # names of many recordings in a message
 
 
@@ -99,7 +102,8 @@ def open_all(
         root: a folder (or file) of one of the known formats.
         format: a name of ``FORMATS``, or ``"auto"`` to recognise it by its content.
         follow_links: whether symbolic links inside the capture may lead out of it.
-        options: keyword options of the reader, see ``dhtorch.data.<format>.read``.
+        options: keyword options of the reader, see ``dhtorch.data.<format>.read``. Where its captures may lack a K
+            ``intrinsics``, ``K`` and ``fov`` are among them, see :mod:`dhtorch.data.intrinsics`.
 
     Returns:
         One recording for each camera (and episode), at least one; where there may be tens of thousands each is opened
@@ -119,6 +123,7 @@ def open_all(
         raise FormatError(root, "path", "no such file or folder", f"a {format} capture")
     read = FORMATS[format].read
     known = list(inspect.signature(read).parameters)[1:]
+    options = {name: value for name, value in options.items() if name in known or (name, value) not in _UNSAID}
     for option in options:
         if option not in known:
             raise ValueError(f"data: format {format} has no option {option!r}, expected one of {', '.join(known)}")

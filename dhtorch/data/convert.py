@@ -32,10 +32,6 @@ _MAX_DISTORTION = 1e4
 _GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-class NoIntrinsics(FormatError):
-    """Nobody says K of a camera: nothing can be measured in it, though it can be looked at."""
-
-
 def to_camera(
     K: object,  # 3×3 numbers
     hw: tuple[int, int],
@@ -59,22 +55,6 @@ def to_camera(
         raise FormatError(file, f"{field} principal point", c.tolist(), f"a place near the {hw[1]}x{hw[0]} image")
     lens = None if distortion is None else _distortion(distortion, file)
     return Camera(_float32(f)[None], _float32(c)[None], None if lens is None else _float32(lens)[None])
-
-
-def wide(K: Sequence[float] | None, fov: float | None, hw: tuple[int, int], root: Path) -> Sequence[float] | None:
-    """fx, fy, cx, cy as given, or of a picture that sees ``fov`` degrees from side to side.
-
-    Raises:
-        FormatError: both, or no angle that a picture can see.
-    """
-    if fov is None:
-        return K
-    if K is not None or isinstance(fov, bool) or not isinstance(fov, int | float) or not 1 <= fov < 179:
-        found = "K as well" if K is not None else fov
-        raise FormatError(root, "option fov", found, "1 to 179 degrees from side to side, where no K is given")
-    h, w = hw
-    f = w / 2 / np.tan(np.radians(fov) / 2)
-    return float(f), float(f), (w - 1) / 2, (h - 1) / 2
 
 
 def K_of(values: Sequence[float], root: Path, field: str) -> np.ndarray:

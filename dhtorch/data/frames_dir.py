@@ -24,6 +24,7 @@ import numpy as np
 import torch
 
 from dhtorch.data import convert, files
+from dhtorch.data import intrinsics as told
 from dhtorch.data.codecs import pgm
 from dhtorch.data.files import FormatError
 from dhtorch.data.recording import Recording
@@ -51,7 +52,9 @@ def recognise(root: Path) -> str | None:
 def read(
     root: str | Path,
     *,
+    intrinsics: told.Intrinsics | None = None,
     K: Sequence[float] | None = None,
+    fov: float | None = None,
     K_depth: Sequence[float] | None = None,
     distortion: Sequence[float] | None = None,
     units_per_metre: float | None = None,
@@ -63,7 +66,9 @@ def read(
 
     Args:
         root: the folder.
+        intrinsics: four numbers as ``K``, or one as ``fov``.
         K: fx, fy, cx, cy of the colour image. None = ``meta.json``, else the intrinsics file.
+        fov: degrees from side to side of the colour image; a guessed K for where none is known.
         K_depth: the same of a depth map that is not registered to colour. None = ``meta.json``, else as colour.
         distortion: of the colour image, OpenCV's order. None = ``meta.json``, else none.
         units_per_metre: of the depth codes. None = ``meta.json``, else 1000 (millimetres).
@@ -85,9 +90,12 @@ def read(
     frames, poses, report = _frames(root)
     hw = files.image_header(frames[0].image).hw
     depth_hw = _depth_hw(frames[0].depth)
-    own = _intrinsics(root, "K", K, meta)
+    said = told.stated(root, hw, intrinsics, K, fov)
+    if said.feature is not None:
+        raise FormatError(root, "option intrinsics", said.feature, "fx fy cx cy, or degrees: there are no features")
+    own = _intrinsics(root, "K", said.K, meta)
     if own is None:
-        raise FormatError(root, "K", "neither meta.json nor an intrinsics file", "one of them, or option K")
+        raise told.missing(root, None, "a file K.txt, intrinsics.txt or meta.json")
     colour = convert.to_camera(own[0], hw, *own[1:], distortion if distortion is not None else meta.get("dist"))
     # Depth has a camera of its own only where someone says so: most sets of this layout are registered.
     of_depth = _intrinsics(root, "K_depth", K_depth, meta) if K_depth is not None or "K_depth" in meta else None
@@ -114,7 +122,7 @@ def read(
             times=None if rate is None else number.double() / rate,
             poses=poses,
             rate_hz=rate,
-            report=tuple(report),
+            report=(*report, *said.report),
         )
     ]
 

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.data import convert, files
+from dhtorch.data import intrinsics as told
 from dhtorch.data.codecs.parquet import read_cell
 from dhtorch.data.codecs.video import read_video_frame, video_times
 from dhtorch.data.files import FormatError
@@ -50,7 +51,7 @@ def read(
     fov: float | None = None,
     K_depth: Sequence[float] | None = None,
     distortion: Sequence[float] | None = None,
-    intrinsics: str | None = None,
+    intrinsics: told.Intrinsics | None = None,
     pose: str | None = None,
     depth_unit: str | None = None,
     depth_range: Sequence[float] | None = None,
@@ -65,11 +66,12 @@ def read(
         depth: key of the depth feature. None = the one named like the camera (``…front_depth``, ``…depth.front``), or
             the only one where there is one camera; without any the depth is empty and the report says so.
         K: fx, fy, cx, cy of the image. None = feature ``intrinsics``, else ``meta/intrinsics.json``.
-        fov: degrees from side to side of the image, square pixels around its centre; a K for where none is known.
+        fov: degrees from side to side of the image; a guessed K for where none is known.
         K_depth: the same of a depth map that is not registered to colour. None = the side-car's, else as colour.
         distortion: of the image, OpenCV's order. None = the side-car's, else none.
-        intrinsics: key of a feature with 4 (fx fy cx cy) or 9 numbers a frame. None = ``<camera>.intrinsics``,
-            ``observation.camera.<name>.intrinsics`` or ``observation.<name>.intrinsics`` where there is one.
+        intrinsics: key of a feature with 4 (fx fy cx cy) or 9 numbers a frame; or four numbers as ``K``, or one as
+            ``fov``. None = ``<camera>.intrinsics``, ``observation.camera.<name>.intrinsics``,
+            ``observation.<name>.intrinsics`` or ``observation.intrinsics.<name>`` where there is one.
         pose: key of a feature with the camera-to-world pose: 16 numbers (4×4 by rows) or 7 (x y z qx qy qz qw). None =
             ``<camera>.pose``, ``observation.camera.<name>.pose`` or ``observation.<name>.T_world_from_cam`` where there
             is one, else no poses.
@@ -103,10 +105,9 @@ def read(
             meta,
             key,
             depth,
-            convert.wide(K, fov, meta.features[key].hw, meta.root),
+            told.stated(meta.root, meta.features[key].hw, intrinsics, K, fov),
             K_depth,
             distortion,
-            intrinsics,
             pose,
             depth_unit,
             span,
@@ -117,16 +118,6 @@ def read(
     columns = sorted({c for rig in rigs for c in (rig.K_key, rig.pose_key) if c})
     names = [rig.name(number) for number in episodes.numbers for rig in rigs]
     return Recordings(names, _Make(episodes, tuple(rigs), tuple(columns)))
-
-
-def picture_hw(root: Path) -> tuple[int, int]:
-    """Height and width of the first camera's pictures, which needs no K.
-
-    Raises:
-        FormatError: damaged metadata.
-    """
-    meta = read_meta(root)
-    return meta.features[_filmed(colour_keys(meta), read_episodes(meta, None))[0]].hw
 
 
 def _filmed(keys: list[str], episodes: Episodes) -> list[str]:
@@ -228,10 +219,9 @@ class _Rig:
     meta: Meta
     key: str
     depth_key: str | None
-    K: Sequence[float] | None
+    stated: told.Stated
     K_depth: Sequence[float] | None
     distortion: Sequence[float] | None
-    intrinsics: str | None
     pose: str | None
     unit: str | None
     span: tuple[float, float]
@@ -244,7 +234,7 @@ class _Rig:
     @property
     def K_key(self) -> str | None:
         """The feature that holds K, if that is where it comes from."""
-        return None if self.K is not None else self._column(self.intrinsics, "intrinsics")
+        return None if self.stated.K is not None else self._column(self.stated.feature, "intrinsics")
 
     @property
     def pose_key(self) -> str | None:
@@ -258,7 +248,8 @@ class _Rig:
                 raise FormatError(self.meta.root, f"option {what}", option, f"one of {', '.join(self.meta.features)}")
             return option
         camera = self.key.split(".")[-1]
-        names = (f"{self.key}.{what}", f"observation.camera.{camera}.{what}", f"observation.{camera}.{what}")
+        above = f"observation.camera.{camera}", f"observation.{camera}"
+        names = (f"{self.key}.{what}", *(f"{name}.{what}" for name in above), f"observation.{what}.{camera}")
         return next((name for name in names if name in self.meta.features), None)
 
     def name(self, episode: int) -> str:
@@ -268,6 +259,7 @@ class _Rig:
     def recording(self, episode: Episode, table: dict[str, np.ndarray]) -> Recording:
         meta, image = self.meta, self.image
         rows, numbers, times, report = episode_rows(meta, episode, table)
+        report += self.stated.report
         depth = depth_of(meta, self.key, self.depth_key)
         if depth is None:
             report.append(f"{self.key}: no depth feature: depth is empty")
@@ -316,13 +308,13 @@ class _Rig:
         if depth is not None and (self.K_depth is not None or entry.get("K_depth") is not None):
             value = convert.K_of(self.K_depth, root, "option K_depth") if self.K_depth is not None else entry["K_depth"]
             of_depth = convert.to_camera(value, depth.hw, side, "K_depth")
-        if self.K is not None:
-            return convert.to_camera(convert.K_of(self.K, root, "option K"), hw, root, "option K", lens), of_depth
+        if self.stated.K is not None:
+            K = convert.matrix_of(*self.stated.K)
+            return convert.to_camera(K, hw, root, "option K", lens), of_depth
         if self.K_key is not None:
             values = table[self.K_key][rows]
             return convert.to_cameras(values, hw, root / "data", self.K_key, lens), of_depth
         if "K" not in entry:
-            found = "no K in option, feature or side-car"
-            expected = f"option K, a feature such as {self.key}.intrinsics (option intrinsics), or meta/intrinsics.json"
-            raise convert.NoIntrinsics(side, self.key, found, expected)
+            others = "data.intrinsics=FEATURE", "meta/intrinsics.json"
+            raise told.missing(root, self.key, *others, depth=depth is not None)
         return convert.to_camera(entry["K"], hw, side, f"{self.key} K", lens), of_depth

@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.data import convert, files
+from dhtorch.data import intrinsics as told
 from dhtorch.data.codecs import tfrecord
 from dhtorch.data.files import FormatError
 from dhtorch.data.recording import Recording, Recordings, numbers
@@ -52,7 +53,7 @@ def read(
     fov: float | None = None,
     K_depth: Sequence[float] | None = None,
     distortion: Sequence[float] | None = None,
-    intrinsics: str | None = None,
+    intrinsics: told.Intrinsics | None = None,
     pose: str | None = None,
     depth_unit: str | None = None,
     rate_hz: float | None = None,
@@ -67,10 +68,11 @@ def read(
         depth: feature with depth: pictures of 16 bits, or an array. None = the one named like the camera with
             ``depth`` in the place of ``image`` or ``rgb``; without any, depth is empty and the report says so.
         K: fx, fy, cx, cy of the picture. None = as ``intrinsics`` says.
-        fov: degrees from side to side of the picture, square pixels around its centre; a K for where none is known.
+        fov: degrees from side to side of the picture; a guessed K for where none is known.
         K_depth: the same as K of a depth map that is not registered to colour.
         distortion: of the picture, OpenCV's order.
-        intrinsics: feature with 4 (fx fy cx cy) or 9 numbers a step. None = ``<camera>_intrinsics`` where there is one.
+        intrinsics: feature with 4 (fx fy cx cy) or 9 numbers a step; or four numbers as ``K``, or one as ``fov``.
+            None = ``<camera>_intrinsics`` where there is one.
         pose: feature with the camera-to-world pose of every step: 16 numbers (4×4 by rows) or 7 (x y z qx qy qz qw).
             None = ``<camera>_T_world_from_cam`` where there is one, else no poses.
         depth_unit: ``"m"`` or ``"mm"``. None = mm for whole numbers and m for others.
@@ -92,16 +94,17 @@ def read(
     rigs = []
     for key in keys:
         hw = _size(root, features, key)
+        said = told.stated(root, hw, intrinsics, K, fov)
         rig = _Rig(
             root=root,
             features=features,
             image=key,
             hw=hw,
             depth=_depth_of(root, features, key, depth),
-            K=convert.wide(K, fov, hw, root),
+            stated=said,
             K_depth=K_depth,
             distortion=distortion,
-            intrinsics=_beside(root, features, key, intrinsics, "intrinsics"),
+            intrinsics=_beside(root, features, key, said.feature, "intrinsics"),
             pose=_beside(root, features, key, pose, "pose", "T_world_from_cam"),
             unit=depth_unit,
             rate_hz=rate,
@@ -112,16 +115,6 @@ def read(
         f"{_set_name(root)}/{e.split}_{e.number:06d}/{rig.image.rpartition('/')[2]}" for e in episodes for rig in rigs
     ]
     return Recordings(names, _Make(tuple(names), tuple(episodes), tuple(rigs)))
-
-
-def picture_hw(root: Path) -> tuple[int, int]:
-    """Height and width of the first camera's pictures, which needs no K.
-
-    Raises:
-        FormatError: damaged metadata.
-    """
-    features = read_features(root)
-    return _size(root, features, _colour(root, features, None)[0])
 
 
 @dataclass(frozen=True)
@@ -317,7 +310,7 @@ class _Rig:
     image: str
     hw: tuple[int, int]
     depth: str | None
-    K: Sequence[float] | None
+    stated: told.Stated
     K_depth: Sequence[float] | None
     distortion: Sequence[float] | None
     intrinsics: str | None
@@ -355,7 +348,7 @@ class _Rig:
             times=None if self.rate_hz is None else numbers(n).double() / self.rate_hz,
             poses=None if self.pose is None else self._poses(file, found, self.pose, n),
             rate_hz=self.rate_hz,
-            report=() if self.depth is not None else (f"{self.image}: no depth feature: depth is empty",),
+            report=self.stated.report + (() if self.depth else (f"{self.image}: no depth feature: depth is empty",)),
             episode=episode.place,
             camera_name=self.image,
         )
@@ -407,12 +400,11 @@ class _Rig:
             of_depth = convert.to_camera(
                 convert.K_of(self.K_depth, self.root, "option K_depth"), hw, self.root, "K_depth"
             )
-        if self.K is not None:
-            K = convert.K_of(self.K, self.root, "option K")
+        if self.stated.K is not None:
+            K = convert.matrix_of(*self.stated.K)
             return convert.to_camera(K, self.hw, self.root, "option K", self.distortion), of_depth
         if self.intrinsics is None:
-            expected = "option K, fov, or a feature (option intrinsics)"
-            raise convert.NoIntrinsics(self.root, self.image, "no K, the format has no place for it", expected)
+            raise told.missing(self.root, self.image, "data.intrinsics=FEATURE", depth=self.depth is not None)
         values = self._numbers(file, found, self.intrinsics, (4, 9), n)
         return convert.to_cameras(values, self.hw, file, self.intrinsics, self.distortion), of_depth
 

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from dhtorch.data import convert, files
+from dhtorch.data import intrinsics as told
 from dhtorch.data.files import FormatError
 from dhtorch.data.recording import Recording
 from dhtorch.records import Camera, Frame
@@ -47,7 +48,9 @@ def recognise(root: Path) -> str | None:
 def read(
     root: str | Path,
     *,
-    intrinsics: str = "camera",
+    intrinsics: told.Intrinsics = "camera",
+    K: Sequence[float] | None = None,
+    fov: float | None = None,
     camera: int | None = None,
     poses: bool = True,
     max_difference: float = 0.02,
@@ -58,7 +61,10 @@ def read(
     Args:
         root: the folder of the sequence.
         intrinsics: ``"camera"`` = the published calibration of the camera that took it, with its distortion;
-            ``"ros"`` = the driver's default that the depth was registered with (f = 525, no distortion).
+            ``"ros"`` = the driver's default that the depth was registered with (f = 525, no distortion); or four
+            numbers as ``K``, or one as ``fov``.
+        K: fx, fy, cx, cy of the pictures, without distortion.
+        fov: degrees from side to side of the pictures; a guessed K for where none is known.
         camera: 1, 2 or 3. None = the ``freiburgN`` (``frN``) in the folder's name or in the trajectory's header;
             failing both, ``K`` and ``dist`` of a side-car ``meta.json``.
         poses: read the trajectory; frames that it does not cover are left out. False keeps every RGB-D frame.
@@ -88,11 +94,12 @@ def read(
         report += _left_out(int((~covered).sum()), "RGB-D frames", "pose", max_difference)
         pairs = [pair for pair, keep in zip(pairs, covered, strict=True) if keep]
     hw = files.image_header(colour[pairs[0][0]][1]).hw
+    said = told.stated(root, hw, None if isinstance(intrinsics, str) else intrinsics, K, fov)
     load = _Load(
         images=tuple(colour[i][1] for i, _ in pairs),
         depths=tuple(depth[j][1] for _, j in pairs),
         hw=hw,
-        camera=_camera(root, intrinsics, camera, hw),
+        camera=_camera(root, intrinsics, camera, hw, said.K),
         units_per_metre=files.to_positive(units_per_metre, root, "option units_per_metre"),
     )
     return [
@@ -105,7 +112,7 @@ def read(
             times=torch.tensor([colour[i][0] for i, _ in pairs], dtype=torch.float64),
             poses=None if c2w is None else convert.to_poses(c2w, trajectory),
             rate_hz=_RATE_HZ,
-            report=tuple(report),
+            report=(*report, *said.report),
         )
     ]
 
@@ -197,7 +204,11 @@ def _poses_at(file: Path, times: np.ndarray, max_difference: float) -> tuple[np.
     return convert.to_c2w(q, (1 - share) * a[:, 1:4] + share * b[:, 1:4], file), covered
 
 
-def _camera(root: Path, intrinsics: str, number: int | None, hw: tuple[int, int]) -> Camera:
+def _camera(
+    root: Path, intrinsics: told.Intrinsics, number: int | None, hw: tuple[int, int], K: tuple[float, ...] | None
+) -> Camera:
+    if K is not None:
+        return convert.to_camera(convert.matrix_of(*K), hw, root, "option K")
     if intrinsics not in ("camera", "ros"):
         raise FormatError(root, "option intrinsics", intrinsics, "camera or ros")
     if number not in (None, *_CALIBRATION):
@@ -206,8 +217,7 @@ def _camera(root: Path, intrinsics: str, number: int | None, hw: tuple[int, int]
     number = number or _camera_number(root)
     if number is None and intrinsics == "camera":
         if not side.is_file():
-            expected = "freiburg1, 2 or 3 in the folder's name, option camera, option intrinsics=ros, or meta.json"
-            raise FormatError(root, "camera", "an unknown one", expected)
+            raise told.missing(root, None, "data.camera=1, 2 or 3 (freiburg), data.intrinsics=ros", "meta.json")
         meta = files.read_json(side)
         return convert.to_camera(meta.get("K"), hw, side, "K", meta.get("dist"))
     if hw != _HW:

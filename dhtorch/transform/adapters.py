@@ -35,12 +35,15 @@ class ExtendedDataset(Dataset[Any]):
 
     Args:
         dataset: ``dataset[i]`` is a dict.
-        transform: for single samples.
+        transform: for single samples; with ``by_batch`` for batches.
         gap: places from the other view to the anchor; None = the sample itself holds both.
         episode_key: key of a number that items of one episode share; None = there is one episode.
+        by_batch: items stay as they are, and :meth:`collate`, the loader's ``collate_fn``, extends the whole batch in
+            the worker: the same bits in less time.
 
     Raises:
-        ValueError: a gap without ``other_image``, or a transform for batches.
+        ValueError: a gap without ``other_image``; a transform for batches without ``by_batch``, or with it one for
+            single samples or one that does not raise.
     """
 
     def __init__(
@@ -50,11 +53,18 @@ class ExtendedDataset(Dataset[Any]):
         *,
         gap: int | None = None,
         episode_key: str | None = "episode_index",
+        by_batch: bool = False,
     ) -> None:
         if gap is not None and (gap < 1 or transform.views.other_image is None):
             raise ValueError(f"gap is {gap}: expected a positive one, and a transform with other_image")
-        if transform.batched:
-            raise ValueError("found a transform for batches, expected one for single samples")
+        if transform.batched != by_batch:
+            found, expected = ("batches", "one for single samples, or by_batch=True")
+            if by_batch:
+                found, expected = ("single samples", "ExtendDepth(batched=True)")
+            raise ValueError(f"found a transform for {found}, expected {expected}")
+        if by_batch and transform.on_error != "raise":
+            raise ValueError(f"on_error is {transform.on_error!r}, expected raise where by_batch is set")
+        self.by_batch = by_batch
         self.dataset, self.transform, self.gap, self.episode_key = dataset, transform, gap, episode_key
         views = transform.views
         self._lent: tuple[str, ...] = (
@@ -71,12 +81,21 @@ class ExtendedDataset(Dataset[Any]):
         i = range(len(self))[index]
         try:
             sample = self._loaded(i)
+            if self.by_batch:
+                return sample
         except Exception as error:  # whatever a decoder raises; lack of memory is no property of a sample
             if self.transform.on_error == "raise" or isinstance(error, MemoryError | torch.OutOfMemoryError):
                 raise
             zeros = {} if self.transform.on_error == "skip" else self._zeros_like_neighbour(i, error)
             return self.transform.left_out(zeros, SampleError(f"item {i} cannot be loaded: {error}"))
-        out: dict[str, Any] | None = self.transform(sample)
+        return self._returned(self.transform(sample))
+
+    def collate(self, samples: Sequence[Any]) -> dict[str, Any]:
+        """One batch, collated as torch does and then extended as a whole; with ``by_batch``."""
+        return self._returned(self.transform(default_collate(list(samples)))) or {}
+
+    def _returned(self, out: dict[str, Any] | None) -> dict[str, Any] | None:
+        """Without what a gap lent."""
         if out is None or self.gap is None:
             return out
         return {key: value for key, value in out.items() if key not in self._lent}

@@ -17,7 +17,7 @@ from dhtorch.methods import chosen
 from dhtorch.pair import merge
 from dhtorch.records import NO_HINT, DepthMap, Estimate, PoseFit, Samples, TrackHint
 from dhtorch.transform import given, maps
-from dhtorch.transform.leaves import SampleError, find, to_tensor
+from dhtorch.transform.leaves import SampleError, check_sample, find, to_tensor
 from dhtorch.transform.problems import SampleProblem, Tally
 from dhtorch.transform.tokens import CHANNELS, FITS, grid, patch_tokens
 from dhtorch.transform.views import Read, Views
@@ -45,7 +45,9 @@ class ExtendDepth(torch.nn.Module):
         on_error: what to do with a sample that cannot be read, or whose values contradict what was stated. ``raise``;
             ``skip`` = return None, see :func:`dhtorch.transform.collate_kept`; ``flag`` = add zeros, and ``problem``
             says so. Skipped and flagged samples are counted (:meth:`report`) and warned of.
-        batched: samples are collated batches. A batch with a missing key or a wrong shape raises in any case.
+        batched: True = samples are collated batches, False = single ones. None = single ones, and where a field shows
+            a batch (3x3 intrinsics, texts, an index or episode for each picture) it is refused instead of being read
+            as frames along time. A batch with a missing key or a wrong shape raises in any case.
         prefix: of the keys that are added.
         **views: where the images, the depth and the intrinsics are, and their units: see
             :class:`dhtorch.transform.Views`. ``depth_unit`` must be given.
@@ -90,7 +92,7 @@ class ExtendDepth(torch.nn.Module):
         tokens_hw: tuple[int, int] | None = None,
         fit: str = "stretch",
         on_error: str = "raise",
-        batched: bool = False,
+        batched: bool | None = None,
         prefix: str = "dhtorch.",
         **views: Any,
     ) -> None:
@@ -108,12 +110,14 @@ class ExtendDepth(torch.nn.Module):
         self.learned = torch.nn.ModuleList(networks(self.method))  # so that .to() and .parameters() find them
         self.seed, self.index_key = seed, index_key
         self.patch, self.tokens_hw, self.fit = patch, tokens_hw, fit
-        self.on_error, self.batched, self.prefix = on_error, batched, prefix
+        self.on_error, self.batched, self.prefix = on_error, bool(batched), prefix
+        self._stated = batched
         self.tally = Tally()
         self._seen_hw: tuple[int, int] | None = None
 
     def forward(self, sample: Mapping[str, Any]) -> dict[str, Any] | None:
         """The sample with our keys; None where it is skipped."""
+        check_sample(sample, self.views.image, self.views.intrinsics, self._stated)
         with torch.set_grad_enabled(torch.is_grad_enabled() and get_worker_info() is None):
             try:
                 read = self.views.read(sample, batched=self.batched)

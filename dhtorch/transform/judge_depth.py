@@ -12,7 +12,7 @@ from dhtorch.codes import State
 from dhtorch.method import Method
 from dhtorch.methods import chosen
 from dhtorch.records import NO_HINT, Frame, TrackHint, Verdict
-from dhtorch.transform.leaves import Leaves, SampleError
+from dhtorch.transform.leaves import Leaves, SampleError, check_sample
 from dhtorch.transform.views import Views
 from dhtorch.tree import stack
 from dhtorch.verdict import judge
@@ -35,7 +35,7 @@ class JudgeDepth(torch.nn.Module):
         judging: options of :func:`dhtorch.verdict.judge`: ``views``, ``partners``, ``size``, ``tolerance``.
         hint: what is known of the motion between the views, for the tracker.
         seed: of the pose search.
-        batched: samples are collated batches.
+        batched: samples are collated batches; None = single ones, and what shows a batch is refused.
         prefix: of the keys that are added.
         **views: where the images, the depth and the intrinsics are, and their units: see
             :class:`dhtorch.transform.Views`. ``depth_unit`` must be given.
@@ -64,7 +64,7 @@ class JudgeDepth(torch.nn.Module):
         judging: Mapping[str, Any] | None = None,
         hint: TrackHint = NO_HINT,
         seed: int = 0,
-        batched: bool = False,
+        batched: bool | None = None,
         prefix: str = "dhtorch.",
         **views: Any,
     ) -> None:
@@ -77,10 +77,12 @@ class JudgeDepth(torch.nn.Module):
             raise ValueError(f"map_unit is {map_unit!r}, expected a positive number of metres")
         self.views = Views(**views)
         self.method, self.map, self.map_unit, self.judging = method, map, map_unit, dict(judging or {})
-        self.hint, self.seed, self.batched, self.prefix = hint, seed, batched, prefix
+        self.hint, self.seed, self.batched, self.prefix = hint, seed, bool(batched), prefix
+        self._stated = batched
 
     def forward(self, sample: Mapping[str, Any]) -> dict[str, Any]:
         """The sample with our keys."""
+        check_sample(sample, self.views.image, self.views.intrinsics, self._stated)
         with torch.no_grad():
             read = self.views.read(sample, batched=self.batched)
             if bool(read.bad.any()):

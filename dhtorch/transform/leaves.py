@@ -63,6 +63,45 @@ def to_tensor(value: Any, key: str, *, signed: bool = True) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(array))
 
 
+#: Keys of numbers that samples have one of, and collated batches one for each sample.
+_COUNTED = ("episode_index", "index", "frame_index")
+
+
+def check_sample(sample: Any, image: str, intrinsics: Numbers, batched: bool | None) -> None:
+    """Refuse what is no sample; where ``batched`` is None also a batch, whose samples would be read as frames in time.
+
+    Raises:
+        SampleError: it is no dict, or a field shows several samples; the message says what to do instead.
+    """
+    if not isinstance(sample, Mapping):
+        size = f" of shape {tuple(sample.shape)}" if hasattr(sample, "shape") else ""
+        raise SampleError(
+            f"sample: found {type(sample).__name__}{size}, expected a dict with pictures and depth; image_transforms "
+            "hands over single pictures: wrap the data set instead, ExtendedDataset(dataset, transform)"
+        )
+    if batched is not None:
+        return
+    try:
+        images = find(sample, image)
+    except SampleError:
+        return  # said where it is read
+    n = len(images) if getattr(images, "ndim", 0) == 4 else 1
+    if tuple(getattr(sample.get(f"{image}_is_pad"), "shape", ())) == (n,):
+        return  # LeRobot's delta_timestamps: time
+    keys: tuple[Any, ...] = () if n < 2 else (intrinsics, *_COUNTED, *sample)
+    for key in keys:
+        value = sample.get(key) if isinstance(key, str) else None
+        shape = tuple(getattr(value, "shape", ()))
+        texts = isinstance(value, list | tuple) and len(value) == n and all(isinstance(text, str) for text in value)
+        several = shape == (n,) and key in _COUNTED
+        if texts or several or (key == intrinsics and shape == (n, 3, 3)):
+            found = f"{n} texts" if texts else f"shape {shape}"
+            raise SampleError(
+                f"{key}: found {found} beside {n} pictures, expected one sample; batched=True reads {n} samples, "
+                f"batched=False one sample of {n} frames"
+            )
+
+
 class Leaves:
     """The tensors of a sample, all with B in front."""
 

@@ -96,7 +96,7 @@ def read_video_frame(
         return _luma(frame)
     try:
         way = "POINT" if nearest else "BICUBIC"
-        return np.asarray(frame.to_ndarray(format=pixels, interpolation=way, threads=1))
+        return np.asarray(frame.to_ndarray(format=pixels, interpolation=way, **decoder.one_thread))
     except decoder.errors as error:
         raise FormatError(file, f"frame {i}", error, f"pixels that convert to {pixels}") from None
 
@@ -139,6 +139,11 @@ def _container(file: Path) -> str:
     raise FormatError(file, "content", repr(head[:12]), "a video file: mp4, mov, mkv, webm or avi")
 
 
+def _index(stream: Any) -> Any:
+    """What the file's index says of its frames, from PyAV 17; before, packets say the same, more slowly."""
+    return getattr(stream, "index_entries", ())
+
+
 class _Decoder:
     """One open video and the place where it stands."""
 
@@ -149,6 +154,8 @@ class _Decoder:
         self.frames: Iterator[Any] = iter(())
         self.next = -1  # number of the frame that comes next; −1 = unknown
         av = need("av")
+        # PyAV before 17 converts with one thread and knows no such option.
+        self.one_thread = {"threads": 1} if int(av.__version__.partition(".")[0]) >= 17 else {}
         self.errors: tuple[type[Exception], ...] = (av.FFmpegError, ValueError, MemoryError, OverflowError, EOFError)
         if not file.exists():
             raise FormatError(file, "file", "no such file", "a video")
@@ -177,8 +184,9 @@ class _Decoder:
         h, w = context.height, context.width
         if not 0 < h * w <= MAX_VIDEO_PIXELS:
             raise FormatError(self.file, "size", f"{w}x{h}", f"1 to {MAX_VIDEO_PIXELS} pixels")
-        shown = [entry for entry in self.stream.index_entries if not entry.is_discard]
-        n = len(shown) if len(self.stream.index_entries) >= self.stream.frames > 0 else len(self.table())
+        index = _index(self.stream)
+        shown = [entry for entry in index if not entry.is_discard]
+        n = len(shown) if len(index) >= self.stream.frames > 0 else len(self.table())
         if not 0 < n <= _MAX_FRAMES or self.stream.time_base is None:
             raise FormatError(self.file, "frames", n, f"1 to {_MAX_FRAMES}, with a time base")
         rate = self.stream.average_rate
