@@ -55,7 +55,7 @@ REAL = {
 
 def written(folder: Path) -> dict[str, Path]:
     """Sources of the other formats: name → path."""
-    room = SyntheticRoom(hw=(96, 128), depth_hw=(48, 64), n_frames=4, supersample=1)
+    room = SyntheticRoom(hw=(72, 128), depth_hw=(72, 128), n_frames=4, supersample=1)
     frames = [room[i] for i in range(len(room))]
     makers: dict[str, Callable[[Path], Any]] = {
         "stray": lambda p: testing.write_stray(p, frames),
