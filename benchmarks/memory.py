@@ -62,7 +62,7 @@ def main() -> None:
     options = parser.parse_args()
     harness.set_threads(1)
     row = measure(options.frames)
-    print(f"{row['frames']} frames: {row['first_mib']:.0f} MiB after {FIRST}, {row['above_mib']:.1f} MiB more at the end")
+    print(f"{row['frames']} frames: {row['first_mib']:.0f} MiB after {FIRST}, then {row['above_mib']:.1f} more")
     if options.json is not None:
         storage.write_json(options.json, [row])
 
