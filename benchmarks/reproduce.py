@@ -76,6 +76,7 @@ SCRIPTS = dict.fromkeys(("frontend", "lk", "pnp", "triangulate", "pair", "loader
 SCRIPTS |= {
     "stream": "--clock cpu --repeats 5",
     "dense_speed": "--clock cpu --repeats 5",
+    "start": "--clock cpu --repeats 3",
     "degenerate": "",
     "mutants": "--quiet",
     "kornia": "--clock cpu",

@@ -140,7 +140,8 @@ def complete(
         others: as :class:`dhtorch.method.Method` takes them: B views, or V × B of them, or a sequence of V.
         method: the sparse method that gives motions; it chooses among the views as it does by itself.
         partners: views that are swept at most, those worth most (at most eight).
-        planes: inverse depths that are tried, evenly from infinity to within the sensor's reach.
+        planes: inverse depths that are tried, evenly from infinity to within the sensor's reach; where an anchor's
+            returns are ``sparse``, to as near as they are.
         size: longer side of the map and of the pictures that are swept, px; smaller pictures stay as they are.
         refinements: Gauss-Newton steps from the best plane.
         min_correlation: of the windows of a pixel in the view that fits best, below which it is silent.

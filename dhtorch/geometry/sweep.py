@@ -130,8 +130,9 @@ def seen_at(view: View, ray: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
     turn = torch.zeros_like(view.T_1_from_0.t) if view.turn is None else view.turn
     if view.camera.distortion is None and native.serves(ray, q, turn, *given):
         R, t, f, c = given
-        uv, front = q.new_empty(*q.shape, 2), torch.empty_like(q, dtype=torch.bool)
-        torch.ops.dhtorch.seen_at(ray, q, R, t, turn, f, c, uv, front)
+        uv = q.new_empty(*q.shape, 2)
+        front = torch.empty_like(q, dtype=torch.bool)
+        torch.ops.dhtorch.seen_at(ray, q, R=R, t=t, turn=turn, f=f, c=c, uv=uv, front=front)
         return uv, front
     x = se3.rotate(view.T_1_from_0.R, ray) + q[..., None] * view.T_1_from_0.t[:, None]
     if view.turn is not None:
