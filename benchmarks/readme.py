@@ -4,8 +4,8 @@ python benchmarks/readme.py            rewrite what stands between markers
 python benchmarks/readme.py --check    exit 1 if a page does not say what result files and code say
 
 ``<!-- name -->`` up to ``<!-- end -->`` holds a table of ``TABLES``, ``<!-- results name -->`` those of a result file
-in the paper's layout, ``<!-- client name -->`` a script of clients/, ``<!-- make: name argument -->`` what a function of docs/hooks.py says. The pages are committed
-whole. Pictures: docs/pictures.py.
+in the paper's layout, ``<!-- client name -->`` a script of clients/, ``<!-- make: name argument -->`` what a function
+of docs/hooks.py says. The pages are committed whole. Pictures: docs/pictures.py.
 """
 
 from __future__ import annotations
