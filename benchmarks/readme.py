@@ -375,10 +375,13 @@ def clients() -> str:
     for row in json.loads((RESULTS / "clients.json").read_text()):
         off = (row["compared"] or {}).get("largest_difference", {})
         compared = ", ".join(f"{name} {off[name]:.1g}" for name in ("depth", "sigma", "numbers") if name in off)
-        step = "–" if row["step"] is None else f"yes, {row['step']['target'].rpartition('.')[2]}"
+        took = row["step"]
+        step = "–" if took is None else f"{took['target'].rpartition('.')[2]}, {took['tokens_known']}"
         cells = [row["source"], row["target"], row["loader"], "yes" if row["opened"] else "no", compared or "–", step]
         rows.append([*cells, row["why"].replace("|", "/")])
-    return table(["source", "target", "loader", "opened", "compared", "trained, predicts", "why not"], rows)
+    return table(
+        ["source", "target", "loader", "opened", "compared", "one step: predicts, tokens with depth", "why not"], rows
+    )
 
 
 def client(name: str) -> str:

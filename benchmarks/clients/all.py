@@ -28,6 +28,7 @@ QUICK = ("method=paper", "method.n=128", "gap=2", "dense=false", "report=false")
 #: Source → its folder below ``DHTORCH_DATA`` and the options it needs.
 SOURCES: dict[str, tuple[str, ...]] = {
     "TUM": ("tum_fr1_desk9", "dense={size: 80}"),
+    "TUM, samples alone": ("tum_fr1_desk9",),
     "7-Scenes": ("7s_redkitchen_000",),
     "HoloLens": ("holo_a",),
     "LeRobot v2.1": ("lerobot_g1", "data=lerobot", "data.fov=69", "data.episode=[29]"),
@@ -86,7 +87,7 @@ def versions(python: str) -> dict[str, str]:
 def enriched(source: str, target: str, work: Path) -> tuple[Path, str]:
     """The folder of one source in one format, and why there is none; what is there already is not made again."""
     folder, *options = SOURCES[source]
-    out = work / f"{Path(folder).parts[0]}-{TARGETS[target]}"
+    out = work / f"{source.replace(',', '').replace(' ', '-')}-{TARGETS[target]}"
     root = Path(os.environ["DHTORCH_DATA"]) / folder
     words = ["-m", "dhtorch", "enrich", str(root), str(out), f"format={TARGETS[target]}", *QUICK, *options]
     found, why = call(sys.executable, *words)
