@@ -4,8 +4,8 @@ python benchmarks/readme.py            rewrite what stands between markers
 python benchmarks/readme.py --check    exit 1 if a page does not say what result files and code say
 
 ``<!-- name -->`` up to ``<!-- end -->`` holds a table of ``TABLES``, ``<!-- results name -->`` those of a result file
-in the paper's layout, ``<!-- make: name argument -->`` what a function of docs/hooks.py says. The pages are committed
-whole. Pictures: docs/pictures.py.
+in the paper's layout, ``<!-- client name -->`` a script of clients/, ``<!-- make: name argument -->`` what a function
+of docs/hooks.py says. The pages are committed whole. Pictures: docs/pictures.py.
 """
 
 from __future__ import annotations
@@ -408,10 +408,30 @@ def caught() -> str:
     return table(["faults planted in", "caught", "change no answer"], cells)
 
 
+def clients() -> str:
+    """Which loader opened which enriched set, what differed, and whether a training step was taken."""
+    rows = []
+    for row in json.loads((RESULTS / "clients.json").read_text()):
+        off = (row["compared"] or {}).get("largest_difference", {})
+        compared = ", ".join(f"{name} {off[name]:.1g}" for name in ("depth", "sigma", "numbers") if name in off)
+        took = row["step"]
+        step = "–" if took is None else f"{took['target'].rpartition('.')[2]}, {took['tokens_known']}"
+        cells = [row["source"], row["target"], row["loader"], "yes" if row["opened"] else "no", compared or "–", step]
+        rows.append([*cells, row["why"].replace("|", "/")])
+    return table(
+        ["source", "target", "loader", "opened", "compared", "one step: predicts, tokens with depth", "why not"], rows
+    )
+
+
+def client(name: str) -> str:
+    """A script of ``clients/`` as it stands."""
+    return f"```python\n{(HERE / 'clients' / f'{name}.py').read_text(encoding='utf-8').rstrip()}\n```"
+
+
 TABLES = {"room": room, "room seeds": room_by_seed, "shared": shared, "truths": truths, "comparison": comparison}
 TABLES |= {"comparison scenes": partial(by_scene, "method_comparison"), "stress": partial(by_scene, "stress")}
 TABLES |= {"chosen views": partial(chosen_views, "method_comparison", "streams"), "beside chosen": beside_chosen}
-TABLES |= {"judge": judge}
+TABLES |= {"judge": judge, "clients": clients}
 TABLES |= {"every pixel": partial(every_pixel, "dense", "dense_streams")}
 TABLES |= {"pixels by scene": partial(pixels_by_scene, "dense")}
 TABLES |= {"speed": speed_tables.stages, "mutants": caught} | speed_tables.TABLES | kornia_tables.TABLES
@@ -499,6 +519,8 @@ def maker(name: str) -> Callable[[], str]:
     """
     if name.startswith("results "):
         return partial(in_layout, name.removeprefix("results "))
+    if name.startswith("client "):
+        return partial(client, name.removeprefix("client "))
     if name.startswith("make: "):
         sys.path.append(str(HERE.parent / "docs"))
         import hooks

@@ -84,10 +84,11 @@ SCRIPTS |= {
     "sweep": "",
     "captures": "",
     "enrich": "",
+    "clients": "",  # interpreters of the loaders in DHTORCH_CLIENTS
 }
 
 #: Scripts of another name than their result: ``kornia.py`` would be imported instead of the library.
-NAMED = {"kornia": "beside_kornia", "dense_speed": "dense"}
+NAMED = {"kornia": "beside_kornia", "dense_speed": "dense", "clients": "clients/all"}
 
 #: Options that change no number, and which a file may hold otherwise.
 ASIDE = {"figures", "traceback", "root"}

@@ -1,41 +1,49 @@
-"""A set from ``dhtorch enrich`` as LeRobot's loader gives it against the bytes in its tables: rows, times, depth.
+"""An enriched set as LeRobot's loader gives it against the bytes in its tables, value by value, and its statistics.
 
-Runs in an environment that has lerobot:  python benchmarks/clients/compare_lerobot.py DST
+In an environment that has lerobot:  python benchmarks/clients/compare_lerobot.py DST
 """
 
 import io
 import json
-import os
 import sys
 from pathlib import Path
 
-os.environ.setdefault("HF_HUB_OFFLINE", "1")
-
 import numpy as np
-import pyarrow.parquet as parquet
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from PIL import Image
+from pyarrow import parquet
 
 
 def main(root: str) -> None:
-    data = LeRobotDataset("local/enriched", root=root, video_backend="pyav")
+    data = LeRobotDataset("local/set", root=root, video_backend="pyav")
     tables = sorted((Path(root) / "data").rglob("*.parquet"))
     rows = [row for table in tables for row in parquet.read_table(table).to_pylist()]
-    maps = [k for k, f in data.meta.features.items() if "quantiser_step_m" in (f.get("info") or {})]
-    known = set(getattr(data.meta, "depth_keys", []) or [])
-    worst = 0.0
+    assert len(rows) == len(data), f"{len(data)} frames, the tables have {len(rows)}"
+    features, known = data.meta.features, set(getattr(data.meta, "depth_keys", []) or [])
+    maps = [k for k, f in features.items() if "quantiser_step_m" in (f.get("info") or {})]
+    numbers = [k for k in features if k.endswith((".intrinsics", ".T_world_from_cam")) or k == "action"]
+    worst = dict.fromkeys(("depth", "sigma", "numbers", "statistics"), 0.0)
+    loaded = {key: [] for key in maps}
     for i, row in enumerate(rows):
         item = data[i]
         assert float(item["timestamp"]) == np.float32(row["timestamp"]), i
         assert int(item["index"]) == row["index"] == i and int(item["frame_index"]) == row["frame_index"], i
+        for key in numbers:
+            worst["numbers"] = max(worst["numbers"], float(np.abs(np.float32(row[key]) - item[key].numpy()).max()))
         for key in maps:
             stored = np.array(Image.open(io.BytesIO(row[key]["bytes"])))
-            loaded = item[key][0].numpy() * (1e-3 if key in known else 1.0)
-            assert np.array_equal(loaded > 0, stored > 0) or key.endswith("_sigma"), (i, key)
-            worst = max(worst, float(np.abs(loaded - stored).max()))
-    pictures = [k for k in data.meta.camera_keys if k not in maps]
-    said = {"frames": len(rows), "maps": len(maps), "pictures": len(pictures), "largest_difference_m": worst}
-    print(json.dumps(said))
+            z = item[key].numpy().squeeze() * (1e-3 if key in known else 1.0)
+            assert np.array_equal(z > 0, stored > 0), (i, key)
+            name = "sigma" if "_depth_sigma" in key else "depth"
+            worst[name] = max(worst[name], float(np.abs(z - stored).max()))
+            loaded[key].append(z[z > 0])
+    for key in maps:  # what a normaliser is given, in the unit of the items
+        values = np.concatenate(loaded[key]).astype(np.float64)
+        if key in data.meta.stats:
+            mean = float(np.ravel(data.meta.stats[key]["mean"])[0]) * (1e-3 if key in known else 1.0)
+            worst["statistics"] = max(worst["statistics"], abs(mean / values.mean() - 1))
+    unit = "mm" if known else "m"
+    print(json.dumps({"frames": len(rows), "maps": len(maps), "unit": unit, "largest_difference": worst}))
 
 
 if __name__ == "__main__":

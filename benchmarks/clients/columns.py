@@ -1,0 +1,18 @@
+"""Names of an enriched set's columns, from what its ``meta/info.json`` says."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+
+def columns(root: str) -> dict[str, Any]:
+    """Options for ``ExtendDepth``, and beside them ``target``: what a policy predicts, and ``fps``."""
+    info = json.loads((Path(root) / "meta" / "info.json").read_text())
+    features = info["features"]
+    maps = [k for k, f in features.items() if "quantiser_step_m" in (f.get("info") or {})]
+    depth = next(k for k in maps if "_depth_sigma" not in k)
+    image = depth.removesuffix("_enriched").removesuffix("_depth")
+    camera = f"observation.{image.removeprefix('observation.images.')}"
+    keys = {"image": image, "depth": depth, "intrinsics": f"{camera}.intrinsics", "depth_unit": "m"}
+    target = "action" if "action" in features else f"{camera}.T_world_from_cam"  # a hand-held camera's own motion
+    return {"keys": keys, "target": target, "fps": info["fps"]}

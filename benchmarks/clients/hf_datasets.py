@@ -1,0 +1,48 @@
+"""Hugging Face ``datasets``: depth tokens made by ``set_transform``, which hands over and takes lists.
+
+In an environment that has datasets and dhtorch:  python benchmarks/clients/hf_datasets.py DST
+"""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import datasets
+import torch
+from columns import columns
+
+from dhtorch import ExtendDepth
+
+GAP = 2
+
+
+def main(root: str) -> None:
+    found = columns(root)
+    files = [str(file) for file in sorted((Path(root) / "data").rglob("*.parquet"))]
+    data = datasets.Dataset.from_parquet(files, cache_dir=str(Path(root).parent / "cache"), keep_in_memory=True)
+    stored, image = data.with_format(None), found["keys"]["image"]
+    transform = ExtendDepth(**found["keys"], other_image="before", n=256, tokens_hw=(56, 56))
+
+    def extended(batch: dict[str, list[Any]]) -> dict[str, list[Any]]:
+        earlier = stored[[max(i - GAP, 0) for i in batch["index"]]]
+        rows = [dict(zip(batch, values, strict=True)) for values in zip(*batch.values(), strict=True)]
+        for i, row in enumerate(rows):
+            row["before"] = earlier[image][i]
+            row["before_is_pad"] = [row["index"] < GAP or earlier["episode_index"][i] != row["episode_index"]]
+        out = [transform(row) for row in rows]
+        return {key: [row[key] for row in out] for key in ("dhtorch.tokens", "dhtorch.tokens_valid", found["target"])}
+
+    data.set_transform(extended)
+    batch = data[:3]
+    tokens, target = torch.stack(batch["dhtorch.tokens"]), torch.tensor(batch[found["target"]])
+    head = torch.nn.Linear(tokens[0].numel(), target.shape[1])
+    loss = (head(tokens.flatten(1)) - target).square().mean()
+    loss.backward()
+    torch.optim.SGD(head.parameters(), 1e-3).step()
+    said = {"frames": len(data), "target": found["target"], "loss": float(loss.detach())}
+    print(json.dumps(said | {"tokens_known": int(torch.stack(batch["dhtorch.tokens_valid"]).sum())}))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

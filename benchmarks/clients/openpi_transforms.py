@@ -1,0 +1,56 @@
+"""In openpi's manner: dict → dict transforms of NumPy leaves one after the other, then every leaf stacked.
+
+python benchmarks/clients/openpi_transforms.py DST
+"""
+
+import json
+import sys
+from typing import Any
+
+import numpy as np
+import torch
+from columns import columns
+from torch_loader import Rows
+
+from dhtorch import ExtendDepth
+from dhtorch.transform import NumpyTransform
+
+GAP = 2
+KEYS = {f"{key}": f"observation/{key}" for key in ("image", "other_image", "depth", "intrinsics")}
+
+
+def policy_inputs(data: dict[str, Any]) -> dict[str, Any]:
+    """What the model takes: pictures by their name there, and the depth tokens beside them."""
+    images = {"image": {"base_0_rgb": data["observation/image"]}, "image_mask": {"base_0_rgb": np.True_}}
+    tokens = {"depth_tokens": data["dhtorch.tokens"], "depth_mask": data["dhtorch.tokens_valid"]}
+    return {**images, **tokens, "actions": np.asarray(data["actions"], np.float32), "prompt": data["prompt"]}
+
+
+def stack(samples: list[Any]) -> Any:
+    if isinstance(samples[0], dict):
+        return {key: stack([sample[key] for sample in samples]) for key in samples[0]}
+    return np.stack([np.asarray(sample) for sample in samples])
+
+
+def main(root: str) -> None:
+    found = columns(root)
+    rows, keys = Rows(root), found["keys"]
+
+    def repacked(i: int) -> dict[str, Any]:
+        out = {KEYS[name]: rows[i][keys[name]] for name in ("image", "depth", "intrinsics")}
+        out[KEYS["other_image"]] = rows[i - GAP][keys["image"]]
+        return {**out, "actions": rows[i][found["target"]], "prompt": "look around"}
+
+    extend = NumpyTransform(ExtendDepth(**KEYS, depth_unit=keys["depth_unit"], n=256, tokens_hw=(56, 56)))
+    batch = stack([policy_inputs(extend(repacked(i))) for i in (GAP, GAP + 1)])
+    tokens, target = torch.from_numpy(batch["depth_tokens"]), torch.from_numpy(batch["actions"])
+    head = torch.nn.Linear(tokens[0].numel(), target.shape[1])
+    loss = (head(tokens.flatten(1)) - target).square().mean()
+    loss.backward()
+    torch.optim.SGD(head.parameters(), 1e-3).step()
+    said = {"frames": len(rows), "target": found["target"], "loss": float(loss.detach())}
+    print(json.dumps(said | {"tokens_known": int(batch["depth_mask"].sum())}))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,55 @@
+"""Plain torch: an enriched set's tables as a map-style data set, depth tokens, one training step.
+
+python benchmarks/clients/torch_loader.py DST [WORKERS]
+"""
+
+import io
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from columns import columns
+from PIL import Image
+from pyarrow import parquet
+from torch.utils.data import DataLoader, Dataset
+
+from dhtorch import ExtendDepth
+from dhtorch.transform import ExtendedDataset, one_thread
+
+
+class Rows(Dataset[dict[str, Any]]):
+    """Rows of a set whose pictures stand in its tables."""
+
+    def __init__(self, root: str) -> None:
+        files = sorted((Path(root) / "data").rglob("*.parquet"))
+        self.rows = [row for file in files for row in parquet.read_table(file).to_pylist()]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, i: int) -> dict[str, Any]:
+        row = self.rows[i]
+        pictures = {k: np.array(Image.open(io.BytesIO(v["bytes"]))) for k, v in row.items() if isinstance(v, dict)}
+        return {**{k: np.asarray(v) for k, v in row.items()}, **pictures}
+
+
+def main(root: str, workers: str = "1") -> None:
+    found = columns(root)
+    transform = ExtendDepth(**found["keys"], other_image="before", n=256, tokens_hw=(56, 56))
+    data = ExtendedDataset(Rows(root), transform, gap=2)
+    loader = DataLoader(data, batch_size=3, num_workers=int(workers), worker_init_fn=one_thread)
+    batch = next(iter(loader))
+    target = batch[found["target"]].float()
+    head = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(batch["dhtorch.tokens"][0].numel(), target.shape[1]))
+    loss = (head(batch["dhtorch.tokens"]) - target).square().mean()
+    loss.backward()
+    torch.optim.SGD(head.parameters(), 1e-3).step()
+    said = {"frames": len(data), "target": found["target"], "loss": float(loss.detach())}
+    print(json.dumps(said | {"tokens_known": int(batch["dhtorch.tokens_valid"].sum())}))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,46 @@
+"""WebDataset: rows of an enriched set as a tar archive, and the stream of it with depth tokens.
+
+In an environment that has webdataset and dhtorch:  python benchmarks/clients/webdataset_stream.py DST ARCHIVE.tar
+"""
+
+import json
+import sys
+
+import torch
+import webdataset
+from columns import columns
+from torch.utils.data import DataLoader
+from torch_loader import Rows
+
+from dhtorch import ExtendDepth
+from dhtorch.transform import ExtendedStream
+
+GAP = 2
+
+
+def main(root: str, archive: str) -> None:
+    found = columns(root)
+    keys, rows = found["keys"], Rows(root)
+    with webdataset.TarWriter(archive) as tar:
+        for i in range(GAP, len(rows)):
+            row, before = rows[i], rows[i - GAP]
+            if row["episode_index"] == before["episode_index"]:
+                numbers = {"intrinsics.npy": row[keys["intrinsics"]], "target.npy": row[found["target"]]}
+                pictures = {"image.png": row[keys["image"]], "before.png": before[keys["image"]]}
+                tar.write({"__key__": f"{i:06d}", "depth.npy": row[keys["depth"]], **pictures, **numbers})
+
+    stream = webdataset.WebDataset(archive, shardshuffle=False).decode("rgb8")
+    places = {"image": "image.png", "other_image": "before.png", "depth": "depth.npy", "intrinsics": "intrinsics.npy"}
+    transform = ExtendDepth(**places, depth_unit=keys["depth_unit"], n=256, tokens_hw=(56, 56))
+    batch = next(iter(DataLoader(ExtendedStream(stream, transform), batch_size=2)))
+    tokens, target = batch["dhtorch.tokens"], batch["target.npy"].float()
+    head = torch.nn.Linear(tokens[0].numel(), target.shape[1])
+    loss = (head(tokens.flatten(1)) - target).square().mean()
+    loss.backward()
+    torch.optim.SGD(head.parameters(), 1e-3).step()
+    said = {"frames": len(rows), "target": found["target"], "loss": float(loss.detach())}
+    print(json.dumps(said | {"tokens_known": int(batch["dhtorch.tokens_valid"].sum())}))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
