@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from dhtorch import dense, metric
+from dhtorch.anchors import gathered
 from dhtorch.codes import Source
 from dhtorch.data.pairs import around
 from dhtorch.data.recording import TruthRecording
@@ -259,7 +260,7 @@ def _judged(look: Look, names: Sequence[str], seed: int) -> Iterator[tuple[str, 
 def _peers(x: Tensor, look: Look) -> dict[str, Tensor]:
     """The usual fits."""
     known = torch.where(x > 0, x, torch.nan)
-    points = metric.anchored(known, look.anchors, look.hw)
+    points = gathered(known, look.anchors, look.hw)
     use = points.used[0]
     value, z, near = points.x[0][use], points.depth[0][use], points.near[0][use]
     fits = {
