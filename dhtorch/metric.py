@@ -135,7 +135,8 @@ def anchor(
     points = gathered(torch.where(known, x, torch.nan), given, hw or (x.shape[-2], x.shape[-1]))
     x = torch.where(known, x, torch.ones_like(x))
     if kind == "ordinal":
-        x, points = _ordered(x, points), points._replace(x=_ordered(points.x, points))
+        x, at = _ordered(x, points), _ordered(points.x, points)
+        points = points._replace(x=at)
     elif kind != "metric":  # values of any unit: 1 is the median of the anchored ones
         unit = median(points.x.detach().abs(), points.used).clamp_min(1e-12)
         x, points = x / unit[..., None], points._replace(x=points.x / unit)
@@ -150,7 +151,8 @@ def anchor(
 def _task(x: Tensor, known: Tensor, points: Anchors, *, of_depth: bool) -> Task:
     """What is fitted, and where fits start."""
     target = points.depth if of_depth else 1 / points.depth
-    start, level = _starts(points.x.detach(), target.detach(), points), median(target.detach(), points.used)
+    start = _starts(points.x.detach(), target.detach(), points)
+    level = median(target.detach(), points.used)
     return Task(points, distortion.basis_of(x, known, of_depth=of_depth), start, level)
 
 
@@ -159,7 +161,8 @@ def _starts(x: Tensor, y: Tensor, points: Anchors) -> Tensor:
     ratio = median(y / torch.where(x == 0, torch.nan, x), points.used)[:, 0]
     scale = torch.stack((ratio.abs(), torch.zeros_like(ratio)), -1)
     A = torch.stack((x, torch.ones_like(x)), -1) / y[..., None]
-    weight, eye = points.weight(points.used), 1e-9 * torch.eye(2).to(x)
+    weight = points.weight(points.used)
+    eye = 1e-9 * torch.eye(2).to(x)
     w = weight
     for _ in range(10):
         W = A * w[..., None]

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 #: Options whose value is a place: whatever stands in it, it is one text.
-PLACES = ("output", "out", "html", "save", "result", "root", "data.root", "path")
+PLACES = ("output", "out", "depth", "html", "save", "result", "root", "data.root", "path")
 
 #: Words that others' commands have → ours.
 USUAL = {"help": "--help", "version": "--version", "-h": "--help", "-V": "--version", "show": "view"}
