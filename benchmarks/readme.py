@@ -392,7 +392,7 @@ def caught() -> str:
 TABLES = {"room": room, "room seeds": room_by_seed, "shared": shared, "truths": truths, "comparison": comparison}
 TABLES |= {"comparison scenes": partial(by_scene, "method_comparison"), "stress": partial(by_scene, "stress")}
 TABLES |= {"chosen views": partial(chosen_views, "method_comparison", "streams"), "beside chosen": beside_chosen}
-TABLES |= {"judge": judge, "anchor": partial(anchored, "anchor_study")}
+TABLES |= {"judge": judge, "anchor": partial(anchored, "anchor_study", "anchor_study_streams")}
 TABLES |= {"every pixel": partial(every_pixel, "dense", "dense_streams")}
 TABLES |= {"pixels by scene": partial(pixels_by_scene, "dense")}
 TABLES |= {"speed": speed_tables.stages, "mutants": caught} | speed_tables.TABLES | kornia_tables.TABLES

@@ -9,7 +9,8 @@ error is at most half that of an affine fit to the near returns; nowhere is it, 
 the better of the raw and the near-only map; sigma is right to .07.
 What would refute it: any of these numbers missed.
 
-The constants of :mod:`dhtorch.distortion` and :mod:`dhtorch.anchors` were chosen on ``data=shared_scenes``, so its numbers there are no test. Map and
+The constants of :mod:`dhtorch.distortion` and :mod:`dhtorch.anchors` were chosen on ``data=shared_scenes``, so its
+numbers there are no test. Map and
 near returns are of one sensor here: a near-only fit of a rescaled map is nearly exact, more than a network's would be.
 """
 
