@@ -115,7 +115,8 @@ def _read(x: Tensor, share: Tensor, told: tuple[Tensor, ...]) -> Anchors:
     var = (rel.square() - common.square()).clamp_min(0) + FLOOR**2 + torch.where(near, 0.0, FAR_ALONE**2)
     common = torch.where(near, 0.0, (common.square() + FAR_SHARED**2).sqrt())
     share = torch.where(use[..., None], share, 0.5)
-    return Anchors(share, torch.where(use, value, 1.0), z, var, common, near, use)
+    told_x = torch.where(use, value, 1.0)
+    return Anchors(share=share, x=told_x, depth=z, var=var, shared=common, near=near, used=use)
 
 
 def at_anchors(x: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:

@@ -134,7 +134,16 @@ def _task(scene: Scene, maps: DepthMaps, method: Method, settings: Mapping[str, 
         }
     )
     options = {**settings, **dict.fromkeys(complete.EXTRAS, False)}
-    return Task(scene, out, layout, method, options, frames, {}, shared)
+    return Task(
+        scene=scene,
+        folder=out,
+        layout=layout,
+        method=method,
+        settings=options,
+        frames=frames,
+        offers={},
+        shared=shared,
+    )
 
 
 def _files(scene: Scene, maps: DepthMaps, frames: Sequence[int]) -> dict[str, Path]:
