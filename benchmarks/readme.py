@@ -393,6 +393,26 @@ def judge() -> str:
     return table(["number", "`judge`", "photometric check", "bar"], rows)
 
 
+#: What anchoring is to reach, in words, and its bars.
+ANCHORED = {
+    "simulated_median": ("far error, map off by 1.3 % in shape and 5 % in scale, median", "≤ 0.02"),
+    "ratio_to_near_affine": ("far error, ratio to an affine fit to near returns, median over faults", "≤ 0.5"),
+    "worst_ratio_to_better": ("worst scene and fault: (error − 0.002) / the better of raw and near-only", "≤ 1.05"),
+    "within_sigma": ("within one sigma, all pixels with truth", "0.68 ± 0.07"),
+    "within_2sigma": ("within two", "≥ 0.90"),
+}
+
+
+def anchored(*results: str) -> str:
+    """What anchoring reaches, of several results, beside its bars."""
+    found = [json.loads((RESULTS / f"{name}.json").read_text()) for name in results]
+    rows = [
+        [words, *(f"{result['summary'][f'anchor.{name}']['value']:.3f}" for result in found), bar]
+        for name, (words, bar) in ANCHORED.items()
+    ]
+    return table(["number", *(f"`{result['data']['name']}`" for result in found), "bar"], rows)
+
+
 def questions() -> str:
     """Every archived answer, in alphabetical order."""
     found = {path.stem: json.loads(path.read_text()) for path in sorted(RESULTS.glob("*.json"))}
@@ -431,7 +451,7 @@ def client(name: str) -> str:
 TABLES = {"room": room, "room seeds": room_by_seed, "shared": shared, "truths": truths, "comparison": comparison}
 TABLES |= {"comparison scenes": partial(by_scene, "method_comparison"), "stress": partial(by_scene, "stress")}
 TABLES |= {"chosen views": partial(chosen_views, "method_comparison", "streams"), "beside chosen": beside_chosen}
-TABLES |= {"judge": judge, "clients": clients}
+TABLES |= {"judge": judge, "clients": clients, "anchor": partial(anchored, "anchor_study", "anchor_study_streams")}
 TABLES |= {"every pixel": partial(every_pixel, "dense", "dense_streams")}
 TABLES |= {"pixels by scene": partial(pixels_by_scene, "dense")}
 TABLES |= {"speed": speed_tables.stages, "mutants": caught} | speed_tables.TABLES | kornia_tables.TABLES

@@ -33,7 +33,7 @@ from dhtorch.commands import run  # noqa: E402
 from dhtorch.drawing import colours as palette  # noqa: E402
 
 #: Words of the command with a help text of their own.
-WORDS = ("", "inspect", "report", "complete", "judge", "extract", "integrate", "stream", "view")
+WORDS = ("", "inspect", "report", "complete", "anchor", "judge", "extract", "integrate", "stream", "view")
 
 _MARK = re.compile(r"^<!-- .*? -->\n", re.M)
 _ASKED = re.compile(

@@ -117,9 +117,39 @@ def test_gradients_reach_map_and_anchors():
     of_map, of_anchor = torch.autograd.grad(found.depth.nan_to_num().sum(), (x, z))
     assert of_map.isfinite().all() and of_anchor.isfinite().all()
     assert (of_map != 0).all() and (of_anchor[far.keep] != 0).double().mean() > 0.9
-    step = 1e-5 * torch.ones_like(z)
-    moved = [anchor(x.detach(), [near, far.replace(depth=z.detach() + k * step)]).depth.sum() for k in (-1, 1)]
-    assert float((moved[1] - moved[0]) / 2e-5) == pytest.approx(float(of_anchor.sum()), rel=1e-3)
+    one = torch.zeros_like(z)
+    one[0, int(far.keep[0].nonzero()[3])] = 1
+    for step in (torch.ones_like(z), one):
+        moved = [anchor(x.detach(), [near, far.replace(depth=z.detach() + k * 1e-5 * step)]).depth for k in (-1, 1)]
+        assert float((moved[1] - moved[0]).sum() / 2e-5) == pytest.approx(float((of_anchor * step).sum()), rel=1e-4)
+    pixel = torch.zeros_like(x)
+    pixel[0, 30, 20] = 1e-6
+    moved = [anchor(x.detach() + k * pixel, [near, far]).depth.sum() for k in (-1, 1)]
+    assert float((moved[1] - moved[0]) / 2e-6) == pytest.approx(float(of_map[0, 30, 20]), rel=1e-4)
+
+
+def test_what_has_an_order_keeps_it():
+    truth, near, far = world()
+    x = (truth + 0.3 * truth.sin()).exp().sqrt()
+    found = anchor(x, [near, far], kind="ordinal")
+    order = x.flatten().argsort()
+    assert (found.depth.flatten()[order].diff() >= 0).all()
+    assert error(found, truth) < 0.05
+
+
+def test_nearly_half_of_the_anchors_may_be_wrong():
+    truth, near, far = world()
+    g = torch.Generator().manual_seed(3)
+    wrong = torch.rand(near.depth.shape, generator=g) < 0.4
+    factor = 1 + 2 * torch.rand(near.depth.shape, generator=g)
+    lost = near.replace(depth=torch.where(wrong, factor * near.depth, near.depth))
+    assert error(anchor(0.8 * truth, [lost, far]), truth) < 0.01
+
+
+def test_far_answers_that_are_all_wrong_alike_do_not_move_a_map_that_near_returns_confirm():
+    truth, near, far = world()
+    for factor in (0.9, 1.1):
+        assert error(anchor(truth, [near, far.replace(depth=factor * far.depth)]), truth) < 0.005
 
 
 def test_bad_input_is_named():

@@ -258,7 +258,7 @@ def _make(task: Task, progress: Progress) -> None:
 def make_one(task: Task, i: int) -> None:
     """Make what is missing of frame ``i``."""
     if task.name(i) not in task.done:
-        _write(task, i, *_completed(task, i))
+        write_frame(task, i, *_completed(task, i))
     _write_extras(task, i)
 
 
@@ -313,7 +313,7 @@ def _shown(task: Task, i: int) -> Frame:
     return range_split(frame, s["cutoff"])
 
 
-def _write(task: Task, i: int, anchor: Frame, found: DepthMap, asked: Row) -> None:
+def write_frame(task: Task, i: int, anchor: Frame, found: DepthMap, asked: Row) -> None:
     """The files of one frame; the one that makes it whole comes last."""
     name, layout, one = task.name(i), task.layout, found[0]
     steps = export.in_steps(one.depth, one.sigma, one.source, layout.unit)
@@ -354,6 +354,8 @@ def _counts(steps: export.Steps, one: DepthMap) -> Row:
     """Pixels by source, and the shares of all pixels that are silent, by reason."""
     kinds = {code: name.lower() for code, name in names(Source).items() if name.lower() in KINDS}
     pixels = {name: int((steps.source == code).sum()) for code, name in kinds.items()}
+    if anchored := int((steps.source == Source.ANCHORED).sum()):
+        pixels["anchored"] = anchored
     gates = {name.lower(): float((one.gate == code).double().mean()) for code, name in names(Gate).items()}
     silent = {name: share for name, share in gates.items() if share and name != "answer"}
     return {"pixels": pixels, "silent": {**silent, "unfit": float(steps.unfit.mean())}}

@@ -98,18 +98,18 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     return int(bool(failed))
 
 
-def exceeded(whole: Mapping[str, Any], limits: Mapping[str, float]) -> list[str]:
+def exceeded(whole: Mapping[str, Any], limits: Mapping[str, float], known: Mapping[str, str] = LIMITS) -> list[str]:
     """Limits that a recording's numbers exceed, in words; a number that cannot be known exceeds none."""
     found = []
     for name, limit in limits.items():
         value = whole["held"][name]
         if value is not None and value > limit:
-            found.append(f"{name} is {value:.4g}, limit {limit:g} ({LIMITS[name]})")
+            found.append(f"{name} is {value:.4g}, limit {limit:g} ({known[name]})")
     return found
 
 
-def parse_limits(text: str | None) -> dict[str, float]:
-    """``wrong>0.05,scale>0.1`` as numbers by name.
+def parse_limits(text: str | None, known: Mapping[str, str] = LIMITS) -> dict[str, float]:
+    """``wrong>0.05,scale>0.1`` as numbers by name, of those ``known``.
 
     Raises:
         ValueError: something else.
@@ -118,11 +118,11 @@ def parse_limits(text: str | None) -> dict[str, float]:
     for part in (text or "").split(",") if text else ():
         match = _LIMIT.fullmatch(part)
         try:
-            if match is None or match.group(1) not in LIMITS:
+            if match is None or match.group(1) not in known:
                 raise ValueError
             limits[match.group(1)] = float(match.group(2))
         except ValueError:
-            expected = f"NAME>NUMBER, separated by commas, of {', '.join(LIMITS)}"
+            expected = f"NAME>NUMBER, separated by commas, of {', '.join(known)}"
             raise ValueError(f"fail_on: found {part.strip()!r}, expected {expected}") from None
     return limits
 

@@ -32,7 +32,7 @@ Row = Mapping[str, Any]
 SPARSE_UNIT = 0.005
 
 #: What a Stray capture says of a depth, by codes.Source.
-CONFIDENCE = {Source.NONE: 0, Source.SENSOR: 2, Source.RECOVERED: 1, Source.SWEPT: 1}
+CONFIDENCE = {Source.NONE: 0, Source.SENSOR: 2, Source.RECOVERED: 1, Source.SWEPT: 1, Source.ANCHORED: 1}
 
 #: Files of a Stray capture that hold for whatever depth it has.
 STRAY_FILES = ("odometry.csv", "camera_matrix.csv", "rgb.mp4")

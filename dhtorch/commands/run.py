@@ -35,6 +35,7 @@ COMMANDS = {"inspect": "dhtorch.commands.inspect", "report": "dhtorch.studies.re
 #: Sub-command with settings of its own, ``conf/<word>.yaml`` → module with ``run(settings, parts, *, progress)``, which
 #: is given all options as plain values, and as objects those that name a function. It returns the exit code.
 CONFIGURED = {
+    "anchor": "dhtorch.commands.anchor",
     "complete": "dhtorch.commands.complete",
     "enrich": "dhtorch.commands.enrich",
     "extract": "dhtorch.extract",
@@ -47,6 +48,7 @@ CONFIGURED = {
 
 #: Sub-command → the options that its first words without a name set.
 FIRST_WORDS = {
+    "anchor": ("data.root",),
     "complete": ("data.root",),
     "enrich": ("data.root", "out"),
     "judge": ("data.root",),
@@ -61,7 +63,7 @@ HUNG_UP, TERMINATED = 129, 143
 #: Exit codes, as ``dhtorch --help`` lists them.
 EXIT_CODES = {
     DONE: "all done or left untouched",
-    SOME_FAILED: "some jobs of a sweep failed, or a judged depth exceeds fail_on",
+    SOME_FAILED: "some jobs of a sweep failed, or a judged or anchored depth exceeds fail_on",
     FAILED: "bad option, bad data or failed job",
     INTERRUPTED: "interrupted",
     HUNG_UP: "told to end by SIGHUP, as when a terminal is closed",

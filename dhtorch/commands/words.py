@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 #: Options whose value is a place: whatever stands in it, it is one text.
-PLACES = ("output", "out", "html", "save", "result", "root", "data.root", "path")
+PLACES = ("output", "out", "depth", "html", "save", "result", "root", "data.root", "path")
 
 #: Options whose value is a list: outside a sweep it needs no brackets.
 LISTS_OF = ("data.K", "data.K_depth", "data.intrinsics", "data.camera", "data.episode", "data.distortion")

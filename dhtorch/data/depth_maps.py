@@ -1,15 +1,17 @@
 """Depth maps beside a recording: a folder with one file a frame, from a network or any other source.
 
-``*.png`` of 16 bits in steps of a stated unit, or ``*.npy`` of floats in the same unit; (h, w) over the field of the
-frame's picture, of any size. 0, and what is not finite, is no depth. What ``dhtorch complete`` wrote is read as it is:
-its ``complete.json`` says the unit.
+``*.png`` of 16 bits in steps of a stated unit; ``*.npy``, ``*.npz`` (its one array, or the one named depth),
+``*.tiff``, ``*.pfm`` or ``*.exr`` of numbers in the same unit; (h, w) over the field of the frame's picture, of any
+size. 0, and what is not finite, is no depth. What ``dhtorch complete`` wrote is read as it is: its ``complete.json``
+says the unit.
 """
 
 from __future__ import annotations
 
 import io
 import re
-from collections.abc import Sequence
+import zipfile
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,13 +20,20 @@ import torch
 from torch import Tensor
 
 from dhtorch.data import files
+from dhtorch.data.codecs.exr import read_exr
+from dhtorch.data.codecs.npy import read_npz
+from dhtorch.data.codecs.pfm import read_pfm
+from dhtorch.data.codecs.tiff import read_tiff
 from dhtorch.data.files import MAX_PIXELS, FormatError
 from dhtorch.data.recording import Recording
 
 #: Name of a unit → metres.
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 
-_ENDINGS = (".png", ".npy")
+_ENDINGS = (".png", ".npy", ".npz", ".tif", ".tiff", ".pfm", ".exr")
+
+#: Array of an archive that is taken where it has several.
+_KEY = "depth"
 
 
 @dataclass(frozen=True)
@@ -43,7 +52,7 @@ class DepthMaps:
         file = self.files[i]
         if file is None:
             return None
-        array = files.read_depth_png(file, 1.0) if file.suffix.lower() == ".png" else _npy(file)
+        array = _READERS[file.suffix.lower()](file)
         depth = torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))[None] * self.unit
         return torch.where(depth.isfinite() & (depth > 0), depth, 0.0)
 
@@ -57,7 +66,8 @@ def open_maps(folder: str | Path, recording: Recording, unit: str | float | None
     Args:
         folder: of the files, or one that ``dhtorch complete`` wrote.
         recording: whose frames they are of.
-        unit: m, cm, mm, inch, or metres a step; None = what ``complete.json`` says, else mm for PNG and m for NPY.
+        unit: m, cm, mm, inch, or metres a step; None = what ``complete.json`` says, else mm for PNG and m for all
+            others.
 
     Raises:
         FormatError: no folder, no map, both kinds, or files that cannot be matched.
@@ -65,14 +75,14 @@ def open_maps(folder: str | Path, recording: Recording, unit: str | float | None
     """
     root = Path(folder).expanduser()
     if not root.is_dir():
-        raise FormatError(root, "depth", "no folder", "a folder of 16-bit PNG or NPY files")
+        raise FormatError(root, "depth", "no folder", f"a folder of files {', '.join(_ENDINGS)}")
     about = root / "complete.json" if (root / "complete.json").is_file() else root.parent / "complete.json"
     place = root / "depth" if (root / "depth").is_dir() else root
     found = sorted(file for file in place.iterdir() if file.suffix.lower() in _ENDINGS)
     kinds = {file.suffix.lower() for file in found}
     if len(kinds) != 1:
         what = "both kinds" if kinds else "no such file"
-        raise FormatError(place, "depth", what, "one 16-bit PNG or NPY file a frame")
+        raise FormatError(place, "depth", what, f"one kind of file a frame of {', '.join(_ENDINGS)}")
     step = _unit(unit)
     if step is None and about.is_file():
         step = files.to_positive(files.read_json(about).get("unit_m"), about, "unit_m")
@@ -110,7 +120,36 @@ def _npy(file: Path) -> np.ndarray:
         raise FormatError(file, "depth", f"{type(error).__name__}", "a NPY array of numbers") from error
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
         raise FormatError(file, "depth", "no array of numbers", "a NPY array of numbers")
+    return _flat(array, file)
+
+
+def _npz(file: Path) -> np.ndarray:
+    """The one array (h, w) of an archive, or that named depth."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(files.read_bytes(file))) as archive:
+            keys = [name.removesuffix(".npy") for name in archive.namelist()]
+    except (zipfile.BadZipFile, OSError, ValueError) as error:
+        raise FormatError(file, "archive", f"{type(error).__name__}", "a whole .npz archive") from None
+    return _flat(read_npz(file, keys[0] if len(keys) == 1 else _KEY), file)
+
+
+def _png(file: Path) -> np.ndarray:
+    return files.read_depth_png(file, 1.0)
+
+
+def _flat(array: np.ndarray, file: Path) -> np.ndarray:
     array = array.squeeze()
     if array.ndim != 2 or not 0 < array.size <= MAX_PIXELS:
         raise FormatError(file, "depth", f"shape {array.shape}", "(height, width)")
     return array
+
+
+_READERS: dict[str, Callable[[Path], np.ndarray]] = {
+    ".png": _png,
+    ".npy": _npy,
+    ".npz": _npz,
+    ".tif": read_tiff,
+    ".tiff": read_tiff,
+    ".pfm": read_pfm,
+    ".exr": read_exr,
+}

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dhtorch.drawing.axis import Axis, spanning
 from dhtorch.drawing.canvas import Canvas, Key, Mark, headed, save
 from dhtorch.drawing.colours import Stroke, series
-from dhtorch.drawing.maps import draw_completed
+from dhtorch.drawing.maps import draw_anchored, draw_completed
 from dhtorch.drawing.panel import Panel
 from dhtorch.drawing.pictures import FEWEST, Layer, Picture, draw_depth, draw_holes, draw_risk_coverage, draw_samples
 from dhtorch.drawing.svg import inline
@@ -27,6 +27,7 @@ __all__ = [
     "Panel",
     "Picture",
     "Stroke",
+    "draw_anchored",
     "draw_completed",
     "draw_depth",
     "draw_holes",

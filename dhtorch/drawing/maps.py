@@ -6,6 +6,7 @@ Arrays may be torch tensors or numpy arrays, on any device, of one view (no batc
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -46,7 +47,6 @@ def draw_completed(
     metres, share = depths(z[known]), Axis(*SIGMA_REL, "sigma / depth, %", log=True, percent=True)
     sensed = known & (code == Source.SENSOR)
     height = WIDTH * z.shape[0] / z.shape[1]
-    canvas = Canvas(2 * WIDTH + GAP, 2 * (height + TITLE) + SCALE, dpi=160)
     rows = SCALE, SCALE + height + TITLE
     ratio = np.where(known, s / np.where(known, z, 1), 1)
     shown = [
@@ -55,12 +55,50 @@ def draw_completed(
         (f"Completed: {_percent(known)}, the rest is silent", rows[0], coloured(z, known, metres, colours.DEPTH)),
         ("Sigma / depth", rows[0], coloured(ratio, known, share, colours.ERROR)),
     ]
+    _draw(path, shown, height, (metres, share))
+
+
+def draw_anchored(
+    path: str | Path | IO[bytes],
+    image: Any,  # (C, h, w) or (C, H, W) uint8, or float in [0, 1]
+    given: Any,  # (1, h, w) or (h, w), in any unit, 0 or NaN where it has no value
+    depth: Any,  # (h, w) m, 0 or NaN where nothing is known
+    sigma: Any,  # (h, w) m
+    *,
+    title: str = "",
+) -> None:
+    """Draw the picture, a map as it was given, the anchored one, and its sigma / depth; the two maps by the logarithm
+    of their values, each over its own range."""
+    x, z, s = (as_array(q) for q in (given, depth, sigma))
+    x = x.reshape(x.shape[-2:])
+    there, known = np.isfinite(x) & (x > 0), np.isfinite(z) & (z > 0)
+    metres, share = depths(z[known]), Axis(*SIGMA_REL, "sigma / depth, %", log=True, percent=True)
+    height = WIDTH * z.shape[0] / z.shape[1]
+    rows = SCALE, SCALE + height + TITLE
+    ratio = np.where(known, s / np.where(known, z, 1), 1)
+    shown = [
+        (_title("Picture", title), rows[1], rgb_of(image)),
+        (f"Map as given: {_percent(there)}", rows[1], coloured(x, there, depths(x[there]), colours.DEPTH)),
+        (f"Anchored: {_percent(known)}, the rest is silent", rows[0], coloured(z, known, metres, colours.DEPTH)),
+        ("Sigma / depth", rows[0], coloured(ratio, known, share, colours.ERROR)),
+    ]
+    _draw(path, shown, height, (metres, share))
+
+
+def _draw(
+    path: str | Path | IO[bytes],
+    shown: Sequence[tuple[str, float, np.ndarray]],
+    height: float,
+    scales: tuple[Axis, Axis],
+) -> None:
+    """Four pictures, with the scales of depth and of sigma below them."""
+    canvas = Canvas(2 * WIDTH + GAP, 2 * (height + TITLE) + SCALE, dpi=160)
     for k, (words, bottom, pixels) in enumerate(shown):
         left = (k % 2) * (WIDTH + GAP)
         canvas.title(words, WIDTH, bottom + height + TITLE, left)
         canvas.picture(pixels, (left, bottom, WIDTH, height))
-    _scale(canvas, metres, colours.DEPTH, 0.0)
-    _scale(canvas, share, colours.ERROR, WIDTH + GAP)
+    _scale(canvas, scales[0], colours.DEPTH, 0.0)
+    _scale(canvas, scales[1], colours.ERROR, WIDTH + GAP)
     save(canvas.figure, path)
 
 

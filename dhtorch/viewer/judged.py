@@ -1,4 +1,5 @@
-"""What the judge says of a data set, as one HTML page that needs nothing beside itself: worst first.
+"""What is said of the depth of a data set, judged or anchored, as one HTML page that needs nothing beside itself:
+worst first.
 
 Names come from files of others: they are escaped. Pictures are inside the page.
 """
@@ -14,6 +15,9 @@ from typing import Any
 
 from dhtorch import storage
 from dhtorch.drawing.colours import style_sheet
+
+#: Under the numbers of a judged data set.
+JUDGED = "Green is consistent, red is wrong; of all else nothing can be known."
 
 _STYLE = """
 body { margin: 0 auto; max-width: 76rem; padding: 1.2rem; background: var(--ground); color: var(--ink);
@@ -43,16 +47,18 @@ def page(
     frames: Sequence[JudgedFrame],
     *,
     failed: Sequence[str] = (),
+    word: str = "judge",
+    note: str = JUDGED,
 ) -> str:
     """The page: what is said of the whole, a table of all frames in the order given, and the pictures."""
     lines = ["<!doctype html>", '<html lang="en"><head><meta charset="utf-8">']
     lines += [
-        f"<title>{html.escape(title)} · dhtorch judge</title>",
+        f"<title>{html.escape(title)} · dhtorch {word}</title>",
         f"<style>{style_sheet()}{_STYLE}</style></head><body>",
     ]
     lines += [f"<h1>{html.escape(title)}</h1>", *(f"<p>{html.escape(text)}</p>" for text in said)]
     lines += [f'<p class="bad">{html.escape(text)}</p>' for text in failed]
-    lines += ['<p class="note">Green is consistent, red is wrong; of all else nothing can be known.</p>']
+    lines += [f'<p class="note">{html.escape(note)}</p>']
     head = "".join(f"<th>{html.escape(name)}</th>" for name in ("frame", *columns))
     lines += ['<div class="scroll"><table>', f"<thead><tr>{head}</tr></thead><tbody>"]
     for frame in frames:

@@ -9,7 +9,8 @@ error is at most half that of an affine fit to the near returns; nowhere is it, 
 the better of the raw and the near-only map; sigma is right to .07.
 What would refute it: any of these numbers missed.
 
-The constants of :mod:`dhtorch.metric` were chosen on ``data=shared_scenes``, so its numbers there are no test. Map and
+The constants of :mod:`dhtorch.distortion` and :mod:`dhtorch.anchors` were chosen on ``data=shared_scenes``, so its
+numbers there are no test. Map and
 near returns are of one sensor here: a near-only fit of a rescaled map is nearly exact, more than a network's would be.
 """
 
@@ -22,6 +23,7 @@ import torch
 from torch import Tensor
 
 from dhtorch import dense, metric
+from dhtorch.anchors import gathered
 from dhtorch.codes import Source
 from dhtorch.data.pairs import around
 from dhtorch.data.recording import TruthRecording
@@ -259,7 +261,7 @@ def _judged(look: Look, names: Sequence[str], seed: int) -> Iterator[tuple[str, 
 def _peers(x: Tensor, look: Look) -> dict[str, Tensor]:
     """The usual fits."""
     known = torch.where(x > 0, x, torch.nan)
-    points = metric.anchored(known, look.anchors, look.hw)
+    points = gathered(known, look.anchors, look.hw)
     use = points.used[0]
     value, z, near = points.x[0][use], points.depth[0][use], points.near[0][use]
     fits = {

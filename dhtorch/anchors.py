@@ -1,0 +1,149 @@
+"""What is known in metres on the pixels of somebody's map: near returns, far answers, other maps.
+
+Alphabet: ``x`` value of the map at an anchor, ``depth`` what the anchor says, ``var`` the variance of its logarithm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import torch
+from torch import Tensor
+
+from dhtorch.codes import Source
+from dhtorch.geometry.lookup import nearest
+from dhtorch.geometry.shapes import check
+from dhtorch.records import DepthMap, Estimate, Samples
+
+#: Anchors of one source that are used at most, evenly spread over its samples or pixels.
+MOST: Final = 512
+
+#: Relative error that every return may have beside what it states.
+FLOOR: Final = 0.01
+
+#: Relative error that far answers have beside what they state, each alone and all together: matches that slip, and
+#: motions that their covariance takes for better than they are.
+FAR_ALONE, FAR_SHARED = 0.02, 0.05
+
+#: Share of a far map's variance that all its pixels share (its motion's).
+SHARED: Final = 0.5
+
+#: Blocks (rows, columns) of the picture whose anchors have errors in common, and share of the variance that they have.
+BLOCKS: Final = (6, 8)
+CORRELATED: Final = 0.3
+
+#: Anchors that stand beside each other: the next one within this share of the picture's longer side.
+BESIDE: Final = 0.04
+
+
+class Anchors(NamedTuple):
+    """What is known in metres, on pixels of the map; (B, N) each."""
+
+    share: Tensor  # (B, N, 2) place, share of width and height
+    x: Tensor  # the map there
+    depth: Tensor  # m
+    var: Tensor  # of log depth, what each has alone
+    shared: Tensor  # standard deviation of log depth that all far ones have in common
+    near: Tensor  # bool
+    used: Tensor  # bool
+
+    @property
+    def block(self) -> Tensor:
+        """Part (B, N) int64 of the picture; near and far ones of one part are two."""
+        rows, columns = BLOCKS
+        cell = (self.share * self.share.new_tensor([columns, rows])).floor().long()
+        column, row = cell[..., 0].clamp(0, columns - 1), cell[..., 1].clamp(0, rows - 1)
+        return 2 * (row * columns + column) + self.near.long()
+
+    def weight(self, used: Tensor) -> Tensor:
+        """How many anchors each of those ``used`` (B, N) counts as among its block's, 0 of the others."""
+        count = self.x.new_zeros(len(used), 2 * BLOCKS[0] * BLOCKS[1])
+        count = count.scatter_add(1, self.block, used.to(count)).gather(1, self.block)
+        return used / (1 + CORRELATED * (count - 1).clamp_min(0))
+
+
+def gathered(
+    x: Tensor,  # (B, h, w)
+    given: Sequence[Samples | Estimate | DepthMap],
+    hw: tuple[int, int],
+) -> Anchors:
+    """All anchors on the pixels of a map, NaN where it has no value; those without one are not used.
+
+    Args:
+        x: the map.
+        given: near returns (usable ``Samples``), far answers (``Estimate``), maps (``DepthMap``).
+        hw: height and width of the picture in whose pixels samples and estimates are.
+
+    Gradient: to map, depth and sigma. Raises ValueError for wrong shapes.
+    """
+    parts = [_of_map(one) if isinstance(one, DepthMap) else _of_points(one, hw) for one in given]
+    found = []
+    for share, depth, sigma, together, near, keep in parts:
+        check("anchor", depth_map=(x, "B h w"), anchors=(share, "B N 2"))
+        n = depth.shape[1]
+        pick = torch.linspace(0, n - 1, min(n, MOST), device=x.device).round().long()
+        found.append(_read(x, share[:, pick], tuple(part[:, pick] for part in (depth, sigma, together, near, keep))))
+    return Anchors(*(torch.cat(parts, 1) for parts in zip(*found, strict=True)))
+
+
+def _of_map(one: DepthMap) -> tuple[Tensor, ...]:
+    depth, sigma = one.depth.double(), one.sigma.double()
+    rows, columns = (torch.arange(n, device=depth.device).double() for n in depth.shape[-2:])
+    v, u = torch.meshgrid((rows + 0.5) / len(rows), (columns + 0.5) / len(columns), indexing="ij")
+    share = torch.stack([u, v], -1).flatten(0, 1).expand(len(depth), -1, -1)
+    depth, sigma, keep, near = (p.flatten(1) for p in (depth, sigma, one.keep, one.source == Source.SENSOR))
+    return share, depth, sigma, SHARED**0.5 * sigma, near, keep
+
+
+def _of_points(one: Samples | Estimate, hw: tuple[int, int]) -> tuple[Tensor, ...]:
+    depth, sigma = one.depth.double(), one.sigma.double()
+    share = (one.uv.double() + 0.5) / one.uv.new_tensor([hw[1], hw[0]]).double()
+    if isinstance(one, Samples):
+        return share, depth, sigma, torch.zeros_like(sigma), torch.ones_like(one.usable), one.usable
+    return share, depth, sigma, one.sigma_shared.double(), torch.zeros_like(one.keep), one.keep
+
+
+def _read(x: Tensor, share: Tensor, told: tuple[Tensor, ...]) -> Anchors:
+    """The map at anchors, and their variances."""
+    depth, sigma, together, near, keep = told
+    value, inside = at_anchors(x, share)
+    use = keep & inside & value.isfinite() & depth.isfinite() & (depth > 0) & sigma.isfinite() & (sigma >= 0)
+    z = torch.where(use, depth, 1.0)
+    rel, common = (torch.where(use & (s >= 0), s / z, 0.0) for s in (sigma, together))
+    common = torch.where(near, 0.0, common)
+    var = (rel.square() - common.square()).clamp_min(0) + FLOOR**2 + torch.where(near, 0.0, FAR_ALONE**2)
+    common = torch.where(near, 0.0, (common.square() + FAR_SHARED**2).sqrt())
+    share = torch.where(use[..., None], share, 0.5)
+    told_x = torch.where(use, value, 1.0)
+    return Anchors(share=share, x=told_x, depth=z, var=var, shared=common, near=near, used=use)
+
+
+def at_anchors(x: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
+    """Values (B, N) of a map (B, h, w) at the pixels nearest to places (B, N, 2), and whether these are inside."""
+    h, w = x.shape[-2:]
+    return nearest(x, share * share.new_tensor([w, h]) - 0.5)
+
+
+def nugget(points: Anchors, r: Tensor, aspect: float) -> Tensor:
+    """Variance (B, 1) of residuals ``r`` (B, N) that near anchors do not share with the one beside them: their own
+    noise, not the map's shape. Robust: by the median of squared differences; infinite where none stand together.
+
+    Args:
+        points: the anchors.
+        r: residuals of log depth.
+        aspect: height / width of the picture.
+
+    Gradient: none.
+    """
+    with torch.no_grad():
+        use = points.used & points.near
+        place = points.share * points.share.new_tensor([1.0, aspect]) / max(1.0, aspect)
+        apart = torch.cdist(place, place)
+        apart = torch.where(use[:, :, None] & use[:, None], apart, torch.inf)
+        apart = apart + torch.diag_embed(torch.full_like(r, torch.inf)).nan_to_num(0.0, posinf=torch.inf)
+        gap, at = apart.min(-1)
+        square = 0.5 * (r - r.gather(1, at)).square()
+        beside = use & (gap < BESIDE)
+        found = torch.where(beside, square, torch.nan).nanquantile(0.683, -1, keepdim=True)
+        return found.nan_to_num(torch.inf)
