@@ -77,7 +77,7 @@ def draw_anchored(
     rows = SCALE, SCALE + height + TITLE
     ratio = np.where(known, s / np.where(known, z, 1), 1)
     shown = [
-        (_title("Picture", title), rows[1], rgb_of(image)),
+        (headed("Picture", title), rows[1], rgb_of(image)),
         (f"Map as given: {_percent(there)}", rows[1], coloured(x, there, depths(x[there]), colours.DEPTH)),
         (f"Anchored: {_percent(known)}, the rest is silent", rows[0], coloured(z, known, metres, colours.DEPTH)),
         ("Sigma / depth", rows[0], coloured(ratio, known, share, colours.ERROR)),
