@@ -330,7 +330,7 @@ def enriched() -> str:
     file = RESULTS / "enrich.json"
     if not file.is_file():
         return "Not measured yet: `benchmarks/results/enrich.json` is not there."
-    others = json.loads((RESULTS.parent / "clients" / "results.json").read_text())
+    others = [each for each in json.loads((RESULTS / "clients.json").read_text()) if each["opened"]]
     rows = []
     for found in sorted(json.loads(file.read_text()), key=lambda found: (found["source"], found["data"])):
         name = f"`{found['data']}`" if found["made"] == "real" else "written"
@@ -339,12 +339,8 @@ def enriched() -> str:
             continue
         weight = "" if found["mb_per_minute"] is None else f"{found['mb_per_minute']:.1f}"
         same = f"{found['compared']:,} values" if found["source_untouched"] and found["done_again"] else "no"
-        opened = [each for each in others if (each["source"], each["target"]) == (found["source"], found["target"])]
-        loaders = [
-            f"{each['loader'].partition(',')[0]}{', a training step' * bool(each.get('act_step'))}"
-            for each in opened
-            if each.get("opened") and each["data"] == found["data"]
-        ]
+        opened = [each for each in others if (each["data"], each["target"]) == (found["data"], found["target"])]
+        loaders = list(dict.fromkeys(f"{each['loader']}{', a training step' * bool(each['step'])}" for each in opened))
         row = [same, f"{found['s_per_frame']:.2f}", weight, "; ".join(loaders)]
         rows.append(["; ".join(found["said"]), found["source"], name, found["target"], *row])
     head = [

@@ -246,7 +246,11 @@ def test_nothing_there_or_unknown(tmp_path: Path, named: Path) -> None:
     for format in data.FORMATS:  # also where the reader is named and the path is a file
         fails(r"scan.xyz", tmp_path / "scan.xyz", format)
     fails(rf"format: found kitti, expected auto, {every}", named, "kitti")
-    fails(r"data: format frames_dir has no option 'unit', expected one of K, K_depth, distortion", named, unit=3)
+    fails(
+        r"data: format frames_dir has no option 'unit', expected one of intrinsics, K, fov, K_depth, distortion",
+        named,
+        unit=3,
+    )
     fails(r"scene_\*.json: found 0 such files, expected exactly one", named, "driving")
     fails(r"rgb frames: found none", named, "tum")
     fails(r"calib.txt|left.png: found 0 such files", named, "rectified")

@@ -622,5 +622,5 @@ def test_options_that_cannot_be_are_refused():
     with pytest.raises(ValueError, match="other_at is a list, expected one number where other_image"):
         Views(depth_unit="m", other_image="right", other_at=[0])
     assert Views(depth_unit="m", other_at=[0, 1]).other_at == [0, 1]
-    with pytest.raises(TypeError, match="depth_unit"):
+    with pytest.raises(ValueError, match="depth_unit is '', expected one of"):
         Views()

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from itertools import islice
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from dhtorch import archive, dense, lock, storage
@@ -257,7 +257,7 @@ def _folders(scenes: Sequence[Scene], whole: plan.Plan, groups: Sequence[Sequenc
         named = {}
         for n in group:
             scene = scenes[whole.order[n]]
-            parts = [part for part in scene.name.split("/") if part not in ("", ".", "..")]
+            parts = [part for part in PurePosixPath(f"/{scene.name}").parts[1:] if part != ".."]
             named[camera_key(scene.recording)] = name = "" if len(whole.order) == 1 else "/".join(parts)
             if name in seen:
                 raise ValueError(f"data: found two recordings called {name}, expected different names")

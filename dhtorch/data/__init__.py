@@ -123,7 +123,7 @@ def open_all(
         raise FormatError(root, "path", "no such file or folder", f"a {format} capture")
     read = FORMATS[format].read
     known = list(inspect.signature(read).parameters)[1:]
-    options = {name: value for name, value in options.items() if name in known or (name, value) not in _UNSAID}
+    options = {name: value for name, value in options.items() if (name, value) not in _UNSAID}
     for option in options:
         if option not in known:
             raise ValueError(f"data: format {format} has no option {option!r}, expected one of {', '.join(known)}")

@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 
+from dhtorch import dense
 from dhtorch.codes import Source
 from dhtorch.drawing import draw_completed, draw_depth, draw_holes, draw_risk_coverage, draw_samples
 from dhtorch.drawing.colours import of_source
@@ -31,9 +32,9 @@ def draw_example(folder: str | Path, example: Any) -> list[Path]:
     draw_samples(folder / "samples.png", image, uv, whole.source[0], e.estimate.gate[0], title=e.place)
     draw_holes(folder / "holes.png", image, uv, e.samples.hole[0], title=e.place)
     written = ["samples.png", "holes.png", "points.ply"]
-    if e.complete is not None:
+    if example.asked is not None:  # where the method was asked
         with torch.no_grad():
-            maps = e.complete().to("cpu")[0]
+            maps = dense.complete(example.frame, calibration=dense.shipped(), **example.asked).to("cpu")[0]
         draw_completed(folder / "completed.png", image, maps.depth, maps.sigma, maps.source, title=e.place)
         written.append("completed.png")
     pooled = errors.select(e.estimate, e.truth)

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from dhtorch import dense, tree
+from dhtorch import tree
 from dhtorch.codes import Gate, Hole, names
 from dhtorch.data.files import set_opencv_threads
 from dhtorch.data.pairs import Pair, between, fixed
@@ -28,7 +28,7 @@ from dhtorch.geometry.lookup import nearest, patches, round_half_up
 from dhtorch.leash import follow_parent
 from dhtorch.method import Method, Trace
 from dhtorch.offers import Picked, choosing, picked
-from dhtorch.records import NO_HINT, DepthMap, Estimate, Frame, PoseFit, Samples, TrackHint, Tracks
+from dhtorch.records import NO_HINT, Estimate, Frame, PoseFit, Samples, TrackHint, Tracks
 from dhtorch.studies.rows import Row, overlay, scene_row, summarise
 from dhtorch.studies.shared_tracks import SharedTracks
 
@@ -232,7 +232,9 @@ class Example:
     truth: holdout.Truth
     pair: str = ""  # the anchor and the views that were used, as numbers of the recording
     cutoff: float | None = None  # m
-    complete: Callable[[], DepthMap] | None = None  # every pixel of it; None where the method was not simply asked
+    asked: dict[str, Any] | None = (
+        None  # as dhtorch.dense.complete takes it; None where the method was not simply asked
+    )
 
     @property
     def place(self) -> str:
@@ -392,23 +394,22 @@ class _Collected:
                 self._count_holes(variant.method, batch.anchor, answer.samples.uv)
                 enough = [int(ok.sum()) >= self.least for ok in truths[self.last].ok]
                 self.n_few += enough.count(False)
+            choices = []
             for b, counts in enumerate(enough):
                 one = answer.one(b)
-                choice = self._picked(one)
+                choices.append(self._picked(one))
                 if counts:
-                    self._note(one, choice)
+                    self._note(one, choices[-1])
             if not self.examples:
-                self.examples.append(self._example(answer.one(0), near[:1], seen[which]))
+                self.examples.append(self._example(answer.one(0), choices[0], near[:1], seen[which]))
 
-    def _example(self, first: Answer, near: Frame, seen: Frame | None) -> Example:
+    def _example(self, first: Answer, choice: Picked | None, near: Frame, seen: Frame | None) -> Example:
         variant, (anchor, other) = self.protocol.variants[first.variant], first.batch.pairs[0]
-        choice = self._picked(first)
         views = choice.views if choice is not None else (other,)
-        complete = None
+        asked: dict[str, Any] | None = None
         if seen is not None and variant.ask is None and variant.fit is None:
-            ways = seen[:, :1] if seen.image.dim() == 5 else seen[:1]
-            told: dict[str, Any] = {"method": variant.method, "seed": self.settings.seed, "hint": self.scene.hint}
-            complete = partial(dense.complete, near, ways, calibration=dense.shipped(), **told)
+            others = seen[:, :1] if seen.image.dim() == 5 else seen[:1]
+            asked = {"others": others, "method": variant.method, "seed": self.settings.seed, "hint": self.scene.hint}
         return Example(
             self.scene.name,
             first.variant,
@@ -416,7 +417,7 @@ class _Collected:
             *(first.samples, first.estimate, first.truths[self.last]),
             pair=f"{anchor} → {', '.join(map(str, views))}",
             cutoff=self.cutoff,
-            complete=complete,
+            asked=asked,
         )
 
     def rows(self) -> list[Row]:

@@ -117,6 +117,8 @@ class ExtendDepth(torch.nn.Module):
 
     def forward(self, sample: Mapping[str, Any]) -> dict[str, Any] | None:
         """The sample with our keys; None where it is skipped."""
+        if sample is None and self.on_error == "skip":  # what a data set gives that could not read one
+            return self.left_out({}, SampleError("sample: found None, expected a dict with pictures and depth"))
         check_sample(sample, self.views.image, self.views.intrinsics, self._stated)
         with torch.set_grad_enabled(torch.is_grad_enabled() and get_worker_info() is None):
             try:
@@ -145,8 +147,6 @@ class ExtendDepth(torch.nn.Module):
         Raises:
             SampleError: it is to be flagged, and nothing tells the size of its image.
         """
-        if not isinstance(sample, Mapping) and self.on_error == "flag":
-            raise error
         hw = (None if self.maps else self.tokens_hw) or self.views.image_hw(sample) or self._seen_hw
         if self.on_error == "flag" and hw is None:
             missing = "maps" if self.maps else "tokens: give tokens_hw"

@@ -31,10 +31,8 @@ def find(sample: Mapping[str, Any], key: str) -> Any:
     """The value under a key, or piece by piece in nested dicts.
 
     Raises:
-        SampleError: there is none, or the sample is none.
+        SampleError: there is none.
     """
-    if not isinstance(sample, Mapping):
-        raise SampleError(f"sample: found a {type(sample).__name__}, expected a dict with the key {key}")
     if key in sample:
         return sample[key]
     value: Any = sample
