@@ -90,7 +90,7 @@ def test_every_setting_composes_and_names_real_options(choice):
         if node.get("format", "auto") != "auto":  # open_all hands further options to the reader of that name
             known |= options(FORMATS[node["format"]].read)
         elif "format" in node:  # or of the one that recognises the files, which may lack a camera
-            known |= {"intrinsics", "K", "fov"}
+            known |= dict.fromkeys(("intrinsics", "K", "fov"))
         if node["_target_"].endswith(".open_room"):  # hands further options to the room
             known |= options(SyntheticRoom)
         keys = {k for k in node if not k.startswith("_")}
