@@ -14,6 +14,7 @@ from hydra.errors import HydraException
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
+from dhtorch.commands import words
 from dhtorch.commands.run import config_dir
 from dhtorch.data import FORMATS
 from dhtorch.data.pairs import by_choice, by_gap, by_time
@@ -95,6 +96,13 @@ def test_every_setting_composes_and_names_real_options(choice):
             known |= options(SyntheticRoom)
         keys = {k for k in node if not k.startswith("_")}
         assert keys <= set(known), f"{choice}{path}: {keys - set(known)} are no options of {node['_target_']}"
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+def test_every_setting_that_ships_is_one_that_the_command_takes(choice):
+    plain = OmegaConf.to_container(compose(choice), resolve=False)
+    group = choice.partition("=")[0]
+    words.refuse_values(plain[group], plain[group], f"{group}.")
 
 
 @pytest.mark.parametrize("choice", [c for c in CHOICES if c.startswith(("method=", "pairs=", "data=synthetic"))])

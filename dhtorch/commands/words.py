@@ -269,7 +269,9 @@ def _kind(usual: Any) -> Any:
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Whether a plain value is what an annotation says; what cannot be told fits."""
+    """Whether a plain value is what an annotation says; what cannot be told fits, as what a function will make."""
+    if isinstance(value, Mapping) and "_target_" in value:
+        return True
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         return any(_fits(value, each) for each in args)
