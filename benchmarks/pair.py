@@ -6,7 +6,8 @@
 Pairs of TUM fr1/desk (640×480, near limit 1 m, gap 4) where DHTORCH_DATA is set, else of the built-in room. All sides
 take turns in one process; errors are medians of the relative depth error over the same candidates. Rows
 ``per_far_answer`` are milliseconds per candidate answered within 5 %: their ratio turned over is how many times as many
-such answers ours gives in the same time.
+such answers ours gives in the same time. ``anchor_auto`` is ``auto`` beside the first release's ``WINDOW_1``: one
+anchor, the same frames around it offered to both, from which each chooses.
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ import torch
 from dhtorch import data, extend, tree
 from dhtorch.data.pairs import by_gap
 from dhtorch.evaluate import errors, holdout
-from dhtorch.methods import MAP, PAPER
+from dhtorch.first_release import WINDOW_1
+from dhtorch.methods import AUTO, MAP, PAPER
+from dhtorch.offers import choosing
 from dhtorch.records import Frame
 from dhtorch.stages import triangulate
 from dhtorch.studies.baselines import opencv
@@ -44,13 +47,16 @@ PEER = partial(
 )
 
 
+def _recording() -> tuple[Any, float]:
+    """The recording and its near limit, m."""
+    root = os.environ.get("DHTORCH_DATA")
+    return (data.open(Path(root) / "tum_fr1_desk9"), 1.0) if root else (SyntheticRoom(), 2.0)
+
+
 def load(batch: int) -> tuple[str, Frame, Frame, Frame, float]:
     """Name, near views 0 and 1, view 0 with all its returns, cutoff: ``batch`` pairs, repeated if need be."""
-    root = os.environ.get("DHTORCH_DATA")
-    if root:
-        recording, near, gap = data.open(Path(root) / "tum_fr1_desk9"), 1.0, 4
-    else:
-        recording, near, gap = SyntheticRoom(), 2.0, 6
+    recording, near = _recording()
+    gap = 4 if near == 1.0 else 6
     chosen = by_gap(recording, gap)
     chosen = [chosen[k % len(chosen)] for k in range(batch)]
     anchor, other = (tree.collate([recording[p[k]] for p in chosen]) for k in (0, 1))
@@ -103,6 +109,30 @@ def measure(batch: int, threads: int, options: Any, n: int = 2048) -> list[dict[
     return rows
 
 
+def measure_anchor(threads: int, options: Any, n: int = 2048) -> dict[str, Any]:
+    """The row of one anchor in the middle of the recording, all other frames being offered."""
+    harness.set_threads(threads)
+    recording, near = _recording()
+    middle = len(recording) // 2
+    anchor, *others = (
+        holdout.range_split(recording[k], near) for k in (middle, *(i for i in range(len(recording)) if i != middle))
+    )
+    truth_of = recording[middle]
+    found = {}
+
+    def call(name: str, method: Any) -> None:
+        trace: dict[str, Any] = {}
+        with torch.no_grad():
+            estimate = method(anchor, others, n=n, trace=trace)
+        truth = holdout.candidates(trace["samples"], holdout.truth_at(truth_of, estimate.uv), near)
+        found[name] = errors.measure(errors.select(estimate, truth))["median_rel"]
+
+    sides = [partial(call, "auto", choosing(AUTO)), partial(call, "window_1", choosing(WINDOW_1))]
+    a, b = harness.in_turn(sides, repeats=options.repeats, clock=options.clock)
+    errors_of = {"ours_error": found["auto"], "peer_error": found["window_1"]}
+    return harness.row("anchor_auto", a, "window_1", b, n=n, batch=1, **errors_of, bar=True)
+
+
 def main() -> None:
     """Print the table; write it with ``--json``."""
     options = harness.arguments(__doc__ or "").parse_args()
@@ -110,6 +140,7 @@ def main() -> None:
     for threads in (1, 2):
         for batch in (1, 8, 32) if options.full else (1, 8):
             rows += measure(batch, threads, options)
+        rows.append(measure_anchor(threads, options))
     print(f"{load(1)[0]}: milliseconds per pair, medians of {options.repeats}; errors are median relative depth errors")
     harness.report(rows, options.json)
     for method in OURS:
