@@ -28,7 +28,7 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset, default_collate
 
-from dhtorch import data, extend
+from dhtorch import PAPER, data
 from dhtorch.geometry import camera as cam
 from dhtorch.stages import triangulate
 from dhtorch.studies.baselines import dinov2, opencv
@@ -42,8 +42,7 @@ ROUNDS = 3  # turns of each loader
 SIZES = {"224x224": (SIDE, SIDE), "640x480": (480, 640)}
 BARS = "640x480"
 NETWORKS = {"dinov2_l": {}, "dinov2_s": {"hidden": 384, "layers": 12, "heads": 6}}
-OPENCV = partial(
-    extend,
+OPENCV = PAPER.replace(
     track=opencv.lucas_kanade,
     pose=opencv.pnp_ransac,
     triangulate=partial(triangulate.two_view, solver=opencv.triangulate),

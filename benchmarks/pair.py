@@ -22,7 +22,7 @@ from typing import Any
 import harness
 import torch
 
-from dhtorch import data, extend, tree
+from dhtorch import data, tree
 from dhtorch.data.pairs import by_gap
 from dhtorch.evaluate import errors, holdout
 from dhtorch.first_release import WINDOW_1
@@ -39,8 +39,7 @@ OURS = {"paper": PAPER, "map": MAP}
 #: Relative error of a far answer that counts.
 GOOD = 0.05
 
-PEER = partial(
-    extend,
+PEER = PAPER.replace(
     track=opencv.lucas_kanade,
     pose=opencv.pnp_ransac,
     triangulate=partial(triangulate.two_view, solver=opencv.triangulate),

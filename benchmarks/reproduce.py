@@ -85,11 +85,16 @@ SCRIPTS |= {
     "sweep": "",
     "captures": "",
     "enrich": "",
+    "judge_speed": "--clock cpu --repeats 9",
+    "phone": "",
+    "memory": "",
+    "kills": "--times 50",
+    "fuzz": "--full",
     "clients": "",  # interpreters of the loaders in DHTORCH_CLIENTS
 }
 
 #: Scripts of another name than their result: ``kornia.py`` would be imported instead of the library.
-NAMED = {"kornia": "beside_kornia", "dense_speed": "dense", "clients": "clients/all"}
+NAMED = {"kornia": "beside_kornia", "dense_speed": "dense", "clients": "clients/all", "judge_speed": "judge"}
 
 #: Options that change no number, and which a file may hold otherwise.
 ASIDE = {"figures", "traceback", "root"}

@@ -121,7 +121,9 @@ def judged(
     Arguments, result, errors and cost as there. Gradient: none.
     """
     hw = dense.map_hw(anchor.hw, size)
-    returns = method.backproject(anchor, dense.pixels(anchor, hw)).map(lambda x: x.unflatten(1, hw))
+    # A depth is held against a depth of the same pixel: without a depth camera of its own no lens stands between them.
+    straight = anchor if anchor.depth_camera is not None else anchor.replace(camera=cam.ideal(anchor.camera))
+    returns = method.backproject(straight, dense.pixels(anchor, hw)).map(lambda x: x.unflatten(1, hw))
     own = depth_map is None
     grid = _usable(returns.depth if depth_map is None else _resized(depth_map.to(anchor.camera.f), hw))
     samples = method.look(anchor) if asked is None else asked.samples
@@ -221,7 +223,7 @@ def _of_sensor(frame: Frame, hw: tuple[int, int]) -> Tensor:
 
 def _joined(grid: Tensor, kinds: tuple[Said, Said, Said], numbers: Numbers, ruler: Tensor, own: bool) -> Verdict:
     answers, pictures, maps = kinds
-    state, said, view = decided(answers, pictures, maps)
+    state, said, view = decided(*((answers,) if maps is pictures else kinds))  # of one silence for both nothing comes
     none = torch.full_like(ruler, torch.nan)
     n_wrong, n_known = ((m.sum((1, 2)) / WINDOW) for m in (state == State.WRONG, state != State.CANNOT_KNOW))
     return Verdict(
@@ -242,12 +244,11 @@ def _joined(grid: Tensor, kinds: tuple[Said, Said, Said], numbers: Numbers, rule
     )
 
 
-def decided(answers: Said, pictures: Said, maps: Said) -> tuple[Tensor, Tensor, Tensor]:
-    """State, evidence and view (B, h, w) of what all kinds of evidence say.
+def decided(*kinds: Said) -> tuple[Tensor, Tensor, Tensor]:
+    """State, evidence and view (B, h, w) of what all kinds of evidence say: answers, pictures, maps.
 
     What speaks against a pixel counts unless another kind, that would have told, speaks for it. Gradient: none.
     """
-    kinds = answers, pictures, maps
     against = torch.stack([k.misfit.abs() > AGAINST for k in kinds])
     speaks_for = torch.stack([k.sure & (k.misfit.abs() < FOR) for k in kinds])
     wrong, fine = against.any(0), speaks_for.any(0)

@@ -1,0 +1,57 @@
+"""Time of a verdict on a frame, beside a fixed-threshold photometric check of the same frame.
+
+    python benchmarks/judge.py --json benchmarks/results/judge_speed.json --clock cpu --repeats 9
+
+``judge_sparse``: :func:`dhtorch.judge` of a map of 640×480 with one other view, by sparse evidence (``views=False``,
+512 samples, ``map``), from the frames to the verdict; ``judge_views`` asks the pictures of the view as well. The peer
+needs a motion like ours and gets one by the same method. Frames of TUM fr1/desk where DHTORCH_DATA is set, else of the
+built-in room; frames a second are 1000 / ms.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import harness
+import pair as pairs
+import torch
+
+from dhtorch import MAP, dense, judge
+from dhtorch.studies.baselines import photometric
+
+METHOD = MAP.replace(n=512)
+
+
+def measure(threads: int, options: Any) -> list[dict[str, Any]]:
+    """A row for each way to ask."""
+    harness.set_threads(threads)
+    _, near, other, anchor, _ = pairs.load(1)
+
+    def check() -> None:
+        trace: dict[str, Any] = {}
+        with torch.no_grad():
+            asked = dense.views_asked(METHOD(near, other, trace=trace), other, trace)
+            photometric.differs(anchor.depth, near, asked)
+
+    def ours(views: bool) -> None:
+        judge(anchor.depth, near, other, method=METHOD, views=views)
+
+    sides = harness.in_turn(
+        [partial(ours, False), partial(ours, True), check], repeats=options.repeats, clock=options.clock
+    )
+    *found, peer = sides
+    names = "judge_sparse", "judge_views"
+    return [harness.row(name, side, "photometric", peer, n=512) for name, side in zip(names, found, strict=True)]
+
+
+def main() -> None:
+    """Print the table; write it with ``--json``."""
+    options = harness.arguments(__doc__ or "").parse_args()
+    rows = measure(1, options)
+    print(f"milliseconds a frame, medians of {options.repeats}")
+    harness.report(rows, options.json)
+
+
+if __name__ == "__main__":
+    main()
