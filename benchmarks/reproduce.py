@@ -86,9 +86,6 @@ SCRIPTS |= {
     "captures": "",
     "enrich": "",
     "judge_speed": "--clock cpu --repeats 9",
-    "phone": "",
-    "memory": "",
-    "kills": "--times 50",
     "fuzz": "--full",
     "clients": "",  # interpreters of the loaders in DHTORCH_CLIENTS
 }
