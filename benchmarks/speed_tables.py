@@ -70,7 +70,8 @@ def bars() -> str:
     """Each speed that has a bar, one thread, beside that bar."""
     rows = []
     for file, name, mode, bar, words in BARS:
-        r = next(r for r in timings(file) if (r["name"], r["mode"], r["threads"]) == (name, mode, 1))
+        found = [r for r in timings(file) if (r["name"], r["mode"], r["threads"]) == (name, mode, 1)]
+        r = next((r for r in found if r["bar"]), found[0])  # of several peers the one that the bar is about
         cells = [words if mode == "eager" else f"{words}, {mode}", f"{r['ours_ms']:.2f}", f"{r['peer_ms']:.2f}"]
         verdict = "met" if r["ratio"] <= bar else "missed"
         maker = r["processor"].partition("(")[0].partition(",")[0]
