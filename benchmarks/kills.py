@@ -47,8 +47,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             found |= suffered(command, Path(place) / command, options)
     print(f"{sum(sum(counts.values()) for counts in found.values())} lost, doubled, changed or left")
     if options.json:
-        words = " ".join(["python benchmarks/kills.py", *(argv if argv is not None else sys.argv[1:])])
-        storage.write_json(options.json, {"command": words, "times": options.times, "faults": found})
+        rows = [{"name": name, "times": options.times, **counts} for name, counts in found.items()]
+        storage.write_json(options.json, rows)
     return int(any(any(counts.values()) for counts in found.values()))
 
 

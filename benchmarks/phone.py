@@ -38,7 +38,7 @@ def main() -> int:
         found = row(capture, Path(folder), ())
     found |= {"frames": options.frames, "hw": list(HW), "processor": archive.processor(), "cores": os.cpu_count()}
     print(found)
-    storage.write_json(options.json, found)
+    storage.write_json(options.json, [found])
     return found["rc"]
 
 
