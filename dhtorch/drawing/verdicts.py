@@ -40,13 +40,13 @@ def draw_verdict(
     ground = np.array(colours.rgb(colours.PICTURE)) / 255
     states = np.array([colours.rgb(colours.STATES[k]) for k in sorted(colours.STATES)])[code.astype(np.int64)] / 255
     strength = mapped((np.nan_to_num(sigmas).clip(-END, END) + END) / (2 * END), colours.SIGNED)
-    wrong, fine = ((code == k).mean() for k in (State.WRONG, State.CONSISTENT))
+    wrong, fine = ((code == k).sum() for k in (State.WRONG, State.CONSISTENT))
     strength = np.where(np.isnan(sigmas)[..., None], ground, strength)
     metres: Axis = depths(z[known])
     shown = [
         (f"{title}: picture" if title else "Picture", 1, rgb_of(image)),
         (f"Depth, {metres.low:.2g} to {metres.high:.2g} m", 1, coloured(z, known, metres, colours.DEPTH)),
-        (f"Wrong {100 * wrong:.1f} %, consistent {100 * fine:.0f} %, else cannot know", 0, states),
+        (_said(int(wrong), int(fine), code.size), 0, states),
         (
             f"Evidence to {END:g} sigmas: red too far, blue too near",
             0,
@@ -58,3 +58,10 @@ def draw_verdict(
         canvas.title(words, WIDTH, bottom + height + TITLE, left)
         canvas.picture(pixels, (left, bottom, WIDTH, height))
     save(canvas.figure, path)
+
+
+def _said(wrong: int, fine: int, size: int) -> str:
+    """The states in words: shares of wrong are of what is known, as in tables and limits."""
+    known = wrong + fine
+    told = f", of which {100 * wrong / known:.1f} % are wrong" if known else ""
+    return f"Known: {100 * known / size:.0f} % of the picture{told}"

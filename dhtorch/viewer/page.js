@@ -60,7 +60,7 @@ function tellCoverage() {
   }
   const left = risk.errors.filter((_, k) => risk.scores[k] >= state.threshold);
   const share = hasViews ? `: ${percent(total.kept / total.holes)} of the ${total.holes} samples without a usable return` : "";
-  const first = `${total.kept} of ${total.answers} answers stay${share}.`;
+  const first = total.answers ? `${total.kept} of ${total.answers} answers stay${share}.` : "No point of these was recovered.";
   const second = left.length ? ` Of ${risk.candidates} held-back returns ${percent(left.length / risk.candidates)} are answered, median error ${percent(quantile(left, 0.5))}.` : "";
   $("coverage").textContent = first + second;
   $("threshold-value").textContent = state.threshold.toFixed(2);
