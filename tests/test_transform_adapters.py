@@ -306,11 +306,11 @@ def test_a_batch_is_not_taken_for_time():
         judge(batch)
 
 
-@pytest.mark.parametrize("what", [torch.zeros(3, 8, 8), None])
-def test_a_picture_is_no_sample(what):
-    """What LeRobot's image_transforms hands over."""
+@pytest.mark.parametrize(("what", "on_error"), [(torch.zeros(3, 8, 8), "skip"), (None, "raise")])
+def test_a_picture_is_no_sample(what, on_error):
+    """What LeRobot's image_transforms hands over; skipped it would leave nothing of a data set, and nobody would know."""
     with pytest.raises(SampleError, match=r"wrap the data set instead, ExtendedDataset\(dataset, transform\)"):
-        tiny(on_error="skip")(what)
+        tiny(on_error=on_error)(what)
 
 
 def test_a_loader_extends_whole_batches_and_the_bits_are_the_same(items):
