@@ -202,6 +202,8 @@ def _usable(depth: Tensor) -> Tensor:
 
 
 def _resized(depth_map: Tensor, hw: tuple[int, int]) -> Tensor:
+    if 0 in depth_map.shape:
+        raise ValueError(f"judge: depth_map has shape {tuple(depth_map.shape)}, expected at least one pixel")
     rows, columns = (
         ((torch.arange(n, device=depth_map.device) + 0.5) * m / n).floor().long().clamp_max(m - 1)
         for n, m in zip(hw, depth_map.shape[-2:], strict=True)

@@ -204,3 +204,9 @@ def test_a_batch_is_judged_as_its_members_are(room, true, anchor, others):
     alone = judge(maps[1:], other, views, **SMALL, views=False)
     assert torch.equal(found.state[1:], alone.state)
     assert torch.allclose(found.scale[1:], alone.scale)
+
+
+def test_a_map_without_pixels_is_refused():
+    room = SyntheticRoom(n_frames=1, hw=(48, 64), depth_hw=(24, 32))
+    with pytest.raises(ValueError, match=r"depth_map has shape \(1, 0, 0\), expected at least one pixel"):
+        judge(torch.zeros(1, 0, 0), room[0], None)

@@ -25,6 +25,9 @@ LEAST_COSINE = 0.5
 #: Planes that are tried, and the share of the points that the floor must hold.
 TRIALS, LEAST_SHARE = 300, 0.1
 
+#: How near a floor's normal is to the direction that is guessed, cosine of 40°.
+WITHIN = 0.77
+
 
 def upwards(recording: Recording, poses: Sequence[Pose], xyz: Tensor, thickness: float) -> list[float]:
     """The upward direction of a map, a unit vector in its world.
@@ -67,7 +70,7 @@ def floor(xyz: Tensor, guess: Tensor, thickness: float) -> Tensor | None:
     normal = torch.linalg.cross(three[:, 1] - three[:, 0], three[:, 2] - three[:, 0])
     normal = torch.nn.functional.normalize(normal, dim=-1)
     normal = normal * torch.where(normal @ guess < 0, -1.0, 1.0)[:, None]
-    level = normal @ guess > 0.77
+    level = normal @ guess > WITHIN
     off = (some @ normal.T - (three[:, 0] * normal).sum(-1)).abs()
     count = torch.where(level, (off < thickness).sum(0), 0)
     best = int(count.argmax())
@@ -75,4 +78,5 @@ def floor(xyz: Tensor, guess: Tensor, thickness: float) -> Tensor | None:
         return None
     held = some[off[:, best] < thickness]
     axis = torch.linalg.eigh((held - held.mean(0)).T @ (held - held.mean(0))).eigenvectors[:, 0]
-    return axis if float(axis @ guess) > 0 else -axis
+    axis = axis if float(axis @ guess) > 0 else -axis
+    return axis if float(axis @ guess) > WITHIN else None  # the fit to all that it holds may have turned away

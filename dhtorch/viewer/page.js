@@ -54,13 +54,13 @@ function tellCoverage() {
   const risk = { scores: [], errors: [], candidates: 0 };
   for (const s of chosen) for (let k = 0; k < s.n; k++) {
     if (s.source[k] !== 1) total.holes++;
-    if (s.source[k] === 2) { total.answers++; total.kept += s.score[k] >= state.threshold; }
+    if (s.source[k] >= 2) { total.answers++; total.kept += s.score[k] >= state.threshold; }
     risk.candidates += s.candidate[k];
     if (Number.isFinite(s.error[k])) { risk.scores.push(s.score[k]); risk.errors.push(s.error[k]); }
   }
   const left = risk.errors.filter((_, k) => risk.scores[k] >= state.threshold);
   const share = hasViews ? `: ${percent(total.kept / total.holes)} of the ${total.holes} samples without a usable return` : "";
-  const first = total.answers ? `${total.kept} of ${total.answers} answers stay${share}.` : "No point of these was recovered.";
+  const first = total.answers ? `${total.kept} of ${total.answers} answers stay${share}.` : "Nothing beyond the sensor was recovered here.";
   const second = left.length ? ` Of ${risk.candidates} held-back returns ${percent(left.length / risk.candidates)} are answered, median error ${percent(quantile(left, 0.5))}.` : "";
   $("coverage").textContent = first + second;
   $("threshold-value").textContent = state.threshold.toFixed(2);
@@ -71,7 +71,7 @@ function tellSample() {
   const s = shots[state.now], k = state.picked;
   $("sample-hint").toggleAttribute("hidden", k !== null);
   if (k === null) return facts($("sample-facts"), {});
-  const source = s.source[k], said = { sample: k, source: ["none", "sensor", "recovered"][source] };
+  const source = s.source[k], said = { sample: k, source: ["none", "sensor", "recovered", "swept"][source] };
   if (source) said.depth = `${short(s.depth[k])} m ± ${short(s.sigma[k])} m (${percent(s.sigma[k] / s.depth[k])})`;
   if (source) said[source === 1 ? "confidence" : "score"] = s.score[k].toFixed(2);
   if (source === 0) said["silent because of"] = gateOf[s.gate[k]]?.name ?? s.gate[k];
