@@ -46,16 +46,15 @@ PEER = PAPER.replace(
 )
 
 
-def _recording() -> tuple[Any, float]:
-    """The recording and its near limit, m."""
+def _recording() -> tuple[Any, float, int]:
+    """The recording, its near limit in m and the gap of its pairs."""
     root = os.environ.get("DHTORCH_DATA")
-    return (data.open(Path(root) / "tum_fr1_desk9"), 1.0) if root else (SyntheticRoom(), 2.0)
+    return (data.open(Path(root) / "tum_fr1_desk9"), 1.0, 4) if root else (SyntheticRoom(), 2.0, 6)
 
 
 def load(batch: int) -> tuple[str, Frame, Frame, Frame, float]:
     """Name, near views 0 and 1, view 0 with all its returns, cutoff: ``batch`` pairs, repeated if need be."""
-    recording, near = _recording()
-    gap = 4 if near == 1.0 else 6
+    recording, near, gap = _recording()
     chosen = by_gap(recording, gap)
     chosen = [chosen[k % len(chosen)] for k in range(batch)]
     anchor, other = (tree.collate([recording[p[k]] for p in chosen]) for k in (0, 1))
@@ -111,7 +110,7 @@ def measure(batch: int, threads: int, options: Any, n: int = 2048) -> list[dict[
 def measure_anchor(threads: int, options: Any, n: int = 2048) -> dict[str, Any]:
     """The row of one anchor in the middle of the recording, all other frames being offered."""
     harness.set_threads(threads)
-    recording, near = _recording()
+    recording, near, _ = _recording()
     middle = len(recording) // 2
     anchor, *others = (
         holdout.range_split(recording[k], near) for k in (middle, *(i for i in range(len(recording)) if i != middle))

@@ -115,7 +115,7 @@ def anchor(
 
     Gradient: depth to the map and to the anchors' depth, by the implicit function theorem (first order); the
     choice of the model, where fits start, ``ordinal``'s order of values and the answer's sigma carry none.
-    Cost: a second a map of any size, on one core.
+    Cost: mostly that of the fits, which does not grow with the map's size.
     Source: Student's t by expectation and maximisation: K. Lange et al., "Robust statistical modeling using the t
     distribution", 1989; evidence: D. MacKay, "Bayesian interpolation", 1992; blocks: D. Roberts et al.,
     "Cross-validation strategies for data with structure", 2017.

@@ -130,15 +130,15 @@ def judged(
     joined = Estimate.silent(samples, Gate.NO_TRACK, n_views=0) if asked is None else asked.joined
     found = evidence.references(samples, joined, near=not own)
     answers = evidence.by_answers(grid, anchor.hw, found, tolerance, None if own else returns)
-    pictures = maps = evidence.silent(grid)
+    kinds = [answers]
     if asked is not None and views:
         number = offered if offered is not None else torch.arange(len(asked.fits.code))[:, None].expand(-1, len(grid))
         source = None if own else other_maps
         of = _Judged(grid, anchor, asked, number.to(grid.device), own)
-        pictures, maps = _asked_views(of, source, partners, tolerance)
+        kinds += _asked_views(of, source, partners, tolerance)
     none = torch.full((len(grid), 3), torch.nan).to(grid)
     ruler = none if asked is None else _ruler(anchor, asked)
-    return _joined(grid, (answers, pictures, maps), _of_frame(grid, anchor, found, own), ruler, own)
+    return _joined(grid, kinds, _of_frame(grid, anchor, found, own), ruler, own)
 
 
 class _Judged(NamedTuple):
@@ -223,9 +223,10 @@ def _of_sensor(frame: Frame, hw: tuple[int, int]) -> Tensor:
 # ------------------------------------------------------------------------------------------------------------ verdicts
 
 
-def _joined(grid: Tensor, kinds: tuple[Said, Said, Said], numbers: Numbers, ruler: Tensor, own: bool) -> Verdict:
-    answers, pictures, maps = kinds
-    state, said, view = decided(*((answers,) if maps is pictures else kinds))  # of one silence for both nothing comes
+def _joined(grid: Tensor, kinds: Sequence[Said], numbers: Numbers, ruler: Tensor, own: bool) -> Verdict:
+    """What answers say and, where they were asked, pictures and maps of other views."""
+    state, said, view = decided(*kinds)
+    answers, pictures, maps = list(kinds) + [evidence.silent(grid)] * (3 - len(kinds))
     none = torch.full_like(ruler, torch.nan)
     n_wrong, n_known = ((m.sum((1, 2)) / WINDOW) for m in (state == State.WRONG, state != State.CANNOT_KNOW))
     return Verdict(

@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 
 from dhtorch import archive, metric, storage
-from dhtorch.codes import Gate, Source, names
 from dhtorch.commands import complete
 from dhtorch.commands.complete import Task
 from dhtorch.commands.judge import exceeded, parse_limits
@@ -113,26 +112,6 @@ def _task(scene: Scene, maps: DepthMaps, method: Method, settings: Mapping[str, 
     assert first is not None
     layout = layout_of(recording, settings["format"], settings["unit"], same=first.shape[-2:] == hw)
     digest = archive.data_digest(_files(scene, maps, frames))
-    config = {k: settings[k] for k in KEYED} | {"scene": scene.name, "format": layout.name, "unit": layout.unit}
-    made = archive.meta(device="cpu", dtype=settings["dtype"], threads=1, seed=settings["seed"])
-    shared: Row = storage.strict(
-        {
-            "format": complete.FORMAT,
-            "scene": scene.name,
-            "layout": layout.name,
-            "unit_m": layout.unit,
-            "sigma_unit_m": layout.sigma_unit,
-            "reach_m": layout.reach,
-            "version": made["versions"]["dhtorch"],
-            "git": made["git"],
-            "method": settings["choices"]["method"],
-            "calibration": None,
-            "key": archive.result_key({**config, "files": complete.FORMAT, "word": "anchor"}, digest, roots=ROOTS),
-            "config": archive.portable(config),
-            "data": {"name": settings["choices"]["data"], "digest": digest},
-            "codes": {"source": names(Source), "gate": names(Gate)},
-        }
-    )
     options = {**settings, **dict.fromkeys(complete.EXTRAS, False)}
     return Task(
         scene=scene,
@@ -142,7 +121,9 @@ def _task(scene: Scene, maps: DepthMaps, method: Method, settings: Mapping[str, 
         settings=options,
         frames=frames,
         offers={},
-        shared=shared,
+        shared=complete.shared(
+            scene, layout, settings, digest, keyed=KEYED, roots=ROOTS, calibration=None, word="anchor"
+        ),
     )
 
 

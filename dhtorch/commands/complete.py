@@ -157,13 +157,28 @@ def task_of(
         settings=settings,
         frames=frames,
         offers={pair.anchor: pair.offered for pair in pairs},
-        shared=_shared(scene, layout, settings, digest),
+        shared=shared(scene, layout, settings, digest, keyed=KEYED, roots=ROOTS, calibration=_calibration()),
     )
 
 
-def _shared(scene: Scene, layout: Layout, settings: Mapping[str, Any], digest: str) -> Row:
-    """What all frames of a scene have in common, and their key."""
-    config = {k: settings[k] for k in KEYED} | {"scene": scene.name, "format": layout.name, "unit": layout.unit}
+def _calibration() -> str | None:
+    return None if dense.shipped() is None else CALIBRATION
+
+
+def shared(
+    scene: Scene,
+    layout: Layout,
+    settings: Mapping[str, Any],
+    digest: str,
+    *,
+    keyed: Sequence[str],
+    roots: Sequence[str],
+    calibration: str | None,
+    **more: str,
+) -> Row:
+    """What all frames of a scene have in common, and their key: of the options ``keyed``, the modules ``roots``, the
+    data's digest and what ``more`` tells one word's files from another's."""
+    config = {k: settings[k] for k in keyed} | {"scene": scene.name, "format": layout.name, "unit": layout.unit}
     made = archive.meta(device="cpu", dtype=settings["dtype"], threads=1, seed=settings["seed"])
     name = settings["choices"]["data"]
     found: Row = storage.strict(
@@ -177,8 +192,8 @@ def _shared(scene: Scene, layout: Layout, settings: Mapping[str, Any], digest: s
             "version": made["versions"]["dhtorch"],
             "git": made["git"],
             "method": settings["choices"]["method"],
-            "calibration": None if dense.shipped() is None else CALIBRATION,
-            "key": archive.result_key({**config, "files": FORMAT}, digest, roots=ROOTS),
+            "calibration": calibration,
+            "key": archive.result_key({**config, "files": FORMAT, **more}, digest, roots=roots),
             "config": archive.portable(config),
             "data": {"name": name, "digest": digest},
             "codes": {"source": names(Source), "gate": names(Gate)},

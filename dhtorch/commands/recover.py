@@ -26,7 +26,7 @@ from dhtorch.data import FORMATS, FormatError, files, open_all
 from dhtorch.data import intrinsics as told
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
-from dhtorch.drawing import draw_completed
+from dhtorch.drawing import at_cutoff, draw_completed
 from dhtorch.integrate.from_maps import FrameMap, join
 from dhtorch.integrate.mapping import meshed, voxel_of, write_surface
 from dhtorch.method import Method
@@ -292,10 +292,8 @@ def _unreadable(recording: Recording, k: int) -> str:
 def _overview(task: Task, i: int) -> None:
     """The picture that shows most: what the camera saw, the sensor, the completed map."""
     maps, source = complete.maps_of(task, i)
-    cutoff = task.settings["cutoff"]
-    held = "" if cutoff is None else f", cutoff {cutoff:g} m"
     out = io.BytesIO()
-    title = f"{task.scene.name} {task.name(i)}{held}"
+    title = at_cutoff(f"{task.scene.name} {task.name(i)}", task.settings["cutoff"])
     draw_completed(out, task.recording[i].image[0], **maps, source=source, title=title)
     storage.replace_file(task.folder / "overview.png", out.getvalue())
 

@@ -430,15 +430,18 @@ def inside(root: Path | None) -> Iterator[None]:
         _capture.reset(before)
 
 
+def lies_in(file: Path, root: Path) -> bool:
+    """Whether a file, wherever links lead, lies in a capture: a folder, or the folder of a file."""
+    home = root.resolve()
+    return file.resolve().is_relative_to(home.parent if root.is_file() else home)
+
+
 def _stay(file: Path) -> None:
     """Refuse a link that leads out of the capture that is being read."""
     root = _capture.get()
     if root is None or not file.is_relative_to(root):
         return
-    home = root.resolve()
-    if root.is_file():
-        home = home.parent
-    if not file.resolve().is_relative_to(home):
+    if not lies_in(file, root):
         raise FormatError(file, "link", "one that leads out of the capture", "a file inside (follow_links=true allows)")
 
 

@@ -10,13 +10,15 @@ import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar, overload
+from typing import ClassVar, TypeVar, overload
 
 import torch
 from torch import Tensor
 
 from dhtorch.data.files import inside
 from dhtorch.records import Frame, Pose
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,8 +124,26 @@ class MeasuredRecording(TruthRecording):
         return {"depth": depth[None], "surface": surface, "disagreement": torch.tensor([disagreement])}
 
 
+class Lazy(Sequence[T]):
+    """A sequence whose items are made when they are asked for; a subclass says how many, and makes each."""
+
+    def made(self, place: int) -> T:
+        """The item at ``place``, from 0 on."""
+        raise NotImplementedError
+
+    @overload
+    def __getitem__(self, index: int) -> T: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[T]: ...
+    def __getitem__(self, index: int | slice) -> T | list[T]:
+        places = range(len(self))
+        if isinstance(index, slice):
+            return [self.made(place) for place in places[index]]
+        return self.made(places[index])
+
+
 @dataclass(frozen=True, eq=False)
-class Recordings(Sequence[Recording]):
+class Recordings(Lazy[Recording]):
     """Many recordings of one data set, each opened when it is asked for.
 
     A set of robot episodes holds tens of thousands, with tables of their own, and a folder of archives hundreds of
@@ -137,15 +157,9 @@ class Recordings(Sequence[Recording]):
     def __len__(self) -> int:
         return len(self.names)
 
-    @overload
-    def __getitem__(self, index: int) -> Recording: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[Recording]: ...
-    def __getitem__(self, index: int | slice) -> Recording | list[Recording]:
-        places = range(len(self))
-        if isinstance(index, slice):
-            return [self[i] for i in places[index]]
-        return self.make(places[index])
+    def made(self, place: int) -> Recording:
+        """As ``make`` opens it."""
+        return self.make(place)
 
     def __repr__(self) -> str:
         return f"Recordings({len(self)}, {self.names[0]!r} …)"

@@ -10,9 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import overload
 
-from dhtorch.data.recording import Recording, Recordings
+from dhtorch.data.recording import Lazy, Recording, Recordings
 from dhtorch.records import TrackHint
 
 
@@ -71,7 +70,7 @@ Given = Scene | Recording
 
 
 @dataclass(frozen=True, eq=False)
-class Scenes(Sequence[Scene]):
+class Scenes(Lazy[Scene]):
     """Scenes of one data set with the same notes, each recording opened when its scene is asked for."""
 
     recordings: Sequence[Recording]
@@ -80,14 +79,9 @@ class Scenes(Sequence[Scene]):
     def __len__(self) -> int:
         return len(self.recordings)
 
-    @overload
-    def __getitem__(self, index: int) -> Scene: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[Scene]: ...
-    def __getitem__(self, index: int | slice) -> Scene | list[Scene]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(len(self))[index]]
-        return self.noted(self.recordings[index])
+    def made(self, place: int) -> Scene:
+        """The recording there, noted."""
+        return self.noted(self.recordings[place])
 
     def __repr__(self) -> str:
         return f"Scenes({self.recordings!r})"

@@ -9,7 +9,7 @@ matplotlib is imported when something is drawn.
 from __future__ import annotations
 
 from dhtorch.drawing.axis import Axis, spanning
-from dhtorch.drawing.canvas import Canvas, Key, Mark, headed, save
+from dhtorch.drawing.canvas import Canvas, Key, Mark, at_cutoff, headed, save
 from dhtorch.drawing.colours import Stroke, series
 from dhtorch.drawing.maps import draw_anchored, draw_completed
 from dhtorch.drawing.panel import Panel
@@ -27,6 +27,7 @@ __all__ = [
     "Panel",
     "Picture",
     "Stroke",
+    "at_cutoff",
     "draw_anchored",
     "draw_completed",
     "draw_depth",

@@ -172,6 +172,11 @@ def cut(text: str, width: float, size: float) -> str:
     return text if len(text) <= most else text[: most - 1] + "…"
 
 
+def at_cutoff(place: str, cutoff: float | None) -> str:
+    """What is shown, and how much of the sensor's depth was kept, m."""
+    return place if cutoff is None else f"{place}, cutoff {cutoff:g} m"
+
+
 def headed(words: str, title: str) -> str:
     """What a figure shows, behind the scene that it shows."""
     return f"{title}: {words[0].lower()}{words[1:]}" if title else words

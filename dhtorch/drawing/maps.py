@@ -44,18 +44,11 @@ def draw_completed(
     """
     z, s, code = (as_array(x) for x in (depth, sigma, source))
     known = np.isfinite(z) & (z > 0) & (code != Source.NONE)
-    metres, share = depths(z[known]), Axis(*SIGMA_REL, "sigma / depth, %", log=True, percent=True)
     sensed = known & (code == Source.SENSOR)
-    height = WIDTH * z.shape[0] / z.shape[1]
-    rows = SCALE, SCALE + height + TITLE
-    ratio = np.where(known, s / np.where(known, z, 1), 1)
-    shown = [
-        (headed("Picture", title), rows[1], rgb_of(image)),
-        (f"Sensor: {_percent(sensed)}", rows[1], coloured(z, sensed, metres, colours.DEPTH)),
-        (f"Completed: {_percent(known)}, the rest is silent", rows[0], coloured(z, known, metres, colours.DEPTH)),
-        ("Sigma / depth", rows[0], coloured(ratio, known, share, colours.ERROR)),
-    ]
-    _draw(path, shown, height, (metres, share))
+    metres = depths(z[known])
+    before = f"Sensor: {_percent(sensed)}", coloured(z, sensed, metres, colours.DEPTH)
+    after = f"Completed: {_percent(known)}, the rest is silent", coloured(z, known, metres, colours.DEPTH)
+    _draw(path, ((headed("Picture", title), rgb_of(image)), before, after), (z, s, known))
 
 
 def draw_anchored(
@@ -72,33 +65,28 @@ def draw_anchored(
     x, z, s = (as_array(q) for q in (given, depth, sigma))
     x = x.reshape(x.shape[-2:])
     there, known = np.isfinite(x) & (x > 0), np.isfinite(z) & (z > 0)
-    metres, share = depths(z[known]), Axis(*SIGMA_REL, "sigma / depth, %", log=True, percent=True)
-    height = WIDTH * z.shape[0] / z.shape[1]
-    rows = SCALE, SCALE + height + TITLE
-    ratio = np.where(known, s / np.where(known, z, 1), 1)
-    shown = [
-        (headed("Picture", title), rows[1], rgb_of(image)),
-        (f"Map as given: {_percent(there)}", rows[1], coloured(x, there, depths(x[there]), colours.DEPTH)),
-        (f"Anchored: {_percent(known)}, the rest is silent", rows[0], coloured(z, known, metres, colours.DEPTH)),
-        ("Sigma / depth", rows[0], coloured(ratio, known, share, colours.ERROR)),
-    ]
-    _draw(path, shown, height, (metres, share))
+    before = f"Map as given: {_percent(there)}", coloured(x, there, depths(x[there]), colours.DEPTH)
+    after = f"Anchored: {_percent(known)}, the rest is silent", coloured(z, known, depths(z[known]), colours.DEPTH)
+    _draw(path, ((headed("Picture", title), rgb_of(image)), before, after), (z, s, known))
 
 
 def _draw(
     path: str | Path | IO[bytes],
-    shown: Sequence[tuple[str, float, np.ndarray]],
-    height: float,
-    scales: tuple[Axis, Axis],
+    shown: Sequence[tuple[str, np.ndarray]],
+    found: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> None:
-    """Four pictures, with the scales of depth and of sigma below them."""
+    """Three pictures and sigma / depth of the depth, sigma and mask ``found``, with the scales of both below them."""
+    z, s, known = found
+    metres, share = depths(z[known]), Axis(*SIGMA_REL, "sigma / depth, %", log=True, percent=True)
+    ratio = np.where(known, s / np.where(known, z, 1), 1)
+    height = WIDTH * z.shape[0] / z.shape[1]
     canvas = Canvas(2 * WIDTH + GAP, 2 * (height + TITLE) + SCALE, dpi=160)
-    for k, (words, bottom, pixels) in enumerate(shown):
-        left = (k % 2) * (WIDTH + GAP)
+    for k, (words, pixels) in enumerate((*shown, ("Sigma / depth", coloured(ratio, known, share, colours.ERROR)))):
+        left, bottom = (k % 2) * (WIDTH + GAP), SCALE + (k < 2) * (height + TITLE)
         canvas.title(words, WIDTH, bottom + height + TITLE, left)
         canvas.picture(pixels, (left, bottom, WIDTH, height))
-    _scale(canvas, scales[0], colours.DEPTH, 0.0)
-    _scale(canvas, scales[1], colours.ERROR, WIDTH + GAP)
+    _scale(canvas, metres, colours.DEPTH, 0.0)
+    _scale(canvas, share, colours.ERROR, WIDTH + GAP)
     save(canvas.figure, path)
 
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import overload
 
-from dhtorch.data.recording import Recording
+from dhtorch.data.recording import Lazy, Recording
 from dhtorch.data.scene import Scene
 
 
 @dataclass(frozen=True, eq=False)
-class Cut(Sequence[Scene]):
+class Cut(Lazy[Scene]):
     """Scenes with so many frames each at most."""
 
     scenes: Sequence[Scene]
@@ -20,19 +19,14 @@ class Cut(Sequence[Scene]):
     def __len__(self) -> int:
         return len(self.scenes)
 
-    @overload
-    def __getitem__(self, index: int) -> Scene: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[Scene]: ...
-    def __getitem__(self, index: int | slice) -> Scene | list[Scene]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(len(self))[index]]
-        scene = self.scenes[index]
+    def made(self, place: int) -> Scene:
+        """The scene there, cut."""
+        scene = self.scenes[place]
         return replace(scene, recording=shorter(scene.recording, self.frames))
 
 
 @dataclass(frozen=True, eq=False)
-class Chosen(Sequence[Recording]):
+class Chosen(Lazy[Recording]):
     """The recordings of some scenes."""
 
     scenes: Sequence[Scene]
@@ -41,14 +35,9 @@ class Chosen(Sequence[Recording]):
     def __len__(self) -> int:
         return len(self.places)
 
-    @overload
-    def __getitem__(self, index: int) -> Recording: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[Recording]: ...
-    def __getitem__(self, index: int | slice) -> Recording | list[Recording]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(len(self))[index]]
-        return self.scenes[self.places[index]].recording
+    def made(self, place: int) -> Recording:
+        """The recording of the scene there."""
+        return self.scenes[self.places[place]].recording
 
 
 def cut(scenes: Sequence[Scene], frames: int | None) -> Sequence[Scene]:

@@ -152,7 +152,7 @@ class RobotSet:
         return found
 
     def _stays(self, path: Path) -> bool:
-        return self.bounds is None or path.resolve().is_relative_to(self.bounds.resolve())
+        return self.bounds is None or files.lies_in(path, self.bounds)
 
     def batches(self, i: int, tasks: list[str]) -> Iterator[Any]:
         """As :meth:`Origin.batches`; ``frame_index`` and ``task_index`` are added where they are missing."""

@@ -18,6 +18,7 @@ from dhtorch.data import files as data_files
 from dhtorch.data.pairs import Pair
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene, scenes_of
+from dhtorch.drawing import at_cutoff
 from dhtorch.evaluate import bootstrap
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
@@ -202,8 +203,7 @@ def write(folder: Path, scene: MappedScene, settings: Mapping[str, Any]) -> list
     columns = {k: cloud[k] for k in ("sigma", "score", "hole", "source")}
     export.write_ply(folder / "points.ply", cloud["xyz"], cloud["rgb"], comments=said, **columns)
     _write_colmap(folder / "colmap", scene)
-    cutoff = scene.row["cutoff_m"]
-    title = scene.recording.name + ("" if cutoff is None else f", cutoff {cutoff:g} m")
+    title = at_cutoff(scene.recording.name, scene.row["cutoff_m"])
     draw_map(folder / "map.png", surface, list(scene.places.poses.values()), up, voxel=voxel, title=title)
     files = ["map.ply", "map.glb", "points.ply", "map.png"]
     files += [f"colmap/{name}" for name in ("cameras.txt", "images.txt", "points3D.txt")]

@@ -9,7 +9,7 @@ import torch
 
 from dhtorch import dense
 from dhtorch.codes import Source
-from dhtorch.drawing import draw_completed, draw_depth, draw_holes, draw_risk_coverage, draw_samples
+from dhtorch.drawing import at_cutoff, draw_completed, draw_depth, draw_holes, draw_risk_coverage, draw_samples
 from dhtorch.drawing.colours import of_source
 from dhtorch.evaluate import errors
 from dhtorch.evaluate.risk import risk_coverage
@@ -28,22 +28,21 @@ def draw_example(folder: str | Path, example: Any) -> list[Path]:
     e = example.cpu()
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
+    place = at_cutoff(f"{e.scene} {e.pair}", e.cutoff)
     whole, image, uv = merge(e.samples, e.estimate), e.frame.image[0], e.samples.uv[0]
-    draw_samples(folder / "samples.png", image, uv, whole.source[0], e.estimate.gate[0], title=e.place)
-    draw_holes(folder / "holes.png", image, uv, e.samples.hole[0], title=e.place)
+    draw_samples(folder / "samples.png", image, uv, whole.source[0], e.estimate.gate[0], title=place)
+    draw_holes(folder / "holes.png", image, uv, e.samples.hole[0], title=place)
     written = ["samples.png", "holes.png", "points.ply"]
     if example.asked is not None:  # where the method was asked
         with torch.no_grad():
             maps = dense.complete(example.frame, calibration=dense.shipped(), **example.asked).to("cpu")[0]
-        draw_completed(folder / "completed.png", image, maps.depth, maps.sigma, maps.source, title=e.place)
+        draw_completed(folder / "completed.png", image, maps.depth, maps.sigma, maps.source, title=place)
         written.append("completed.png")
     pooled = errors.select(e.estimate, e.truth)
     if pooled.keep.any():
-        draw_depth(folder / "depth.png", pooled.true_depth, pooled.depth, pooled.score, title=e.place)
+        draw_depth(folder / "depth.png", pooled.true_depth, pooled.depth, pooled.score, title=place)
         curves = {e.method: risk_coverage(pooled)}
-        draw_risk_coverage(
-            folder / "risk_coverage.png", curves, oracle=risk_coverage(pooled, oracle=True), title=e.place
-        )
+        draw_risk_coverage(folder / "risk_coverage.png", curves, oracle=risk_coverage(pooled, oracle=True), title=place)
         written += ["depth.png", "risk_coverage.png"]
     filled = whole.source[0] != Source.NONE
     xyz = unproject(e.frame.camera, whole.uv, whole.depth)[0][filled]

@@ -236,11 +236,6 @@ class Example:
         None  # as dhtorch.dense.complete takes it; None where the method was not simply asked
     )
 
-    @property
-    def place(self) -> str:
-        """Which pair this is, in words."""
-        return f"{self.scene} {self.pair}" + ("" if self.cutoff is None else f", cutoff {self.cutoff:g} m")
-
     def cpu(self) -> Example:
         """The same on the CPU, for figures."""
         moved = {k: getattr(self, k).to("cpu") for k in ("frame", "samples", "estimate", "truth")}
