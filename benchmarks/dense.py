@@ -10,9 +10,7 @@ pictures to disparities, without reading them back into the view. Frames of the 
 
 from __future__ import annotations
 
-import os
 from typing import Any
-from unittest import mock
 
 import cv2
 import harness
@@ -54,9 +52,8 @@ def measure(hw: tuple[int, int], threads: int, options: Any) -> list[dict[str, A
         stereo.matched(stereo.rectify(*views, trace["fit"].T_1_from_0, nearest_m=0.7 * NEAR).pictures)
 
     def compiled() -> None:
-        with mock.patch.dict(os.environ, DHTORCH_NATIVE="1"):
+        with harness.natively():
             ours()
-        native._loaded.clear()  # the next call is torch's again
 
     a, b, c = harness.in_turn([ours, peer, compiled], repeats=options.repeats, clock=options.clock)
     more: dict[str, Any] = {"n": size[0] * size[1], "bar": True}

@@ -7,16 +7,19 @@ peer_error, bar}``; ``ratio`` is ours / peer of medians, below 1 = ours is faste
 from __future__ import annotations
 
 import argparse
+import os
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import cv2
 import torch
 
-from dhtorch import archive, storage
+from dhtorch import archive, native, storage
 
 #: Clocks by name: what a wall shows, or (on a busy machine) the time this process was really given.
 CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
@@ -47,6 +50,14 @@ def in_turn(
         for call, count, record in zip(calls, counts, times, strict=True):
             record.append(_time(call, count, clock, device))
     return times
+
+
+@contextmanager
+def natively() -> Iterator[None]:
+    """Within, inner loops are the compiled ones."""
+    with mock.patch.dict(os.environ, DHTORCH_NATIVE="1"):
+        yield
+    native._loaded.clear()  # the next call is torch's again
 
 
 def _time(call: Callable[[], Any], count: int, clock: str, device: str) -> float:

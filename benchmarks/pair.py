@@ -6,8 +6,9 @@
 Pairs of TUM fr1/desk (640×480, near limit 1 m, gap 4) where DHTORCH_DATA is set, else of the built-in room. All sides
 take turns in one process; errors are medians of the relative depth error over the same candidates. Rows
 ``per_far_answer`` are milliseconds per candidate answered within 5 %: their ratio turned over is how many times as many
-such answers ours gives in the same time. ``anchor_auto`` is ``auto`` beside the first release's ``WINDOW_1``: one
-anchor, the same frames around it offered to both, from which each chooses.
+such answers ours gives in the same time. ``every_pixel`` is the same for ``complete``, whose answers are pixels,
+counted on every fourth row and column and multiplied by sixteen. ``anchor_auto`` is ``auto`` beside the first release's
+``WINDOW_1``: one anchor, the same frames around it offered to both, from which each chooses.
 """
 
 from __future__ import annotations
@@ -22,13 +23,14 @@ from typing import Any
 import harness
 import torch
 
-from dhtorch import data, tree
+from dhtorch import data, dense, tree
+from dhtorch.codes import Source
 from dhtorch.data.pairs import by_gap
 from dhtorch.evaluate import errors, holdout
 from dhtorch.first_release import WINDOW_1
 from dhtorch.methods import AUTO, MAP, PAPER
 from dhtorch.offers import choosing
-from dhtorch.records import Frame
+from dhtorch.records import DepthMap, Frame
 from dhtorch.stages import triangulate
 from dhtorch.studies.baselines import opencv
 from dhtorch.synthetic.recording import SyntheticRoom
@@ -38,6 +40,9 @@ OURS = {"paper": PAPER, "map": MAP}
 
 #: Relative error of a far answer that counts.
 GOOD = 0.05
+
+#: Rows and columns of a map from one pixel that is held against the truth to the next.
+EVERY = 4
 
 PEER = PAPER.replace(
     track=opencv.lucas_kanade,
@@ -107,6 +112,46 @@ def measure(batch: int, threads: int, options: Any, n: int = 2048) -> list[dict[
     return rows
 
 
+def measure_every_pixel(threads: int, options: Any, n: int = 2048) -> list[dict[str, Any]]:
+    """Time per hidden pixel that ``complete`` answers within 5 %, in torch and compiled, beside an answer of OpenCV."""
+    harness.set_threads(threads)
+    _, near, other, _, _ = pair = load(1)
+
+    def ours() -> DepthMap:
+        with torch.no_grad():
+            return dense.complete(near, other, method=MAP, partners=1)
+
+    def compiled() -> DepthMap:
+        with harness.natively():
+            return ours()
+
+    def peer() -> None:
+        with torch.no_grad():
+            PEER(near, other, n=n)
+
+    *sides, theirs = harness.in_turn([ours, compiled, peer], repeats=options.repeats, clock=options.clock)
+    error, their_error = pixel_errors(ours(), pair), answers(PEER, pair).answered().error
+    good, their_good = (int((e <= GOOD).sum()) for e in (error, their_error))
+    common = {"n": n, "batch": 1, "ours_error": float(error.median()), "peer_error": float(their_error.median())}
+    b = [t / their_good for t in theirs]
+    return [
+        harness.row("every_pixel.per_far_answer", [t / good / EVERY**2 for t in side], "opencv", b, mode=mode, **common)
+        for mode, side in zip(("eager", "native"), sides, strict=True)
+    ]
+
+
+def pixel_errors(found: DepthMap, pair: tuple[str, Frame, Frame, Frame, float]) -> torch.Tensor:
+    """Relative errors of the swept pixels in every so many rows and columns that have truth beyond the cutoff."""
+    _, near, _, anchor, cutoff = pair
+    chosen = torch.zeros_like(found.keep)
+    chosen[:, ::EVERY, ::EVERY] = True
+    chosen &= found.source == Source.SWEPT
+    _, h, w = found.depth.shape
+    truth = holdout.truth_at(anchor, dense.pixels(near, (h, w))[chosen.flatten()][None])
+    counts = truth.ok & (truth.depth > cutoff)
+    return (found.depth[chosen][None] / truth.depth - 1).abs()[counts]
+
+
 def measure_anchor(threads: int, options: Any, n: int = 2048) -> dict[str, Any]:
     """The row of one anchor in the middle of the recording, all other frames being offered."""
     harness.set_threads(threads)
@@ -138,7 +183,7 @@ def main() -> None:
     for threads in (1, 2):
         for batch in (1, 8, 32) if options.full else (1, 8):
             rows += measure(batch, threads, options)
-        rows.append(measure_anchor(threads, options))
+        rows += [*measure_every_pixel(threads, options), measure_anchor(threads, options)]
     print(f"{load(1)[0]}: milliseconds per pair, medians of {options.repeats}; errors are median relative depth errors")
     harness.report(rows, options.json)
     for method in OURS:
