@@ -510,6 +510,7 @@ ELSEWHERE = {
     *(f"dhtorch.integrate.surface.{name}" for name in ("points", "mesh")),
     "dhtorch.integrate.picture.draw_map",
     "dhtorch.integrate.from_maps.join",
+    *(f"dhtorch.integrate.scales.{name}" for name in ("coarse", "union")),
     *(f"dhtorch.integrate.mapping.{name}" for name in ("make", "run", "voxel_of", "meshed", "write", "write_surface")),
     *(f"dhtorch.integrate.level.{name}" for name in ("upwards", "mean_upwards", "floor")),
     "dhtorch.geometry.se3.turn_between",

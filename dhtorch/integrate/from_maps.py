@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import torch
@@ -13,9 +14,10 @@ from dhtorch.data.recording import Recording
 from dhtorch.geometry import se3
 from dhtorch.integrate.level import mean_upwards, upwards
 from dhtorch.integrate.recording import mapped
+from dhtorch.integrate.scales import REACH, TOLD_BY, coarse, union
 from dhtorch.integrate.surface import Surface, mesh, points
 from dhtorch.integrate.sweeps import edges
-from dhtorch.integrate.volume import confirmed, empty, fuse, reserve
+from dhtorch.integrate.volume import Volume, confirmed, empty, fuse, reserve
 from dhtorch.records import Pose
 
 #: Swept maps that must agree on a surface of which nothing else speaks; of fewer maps all.
@@ -23,6 +25,9 @@ MIN_MAPS = 2
 
 #: Depth of a neighbour over a pixel's own, minus one, from which on neither is believed: a step lies between them.
 EDGE_REL = 0.1
+
+
+Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
 
 
 class FrameMap(NamedTuple):
@@ -40,7 +45,7 @@ def join(
     *,
     voxel: float,
     meshed: bool,
-    progress: Callable[[Iterable[Any], str, int], Iterable[Any]] = lambda items, _text, _total: items,
+    progress: Progress = lambda items, _text, _total: items,
 ) -> tuple[Surface, list[float]]:
     """The surface that the maps of ``frames`` show together, and which way is up.
 
@@ -49,7 +54,7 @@ def join(
             world is its camera.
         frames: positions; those without a finite pose are left out.
         read: the map of a frame.
-        voxel: m.
+        voxel: m, of what the sensor sees; what was swept has voxels of its own where it is less sure.
         meshed: triangles (needs scikit-image), else points.
         progress: wraps the loop over frames.
 
@@ -59,18 +64,42 @@ def join(
     poses = _places(recording, frames)
     if not poses:
         raise ValueError(f"{recording.name}: found no frame with a finite pose, expected one at least")
-    volume = empty(voxel)
-    for k in poses:
-        volume = reserve(volume, _view(recording, k, read(k), Source.SWEPT, poses[k]))
-    for source in (Source.SENSOR, Source.SWEPT):
-        name = "sensor" if source == Source.SENSOR else "swept"
-        for k in progress(list(poses), f"{recording.name}: {name}", len(poses)):
-            volume = fuse(volume, _view(recording, k, read(k), source, poses[k]), source=source)
-    volume = confirmed(volume, min(MIN_MAPS, len(poses)))
-    surface = points(volume)
+    wide = coarse(voxel, _sigmas([read(k) for k in list(poses)[:TOLD_BY]]))
+    views = partial(_fused, recording, poses, read, progress=progress)
+    if wide is None:
+        volumes = [views(empty(voxel), (Source.SENSOR, Source.SWEPT))]
+    else:
+        volumes = [views(empty(voxel), (Source.SENSOR,)), views(empty(wide), (Source.SENSOR, Source.SWEPT))]
+    surface = reduce(union, map(points, volumes))
     placed = list(poses.values())
     up = upwards(recording, placed, surface.xyz, 2 * voxel) if len(surface.xyz) else mean_upwards(placed).tolist()
-    return (mesh(volume) if meshed and len(surface.xyz) else surface), up
+    return (reduce(union, map(mesh, volumes)) if meshed and len(surface.xyz) else surface), up
+
+
+def _fused(
+    recording: Recording,
+    poses: Mapping[int, Pose],
+    read: Callable[[int], FrameMap],
+    volume: Volume,
+    sources: Sequence[int],
+    *,
+    progress: Progress,
+) -> Volume:
+    """The volume after these sources of all frames."""
+    if Source.SWEPT in sources:
+        for k in poses:
+            volume = reserve(volume, _view(recording, k, read(k), Source.SWEPT, poses[k]), max_reach=REACH)
+    for source in sources:
+        name = "sensor" if source == Source.SENSOR else "swept"
+        for k in progress(list(poses), f"{recording.name}: {name}", len(poses)):
+            view = _view(recording, k, read(k), source, poses[k])
+            volume = fuse(volume, view, source=source, max_reach=REACH)
+    return confirmed(volume, min(MIN_MAPS, len(poses)))
+
+
+def _sigmas(maps: Sequence[FrameMap]) -> Tensor:
+    """Of swept pixels."""
+    return torch.cat([found.sigma[(found.source == Source.SWEPT) & (found.depth > 0)] for found in maps])
 
 
 def _places(recording: Recording, frames: Sequence[int]) -> dict[int, Pose]:

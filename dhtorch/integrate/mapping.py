@@ -6,6 +6,7 @@ import importlib.util
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from dhtorch.integrate import recording as recordings
 from dhtorch.integrate.level import upwards
 from dhtorch.integrate.picture import draw_map
 from dhtorch.integrate.recording import PairEstimate, Places
+from dhtorch.integrate.scales import REACH, TOLD_BY, coarse, union
 from dhtorch.integrate.sweeps import Shelf, Sweep
 from dhtorch.method import Method
 from dhtorch.pair import merge
@@ -49,7 +51,7 @@ class MappedScene:
     recording: Recording
     answers: Sequence[PairEstimate]
     places: Places
-    volume: integrate.Volume
+    voxel: float  # m, of what the sensor sees
     surface: integrate.Surface
     row: Row
 
@@ -57,7 +59,7 @@ class MappedScene:
     def up(self) -> list[float]:
         """The upward direction of the map."""
         poses = list(self.places.poses.values())
-        return upwards(self.recording, poses, self.surface.xyz, 2 * self.volume.voxel)
+        return upwards(self.recording, poses, self.surface.xyz, 2 * self.voxel)
 
 
 def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:
@@ -96,7 +98,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         raise KeyboardInterrupt(f"{len(found)} of {len(sources)} scenes in {folder} are whole and stay") from None
     result = _result(settings, sources, rows, found)
     archive.write(folder / "result.json", result)
-    print("\n".join(_said(row, row["voxel_m"]) for row in found))
+    print("\n".join(_said(row, row["cell_m"]) for row in found))
     print("\n".join(["wrote", *(f"  {path}" for path in [folder / "result.json", *written])]))
     return 0
 
@@ -121,17 +123,19 @@ def make(scene: Scene, method: Method, pairs: Pairs, settings: Mapping[str, Any]
     places = recordings.place(recording, found, poses=settings["poses"])
     if not places.poses:
         raise ValueError(f"{recording.name}: found no frame with a finite pose, expected one at least")
-    volume, points = _fused(recording, answers, places, settings, progress)
-    *_, last = points.values()
-    surface = integrate.mesh(volume, min_weight=settings["min_weight"]) if meshed(settings["mesh"]) else last
+    volumes, points = _fused(recording, answers, places, settings, progress)
+    *_, surface = points.values()
+    if meshed(settings["mesh"]):
+        surface = reduce(union, (integrate.mesh(volume, min_weight=settings["min_weight"]) for volume in volumes))
     row: Row = {"scene": recording.name, "pair": None, "method": _name(settings), "truth": settings["poses"]}
     row |= {"role": scene.role, "cutoff_m": settings["cutoff"], "n_pairs": len(chosen), "n_frames": len(places.poses)}
     row |= {"n_fragments": places.n_fragments, "n_unplaced": places.n_unplaced, "n_recovered": _n_recovered(answers)}
     row |= {} if sweep is None else {"n_swept": sum(a.swept.n for a in answers if a.swept is not None)}
-    row |= _covered(points, settings["voxel"])
+    row |= _covered(points, volumes[-1].voxel)
     row |= {"n_points": len(surface.xyz), "n_triangles": None if surface.face is None else len(surface.face)}
-    row |= {"volume_mib": volume.bytes / 2**20, "voxel_m": settings["voxel"]}
-    return MappedScene(recording, answers, places, volume, surface, row)
+    row |= {"volume_mib": sum(v.bytes for v in volumes) / 2**20}
+    row |= {"voxel_m": settings["voxel"], "cell_m": volumes[-1].voxel}
+    return MappedScene(recording, answers, places, settings["voxel"], surface, row)
 
 
 def voxel_of(recording: Recording, frames: Sequence[int] | None = None) -> float:
@@ -158,20 +162,40 @@ def _fused(
     places: Places,
     settings: Mapping[str, Any],
     progress: Progress,
-) -> tuple[integrate.Volume, dict[str, integrate.Surface]]:
-    """The volume, and what it showed after each source: of the ``sensor``, also ``sparse``, and with what was swept."""
+) -> tuple[list[integrate.Volume], dict[str, integrate.Surface]]:
+    """The volumes, finest first, and what they showed after each source: of the ``sensor``, also ``sparse``, and with
+    what was swept."""
     stages = {Source.SENSOR: "sensor", Source.RECOVERED: "sparse"}
     stages |= {Source.SWEPT: "dense"} if any(a.swept is not None for a in answers) else {}
     points: dict[str, integrate.Surface] = {}
+    wide = coarse(settings["voxel"], _sigmas(answers))
+
+    def seen(volume: integrate.Volume) -> integrate.Surface:
+        return integrate.points(volume, min_weight=settings["min_weight"])
 
     def after(source: int, volume: integrate.Volume) -> None:
-        points[stages[source]] = integrate.points(volume, min_weight=settings["min_weight"])
+        if source != Source.SENSOR:
+            points[stages[source]] = seen(volume) if wide is None else union(points["sensor"], seen(volume))
+        elif "sensor" not in points:  # of the finest
+            points["sensor"] = seen(volume)
 
     options = {k: settings[k] for k in ("cutoff", "min_conf", "min_maps")} | {"progress": progress}
-    options |= {"sigma_m": settings["sensor_sigma_m"], "sigma_rel": settings["sensor_sigma_rel"]}
-    volume = integrate.empty(settings["voxel"], truncation=settings["truncation"])
-    volume = recordings.build(recording, volume, answers, places, sources=list(stages), after=after, **options)
-    return volume, points
+    options |= {"sigma_m": settings["sensor_sigma_m"], "sigma_rel": settings["sensor_sigma_rel"], "max_reach": REACH}
+    empty = [integrate.empty(settings["voxel"], truncation=settings["truncation"])]
+    empty += [] if wide is None else [integrate.empty(wide)]
+    asked = [list(stages)] if wide is None else [[Source.SENSOR], list(stages)]
+    volumes = [
+        recordings.build(recording, volume, answers, places, sources=sources, after=after, **options)
+        for volume, sources in zip(empty, asked, strict=True)
+    ]
+    return volumes, points
+
+
+def _sigmas(answers: Sequence[PairEstimate]) -> Tensor:
+    """Of what was swept, or where nothing was, of the recovered points."""
+    maps = [swept.read() for swept in [a.swept for a in answers if a.swept is not None][:TOLD_BY]]
+    sigmas = [sigma[depth > 0] for depth, sigma, _ in maps]
+    return torch.cat(sigmas or [a.estimate.sigma[a.recovered] for a in answers] or [torch.zeros(0)])
 
 
 def _covered(points: Mapping[str, integrate.Surface], voxel: float) -> Row:
@@ -188,7 +212,7 @@ def _covered(points: Mapping[str, integrate.Surface], voxel: float) -> Row:
 
 def write(folder: Path, scene: MappedScene, settings: Mapping[str, Any]) -> list[Path]:
     """The files of one scene; returns what was written."""
-    surface, voxel, up = scene.surface, scene.volume.voxel, scene.up
+    surface, voxel, up = scene.surface, scene.voxel, scene.up
     rgb = surface.features[:, :3]
     said = write_surface(folder / "map.ply", surface, f"{scene.recording.name}'s world", up)
     cloud = _cloud(scene)
@@ -278,7 +302,7 @@ def _pair_rows(scene: MappedScene) -> list[Row]:
     ]
 
 
-def _said(row: Row, voxel: float) -> str:
+def _said(row: Row, cell: float) -> str:
     """One scene in words."""
     placed = f"{row['n_frames']} of {row['n_frames'] + row['n_unplaced']} frames placed by {row['truth']} poses"
     fragments = f"{row['n_fragments']} fragment{'s' * (row['n_fragments'] != 1)}"
@@ -289,7 +313,7 @@ def _said(row: Row, voxel: float) -> str:
     islands = f"{row['n_islands']} islands, the largest {row['largest_island']:.0%}"
     size = f"{row['n_points']} points" + (f", {row['n_triangles']} triangles" if row["n_triangles"] else "")
     return (
-        f"{row['scene']}: {placed}, {fragments}; {row['n_voxels']} voxels of {100 * voxel:g} cm{wider}, {islands};"
+        f"{row['scene']}: {placed}, {fragments}; {row['n_voxels']} voxels of {100 * cell:g} cm{wider}, {islands};"
         f" {size}, {row['volume_mib']:.1f} MiB, {row['seconds']:.1f} s"
     )
 

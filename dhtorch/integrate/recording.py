@@ -204,6 +204,7 @@ def build(
     sigma_rel: float = 0.01,
     min_conf: int = 1,
     min_maps: int = 2,
+    max_reach: float = 3.0,
     after: Callable[[int, Volume], None] = lambda _source, _volume: None,
     progress: Callable[[Iterable[Any], str, int], Iterable[Any]] = lambda items, _text, _total: items,
 ) -> Volume:
@@ -222,6 +223,7 @@ def build(
         cutoff: m; returns beyond it are hidden.
         sigma_m, sigma_rel, min_conf: the sensor's noise and least confidence, as in stage 2.
         min_maps: swept maps that must agree on a surface of which nothing else speaks; of fewer maps all.
+        max_reach: in truncations; a depth whose twofold sigma exceeds it says nothing.
         after: is told the volume after each source: (codes.Source, volume).
         progress: wraps the loop over frames: (items, text, number of items) → items.
 
@@ -230,7 +232,7 @@ def build(
     """
     maps = [a for a in answers if a.pair[0] in places.poses and a.swept is not None and a.swept.n]
     for answer in progress(maps, f"{recording.name}: room", len(maps)) if Source.SWEPT in sources else ():
-        volume = reserve(volume, swept(recording, answer, places))
+        volume = reserve(volume, swept(recording, answer, places), max_reach=max_reach)
     if Source.SENSOR in sources:
         for k in progress(list(places.poses), f"{recording.name}: sensor", len(places.poses)):
             frame = range_split(recording[k].to(volume.distance.dtype), cutoff)
@@ -242,11 +244,11 @@ def build(
         placed = [a for a in answers if a.pair[0] in places.poses and bool(a.recovered.any())]
         for answer in progress(placed, f"{recording.name}: recovered", len(placed)):
             one = recovered(answer, places.poses[answer.pair[0]], radius=PATCH * volume.voxel)
-            volume = fuse(volume, one, source=Source.RECOVERED)
+            volume = fuse(volume, one, source=Source.RECOVERED, max_reach=max_reach)
         after(Source.RECOVERED, volume)
     if Source.SWEPT in sources:
         for answer in progress(maps, f"{recording.name}: swept", len(maps)):
-            volume = fuse(volume, swept(recording, answer, places), source=Source.SWEPT)
+            volume = fuse(volume, swept(recording, answer, places), source=Source.SWEPT, max_reach=max_reach)
         volume = confirmed(volume, max(1, min(min_maps, len(maps))))
         after(Source.SWEPT, volume)
     return volume

@@ -32,7 +32,7 @@ def read(path: Path) -> Exhibit:
     vertex = _read_ply(path)
     vertex = vertex[np.isfinite([vertex[a] for a in "xyz"]).all(0)]
     if len(vertex) > MOST_POINTS:
-        vertex = np.random.default_rng(0).choice(vertex, MOST_POINTS, replace=False)
+        vertex = _fewer(vertex)
     n, known = len(vertex), vertex.dtype.names or ()
     column = {name: vertex[name] if name in known else np.zeros(n) for name in ("sigma", "score")}
     source = vertex["source"] if "source" in known else np.full(n, Source.RECOVERED)
@@ -55,6 +55,15 @@ def read(path: Path) -> Exhibit:
     samples |= dict.fromkeys(("parallax_deg", "residual_px", "error"), absent)
     rest = {name: values[~dense] for name, values in samples.items()}
     return Exhibit(path.name, [Shot(path.name, rest, np.eye(4), swept=swept if dense.any() else NO_SWEPT)])
+
+
+def _fewer(vertex: np.ndarray) -> np.ndarray:
+    """So many of them as a page can hold: what was recovered first, up to half, as the sensor's lie closer together."""
+    draw = np.random.default_rng(0)
+    ours = vertex["source"] != Source.SENSOR if "source" in (vertex.dtype.names or ()) else np.zeros(len(vertex), bool)
+    n = min(int(ours.sum()), max(MOST_POINTS // 2, MOST_POINTS - int((~ours).sum())))
+    parts = (ours.nonzero()[0], n), ((~ours).nonzero()[0], min(int((~ours).sum()), MOST_POINTS - n))
+    return vertex[np.sort(np.concatenate([draw.choice(which, count, replace=False) for which, count in parts]))]
 
 
 def _up(path: Path) -> list[float] | None:
