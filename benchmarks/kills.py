@@ -5,7 +5,7 @@
 Every fault hits ``dhtorch extract`` and ``dhtorch enrich`` on a small set, with two workers, at a moment drawn from the
 seed. Afterwards the same command is run undisturbed, and its files are held against those of a run that nobody
 disturbed: ``lost``, ``doubled`` and ``changed`` files, and hidden files and processes ``left`` behind, each of which
-must be 0.
+must be 0. Commands are forked off a process that has imported what they need, so that faults hit work, not imports.
 """
 
 from __future__ import annotations
@@ -14,24 +14,31 @@ import argparse
 import hashlib
 import os
 import random
+import resource
 import shutil
 import signal
-import subprocess
-import sys
 import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from multiprocessing import get_context
+from multiprocessing.context import ForkProcess
 from pathlib import Path
+from typing import cast
 
-from dhtorch import storage
+from dhtorch import extract, storage  # noqa: F401 (imported once, before commands are forked)
+from dhtorch.commands import enrich, run  # noqa: F401
 
 ROOM = ("data=synthetic", "data.n_frames=6", "data.hw=[96,128]", "data.depth_hw=[48,64]", "method.n=64", "workers=2")
 COMMANDS = {
     "extract": (*ROOM, "extract.gap=1", "extract.shard_rows=1", "extract.columns=[depth]"),
     "enrich": (*ROOM, "shard_rows=1", "report=false"),
 }
+LOSSES = "lost", "doubled", "changed", "left"
+FORK = get_context("fork")
 PATIENCE_S = 5  # after which a process that lives on is left behind
+
+Row = dict[str, str | int]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -41,54 +48,69 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(argv)
-    found: dict[str, dict[str, int]] = {}
+    rows: list[Row] = []
     with tempfile.TemporaryDirectory(prefix="dhtorch-kills-") as place:
         for command in COMMANDS:
-            found |= suffered(command, Path(place) / command, options)
-    print(f"{sum(sum(counts.values()) for counts in found.values())} lost, doubled, changed or left")
+            rows += suffered(command, Path(place) / command, options)
+    bad = sum(int(row[loss]) for row in rows for loss in LOSSES)
+    print(f"{bad} lost, doubled, changed or left")
     if options.json:
-        rows = [{"name": name, "times": options.times, **counts} for name, counts in found.items()]
         storage.write_json(options.json, rows)
-    return int(any(any(counts.values()) for counts in found.values()))
+    return int(bad > 0)
 
 
-def suffered(command: str, place: Path, options: argparse.Namespace) -> dict[str, dict[str, int]]:
-    """What every fault, so many times, costs one command."""
-    draw, found, began = random.Random(options.seed), {}, time.monotonic()
-    if start(command, place / "whole").wait():
+def suffered(command: str, place: Path, options: argparse.Namespace) -> list[Row]:
+    """What every fault, so many times, costs one command; ``hit``: how often it ended the command early."""
+    draw, began = random.Random(options.seed), time.monotonic()
+    rows: list[Row] = []
+    whole = start(command, place / "whole")
+    whole.join()
+    if whole.exitcode:
         raise SystemExit(f"dhtorch {command}: fails undisturbed")
     took, want = time.monotonic() - began, contents(place / "whole")
     for name, fault in FAULTS.items():
-        counts = Counter(lost=0, doubled=0, changed=0, left=0)
+        counts = Counter(dict.fromkeys(("hit", *LOSSES), 0))
         for number in range(options.times):
             folder = place / f"{name}-{number}"
-            counts["left"] += fault(command, folder, draw.uniform(0.0, 1.0) * took)
-            start(command, folder).wait()
+            processes = fault(command, folder, draw.uniform(0.0, 1.0) * took)
+            counts["left"] += ended(*processes)
+            counts["hit"] += any(p.exitcode for p in processes)
+            start(command, folder).join()
             counts.update(difference(want, contents(folder)))
             counts["left"] += sum(file.name.startswith(".") for file in folder.rglob("*"))
             shutil.rmtree(folder)
-        found[f"{command}, {name}"] = dict(counts)
-        print(f"{command}, {name}: {options.times} times: {dict(counts)}", flush=True)
-    return found
+        rows.append({"name": f"{command}, {name}", "times": options.times, **counts})
+        print(*(f"{key} {value}" for key, value in rows[-1].items()), sep=", ", flush=True)
+    return rows
 
 
-def start(command: str, folder: Path, limit: int | None = None) -> subprocess.Popen[bytes]:
-    """The command in a process group of its own; ``limit``: blocks of 512 or 1024 bytes that a file of it may have."""
-    words = [sys.executable, "-m", "dhtorch", command, *COMMANDS[command], f"out={folder}"]
+def start(command: str, folder: Path, limit: int | None = None) -> ForkProcess:
+    """The command in a process group of its own; ``limit``: bytes that a file of it may have."""
+    process = FORK.Process(target=_run, args=(command, folder, limit))
+    process.start()
+    return process
+
+
+def _run(command: str, folder: Path, limit: int | None) -> None:
+    os.setsid()
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    for stream in (0, 1, 2):
+        os.dup2(nowhere, stream)
     if limit is not None:
-        words = ["sh", "-c", f'ulimit -f {limit} && exec "$@"', "sh", *words]
-    return subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+    raise SystemExit(run.main([command, *COMMANDS[command], f"out={folder}"]))
 
 
-def ended(*processes: subprocess.Popen[bytes]) -> int:
+def ended(*processes: ForkProcess) -> int:
     """Waits for processes; how many of their groups live on, which are then killed."""
     left = 0
     for process in processes:
-        process.wait()
+        process.join()
+        group = cast("int", process.pid)
         end = time.monotonic() + PATIENCE_S
-        while alive := _alive(process.pid):
+        while alive := _alive(group):
             if time.monotonic() > end:
-                os.killpg(process.pid, signal.SIGKILL)
+                os.killpg(group, signal.SIGKILL)
                 break
             time.sleep(0.05)
         left += alive
@@ -103,29 +125,29 @@ def _alive(group: int) -> bool:
     return True
 
 
-def _signalled(number: int) -> Callable[[str, Path, float], int]:
-    def fault(command: str, folder: Path, after: float) -> int:
+def _signalled(number: int) -> Callable[[str, Path, float], list[ForkProcess]]:
+    def fault(command: str, folder: Path, after: float) -> list[ForkProcess]:
         process = start(command, folder)
         time.sleep(after)
-        process.send_signal(number)
-        return ended(process)
+        os.kill(cast("int", process.pid), number)
+        return [process]
 
     return fault
 
 
-def _raced(command: str, folder: Path, after: float) -> int:
+def _raced(command: str, folder: Path, after: float) -> list[ForkProcess]:
     """A second one in the same folder."""
     first = start(command, folder)
     time.sleep(after / 4)
-    return ended(first, start(command, folder))
+    return [first, start(command, folder)]
 
 
-def _full(command: str, folder: Path, after: float) -> int:
+def _full(command: str, folder: Path, after: float) -> list[ForkProcess]:
     """No file may grow beyond some kilobytes."""
-    return ended(start(command, folder, limit=1 + int(2 * after)))
+    return [start(command, folder, limit=1024 * (1 + int(2 * after)))]
 
 
-FAULTS: dict[str, Callable[[str, Path, float], int]] = {
+FAULTS: dict[str, Callable[[str, Path, float], list[ForkProcess]]] = {
     "kill": _signalled(signal.SIGKILL),
     "terminate": _signalled(signal.SIGTERM),
     "race": _raced,
