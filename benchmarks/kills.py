@@ -26,7 +26,7 @@ from multiprocessing.context import ForkProcess
 from pathlib import Path
 from typing import cast
 
-from dhtorch import extract, storage  # noqa: F401 (imported once, before commands are forked)
+from dhtorch import archive, extract, storage  # noqa: F401 (imported once, before commands are forked)
 from dhtorch.commands import enrich, run  # noqa: F401
 
 ROOM = ("data=synthetic", "data.n_frames=6", "data.hw=[96,128]", "data.depth_hw=[48,64]", "method.n=64", "workers=2")
@@ -67,7 +67,7 @@ def suffered(command: str, place: Path, options: argparse.Namespace) -> list[Row
     whole.join()
     if whole.exitcode:
         raise SystemExit(f"dhtorch {command}: fails undisturbed")
-    took, want = time.monotonic() - began, contents(place / "whole")
+    took, want, source = time.monotonic() - began, contents(place / "whole"), _checkout()
     for name, fault in FAULTS.items():
         counts = Counter(dict.fromkeys(("hit", *LOSSES), 0))
         for number in range(options.times):
@@ -79,9 +79,16 @@ def suffered(command: str, place: Path, options: argparse.Namespace) -> list[Row
             counts.update(difference(want, contents(folder)))
             counts["left"] += sum(file.name.startswith(".") for file in folder.rglob("*"))
             shutil.rmtree(folder)
+        if _checkout() != source:
+            raise SystemExit("the checkout changed meanwhile: run it where nobody works")
         rows.append({"name": f"{command}, {name}", "times": options.times, **counts})
         print(*(f"{key} {value}" for key, value in rows[-1].items()), sep=", ", flush=True)
     return rows
+
+
+def _checkout() -> str:
+    """The state of the code, which every file names."""
+    return str(archive.meta(device="cpu", dtype="float32", threads=1, seed=0)["git"])
 
 
 def start(command: str, folder: Path, limit: int | None = None) -> ForkProcess:
