@@ -10,16 +10,14 @@ pictures to disparities, without reading them back into the view. Frames of the 
 
 from __future__ import annotations
 
-import os
 from typing import Any
-from unittest import mock
 
 import cv2
 import harness
 import numpy as np
 import torch
 
-from dhtorch import MAP, dense, native
+from dhtorch import MAP, dense
 from dhtorch.evaluate.holdout import range_split
 from dhtorch.records import Frame
 from dhtorch.studies.baselines import stereo
@@ -54,9 +52,8 @@ def measure(hw: tuple[int, int], threads: int, options: Any) -> list[dict[str, A
         stereo.matched(stereo.rectify(*views, trace["fit"].T_1_from_0, nearest_m=0.7 * NEAR).pictures)
 
     def compiled() -> None:
-        with mock.patch.dict(os.environ, DHTORCH_NATIVE="1"):
+        with harness.natively():
             ours()
-        native._loaded.clear()  # the next call is torch's again
 
     a, b, c = harness.in_turn([ours, peer, compiled], repeats=options.repeats, clock=options.clock)
     more: dict[str, Any] = {"n": size[0] * size[1], "bar": True}
@@ -83,7 +80,6 @@ def _float(frame: Frame) -> torch.Tensor:
 def main() -> None:
     """Print the table; write it with ``--json``."""
     options = harness.arguments(__doc__ or "").parse_args()
-    native.build()
     rows = [row for hw in SIZES for row in measure(hw, 1, options)]
     print(f"milliseconds, medians of {options.repeats}")
     harness.report(rows, options.json)

@@ -9,14 +9,17 @@ from __future__ import annotations
 import argparse
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import cv2
 import torch
 
-from dhtorch import archive, storage
+from dhtorch import archive, native, storage
 
 #: Clocks by name: what a wall shows, or (on a busy machine) the time this process was really given.
 CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
@@ -65,6 +68,21 @@ def _time(call: Callable[[], Any], count: int, clock: str, device: str) -> float
     for _ in range(count):
         call()
     return 1e3 * (now() - begin) / count
+
+
+@contextmanager
+def natively() -> Iterator[None]:
+    """Compiled code is used in this block, and in processes forked from it."""
+    with mock.patch.object(native, "_loaded", [_library()]):
+        yield
+
+
+@cache
+def _library() -> Path:
+    """The compiled file, built unless it was, and loaded for whoever asks."""
+    path = native.build()
+    torch.ops.load_library(str(path))
+    return path
 
 
 def iqr(values: Sequence[float]) -> float:
