@@ -262,7 +262,7 @@ void on_map(Window& window, const float* inverse, const Level& target, int64_t b
     const float a = C[i] - sums[0], b = C[N * N + i] - sums[1];
     C[i] = inverse[0] * a + inverse[1] * b;
     C[N * N + i] = inverse[1] * a + inverse[2] * b;
-    if (K == 3) C[2 * N * N * (K == 3) + i] = sums[5] > 0.0f ? C[2 * N * N * (K == 3) + i] / sums[5] : 1.0f;
+    if constexpr (K == 3) C[2 * N * N + i] = sums[5] > 0.0f ? C[2 * N * N + i] / sums[5] : 1.0f;
   }
   walk<K>(C, N, corner, x, steps, o, s);
 }

@@ -10,7 +10,7 @@ import torch
 
 from dhtorch import native
 from dhtorch.geometry import lucas_kanade as lk
-from dhtorch.geometry import se3, sweep
+from dhtorch.geometry import pyramid, se3, sweep
 from dhtorch.geometry.camera import Camera
 from dhtorch.geometry.filters import gaussian
 from dhtorch.records import NO_HINT, TrackHint
@@ -158,6 +158,19 @@ def test_a_search_for_points_agrees_up_to_rounding(loaded, monkeypatch, seen_twi
         if hint is not NO_HINT or levels > 1:
             wide = lucas_kanade(here.double(), there.double(), uv.double(), hint=hint, **options)
             agree(*both_ways(lambda h=hint: lucas_kanade(here, there, uv, hint=h, **options), monkeypatch), wide)
+
+
+def test_compiled_code_has_the_constants_of_torchs():
+    """It reads past the end of a row: a level has a row more than a window at its border reaches."""
+    source = native.SOURCES[1].read_text()
+    for line in (
+        f"STEPS = {lk.STEPS}, LEAP = {lk.LEAP}, MARGIN = {pyramid.MARGIN};",
+        f"RATIO = {lk.RATIO[1]}f, LEAST_GAIN = {lk.GAIN[0]}f, MOST_GAIN = {lk.GAIN[1]}f;",
+        f"{{ {', '.join(lk.NORMALISE).upper()} }}",
+    ):
+        assert line in source
+    assert lk.RATIO[0] == -lk.RATIO[1] and {*lk.TOP, *lk.BETWEEN, *lk.FINEST} <= {1, 2}
+    assert pyramid.REACH >= pyramid.MARGIN + 2 + 2, "the largest radius, and the row"
 
 
 @needs_compiler
