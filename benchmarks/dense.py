@@ -17,7 +17,7 @@ import harness
 import numpy as np
 import torch
 
-from dhtorch import MAP, dense, native
+from dhtorch import MAP, dense
 from dhtorch.evaluate.holdout import range_split
 from dhtorch.records import Frame
 from dhtorch.studies.baselines import stereo
@@ -80,7 +80,6 @@ def _float(frame: Frame) -> torch.Tensor:
 def main() -> None:
     """Print the table; write it with ``--json``."""
     options = harness.arguments(__doc__ or "").parse_args()
-    native.build()
     rows = [row for hw in SIZES for row in measure(hw, 1, options)]
     print(f"milliseconds, medians of {options.repeats}")
     harness.report(rows, options.json)

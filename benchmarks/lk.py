@@ -4,7 +4,8 @@
 
 *Forward* is both pyramids and one search; mode ``cached`` has the pyramid of image 0 made before, as for an anchor seen
 from many views. Mode ``compiled`` has the steps on maps compiled: the whole search under ``torch.compile`` would unroll
-every map that the eager search makes for few points only, and was not compiled after 400 s. *Forward-backward* is
+every map that the eager search makes for few points only, and was not compiled after 400 s. Mode ``native`` uses
+``python -m dhtorch.native``. *Forward-backward* is
 ``lucas_kanade`` with all its fields against two calls of OpenCV. Times are of real pairs where DHTORCH_DATA is set,
 else of the built-in room; both sides take turns in one process.
 
@@ -88,6 +89,12 @@ def forward_compiled(image_0: Tensor, image_1: Tensor, uv: Tensor, window: int):
         return forward(image_0, image_1, uv, window)
 
 
+def natively(call: Callable[..., Any], *args: Any, **options: Any) -> Any:
+    """A call that may use compiled code."""
+    with harness.natively():
+        return call(*args, **options)
+
+
 def forward_opencv(image_0: Tensor, image_1: Tensor, uv: Tensor, window: int):
     """The same by OpenCV, pair after pair."""
     options: Any = {"winSize": (window, window), "maxLevel": LEVELS - 1, "criteria": (3, 30, 0.01)}
@@ -144,6 +151,8 @@ def measure(n: int, batch: int, window: int, repeats: int) -> list[dict[str, Any
         partial(track.lucas_kanade, *views, **options),
         partial(track.lucas_kanade, *views, hint=TrackHint(pyramid=kept), **options),
         partial(opencv.lucas_kanade, *views, **options),
+        partial(natively, forward, *views, window),
+        partial(natively, track.lucas_kanade, *views, **options),
         partial(forward_compiled, *views, window),
     ]
     begin = time.perf_counter()
@@ -151,19 +160,24 @@ def measure(n: int, batch: int, window: int, repeats: int) -> list[dict[str, Any
     warm_up = time.perf_counter() - begin
     times = [[t / batch for t in side] for side in harness.in_turn(calls, repeats=repeats, warm_up=2)]
     (missed, median), (peer_missed, peer_median) = accuracy(image_0, uv, window)
-    differ = (calls[3]().valid != calls[5]().valid).double().mean().item()
+    differ, differ_native = ((calls[k]().valid != calls[5]().valid).double().mean().item() for k in (3, 7))
     print(
         f"{suffix[1:]}: misses {missed:.4f}, OpenCV {peer_missed:.4f}; median distance {median:.4f}, {peer_median:.4f}"
         f" px; same verdict {1 - differ:.3f}; first compiled call {warm_up:.1f} s"
     )
     common: dict[str, Any] = {"n": n, "batch": batch, "bar": window == 21}
     more = {"mode": "compiled", "warm_up_s": warm_up, **common, "ours_error": missed, "peer_error": peer_missed}
-    rows = [harness.row(f"lk{suffix}", times[6], "opencv", times[2], **more)]
-    for k, mode in enumerate(("eager", "cached")):
-        more = {"mode": mode, **common, "ours_error": missed, "peer_error": peer_missed}
-        rows.append(harness.row(f"lk{suffix}", times[k], "opencv", times[2], **more))
-        more = {"mode": mode, **common, "ours_error": differ}
-        rows.append(harness.row(f"lk_fb{suffix}", times[3 + k], "opencv", times[5], **more))
+    rows = [harness.row(f"lk{suffix}", times[8], "opencv", times[2], **more)]
+    with harness.natively():
+        (missed_native, _), _ = accuracy(image_0, uv, window)
+    errors = (missed, differ), (missed, differ), (missed_native, differ_native)
+    for (there, back), mode, (lost, other) in zip(
+        ((0, 3), (1, 4), (6, 7)), ("eager", "cached", "native"), errors, strict=True
+    ):
+        more = {"mode": mode, **common, "ours_error": lost, "peer_error": peer_missed}
+        rows.append(harness.row(f"lk{suffix}", times[there], "opencv", times[2], **more))
+        more = {"mode": mode, **common, "ours_error": other}
+        rows.append(harness.row(f"lk_fb{suffix}", times[back], "opencv", times[5], **more))
     return rows
 
 

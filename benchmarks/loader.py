@@ -5,6 +5,7 @@
 The plain loader decodes a JPEG and a 16-bit PNG with the depth, resizes both where asked for, and resizes the picture
 to 224×224 for a network; only that leaves the worker. ``single`` is one view per sample, of which the transform's
 front end alone is asked; ``pair`` is two views, and beside the transform stands the same with OpenCV in its seats. Rows
+of mode ``native`` use the compiled code of ``python -m dhtorch.native``. Rows
 with ``by_batch`` collate in the worker first and extend the whole batch at once (``batched=True``): the same answers.
 ``ours_ms`` and ``peer_ms`` are milliseconds per sample in the steady state, workers included. In ``scaling`` rows
 ``peer_ms`` is what two workers would take per sample if the transform scaled from one worker to two as the plain
@@ -17,6 +18,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from statistics import median
@@ -41,6 +43,8 @@ STRETCH = 2  # batches that make one time
 ROUNDS = 3  # turns of each loader
 SIZES = {"224x224": (SIDE, SIDE), "640x480": (480, 640)}
 BARS = "640x480"
+#: Loaders that use compiled code, and which transform they are.
+NATIVE = {"transform_native": "transform", "by_batch_native": "by_batch"}
 NETWORKS = {"dinov2_l": {}, "dinov2_s": {"hidden": 384, "layers": 12, "heads": 6}}
 OPENCV = PAPER.replace(
     track=opencv.lucas_kanade,
@@ -134,6 +138,7 @@ class Bench:
         self.transforms = {"transform": self.transform(), "by_batch": self.transform(batched=True)}
         self.transforms["plain_loader"] = None
         if mode == "pair":
+            self.transforms |= {side: self.transforms[NATIVE[side]] for side in NATIVE}
             self.transforms["opencv_seats"] = self.transform(method=OPENCV)
         self.times: dict[tuple[str, int], list[float]] = {}
 
@@ -153,7 +158,8 @@ class Bench:
         """Loaders take turns, so that a busy minute hits all alike."""
         for _ in range(ROUNDS):
             for name, transform in self.transforms.items():
-                found = per_sample(self.dataset(transform, workers), workers, self.repeats, self.clock)
+                with harness.natively() if name in NATIVE else nullcontext():
+                    found = list(per_sample(self.dataset(transform, workers), workers, self.repeats, self.clock))
                 self.times.setdefault((name, workers), []).extend(found)
         rates = {name: 1e3 / median(self.times[name, workers]) for name in self.transforms}
         said = ", ".join(f"{name} {rate:.1f}" for name, rate in rates.items())
@@ -162,13 +168,15 @@ class Bench:
     def rows(self, workers: int) -> list[dict[str, Any]]:
         """Against the plain loader and against OpenCV; the bars stand on the larger pictures."""
         barred = {"single": "plain_loader", "pair": "opencv_seats"}[self.mode]
-        name, ours = f"loader_{self.mode}_{self.size}_workers{workers}", ("transform", "by_batch")
+        name = f"loader_{self.mode}_{self.size}_workers{workers}"
+        ours = [side for side in self.transforms if NATIVE.get(side, side) in ("transform", "by_batch")]
         return [
             harness.row(
-                name if side == "transform" else f"{name}_{side}",
+                f"{name}_by_batch" if side.startswith("by_batch") else name,
                 self.times[side, workers],
                 peer,
                 self.times[peer, workers],
+                mode="native" if side in NATIVE else "eager",
                 **self.common(peer == barred),
             )
             for side in ours

@@ -40,6 +40,7 @@ def measure(frames: int) -> dict[str, Any]:
             if k == FIRST:
                 peaks.append(peak_mib())
             yield k
+            room._frames.clear()  # the room keeps what it has rendered, a recording in files does not
 
     room = SyntheticRoom(n_frames=frames, hw=HW, depth_hw=HW)
     settings = {"steps": (1, 2, 3, 5, 8), "seed": 0, "most": None, "dtype": "float32", "device": "cpu", "cutoff": 2.0}
@@ -60,6 +61,8 @@ def main() -> None:
     parser = harness.arguments(__doc__ or "")
     parser.add_argument("--frames", type=int, default=FRAMES)
     options = parser.parse_args()
+    if options.frames <= FIRST:
+        parser.error(f"--frames: found {options.frames}, expected more than {FIRST}")
     harness.set_threads(1)
     row = measure(options.frames)
     print(f"{row['frames']} frames: {row['first_mib']:.0f} MiB after {FIRST}, then {row['above_mib']:.1f} more")

@@ -8,7 +8,8 @@ take turns in one process; errors are medians of the relative depth error over t
 ``per_far_answer`` are milliseconds per candidate answered within 5 %: their ratio turned over is how many times as many
 such answers ours gives in the same time. ``every_pixel`` is the same for ``complete``, whose answers are pixels,
 counted on every fourth row and column and multiplied by sixteen. ``anchor_auto`` is ``auto`` beside the first release's
-``WINDOW_1``: one anchor, the same frames around it offered to both, from which each chooses.
+``WINDOW_1``: one anchor, the same frames around it offered to both, from which each chooses. Mode ``native`` is ours
+with the compiled code of ``python -m dhtorch.native``; the peer stays as it is.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from __future__ import annotations
 import os
 import statistics
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -37,6 +39,9 @@ from dhtorch.synthetic.recording import SyntheticRoom
 
 #: Ours, by name.
 OURS = {"paper": PAPER, "map": MAP}
+
+#: What ours runs in, by mode.
+MODES: dict[str, Callable[[], Any]] = {"eager": nullcontext, "native": harness.natively}
 
 #: Relative error of a far answer that counts.
 GOOD = 0.05
@@ -81,33 +86,41 @@ def answers(method: Any, pair: tuple[str, Frame, Frame, Frame, float]) -> errors
 
 
 def measure(batch: int, threads: int, options: Any, n: int = 2048) -> list[dict[str, Any]]:
-    """Rows for one batch size and thread count: for each method the whole pair, then each stage."""
+    """Rows for one batch size and thread count: for each method and mode the whole pair, then each stage."""
     harness.set_threads(threads)
     pair = load(batch)
-    methods: dict[str, Callable[..., Any]] = {**OURS, "opencv": PEER}
-    traces: dict[str, list[dict[str, float]]] = {name: [] for name in methods}
+    peer = "opencv", "eager"
+    methods: dict[tuple[str, str], Callable[..., Any]] = {(k, mode): OURS[k] for k in OURS for mode in MODES}
+    methods[peer] = PEER
+    traces: dict[tuple[str, str], list[dict[str, float]]] = {side: [] for side in methods}
 
-    def call(name: str) -> None:
+    def call(side: tuple[str, str]) -> None:
         trace: dict[str, Any] = {}
-        with torch.no_grad():
-            methods[name](pair[1], pair[2], n=n, trace=trace)
-        traces[name].append(trace["ms"])
+        with torch.no_grad(), MODES[side[1]]():
+            methods[side](pair[1], pair[2], n=n, trace=trace)
+        traces[side].append(trace["ms"])
 
-    sides = harness.in_turn([partial(call, name) for name in methods], repeats=options.repeats, clock=options.clock)
-    times = {name: [t / batch for t in side] for name, side in zip(methods, sides, strict=True)}
-    said = {name: answers(method, pair) for name, method in methods.items()}
-    found = {name: errors.measure(points)["median_rel"] for name, points in said.items()}
-    good = {name: int((points.answered().error <= GOOD).sum()) / batch for name, points in said.items()}
+    def said(side: tuple[str, str]) -> errors.Points:
+        with MODES[side[1]]():
+            return answers(methods[side], pair)
+
+    sides = harness.in_turn([partial(call, side) for side in methods], repeats=options.repeats, clock=options.clock)
+    times = {side: [t / batch for t in found] for side, found in zip(methods, sides, strict=True)}
+    points = {side: said(side) for side in methods}
+    found = {side: errors.measure(points[side])["median_rel"] for side in methods}
+    good = {side: int((points[side].answered().error <= GOOD).sum()) / batch for side in methods}
     rows = []
-    for method in OURS:
-        name, common = f"pair_{method}_b{batch}", {"n": n, "batch": batch}
-        errors_of = {"ours_error": found[method], "peer_error": found["opencv"]}
-        rows.append(harness.row(name, times[method], "opencv", times["opencv"], **common, **errors_of, bar=True))
-        if good[method] and good["opencv"]:
-            a, b = ([t / good[k] for t in times[k]] for k in (method, "opencv"))
+    for side in methods:
+        if side == peer:
+            continue
+        name, common = f"pair_{side[0]}_b{batch}", {"n": n, "batch": batch, "mode": side[1]}
+        errors_of = {"ours_error": found[side], "peer_error": found[peer]}
+        rows.append(harness.row(name, times[side], "opencv", times[peer], **common, **errors_of, bar=True))
+        if good[side] and good[peer]:
+            a, b = ([t / good[k] for t in times[k]] for k in (side, peer))
             rows.append(harness.row(f"{name}.per_far_answer", a, "opencv", b, **common))
-        for stage in traces[method][0]:
-            a, b = ([t[stage] / batch for t in traces[k][-options.repeats :]] for k in (method, "opencv"))
+        for stage in traces[side][0]:
+            a, b = ([t[stage] / batch for t in traces[k][-options.repeats :]] for k in (side, peer))
             rows.append(harness.row(f"{name}.{stage}", a, "opencv", b, **common))
     return rows
 
@@ -152,8 +165,8 @@ def pixel_errors(found: DepthMap, pair: tuple[str, Frame, Frame, Frame, float]) 
     return (found.depth[chosen][None] / truth.depth - 1).abs()[counts]
 
 
-def measure_anchor(threads: int, options: Any, n: int = 2048) -> dict[str, Any]:
-    """The row of one anchor in the middle of the recording, all other frames being offered."""
+def measure_anchor(threads: int, options: Any, n: int = 2048) -> list[dict[str, Any]]:
+    """The rows of one anchor in the middle of the recording, all other frames being offered."""
     harness.set_threads(threads)
     recording, near, _ = _recording()
     middle = len(recording) // 2
@@ -163,17 +176,22 @@ def measure_anchor(threads: int, options: Any, n: int = 2048) -> dict[str, Any]:
     truth_of = recording[middle]
     found = {}
 
-    def call(name: str, method: Any) -> None:
+    def call(name: str, method: Any, mode: str = "eager") -> None:
         trace: dict[str, Any] = {}
-        with torch.no_grad():
+        with torch.no_grad(), MODES[mode]():
             estimate = method(anchor, others, n=n, trace=trace)
         truth = holdout.candidates(trace["samples"], holdout.truth_at(truth_of, estimate.uv), near)
         found[name] = errors.measure(errors.select(estimate, truth))["median_rel"]
 
-    sides = [partial(call, "auto", choosing(AUTO)), partial(call, "window_1", choosing(WINDOW_1))]
-    a, b = harness.in_turn(sides, repeats=options.repeats, clock=options.clock)
-    errors_of = {"ours_error": found["auto"], "peer_error": found["window_1"]}
-    return harness.row("anchor_auto", a, "window_1", b, n=n, batch=1, **errors_of, bar=True)
+    sides = [partial(call, mode, choosing(AUTO), mode) for mode in MODES]
+    sides.append(partial(call, "window_1", choosing(WINDOW_1)))
+    *ours, peer = harness.in_turn(sides, repeats=options.repeats, clock=options.clock)
+    rows = []
+    for mode, times in zip(MODES, ours, strict=True):
+        more: dict[str, Any] = {"n": n, "mode": mode, "bar": True}
+        more |= {"ours_error": found[mode], "peer_error": found["window_1"]}
+        rows.append(harness.row("anchor_auto", times, "window_1", peer, **more))
+    return rows
 
 
 def main() -> None:
@@ -183,7 +201,7 @@ def main() -> None:
     for threads in (1, 2):
         for batch in (1, 8, 32) if options.full else (1, 8):
             rows += measure(batch, threads, options)
-        rows += [*measure_every_pixel(threads, options), measure_anchor(threads, options)]
+        rows += measure_every_pixel(threads, options) + measure_anchor(threads, options)
     print(f"{load(1)[0]}: milliseconds per pair, medians of {options.repeats}; errors are median relative depth errors")
     harness.report(rows, options.json)
     for method in OURS:

@@ -1,4 +1,5 @@
-"""Compiled code answers as torch does, bit for bit; nothing is compiled, loaded or used that nobody asked for."""
+"""Compiled code answers as torch does, the sweep bit for bit and a search for points up to the rounding of its sums;
+nothing is compiled, loaded or used that nobody asked for."""
 
 import shutil
 import subprocess
@@ -8,9 +9,12 @@ import pytest
 import torch
 
 from dhtorch import native
-from dhtorch.geometry import se3, sweep
+from dhtorch.geometry import lucas_kanade as lk
+from dhtorch.geometry import pyramid, se3, sweep
 from dhtorch.geometry.camera import Camera
 from dhtorch.geometry.filters import gaussian
+from dhtorch.records import NO_HINT, TrackHint
+from dhtorch.stages.track import lucas_kanade
 
 COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
 needs_compiler = pytest.mark.skipif(COMPILER is None or sys.platform == "win32", reason="no C++ compiler here")
@@ -111,6 +115,93 @@ def test_places_codes_and_smooth_maps_are_equal(loaded, monkeypatch, turning):
         q = torch.rand(*shape, generator=g)
         smooth = both_ways(lambda q=q: sweep.smooth(q, torch.tensor([0.2, 0.5])), monkeypatch)
         assert torch.equal(*smooth)
+
+
+@pytest.fixture(scope="module")
+def seen_twice():
+    """Two pictures, each seen again moved by a few pixels and lit otherwise; points in, at the border of and beside it."""
+    g = torch.Generator().manual_seed(5)
+    rough, fine = (gaussian(torch.rand(2, 1, 120, 150, generator=g), s) - 0.5 for s in (3.0, 0.8))
+    wide = 2.5 * rough + fine + 0.5
+    here, there = wide[..., 10:-10, 10:-10], 0.8 * wide[..., 13:-7, 5:-15] + 0.1
+    there = there + 0.004 * torch.randn(there.shape, generator=g)
+    uv = torch.rand(2, 300, 2, generator=g) * torch.tensor([134.0, 104.0]) - 2
+    uv[:, 0], uv[0, 1], uv[1, 1] = torch.nan, torch.inf, 1e30
+    return here.clamp(0, 1), there.clamp(0, 1), uv
+
+
+def agree(found, expected, exact=None):
+    """The same verdicts but for one in 200 (or as many as single precision itself changes of ``exact`` ones), and valid
+    places alike to far less than their sigma."""
+    unsure = 0.0 if exact is None else (exact.valid != expected.valid).float().mean()
+    assert (found.valid != expected.valid).float().mean() <= max(0.005, unsure)
+    both = found.valid & expected.valid
+    assert both.float().mean() > 0.5
+    apart = (found.uv_1 - expected.uv_1)[both].norm(dim=-1)
+    sigma = expected.cov[both].diagonal(dim1=-1, dim2=-2).amax(-1).sqrt()
+    assert apart.median() <= 1e-4 and (apart / sigma).quantile(0.99) <= 0.1
+    for name in ("error", "photometric", "cov"):
+        a, b = (getattr(x, name)[both].flatten() for x in (found, expected))
+        assert (a - b).abs().median() <= 1e-3 * b.abs().median()
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("normalise", "window", "levels"), [("none", 21, 4), ("bias", 15, 3), ("gain_bias", 11, 3), ("none", 33, 1)]
+)
+def test_a_search_for_points_agrees_up_to_rounding(loaded, monkeypatch, seen_twice, normalise, window, levels):
+    here, there, uv = seen_twice
+    if normalise != "gain_bias":
+        there = (there - there.mean()) * here.std() / there.std() + here.mean()
+    options = {"normalise": normalise, "window": window, "levels": levels}
+    for hint in (NO_HINT, TrackHint(start=(uv + torch.tensor([4.0, -4.0])).nan_to_num(posinf=1e30))):
+        if hint is not NO_HINT or levels > 1:
+            wide = lucas_kanade(here.double(), there.double(), uv.double(), hint=hint, **options)
+            agree(*both_ways(lambda h=hint: lucas_kanade(here, there, uv, hint=h, **options), monkeypatch), wide)
+
+
+def test_compiled_code_has_the_constants_of_torchs():
+    """It reads past the end of a row: a level has a row more than a window at its border reaches."""
+    source = native.SOURCES[1].read_text()
+    for line in (
+        f"STEPS = {lk.STEPS}, LEAP = {lk.LEAP}, MARGIN = {pyramid.MARGIN};",
+        f"RATIO = {lk.RATIO[1]}f, LEAST_GAIN = {lk.GAIN[0]}f, MOST_GAIN = {lk.GAIN[1]}f;",
+        f"{{ {', '.join(lk.NORMALISE).upper()} }}",
+    ):
+        assert line in source
+    assert lk.RATIO[0] == -lk.RATIO[1] and {*lk.TOP, *lk.BETWEEN, *lk.FINEST} <= {1, 2}
+    assert pyramid.REACH >= pyramid.MARGIN + 2 + 2, "the largest radius, and the row"
+
+
+@needs_compiler
+def test_a_point_is_told_the_same_in_any_company(loaded, seen_twice):
+    here, there, uv = seen_twice
+    together = lucas_kanade(here, there, uv)
+    for k in range(len(uv)):
+        alone = lucas_kanade(here[k : k + 1], there[k : k + 1], uv[k : k + 1].flip(1))
+        for name in ("uv_1", "cov", "error", "photometric", "valid"):
+            assert torch.equal(getattr(alone, name)[0].flip(0), getattr(together, name)[k]), name
+
+
+@needs_compiler
+def test_pixels_that_are_no_numbers_hurt_only_the_windows_they_are_in(loaded, monkeypatch, seen_twice):
+    here, there, uv = seen_twice
+    here, there = here.clone(), there.clone()
+    here[0, 0, 30:33, 60:63], there[1, 0, 70:72, :20] = torch.nan, torch.inf
+    found, expected = both_ways(lambda: lucas_kanade(here, there, uv, normalise="bias", levels=2), monkeypatch)
+    agree(found, expected)
+    assert bool(found.cov.isfinite().all() and found.uv_1.isfinite().all())
+
+
+@needs_compiler
+def test_a_search_in_another_type_or_with_a_graph_is_torchs(loaded, monkeypatch, seen_twice):
+    here, there, uv = seen_twice
+    found, expected = both_ways(lambda: lucas_kanade(here.double(), there.double(), uv.double()), monkeypatch)
+    assert torch.equal(found.uv_1, expected.uv_1)
+    monkeypatch.setattr(lk, "_compiled", None)
+    lucas_kanade(here.double(), there.double(), uv.double())
+    with pytest.raises(TypeError):
+        lucas_kanade(here, there, uv)
 
 
 @needs_compiler

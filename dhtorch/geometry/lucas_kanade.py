@@ -11,7 +11,8 @@ C[o] = sum_p g(p) J(p + o), o an offset in whole pixels. This *map* C is compute
 a depthwise convolution whose channels are the points. After that a step touches eight numbers per point, and no pixel.
 Coarse levels only provide a start: there the points of a small *cell* of the image share one search.
 
-The same without maps, one point at a time: :func:`dhtorch.geometry.reference.search`.
+The same without maps, one point at a time: :func:`dhtorch.geometry.reference.search`; one level of it in compiled code:
+:mod:`dhtorch.native`.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
+from dhtorch import native
 from dhtorch.geometry.exact import CHUNK, LANES
 from dhtorch.geometry.lookup import QUANTISATION
 from dhtorch.geometry.pyramid import GRAD_X, GRAD_Y, GREY, Pyramid
@@ -51,6 +53,9 @@ TOP, BETWEEN, FINEST = (2, 2, 2, 2), (1, 2, 2), (1, 2, 2, 2)
 
 #: A ratio of contrasts beyond these limits is not believed.
 GAIN = (0.2, 5.0)
+
+#: What may be taken out of the difference of two windows.
+NORMALISE = ("none", "bias", "gain_bias")
 
 
 class SearchOptions(NamedTuple):
@@ -223,7 +228,11 @@ def _descend(pair: _Pair, radii: tuple[int, ...], x: Tensor, d: Tensor, batch: T
 
     Returns the displacement; who stayed on the last map, and whose window is textured (both (M,)); and A (3, M).
     """
-    o, corner = pair.o, pair.target.corner(pair.level, x + d) - radii[0]
+    o = pair.o
+    levels = pair.source.levels[pair.level], pair.target.levels[pair.level]
+    if native.serves(*levels, x, d, batch, known) and levels[0].dtype == levels[1].dtype == x.dtype == torch.float32:
+        return _compiled(pair, radii, x, d, batch, known)
+    corner = pair.target.corner(pair.level, x + d) - radii[0]
     C, moments = _map(pair, radii[0], x, corner, batch)
     A_inv, textured = _inverse(moments[2:5], o.min_eigenvalue * o.window**2)
     windows = _Windows(x, batch, moments, A_inv)
@@ -235,6 +244,35 @@ def _descend(pair: _Pair, radii: tuple[int, ...], x: Tensor, d: Tensor, batch: T
             again = partial(_on_new_map, pair, radius, steps)
             state = _State(*for_some(state.live, again, state, (windows, state)))
     return state.d, state.held, textured, moments[2:5]
+
+
+def _compiled(pair: _Pair, radii: tuple[int, ...], x: Tensor, d: Tensor, batch: Tensor, known: Tensor):
+    """:func:`_descend` in compiled code (:mod:`dhtorch.native`), the same up to the rounding of sums over a window."""
+    o = pair.o
+    found, A = d.new_empty(2, d.shape[-1]), d.new_empty(3, d.shape[-1])
+    held, textured = torch.empty_like(known), torch.empty_like(known)
+    torch.ops.dhtorch.descend(
+        source=pair.source.levels[pair.level],
+        target=pair.target.levels[pair.level],
+        x=x,
+        d=d,
+        batch=batch,
+        known=known,
+        limits=torch.cat([pair.low, pair.high], 1).T.contiguous(),
+        radii=torch.tensor(radii),
+        found=found,
+        A=A,
+        held=held,
+        textured=textured,
+        window=o.window,
+        iterations=o.iterations,
+        level=pair.level,
+        pad=pair.source.pad,
+        normalise=NORMALISE.index(o.normalise),
+        epsilon=o.epsilon_px,
+        min_eigenvalue=o.min_eigenvalue,
+    )
+    return found, held, textured, A
 
 
 def _on_new_map(pair: _Pair, radius: int, steps: int, windows: _Windows, state: _State) -> _State:
