@@ -37,6 +37,7 @@ EXPERIMENTS = {
     "views_study": "experiment=views_study data=shared_scenes experiment.anchors=3",
     "dense": "experiment=dense_comparison data=shared_scenes experiment.anchors=6",
     "judge_study": "experiment=judge_study data=shared_scenes",
+    "judge_study_streams": "experiment=judge_study data=streams experiment.rooms=[]",
     "dense_streams": "experiment=dense_comparison data=streams experiment.anchors=6 experiment.rooms=[]",
     "anchor_study": "experiment=anchor_study data=shared_scenes",
     "anchor_study_streams": "experiment=anchor_study data=streams",
