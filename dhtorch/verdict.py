@@ -249,7 +249,7 @@ def _of_sensor(frame: Frame, hw: tuple[int, int]) -> Tensor:
 def _joined(grid: Tensor, kinds: Sequence[Said], numbers: Numbers, ruler: Tensor, own: bool) -> Verdict:
     """What answers say and, where they were asked, pictures and maps of other views."""
     state, said, view = decided(*kinds)
-    ceiling, at_ceiling = _cut(grid, state, said)
+    ceiling, at_ceiling = cut(grid, state, said)
     state = torch.where(at_ceiling & (state != State.WRONG), State.CANNOT_KNOW, state).to(torch.int32)
     answers, pictures, maps = list(kinds) + [evidence.silent(grid)] * (3 - len(kinds))
     none = torch.full_like(ruler, torch.nan)
@@ -273,12 +273,14 @@ def _joined(grid: Tensor, kinds: Sequence[Said], numbers: Numbers, ruler: Tensor
     )
 
 
-def _cut(grid: Tensor, state: Tensor, said: Tensor) -> tuple[Tensor, Tensor]:
+def cut(grid: Tensor, state: Tensor, said: Tensor) -> tuple[Tensor, Tensor]:
     """Depth (B,) at which a map is cut, NaN where it is not, and the pixels (B, h, w) that stand there.
 
     A surface that is said to stand exactly as far as the farthest of a map may be a wall in front of the camera: it is
     a cut where evidence tells that much of it stands too near. Windows that straddle its outline show what is before
     it, and answers at the outline lie on a "surface" that the cut has made of two: both speak for pixels that are off.
+
+    Gradient: none.
     """
     farthest = grid.amax((1, 2))
     there = (grid > 0) & (grid >= farthest[:, None, None])
@@ -287,8 +289,8 @@ def _cut(grid: Tensor, state: Tensor, said: Tensor) -> tuple[Tensor, Tensor]:
     here, elsewhere = (
         (near & m).sum((1, 2)) / (known & m).sum((1, 2)).clamp_min(1) for m in (there, (grid > 0) & ~there)
     )
-    cut = (there.sum((1, 2)) >= PLATEAU * n) & (here >= CUT) & (here > MORE * elsewhere)
-    return torch.where(cut, farthest, torch.nan), there & cut[:, None, None]
+    ends = (there.sum((1, 2)) >= PLATEAU * n) & (here >= CUT) & (here > MORE * elsewhere)
+    return torch.where(ends, farthest, torch.nan), there & ends[:, None, None]
 
 
 def decided(*kinds: Said) -> tuple[Tensor, Tensor, Tensor]:

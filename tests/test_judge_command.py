@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader
 
 from dhtorch.codes import State
 from dhtorch.commands import run
-from dhtorch.commands.judge import exceeded, parse_limits
+from dhtorch.commands.judge import _cut, _off_at_least, _share_at_least, _wrong_at_least, exceeded, parse_limits
 from dhtorch.data.depth_maps import open_maps
 from dhtorch.data.files import FormatError
 from dhtorch.export import png
@@ -74,6 +74,48 @@ def test_what_cannot_be_is_said_in_one_line(word, said, tmp_path, capsys):
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1
     assert said in lines[0]
+
+
+def test_a_single_frame_exceeds_a_limit_by_its_bound_alone(tmp_path, maps):
+    for file in maps.glob("*.npy"):
+        np.save(file, 1.1 * np.load(file))
+    out = tmp_path / "out"
+    code, found = judged(out, f"depth={maps}", "views=false", "most=1", 'fail_on="scale>0.05,wrong>0.9"')
+    scale = found["frames"][0]["scale"]
+    assert code == run.SOME_FAILED
+    assert found["whole"]["held"]["scale"] == pytest.approx(scale["low"] - 1)
+    assert scale["low"] - 1 < 0.099 < scale["value"] - 1 + 0.01
+    code, _ = judged(out, f"depth={maps}", "views=false", "most=1", 'fail_on="scale>0.097"')
+    assert code == run.DONE, "the value is more, its interval is not"
+    assert found["intrinsics_guessed"] is None
+
+
+def test_bounds_of_a_recording():
+    def row(low, high):
+        return {"scale": {"value": (low + high) / 2, "low": low, "high": high}}
+
+    assert _off_at_least([row(0.98, 1.03)], "scale", 1.0) == 0
+    assert _off_at_least([row(1.02, 1.08), row(1.03, 1.2), row(0.5, 0.6)], "scale", 1.0) == pytest.approx(0.02)
+    assert _off_at_least([row(0.8, 0.9)], "scale", 1.0) == pytest.approx(0.1)
+    assert _off_at_least([{"scale": None}], "scale", 1.0) is None
+    assert _share_at_least(0, 0) is None
+    assert _share_at_least(1, 1) < 0.3 < _share_at_least(20, 20)
+    few = {"wrong": {"value": 0.5, "low": 0.1, "high": 0.9}, "pixels": 100, "share_cannot_know": 0.9}
+    many = {"wrong": {"value": 0.5, "low": 0.4, "high": 0.6}, "pixels": 100, "share_cannot_know": 0.7}
+    nothing = {"wrong": None, "pixels": 100, "share_cannot_know": 1.0}
+    assert _wrong_at_least([few, many, nothing]) == pytest.approx((10 * 0.1 + 30 * 0.4) / 40)
+    assert _wrong_at_least([nothing]) is None
+
+
+def test_maps_that_are_cut_and_a_guessed_field_of_view_are_told(tmp_path, maps, room):
+    for file in maps.glob("*.npy"):
+        np.save(file, np.minimum(np.load(file), np.float32(2.55)))
+    code, found = judged(tmp_path / "out", f"depth={maps}", "window=6", "every=2", "most=3", "method.n=512")
+    assert code == run.DONE
+    assert [row["ceiling"] for row in found["frames"]] == pytest.approx([2.55] * 3)
+    assert [(row["cause"], row["kind"]) for row in found["windows"]] == [("cut at 2.55 m", "cut")]
+    assert _cut([{"ceiling": 2.55}, {"ceiling": None}]) is None, "not most of them"
+    assert _cut([{"ceiling": 2.55}, {"ceiling": 3.0}]) is None, "not at one depth"
 
 
 def test_limits():
