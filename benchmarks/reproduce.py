@@ -87,6 +87,7 @@ SCRIPTS |= {
     "captures": "",
     "enrich": "",
     "judge_speed": "--clock cpu --repeats 9",
+    "judge_real": "",
     "fuzz": "--full",
     "clients": "",  # interpreters of the loaders in DHTORCH_CLIENTS
 }
