@@ -19,11 +19,12 @@ from typing import Any
 
 from dhtorch import archive, storage
 
-#: Capture → options beside those as they come. The RealSense's K is nobody's: the field of view is the maker's.
-CAPTURES = {
+#: Capture → options beside those as they come. The RealSense's K is nobody's: the field of view is the maker's. The
+#: last are single views, each in a folder of its own.
+CAPTURES: dict[str, tuple[str, ...]] = {
     "realsense_slam": ("data.fov=69", "every=2"),
     "slambook_rgbd": (),
-    "lingbot_examples": (),
+    **{f"lingbot_examples/{k}": () for k in range(8)},
 }
 
 #: What is kept of a frame.
@@ -38,7 +39,6 @@ def rows(path: Path, options: tuple[str, ...], folder: Path) -> list[dict[str, A
     for file in sorted(folder.rglob("judge.json")):
         said = json.loads(file.read_text())
         row = {
-            "name": path.name,
             "recording": said["scene"],
             "options": list(options),
             "processor": archive.processor(),
@@ -61,7 +61,7 @@ def main() -> int:
         for name, asked in CAPTURES.items():
             folder = Path(options.pages or scratch).resolve() / name
             folder.mkdir(parents=True, exist_ok=True)
-            found += rows(data / name, asked, folder)
+            found += [{"name": name} | row for row in rows(data / name, asked, folder)]
     options.json.write_text(storage.dumps(storage.strict(found), indent=1) + "\n")
     return 0
 

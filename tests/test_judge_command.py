@@ -107,7 +107,7 @@ def test_bounds_of_a_recording():
     assert _wrong_at_least([nothing]) is None
 
 
-def test_maps_that_are_cut_and_a_guessed_field_of_view_are_told(tmp_path, maps, room):
+def test_maps_that_are_cut_are_told(tmp_path, maps, room):
     for file in maps.glob("*.npy"):
         np.save(file, np.minimum(np.load(file), np.float32(2.55)))
     code, found = judged(tmp_path / "out", f"depth={maps}", "window=6", "every=2", "most=3", "method.n=512")
@@ -116,6 +116,19 @@ def test_maps_that_are_cut_and_a_guessed_field_of_view_are_told(tmp_path, maps, 
     assert [(row["cause"], row["kind"]) for row in found["windows"]] == [("cut at 2.55 m", "cut")]
     assert _cut([{"ceiling": 2.55}, {"ceiling": None}]) is None, "not most of them"
     assert _cut([{"ceiling": 2.55}, {"ceiling": 3.0}]) is None, "not at one depth"
+
+
+def test_a_guessed_field_of_view_is_told(tmp_path, room):
+    for k in range(2):
+        for name, picture in (("rgb", room[k].image[0]), ("depth", (1000 * room[k].depth[0]).to(torch.uint16))):
+            (tmp_path / "capture" / name).mkdir(parents=True, exist_ok=True)
+            array = picture.permute(1, 2, 0).numpy() if name == "rgb" else picture.numpy()
+            (tmp_path / "capture" / name / f"{k}.png").write_bytes(png(np.ascontiguousarray(array)))
+    words = ["judge", str(tmp_path / "capture"), "data.fov=60", "method.n=256", "size=96", "window=0", "most=1"]
+    with pytest.warns(UserWarning, match="intrinsics are a guess"):
+        assert run.main([*words, f"output={tmp_path}"]) == run.DONE
+    told = json.loads((tmp_path / "judge.json").read_text())["intrinsics_guessed"]
+    assert told.startswith("intrinsics are a guess") and "60" in told
 
 
 def test_limits():
@@ -211,6 +224,8 @@ def test_a_study_counts_what_was_planted():
     rows += [window("unit_mm", "unit", "unit", 50.0), window("unit_m", "unit", None, 50.0)]
     rows += [window("mirrored", "mirrored", "mirrored", 9.0), window("mirrored", "mirrored", None, 1.0)]
     rows += [window("none", None, None, 0.0), window("none", None, "rolled", 0.0)]
+    found = judge_study.summary([*rows, {**rows[0], "judge.called_right_wrong": 0.02}])
+    assert found["judge.called_right_wrong_worst"]["value"] == 0.02
     found = judge_study.summary(rows)
     assert found["judge.scale_found"]["value"] == 0.75
     assert found["judge.known"]["value"] == 0.5
@@ -236,5 +251,7 @@ def test_the_study_runs_on_a_room(room):
 
     options = {"anchors": 1, "windows": 0, "rooms": [], "size": 96}
     found = judge_study.run([room], {"auto": AUTO.replace(n=512)}, None, Settings(cutoff=2.0), **options)
-    assert {"judge.called_right_wrong", "photometric.called_right_wrong"} <= set(found.summary)
+    told = {"called_right_wrong", "called_right_wrong_worst", "called_right_wrong_cut"}
+    assert {f"{who}.{name}" for who in ("judge", "quick", "photometric") for name in told} <= set(found.summary)
+    assert found.summary["judge.scale_found_quick_far"]["n"] <= 1
     assert found.verdict in ("supported", "refuted", "undecided")
