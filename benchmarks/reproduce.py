@@ -71,6 +71,7 @@ EXPERIMENTS = {
     "learned_score": "experiment=learned_score data=shared_scenes",
     "rh20t_probe": "experiment=rh20t_probe data=rh20t_synthetic",
     "vo_probe": "experiment=vo_probe data=shared_scenes",
+    "vo_probe_xfeat": "experiment=vo_probe data=shared_scenes experiment.dinov2=null experiment.xfeat=true",
 }
 
 #: Result of a script of this folder → its arguments.
