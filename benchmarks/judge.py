@@ -2,10 +2,11 @@
 
     python benchmarks/judge.py --json benchmarks/results/judge_speed.json --clock cpu --repeats 9
 
-``judge_sparse``: :func:`dhtorch.judge` of a map of 640×480 with one other view, by sparse evidence (``views=False``,
-512 samples, ``map``), from the frames to the verdict; ``judge_views`` asks the pictures of the view as well. The peer
-needs a motion like ours and gets one by the same method. Frames of TUM fr1/desk where DHTORCH_DATA is set, else of the
-built-in room; frames a second are 1000 / ms.
+``judge_sparse``: :func:`dhtorch.judge` of a map of 640×480 with one other view, by sparse evidence (``views=False``) of
+:data:`dhtorch.verdict.QUICK`, from the frames to the verdict; ``judge_sparse_512`` the same by 512 samples of ``map``,
+and ``judge_views`` asks the pictures of the view as well. All take turns in one process. The peer needs a motion like
+ours and gets one by the same method. Frames of TUM fr1/desk where DHTORCH_DATA is set, else of the built-in room;
+frames a second are 1000 / ms.
 """
 
 from __future__ import annotations
@@ -18,7 +19,9 @@ import pair as pairs
 import torch
 
 from dhtorch import MAP, dense, judge
+from dhtorch.method import Method
 from dhtorch.studies.baselines import photometric
+from dhtorch.verdict import QUICK
 
 METHOD = MAP.replace(n=512)
 
@@ -34,15 +37,14 @@ def measure(threads: int, options: Any) -> list[dict[str, Any]]:
             asked = dense.views_asked(METHOD(near, other, trace=trace), other, trace)
             photometric.differs(anchor.depth, near, asked)
 
-    def ours(views: bool) -> None:
-        judge(anchor.depth, near, other, method=METHOD, views=views)
+    def ours(method: Method, views: bool) -> None:
+        judge(anchor.depth, near, other, method=method, views=views)
 
-    sides = harness.in_turn(
-        [partial(ours, False), partial(ours, True), check], repeats=options.repeats, clock=options.clock
-    )
-    *found, peer = sides
-    names = "judge_sparse", "judge_views"
-    return [harness.row(name, side, "photometric", peer, n=512) for name, side in zip(names, found, strict=True)]
+    asked = {"judge_sparse": (QUICK, False), "judge_sparse_512": (METHOD, False), "judge_views": (METHOD, True)}
+    calls = [*(partial(ours, *how) for how in asked.values()), check]
+    *found, peer = harness.in_turn(calls, repeats=options.repeats, clock=options.clock)
+    rows = zip(asked.items(), found, strict=True)
+    return [harness.row(name, side, "photometric", peer, n=method.n) for (name, (method, _)), side in rows]
 
 
 def main() -> None:

@@ -372,6 +372,8 @@ FOUND = {
         "≥ 0.95",
     ),
     "called_right_wrong": ("pixels called consistent that are a fifth off", "≤ 0.01"),
+    "called_right_wrong_worst": ("the same in the worst scene", ""),
+    "called_right_wrong_cut": ("the same of maps that are cut at the depth that six in ten pixels are nearer than", ""),
     "called_wrong_right": ("pixels of sound maps called wrong, of those judged", ""),
     "known": ("pixels of sound maps of which something is said", ""),
     "named_worst": ("cause named, worst kind, windows moved by two pixels", "≥ 0.90"),
@@ -379,14 +381,53 @@ FOUND = {
 }
 
 
+#: Columns of the judge's table: result, whose number, head.
+JUDGES = (
+    ("judge_study", "judge", "`judge`"),
+    ("judge_study_streams", "judge", "`judge`, streams"),
+    ("judge_study", "quick", "`QUICK`, no pictures"),
+    ("judge_study_streams", "quick", "`QUICK`, streams"),
+    ("judge_study", "photometric", "photometric check"),
+)
+
+
 def judge() -> str:
     """What the judge finds, beside a fixed-threshold photometric check and the bars."""
-    summary = json.loads((RESULTS / "judge_study.json").read_text())["summary"]
+    found = {name: json.loads((RESULTS / f"{name}.json").read_text()) for name, _, _ in JUDGES}
+    summary = {name: result["summary"] for name, result in found.items()}
     rows = []
     for name, (words, bar) in FOUND.items():
-        values = (summary.get(f"{who}.{name}", {}).get("value") for who in ("judge", "photometric"))
+        values = []
+        for result, who, _ in JUDGES:
+            key = (
+                f"judge.{name.removesuffix('_far')}_quick_far"
+                if who == "quick" and name.endswith("_far")
+                else f"{who}.{name}"
+            )
+            values.append(summary[result].get(key, {}).get("value"))
         rows.append([words, *("" if value is None else f"{value:.3f}" for value in values), bar])
-    return table(["number", "`judge`", "photometric check", "bar"], rows)
+    shares = [named_registration(found[result]["rows"]) if who == "judge" else "" for result, who, _ in JUDGES]
+    rows.append(["depth that is not registered: named, all windows", *shares, ""])
+    return table(["number", *(head for _, _, head in JUDGES), "bar"], rows)
+
+
+def named_registration(rows: list[dict[str, Any]]) -> str:
+    """Of the windows in which the depth is not registered, in how many that was named."""
+    names = [row["named_kind"] for row in rows if row.get("planted_kind") == "registration"]
+    return f"{names.count('registration')} of {len(names)}"
+
+
+def judged_real() -> str:
+    """What is said of real sensors' own depth."""
+    rows = []
+    for row in json.loads((RESULTS / "judge_real.json").read_text()):
+        whole, held = row["whole"], row["whole"]["held"]
+        wrong = "nothing is known" if whole["wrong"] is None else f"{whole['wrong']:.1%}, at least {held['wrong']:.1%}"
+        causes = "; ".join(f"{cause} ({n} of {whole['windows']})" for cause, n in whole["causes"].items())
+        options = f" {' '.join(row['options'])}" if row["options"] else ""
+        cells = [f"`{row['name']}{options}`", str(whole["frames"]), wrong, f"{held['unknown']:.1%}"]
+        rows.append([*cells, causes or ("no window" if not whole["windows"] else "none")])
+    return table(["capture", "frames", "wrong, of what is known", "cannot be known", "likely cause (windows)"], rows)
 
 
 #: What anchoring is to reach, in words, and its bars.
@@ -447,7 +488,12 @@ def client(name: str) -> str:
 TABLES = {"room": room, "room seeds": room_by_seed, "shared": shared, "truths": truths, "comparison": comparison}
 TABLES |= {"comparison scenes": partial(by_scene, "method_comparison"), "stress": partial(by_scene, "stress")}
 TABLES |= {"chosen views": partial(chosen_views, "method_comparison", "streams"), "beside chosen": beside_chosen}
-TABLES |= {"judge": judge, "clients": clients, "anchor": partial(anchored, "anchor_study", "anchor_study_streams")}
+TABLES |= {
+    "judge": judge,
+    "judge real": judged_real,
+    "clients": clients,
+    "anchor": partial(anchored, "anchor_study", "anchor_study_streams"),
+}
 TABLES |= {"every pixel": partial(every_pixel, "dense", "dense_streams")}
 TABLES |= {"pixels by scene": partial(pixels_by_scene, "dense")}
 TABLES |= {"speed": speed_tables.stages, "mutants": caught} | speed_tables.TABLES | kornia_tables.TABLES

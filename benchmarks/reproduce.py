@@ -37,6 +37,7 @@ EXPERIMENTS = {
     "views_study": "experiment=views_study data=shared_scenes experiment.anchors=3",
     "dense": "experiment=dense_comparison data=shared_scenes experiment.anchors=6",
     "judge_study": "experiment=judge_study data=shared_scenes",
+    "judge_study_streams": "experiment=judge_study data=streams experiment.rooms=[]",
     "dense_streams": "experiment=dense_comparison data=streams experiment.anchors=6 experiment.rooms=[]",
     "anchor_study": "experiment=anchor_study data=shared_scenes",
     "anchor_study_streams": "experiment=anchor_study data=streams",
@@ -70,6 +71,7 @@ EXPERIMENTS = {
     "learned_score": "experiment=learned_score data=shared_scenes",
     "rh20t_probe": "experiment=rh20t_probe data=rh20t_synthetic",
     "vo_probe": "experiment=vo_probe data=shared_scenes",
+    "vo_probe_xfeat": "experiment=vo_probe data=shared_scenes experiment.dinov2=null experiment.xfeat=true",
 }
 
 #: Result of a script of this folder → its arguments.
@@ -86,6 +88,7 @@ SCRIPTS |= {
     "captures": "",
     "enrich": "",
     "judge_speed": "--clock cpu --repeats 9",
+    "judge_real": "",
     "fuzz": "--full",
     "clients": "",  # interpreters of the loaders in DHTORCH_CLIENTS
 }

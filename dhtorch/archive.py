@@ -88,6 +88,7 @@ IMPLIED: dict[str, dict[str, Any]] = {
             **{"correlation": 1.0, "max_sigma_rel": 0.1, "max_still": 0.5},
         },
     },
+    **{f"dhtorch.studies.probes.{name}.run": {"xfeat": False} for name in ("rh20t_probe", "vo_probe")},
     "dhtorch.studies.negative.helix_correlation.run": {"turns": None, "foveation": 1.0, "gaze": None},
 }
 

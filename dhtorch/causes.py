@@ -23,7 +23,7 @@ from torch import Tensor
 from dhtorch import tree
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
-from dhtorch.geometry.lookup import nearest
+from dhtorch.geometry.lookup import magnified, nearest
 from dhtorch.geometry.start import coarse_flow
 from dhtorch.method import Method
 from dhtorch.pair import Clock, under_pose
@@ -50,6 +50,10 @@ SAVES, ERRORS, BEYOND = 0.04, 3.0, 0.015
 LAG = 5
 FOCALS = (0.8, 0.87, 0.93, 0.95, 1.05, 1.07, 1.15, 1.25)
 
+#: Fields of view of a depth over that of the picture it should be laid over, and by which share of the width it may lie
+#: beside its place.
+FIELDS, BESIDE = (0.7, 0.78, 0.87, 1.15, 1.28, 1.43), (-0.08, -0.04, 0.04, 0.08)
+
 #: Factors that take a depth in another unit to metres.
 UNITS = {"mm read as m": 1e-3, "m read as mm": 1e3, "inch read as m": 0.0254, "m read as inch": 1 / 0.0254}
 
@@ -62,7 +66,7 @@ PAIRS, FEWEST, GAPS, FOUND = 8, 4, (8, 4, 2, 1), 0.4
 class Cause:
     """A fault that maps of a recording may share, and how it is undone."""
 
-    kind: str  # unit | mirrored | rolled | time offset | focal length
+    kind: str  # unit | mirrored | rolled | registration | time offset | focal length
     name: str  # of this one
     undo: Callable[[Tensor], Tensor] = lambda depth: depth  # map (B, h, w) → as it should be
     lag: int = 0  # frames by which the maps come late
@@ -92,6 +96,22 @@ CAUSES: tuple[Cause, ...] = (
     *(Cause("unit", name, partial(_times, factor=factor)) for name, factor in UNITS.items()),
     Cause("mirrored", "mirrored left to right", _mirrored),
     *(Cause("rolled", f"rolled by {90 * k} degrees", partial(turned, quarters=4 - k)) for k in (1, 2, 3)),
+    *(
+        Cause(
+            "registration",
+            f"not registered: seen over {field:.2f} of the picture's field",
+            partial(magnified, factor=field),
+        )
+        for field in FIELDS
+    ),
+    *(
+        Cause(
+            "registration",
+            f"not registered: {abs(x):.0%} of the width too far {'right' if x > 0 else 'left'}",
+            partial(magnified, factor=1.0, right=x),
+        )
+        for x in BESIDE
+    ),
     *(
         Cause("time offset", f"{abs(k)} frames {'late' if k > 0 else 'early'}", lag=k)
         for k in range(-LAG, LAG + 1)

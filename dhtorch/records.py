@@ -252,6 +252,7 @@ class Verdict(Record):
     shift: Tensor  # (B, 3) m, in the map = scale · truth + shift
     tilt: Tensor  # (B, 3) relative error from one side of the picture to the other, along its steepest direction
     wrong: Tensor  # (B, 3) share of wrong ones among pixels of which something is known
+    ceiling: Tensor  # (B,) m, where the map is cut: what is farther is said to lie there; NaN = it is not
 
     @property
     def known(self) -> Tensor:

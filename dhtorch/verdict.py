@@ -26,9 +26,13 @@ from dhtorch.geometry.covariance import median
 from dhtorch.geometry.lookup import nearest
 from dhtorch.geometry.shapes import check
 from dhtorch.method import Method, Trace
-from dhtorch.methods import AUTO
+from dhtorch.methods import AUTO, MAP
 from dhtorch.offers import choosing
 from dhtorch.records import NO_HINT, Estimate, Frame, PoseFit, TrackHint, Verdict
+
+#: The sparse method of a verdict in little time, by one other view (with ``views=False``): a metre is told by some
+#: dozens of points, and their motion by as few. ``experiment=judge_study`` holds what it says against the whole method.
+QUICK = MAP.replace(n=256, hypotheses=64, pose={"near_steps": 2, "steps": 3})
 
 #: Sigmas from which on evidence speaks against a pixel, and up to which it speaks for it.
 AGAINST, FOR = 3.0, 2.0
@@ -44,6 +48,11 @@ FEWEST, FEWEST_SHAPE = 8, 24
 
 #: Pixels of a grid that count as one when a share is counted: a window.
 WINDOW = 81
+
+#: Least share of a map's pixels that all stand exactly as far as its farthest; the least share of those of which
+#: something is known that are wrong for standing too near, and how many times the share of all others that is: from
+#: there on the map is cut, and what it gives is a bound.
+PLATEAU, CUT, MORE = 0.01, 0.1, 2.0
 
 
 def judge(
@@ -80,10 +89,13 @@ def judge(
     Returns:
         Verdict (B, h, w) over the field of the anchor's picture. CONSISTENT only where evidence that would have told
         an error of a fifth tells none; WRONG where some speaks against the depth by three sigmas; where kinds of
-        evidence contradict each other, or none speaks, CANNOT_KNOW.
+        evidence contradict each other, or none speaks, CANNOT_KNOW. Where a map is cut (``ceiling``: all that is
+        farther is said to lie at one depth) the pixels at the cut are WRONG or unknown, since they say no more than
+        that the depth is at least that.
 
     Raises:
-        ValueError: wrong shapes, or an option out of range.
+        ValueError: wrong shapes, maps that are no real numbers or have fewer than 2×2 pixels, or an option out of
+            range.
 
     Gradient: none; a verdict.
     Cost: that of the method, and with ``views`` eleven fits of every grid pixel for each partner.
@@ -94,6 +106,9 @@ def judge(
         raise ValueError(f"judge: size is {size}, partners {partners}, expected at least 16 and 1")
     check("judge", image=(anchor.image, "B C H W"), depth_map=(depth_map, "B h w"))
     check("judge", depth=(anchor.depth, "B y x"), depth_map=(depth_map, "B h w"))
+    check("judge", other_maps=(other_maps, "V B h w"))
+    for name, given in (("depth_map", depth_map), ("other_maps", other_maps)):
+        _must_be_metres(name, given)
     trace = {} if trace is None else trace
     with torch.no_grad():
         asked = None if others is None else _asked(method, anchor, others, trace, seed=seed, fit=fit, hint=hint)
@@ -201,9 +216,17 @@ def _usable(depth: Tensor) -> Tensor:
     return torch.where(depth > 0, depth, 0.0)
 
 
+def _must_be_metres(name: str, maps: Tensor | None) -> None:
+    """Refuse what is no map of metres."""
+    if maps is None:
+        return
+    if maps.dtype == torch.bool or maps.is_complex():
+        raise ValueError(f"judge: {name} is of {str(maps.dtype).removeprefix('torch.')}, expected real numbers, m")
+    if min(maps.shape[-2:]) < 2:
+        raise ValueError(f"judge: {name} has shape {tuple(maps.shape)}, expected at least 2×2 pixels")
+
+
 def _resized(depth_map: Tensor, hw: tuple[int, int]) -> Tensor:
-    if 0 in depth_map.shape:
-        raise ValueError(f"judge: depth_map has shape {tuple(depth_map.shape)}, expected at least one pixel")
     rows, columns = (
         ((torch.arange(n, device=depth_map.device) + 0.5) * m / n).floor().long().clamp_max(m - 1)
         for n, m in zip(hw, depth_map.shape[-2:], strict=True)
@@ -226,6 +249,8 @@ def _of_sensor(frame: Frame, hw: tuple[int, int]) -> Tensor:
 def _joined(grid: Tensor, kinds: Sequence[Said], numbers: Numbers, ruler: Tensor, own: bool) -> Verdict:
     """What answers say and, where they were asked, pictures and maps of other views."""
     state, said, view = decided(*kinds)
+    ceiling, at_ceiling = cut(grid, state, said)
+    state = torch.where(at_ceiling & (state != State.WRONG), State.CANNOT_KNOW, state).to(torch.int32)
     answers, pictures, maps = list(kinds) + [evidence.silent(grid)] * (3 - len(kinds))
     none = torch.full_like(ruler, torch.nan)
     n_wrong, n_known = ((m.sum((1, 2)) / WINDOW) for m in (state == State.WRONG, state != State.CANNOT_KNOW))
@@ -244,7 +269,28 @@ def _joined(grid: Tensor, kinds: Sequence[Said], numbers: Numbers, ruler: Tensor
         shift=numbers.shift,
         tilt=numbers.tilt,
         wrong=share(n_wrong.to(grid), n_known.to(grid)),
+        ceiling=ceiling,
     )
+
+
+def cut(grid: Tensor, state: Tensor, said: Tensor) -> tuple[Tensor, Tensor]:
+    """Depth (B,) at which a map is cut, NaN where it is not, and the pixels (B, h, w) that stand there.
+
+    A surface that is said to stand exactly as far as the farthest of a map may be a wall in front of the camera: it is
+    a cut where evidence tells that much of it stands too near. Windows that straddle its outline show what is before
+    it, and answers at the outline lie on a "surface" that the cut has made of two: both speak for pixels that are off.
+
+    Gradient: none.
+    """
+    farthest = grid.amax((1, 2))
+    there = (grid > 0) & (grid >= farthest[:, None, None])
+    n = (grid > 0).sum((1, 2)).clamp_min(1)
+    near, known = (state == State.WRONG) & (said < 0), state != State.CANNOT_KNOW
+    here, elsewhere = (
+        (near & m).sum((1, 2)) / (known & m).sum((1, 2)).clamp_min(1) for m in (there, (grid > 0) & ~there)
+    )
+    ends = (there.sum((1, 2)) >= PLATEAU * n) & (here >= CUT) & (here > MORE * elsewhere)
+    return torch.where(ends, farthest, torch.nan), there & ends[:, None, None]
 
 
 def decided(*kinds: Said) -> tuple[Tensor, Tensor, Tensor]:

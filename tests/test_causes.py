@@ -5,6 +5,7 @@ import torch
 
 from dhtorch.causes import CAUSES, NONE, TRACKING, decided, name_cause, turned, watch
 from dhtorch.evaluate.holdout import range_split
+from dhtorch.geometry.lookup import magnified
 from dhtorch.synthetic import SyntheticRoom
 from dhtorch.synthetic.depth_faults import mirrored
 
@@ -27,6 +28,7 @@ FAULTS = {
     "unit": lambda d: 1000 * d,
     "mirrored": mirrored,
     "rolled": lambda d: turned(d, 1),
+    "registration": lambda d: magnified(d, 1 / 1.35),
 }
 
 

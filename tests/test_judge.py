@@ -12,7 +12,7 @@ from dhtorch.evaluate.holdout import range_split
 from dhtorch.evidence import Said
 from dhtorch.synthetic import SyntheticRoom
 from dhtorch.tree import collate, stack
-from dhtorch.verdict import decided, share
+from dhtorch.verdict import cut, decided, share
 
 NEAR, ANCHOR, OTHERS = 2.0, 5, (0, 2, 8, 11)
 METHOD = AUTO.replace(n=768)
@@ -140,6 +140,45 @@ def test_maps_of_other_views_see_through_what_stands_too_near(room, true, anchor
     assert (found.by_maps[told & ~inside] < -3).float().mean() < 0.1
 
 
+def test_a_map_that_is_cut_is_wrong_or_unknown_where_it_is(true, anchor, others):
+    """A byte in centimetres: nothing is farther than 2.55 m, as windows at the outline of what is near would have it."""
+    byte = (true * 100).round().clamp_max(255) / 100
+    found = judge(byte, anchor, others, **SMALL)
+    off = at_grid(true, found) > 1.2 * found.depth
+    assert off.float().mean() > 0.3
+    assert not (found.state == State.CONSISTENT)[off].any()
+    assert ((found.state == State.CONSISTENT) & ~off).sum() > 0.5 * (~off).sum()
+    assert found.ceiling[0] == pytest.approx(2.55)
+
+
+def test_a_wall_that_ends_a_map_is_no_cut_and_neither_is_a_wrong_metre():
+    grid = torch.full((4, 20, 20), 2.0)
+    grid[:, :, 10:] = 3.0
+    state = torch.full(grid.shape, State.CONSISTENT)
+    said = torch.zeros_like(grid)
+    state[1:, :, 10:], said[1, :, 10:] = State.WRONG, 5.0  # too far
+    state[2], said[2:] = State.WRONG, -5.0  # all too near
+    depth, at = cut(grid, state, said)
+    assert depth[:3].isnan().all() and not at[:3].any()
+    assert depth[3] == 3 and torch.equal(at[3], grid[3] == 3)
+
+
+@pytest.mark.parametrize(
+    ("bad", "said"),
+    [
+        (lambda d: d > 1, "depth_map is of bool, expected real numbers"),
+        (lambda d: d.to(torch.complex64), "depth_map is of complex64"),
+        (lambda d: d[:, :1, :1], "at least 2×2 pixels"),
+        (lambda d: d[:, :, :1], "at least 2×2 pixels"),
+    ],
+)
+def test_what_is_no_map_is_refused(bad, said, true, anchor):
+    with pytest.raises(ValueError, match=said):
+        judge(bad(true), anchor)
+    with pytest.raises(ValueError, match=said.replace("depth_map", "other_maps")):
+        judge(true, anchor, other_maps=bad(true)[None])
+
+
 def test_no_depth_is_never_right_or_wrong(true, anchor, others):
     holes = true.clone()
     holes[:, :, :120] = torch.nan
@@ -208,5 +247,5 @@ def test_a_batch_is_judged_as_its_members_are(room, true, anchor, others):
 
 def test_a_map_without_pixels_is_refused():
     room = SyntheticRoom(n_frames=1, hw=(48, 64), depth_hw=(24, 32))
-    with pytest.raises(ValueError, match=r"depth_map has shape \(1, 0, 0\), expected at least one pixel"):
+    with pytest.raises(ValueError, match=r"depth_map has shape \(1, 0, 0\), expected at least 2×2 pixels"):
         judge(torch.zeros(1, 0, 0), room[0], None)

@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader
 
 from dhtorch.codes import State
 from dhtorch.commands import run
-from dhtorch.commands.judge import exceeded, parse_limits
+from dhtorch.commands.judge import _cut, _off_at_least, _share_at_least, _wrong_at_least, exceeded, parse_limits
 from dhtorch.data.depth_maps import open_maps
 from dhtorch.data.files import FormatError
 from dhtorch.export import png
@@ -74,6 +74,61 @@ def test_what_cannot_be_is_said_in_one_line(word, said, tmp_path, capsys):
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1
     assert said in lines[0]
+
+
+def test_a_single_frame_exceeds_a_limit_by_its_bound_alone(tmp_path, maps):
+    for file in maps.glob("*.npy"):
+        np.save(file, 1.1 * np.load(file))
+    out = tmp_path / "out"
+    code, found = judged(out, f"depth={maps}", "views=false", "most=1", 'fail_on="scale>0.05,wrong>0.9"')
+    scale = found["frames"][0]["scale"]
+    assert code == run.SOME_FAILED
+    assert found["whole"]["held"]["scale"] == pytest.approx(scale["low"] - 1)
+    assert scale["low"] - 1 < 0.099 < scale["value"] - 1 + 0.01
+    code, _ = judged(out, f"depth={maps}", "views=false", "most=1", 'fail_on="scale>0.097"')
+    assert code == run.DONE, "the value is more, its interval is not"
+    assert found["intrinsics_guessed"] is None
+
+
+def test_bounds_of_a_recording():
+    def row(low, high):
+        return {"scale": {"value": (low + high) / 2, "low": low, "high": high}}
+
+    assert _off_at_least([row(0.98, 1.03)], "scale", 1.0) == 0
+    assert _off_at_least([row(1.02, 1.08), row(1.03, 1.2), row(0.5, 0.6)], "scale", 1.0) == pytest.approx(0.02)
+    assert _off_at_least([row(0.8, 0.9)], "scale", 1.0) == pytest.approx(0.1)
+    assert _off_at_least([{"scale": None}], "scale", 1.0) is None
+    assert _share_at_least(0, 0) is None
+    assert _share_at_least(1, 1) < 0.3 < _share_at_least(20, 20)
+    few = {"wrong": {"value": 0.5, "low": 0.1, "high": 0.9}, "pixels": 100, "share_cannot_know": 0.9}
+    many = {"wrong": {"value": 0.5, "low": 0.4, "high": 0.6}, "pixels": 100, "share_cannot_know": 0.7}
+    nothing = {"wrong": None, "pixels": 100, "share_cannot_know": 1.0}
+    assert _wrong_at_least([few, many, nothing]) == pytest.approx((10 * 0.1 + 30 * 0.4) / 40)
+    assert _wrong_at_least([nothing]) is None
+
+
+def test_maps_that_are_cut_are_told(tmp_path, maps, room):
+    for file in maps.glob("*.npy"):
+        np.save(file, np.minimum(np.load(file), np.float32(2.55)))
+    code, found = judged(tmp_path / "out", f"depth={maps}", "window=6", "every=2", "most=3", "method.n=512")
+    assert code == run.DONE
+    assert [row["ceiling"] for row in found["frames"]] == pytest.approx([2.55] * 3)
+    assert [(row["cause"], row["kind"]) for row in found["windows"]] == [("cut at 2.55 m", "cut")]
+    assert _cut([{"ceiling": 2.55}, {"ceiling": None}]) is None, "not most of them"
+    assert _cut([{"ceiling": 2.55}, {"ceiling": 3.0}]) is None, "not at one depth"
+
+
+def test_a_guessed_field_of_view_is_told(tmp_path, room):
+    for k in range(2):
+        for name, picture in (("rgb", room[k].image[0]), ("depth", (1000 * room[k].depth[0]).to(torch.uint16))):
+            (tmp_path / "capture" / name).mkdir(parents=True, exist_ok=True)
+            array = picture.permute(1, 2, 0).numpy() if name == "rgb" else picture.numpy()
+            (tmp_path / "capture" / name / f"{k}.png").write_bytes(png(np.ascontiguousarray(array)))
+    words = ["judge", str(tmp_path / "capture"), "data.fov=60", "method.n=256", "size=96", "window=0", "most=1"]
+    with pytest.warns(UserWarning, match="intrinsics are a guess"):
+        assert run.main([*words, f"output={tmp_path}"]) == run.DONE
+    told = json.loads((tmp_path / "judge.json").read_text())["intrinsics_guessed"]
+    assert told.startswith("intrinsics are a guess") and "60" in told
 
 
 def test_limits():
@@ -169,6 +224,8 @@ def test_a_study_counts_what_was_planted():
     rows += [window("unit_mm", "unit", "unit", 50.0), window("unit_m", "unit", None, 50.0)]
     rows += [window("mirrored", "mirrored", "mirrored", 9.0), window("mirrored", "mirrored", None, 1.0)]
     rows += [window("none", None, None, 0.0), window("none", None, "rolled", 0.0)]
+    found = judge_study.summary([*rows, {**rows[0], "judge.called_right_wrong": 0.02}])
+    assert found["judge.called_right_wrong_worst"]["value"] == 0.02
     found = judge_study.summary(rows)
     assert found["judge.scale_found"]["value"] == 0.75
     assert found["judge.known"]["value"] == 0.5
@@ -194,5 +251,7 @@ def test_the_study_runs_on_a_room(room):
 
     options = {"anchors": 1, "windows": 0, "rooms": [], "size": 96}
     found = judge_study.run([room], {"auto": AUTO.replace(n=512)}, None, Settings(cutoff=2.0), **options)
-    assert {"judge.called_right_wrong", "photometric.called_right_wrong"} <= set(found.summary)
+    told = {"called_right_wrong", "called_right_wrong_worst", "called_right_wrong_cut"}
+    assert {f"{who}.{name}" for who in ("judge", "quick", "photometric") for name in told} <= set(found.summary)
+    assert found.summary["judge.scale_found_quick_far"]["n"] <= 1
     assert found.verdict in ("supported", "refuted", "undecided")

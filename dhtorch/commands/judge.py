@@ -22,6 +22,7 @@ import torch
 from dhtorch import causes, storage
 from dhtorch.codes import State, names
 from dhtorch.data import depth_maps, files
+from dhtorch.data import intrinsics as told
 from dhtorch.data.depth_maps import DepthMaps
 from dhtorch.data.pairs import around
 from dhtorch.data.scene import Scene, scenes_of
@@ -30,7 +31,7 @@ from dhtorch.evaluate.holdout import range_split
 from dhtorch.method import Method
 from dhtorch.records import Frame, Verdict
 from dhtorch.tree import stack
-from dhtorch.verdict import judge
+from dhtorch.verdict import judge, share
 from dhtorch.viewer import judged as pages
 
 Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
@@ -39,13 +40,14 @@ Row = dict[str, Any]
 #: Numbers of a frame with their interval.
 NUMBERS = ("scale", "scale_near", "scale_far", "ruler", "shift", "tilt", "wrong")
 
-#: What ``fail_on`` may name → what is held against the limit, in words. All are of a whole recording.
+#: What ``fail_on`` may name → what is held against the limit, in words. All are of a whole recording, and all but the
+#: last are bounds that the number exceeds with 95 %: few frames, or unsure ones, exceed no limit by chance.
 LIMITS = {
-    "wrong": "share of wrong pixels among those of which something is known",
-    "scale": "|median scale - 1| of the frames whose scale is known",
-    "shift": "median |shift| of the frames, m",
-    "tilt": "median tilt of the frames",
-    "causes": "share of the windows in which a cause is named",
+    "wrong": "share of wrong pixels among those of which something is known, at least",
+    "scale": "|scale - 1| of the median frame, at least",
+    "shift": "|shift| of the median frame, m, at least",
+    "tilt": "tilt of the median frame, at least",
+    "causes": "share of the windows in which a cause is named, at least",
     "unknown": "share of the pixels with a depth of which nothing can be known",
 }
 
@@ -65,6 +67,11 @@ class Found:
     windows: list[Row] = field(default_factory=list)
     pictures: dict[int, bytes] = field(default_factory=dict)  # frame → PNG, of the worst
 
+    @property
+    def by_number(self) -> dict[int, Row]:
+        """Rows of the frames that were looked at, by their number in the capture."""
+        return {row["frame"]: row for row in self.rows}
+
 
 def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:
     """Judge every scene of the settings; returns the exit code, 1 where a limit is exceeded.
@@ -80,7 +87,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     if settings["depth"] is not None and len(scenes) > 1:
         raise ValueError(f"depth: found {len(scenes)} recordings for one folder of maps, expected one (data.root=…)")
     folder = Path(str(settings["output"])).expanduser()
-    written, failed, told = [], [], []
+    written, failed, lines = [], [], []
     for scene in scenes:
         maps = None
         if settings["depth"] is not None:
@@ -90,11 +97,12 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         over = exceeded(whole, limits)
         place = folder if len(scenes) == 1 else folder / scene.name
         content = {"scene": scene.name, "source": "sensor" if maps is None else "maps", "fail_on": settings["fail_on"]}
+        content |= {"intrinsics_guessed": told.guessed(scene.recording.report)}
         content |= {"exceeded": over, "whole": whole, "windows": found.windows, "frames": found.rows}
         written += [storage.write_json(place / "judge.json", storage.strict(content)), _page(place, found, whole, over)]
-        told += [*_said(scene.name, whole), *(f"  exceeded: {line}" for line in over)]
+        lines += [*_said(scene.name, whole), *(f"  exceeded: {line}" for line in over)]
         failed += over
-    print("\n".join([*told, "wrote", *(f"  {path}" for path in written)]))
+    print("\n".join([*lines, "wrote", *(f"  {path}" for path in written)]))
     return int(bool(failed))
 
 
@@ -187,7 +195,8 @@ def _row(number: int, verdict: Verdict) -> Row:
         said = getattr(verdict, name)[there]
         against = said.abs() > 3
         row[name] = {"told": float(said.isfinite().double().mean()) if n else None, "against": int(against.sum())}
-    return row
+    ceiling = float(verdict.ceiling[0])
+    return row | {"ceiling": None if math.isnan(ceiling) else ceiling}
 
 
 def _keep_worst(found: Found, i: int, frame: Frame, verdict: Verdict, most: int) -> None:
@@ -207,8 +216,8 @@ def _keep_worst(found: Found, i: int, frame: Frame, verdict: Verdict, most: int)
 
 def _worse(row: Row) -> float:
     """By which frames are ordered: the share of all pixels that are wrong."""
-    share = row["share_wrong"]
-    return float(share) if share is not None else -1.0
+    wrong = row["share_wrong"]
+    return float(wrong) if wrong is not None else -1.0
 
 
 def _window(found: Found, first: int, size: int, settings: Mapping[str, Any]) -> Row:
@@ -225,7 +234,19 @@ def _window(found: Found, first: int, size: int, settings: Mapping[str, Any]) ->
             named = causes.name_cause(frames, [blank if m is None else m for m in given], seed=settings["seed"])
     number = found.scene.recording.number
     row: Row = {"frames": [int(number[first]), int(number[first + size - 1])], "pairs": named.n_pairs}
+    cut = _cut([found.by_number[k] for k in number[first : first + size].tolist() if k in found.by_number])
+    if named.cause is None and cut is not None:
+        return row | {"cause": f"cut at {cut:.3g} m", "kind": "cut", "loss": dict(named.loss)}
     return row | {"cause": named.cause, "kind": named.kind, "loss": dict(named.loss)}
+
+
+def _cut(rows: Sequence[Row]) -> float | None:
+    """Where the maps of some frames are cut, if those of most of them are, all at one depth."""
+    at = [row["ceiling"] for row in rows if row["ceiling"] is not None]
+    if 2 * len(at) <= len(rows):
+        return None
+    middle = statistics.median(at)
+    return middle if 2 * sum(abs(x - middle) <= 0.01 * middle for x in at) > len(rows) else None
 
 
 # -------------------------------------------------------------------------------------------------------- what is said
@@ -242,30 +263,57 @@ def _whole(found: Found) -> Row:
     for name in ("scale", "ruler", "shift", "tilt"):
         values = [row[name]["value"] for row in rows if row[name] is not None]
         middle[name] = statistics.median(values) if values else None
-    told = [row for row in found.windows if row["pairs"] >= causes.FEWEST]
-    kinds = Counter(row["cause"] for row in told if row["cause"] is not None)
+    able = [row for row in found.windows if row["pairs"] >= causes.FEWEST or row["cause"] is not None]
+    kinds = Counter(row["cause"] for row in able if row["cause"] is not None)
     held = {
-        "wrong": count["wrong"] / known if known else None,
-        "scale": None if middle["scale"] is None else abs(middle["scale"] - 1),
-        "shift": None if middle["shift"] is None else abs(middle["shift"]),
-        "tilt": middle["tilt"],
-        "causes": sum(kinds.values()) / len(told) if told else None,
+        "wrong": _wrong_at_least(rows),
+        "scale": _off_at_least(rows, "scale", 1.0),
+        "shift": _off_at_least(rows, "shift", 0.0),
+        "tilt": _off_at_least(rows, "tilt", 0.0),
+        "causes": _share_at_least(sum(kinds.values()), len(able)),
         "unknown": count["cannot_know"] / pixels if pixels else None,
     }
     return {
         "frames": len(rows),
         "pixels": pixels,
         "median": middle,
+        "wrong": count["wrong"] / known if known else None,
         "causes": dict(kinds),
-        "windows": len(told),
+        "windows": len(able),
         "held": held,
     }
+
+
+def _off_at_least(rows: Sequence[Row], name: str, sound: float) -> float | None:
+    """How far a number of the median frame is from what it would be of a sound map, by the nearer bound of its
+    interval; 0 where the interval holds that.
+
+    What errs in all frames alike is in each frame's interval, so more frames make it no narrower.
+    """
+    known = [row[name] for row in rows if row[name] is not None]
+    if not known:
+        return None
+    low, high = (statistics.median(x[bound] for x in known) for bound in ("low", "high"))
+    return max(low - sound, sound - high, 0.0)
+
+
+def _wrong_at_least(rows: Sequence[Row]) -> float | None:
+    """Lower bounds of the frames' shares that are wrong, averaged by the pixels of which something is known."""
+    known = [(row["wrong"]["low"], row["pixels"] * (1 - row["share_cannot_know"])) for row in rows if row["wrong"]]
+    weight = sum(n for _, n in known)
+    return sum(low * n for low, n in known) / weight if weight else None
+
+
+def _share_at_least(part: int, whole: int) -> float | None:
+    """Lower bound of a share, one of 95 % to both sides."""
+    low = float(share(torch.tensor([float(part)]), torch.tensor([float(whole)]))[0, 1])
+    return None if math.isnan(low) else low
 
 
 def _said(name: str, whole: Row) -> list[str]:
     """A recording in words."""
     held, middle = whole["held"], whole["median"]
-    wrong = "nothing can be known" if held["wrong"] is None else f"{held['wrong']:.1%} of what is known is wrong"
+    wrong = "nothing can be known" if whole["wrong"] is None else f"{whole['wrong']:.1%} of what is known is wrong"
     unknown = "no depth" if held["unknown"] is None else f"{held['unknown']:.1%} cannot be known"
     scale = "scale cannot be known" if middle["scale"] is None else f"scale {middle['scale']:.3f}"
     lines = [f"{name}: {whole['frames']} frames: {wrong}, {unknown}; {scale}"]

@@ -230,3 +230,19 @@ def _view_is_safe(image: Tensor) -> bool:
     if torch.compiler.is_compiling() or (image.requires_grad and torch.is_grad_enabled()):
         return False
     return not torch._C._functorch.is_functorch_wrapped_tensor(image)
+
+
+def magnified(depth: Tensor, factor: float, right: float = 0.0) -> Tensor:
+    """A map (..., h, w) laid over the picture with another field of view: each pixel shows what lies nearer to the
+    middle by ``factor``, or farther from it, and ``right`` of the width beside that; 0 where that is outside.
+
+    Gradient: to the map; the choice of pixels carries none.
+    """
+    h, w = depth.shape[-2:]
+    rows, columns = (
+        ((torch.arange(n, device=depth.device) - (n - 1) / 2) / factor + (n - 1) / 2 + aside).round().long()
+        for n, aside in ((h, 0.0), (w, right * w))
+    )
+    inside = ((rows >= 0) & (rows < h))[:, None] & ((columns >= 0) & (columns < w))
+    found = depth[..., rows.clamp(0, h - 1), :][..., columns.clamp(0, w - 1)]
+    return torch.where(inside, found, 0.0)

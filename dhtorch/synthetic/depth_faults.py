@@ -15,6 +15,7 @@ import torch
 from torch import Generator, Tensor
 
 from dhtorch.geometry.filters import gaussian
+from dhtorch.geometry.lookup import magnified
 from dhtorch.geometry.shapes import check
 
 #: Scales of a map that is otherwise right, and the shift of one, m.
@@ -44,6 +45,9 @@ UNIT, FOCAL = 5.0, 1.1
 
 #: A map that was rolled sideways by this share of its width.
 ROLL = 0.1
+
+#: A map that is cut where so many of its pixels are nearer.
+NEARER = 0.6
 
 #: From which relative change on a pixel of a faulty map counts as wrong.
 WRONG = 0.02
@@ -128,14 +132,11 @@ def rolled(depth: Tensor, share: float = ROLL) -> Tensor:
     return depth.roll(round(share * depth.shape[-1]), -1)
 
 
-def magnified(depth: Tensor, factor: float = FOCAL) -> Tensor:
-    """Depth laid over the picture with a focal length that is wrong by ``factor``: each pixel shows what lies nearer to
-    the middle by that factor, or farther from it; none where that is outside."""
-    h, w = depth.shape[-2:]
-    rows, columns = (((torch.arange(n, device=depth.device) - (n - 1) / 2) / factor + (n - 1) / 2) for n in (h, w))
-    row, column = rows.round().long(), columns.round().long()
-    inside = ((row >= 0) & (row < h))[:, None] & ((column >= 0) & (column < w))
-    return torch.where(inside, depth[:, row.clamp(0, h - 1)][:, :, column.clamp(0, w - 1)], 0.0)
+def cut(depth: Tensor, nearer: float = NEARER) -> Tensor:
+    """What is farther than a share of the pixels stands where that share ends, as where numbers of few bits run out."""
+    known = torch.where(depth > 0, depth, torch.inf).flatten(1).sort(-1).values
+    last = (nearer * ((depth > 0).flatten(1).sum(-1) - 1).clamp_min(0)).long()
+    return depth.minimum(known.gather(1, last[:, None])[..., None])
 
 
 def _fixed(fault: Callable[[Tensor], Tensor]) -> Fault:
@@ -163,9 +164,12 @@ OF_FILES: dict[str, Fault] = {
     "unit": _fixed(partial(scaled, factor=UNIT)),
     "mirrored": _fixed(mirrored),
     "rolled": _fixed(rolled),
-    "wrong_k": _fixed(magnified),
+    "wrong_k": _fixed(partial(magnified, factor=FOCAL)),
 }
 FAULTS = OF_NETWORKS | OF_FILES
+
+#: What a format does to maps that are right by themselves, of which only a bound is left.
+OF_FORMATS: dict[str, Fault] = {"cut": _fixed(cut)}
 
 #: A fault that is another frame's map: it is no function of this one.
 WRONG_TIME = "time"
@@ -181,7 +185,7 @@ def spoil(
     """A map with a fault, and which of its pixels are wrong by more than ``WRONG``, (B, h, w) each.
 
     Args:
-        name: of :data:`FAULTS`, or ``time``.
+        name: of :data:`FAULTS` or :data:`OF_FORMATS`, or ``time``.
         depth: the true map.
         seed: of what is drawn.
         other: what ``time`` gives instead.
@@ -196,10 +200,10 @@ def spoil(
         if other is None:
             raise ValueError("spoil: found no map of another time, expected other=")
         found = other
-    elif name in FAULTS:
-        found = FAULTS[name](depth, Generator().manual_seed(seed))
+    elif name in (known := FAULTS | OF_FORMATS):
+        found = known[name](depth, Generator().manual_seed(seed))
     else:
-        raise ValueError(f"spoil: found {name!r}, expected one of {', '.join((*FAULTS, WRONG_TIME))}")
+        raise ValueError(f"spoil: found {name!r}, expected one of {', '.join((*known, WRONG_TIME))}")
     wrong = (found > 0) & (depth > 0) & ((found - depth).abs() > WRONG * depth)
     return found, wrong
 

@@ -3,8 +3,8 @@
 Expectation (written before the run): a metre that is wrong by a tenth is found in 95 % of the pairs with a baseline, at
 2 % false alarms; objects that stand elsewhere are told from the rest with an area under the curve of .95 where
 something is said; of the pixels called consistent one in a hundred at most is a fifth off; a wrong unit, a mirrored, a
-rolled, a late map and a wrong focal length are named in nine of ten windows in which they move the picture by two
-pixels.
+rolled, a late map, one that is not registered and a wrong focal length are named in nine of ten windows in which they
+move the picture by two pixels.
 What would refute it: any of these numbers missed.
 """
 
@@ -29,7 +29,7 @@ from dhtorch.evaluate.detection import auroc
 from dhtorch.evaluate.holdout import range_split
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
-from dhtorch.geometry.lookup import nearest
+from dhtorch.geometry.lookup import magnified, nearest
 from dhtorch.method import Method, Trace
 from dhtorch.offers import choosing
 from dhtorch.records import Frame, Verdict
@@ -39,7 +39,7 @@ from dhtorch.studies.rows import Row, mean
 from dhtorch.synthetic import SyntheticRoom
 from dhtorch.synthetic.depth_faults import mirrored, scaled, spoil
 from dhtorch.tree import stack
-from dhtorch.verdict import judged
+from dhtorch.verdict import QUICK, judged
 
 QUESTION = "Does the judge find what is wrong with a depth map, and keep silent where nothing can tell?"
 EXPECTATION = "Every number of the list of bars is met; scenes, and of causes windows, are the unit."
@@ -57,7 +57,7 @@ BARS: dict[str, tuple[float, Callable[[float, float], bool]]] = {
 SCALES = {"10_long": 1.1, "10_short": 1 / 1.1, "5_long": 1.05, "5_short": 1 / 1.05}
 
 #: Maps whose pixels are judged one by one: faults of one map, and the map of another time.
-PIXELS = ("none", "jumps", "invented", "warp_large", "time")
+PIXELS = ("none", "jumps", "invented", "warp_large", "cut", "time")
 
 #: A scale is found where its interval leaves out 1 and it lies so far from it, as a logarithm.
 ALARM = 0.03
@@ -71,8 +71,12 @@ STATED, ANSWERS = 0.05, 20
 #: Windows of so many frames, and the motion of the median pixel, of a picture 640 wide, from which on a fault counts.
 WINDOW, MOVED_PX = 20, 2.0
 
-#: Share of a scene's columns that are looked at for the metre: ours by all evidence, and by triangulated points alone.
-WAYS = ("scale", "scale_far")
+#: Columns that are looked at for the metre, and how their numbers end: ours by all evidence, by triangulated points
+#: alone, and the quick method's by points alone.
+WAYS = {"scale": "", "scale_far": "_far", "quick_far": "_quick_far"}
+
+#: Whose pixels are counted → how their columns begin.
+WHO = {"judge": "", "quick": "quick_", "photometric": "peer_"}
 
 
 @dataclass(frozen=True)
@@ -93,6 +97,9 @@ PLANTED: dict[str, Planted] = {
     "mirrored": Planted("mirrored", mirrored),
     "rolled_90": Planted("rolled", partial(causes.turned, quarters=1)),
     "rolled_180": Planted("rolled", partial(causes.turned, quarters=2)),
+    "wide": Planted("registration", partial(magnified, factor=1 / 1.35)),
+    "narrow": Planted("registration", partial(magnified, factor=1.2)),
+    "beside": Planted("registration", partial(magnified, factor=1.0, right=-0.06)),
     "late_3": Planted("time offset", lag=3),
     "early_4": Planted("time offset", lag=-4),
     "focal_long": Planted("focal length", focal=1.06),
@@ -119,8 +126,10 @@ def run(
     ``causes``), one per scene. In the summary shares of anchors are means over scenes with intervals over these:
     ``judge.scale_found`` and ``judge.false_alarm`` (all evidence), the same with ``_5`` for a twentieth and with
     ``_far`` by triangulated points alone; ``judge.jump_auroc`` of pixels without a shown return, ``_all`` of all;
-    ``judge.called_right_wrong``; ``judge.known``; ``photometric.<the same>`` of the peer. Named are shares of windows:
-    ``judge.named.<kind>``, their least ``judge.named_worst``, and ``judge.misnamed`` where nothing was planted.
+    ``judge.called_right_wrong``, ``_worst`` of the worst scene, ``_cut`` of maps that are cut alone; ``judge.known``;
+    ``photometric.<the same>`` of the peer, ``quick.<the same>`` of :data:`dhtorch.verdict.QUICK` without the pictures
+    of other views, whose metre by points alone is ``_quick_far``. Nothing is fitted to the scenes. Named are shares of
+    windows: ``judge.named.<kind>``, their least ``judge.named_worst``; ``judge.misnamed`` where nothing was planted.
 
     Args:
         scenes, chosen, settings, progress: as :func:`dhtorch.studies.protocol.run`.
@@ -172,14 +181,17 @@ def summary(rows: Sequence[Row]) -> Row:
     whole = [row for row in rows if row["pair"] is None and row["role"] is None]
     names = sorted({name for row in whole for name, value in row.items() if "." in name and not isinstance(value, str)})
     found: Row = {n: bootstrap.interval([row.get(n) for row in whole], statistic="mean").entry("1") for n in names}
+    for who in WHO:
+        shares = [row[f"{who}.called_right_wrong"] for row in whole if row.get(f"{who}.called_right_wrong") is not None]
+        found[f"{who}.called_right_wrong_worst"] = bootstrap.single(max(shares, default=None), len(shares))
     told = [row for row in rows if row["method"] == "causes" and row["moved_px"] is not None]
     counted = [row for row in told if row["planted_kind"] is not None and row["moved_px"] >= MOVED_PX]
-    shares = {}
+    right_of = {}
     for kind in sorted({row["planted_kind"] for row in counted}):
         right = [float(row["named_kind"] == kind) for row in counted if row["planted_kind"] == kind]
-        shares[kind] = sum(right) / len(right)
-        found[f"judge.named.{kind.replace(' ', '_')}"] = bootstrap.single(shares[kind], len(right))
-    found["judge.named_worst"] = bootstrap.single(min(shares.values(), default=None), len(counted))
+        right_of[kind] = sum(right) / len(right)
+        found[f"judge.named.{kind.replace(' ', '_')}"] = bootstrap.single(right_of[kind], len(right))
+    found["judge.named_worst"] = bootstrap.single(min(right_of.values(), default=None), len(counted))
     clean = [
         float(row["named_kind"] is not None) for row in rows if row["method"] == "causes" and row["fault"] == "none"
     ]
@@ -204,24 +216,15 @@ def _anchor_row(scene: Scene, i: int, look: Callable[[int], Frame], ask: Method,
     near = range_split(full, cutoff)
     offered = around(scene.recording, i)
     others = stack([range_split(look(k), cutoff) for k in offered])
-    trace: Trace = {}
-    with torch.no_grad():
-        joined = ask(near, others, seed=settings.seed, hint=scene.hint, trace=trace)
-    asked = dense.views_asked(joined, others, trace)
-    say = partial(
-        judged,
-        anchor=near,
-        asked=asked,
-        offered=trace["choice"].index if "choice" in trace else None,
-        method=ask,
-        size=size,
-    )
+    asked, say = _asked(ask, scene, near, others, settings, size)
+    _, hurry = _asked(choosing(QUICK), scene, near, others, settings, size)
     true = _true_map(scene.recording, i, full, size, ask)
     row: Row = {"scene": scene.name, "pair": [i, i], "method": "judge", **_baseline(asked)}
     for name, factor in {"none": 1.0, **SCALES}.items():
-        found = say(true * factor, views=False)
-        row |= {f"{way}.{name}": alarm(getattr(found, way)[0]) for way in WAYS}
-        row |= {f"{way}_value.{name}": float(getattr(found, way)[0, 0] / factor) for way in WAYS}
+        found, fast = (speak(true * factor, views=False) for speak in (say, hurry))
+        scale = {"scale": found.scale[0], "scale_far": found.scale_far[0], "quick_far": fast.scale_far[0]}
+        row |= {f"{way}.{name}": alarm(scale[way]) for way in WAYS}
+        row |= {f"{way}_value.{name}": float(scale[way][0] / factor) for way in WAYS}
     elsewhere = offered[-1] if offered[-1] > i else offered[0]
     later = _true_map(scene.recording, elsewhere, look(elsewhere), size, ask)
     shown = ask.backproject(near, dense.pixels(near, (true.shape[-2], true.shape[-1]))).usable.unflatten(
@@ -229,14 +232,28 @@ def _anchor_row(scene: Scene, i: int, look: Callable[[int], Frame], ask: Method,
     )
     for name in PIXELS:
         spoilt = true if name == "none" else spoil(name, true, seed=i, other=later)[0]
-        row |= _pixels(name, spoilt, true, say(spoilt), shown)
+        row |= _pixels("", name, spoilt, true, say(spoilt), shown)
+        row |= _pixels("quick_", name, spoilt, true, hurry(spoilt, views=False), shown)
         miss, state = photometric.differs(spoilt, near, asked)
         row |= {f"peer_{k}": v for k, v in _counts(name, spoilt, true, miss, state, shown).items()}
     return row
 
 
-def _pixels(name: str, spoilt: Tensor, true: Tensor, found: Verdict, shown: Tensor) -> Row:
-    return _counts(name, spoilt, true, found.evidence.abs(), found.state, shown)
+def _asked(
+    ask: Method, scene: Scene, near: Frame, others: Frame, settings: Settings, size: int
+) -> tuple[dense.Asked, Callable[..., Verdict]]:
+    """What a method finds at an anchor, and what is said of a map by it."""
+    trace: Trace = {}
+    with torch.no_grad():
+        joined = ask(near, others, seed=settings.seed, hint=scene.hint, trace=trace)
+    asked = dense.views_asked(joined, others, trace)
+    offered = trace["choice"].index if "choice" in trace else None
+    return asked, partial(judged, anchor=near, asked=asked, offered=offered, method=ask, size=size)
+
+
+def _pixels(begin: str, name: str, spoilt: Tensor, true: Tensor, found: Verdict, shown: Tensor) -> Row:
+    counts = _counts(name, spoilt, true, found.evidence.abs(), found.state, shown)
+    return {f"{begin}{key}": value for key, value in counts.items()}
 
 
 def _counts(name: str, spoilt: Tensor, true: Tensor, score: Tensor, state: Tensor, shown: Tensor) -> Row:
@@ -267,18 +284,20 @@ def _scene_row(scene: Scene, rows: Sequence[Row]) -> Row:
     """Shares over a scene's anchors."""
     wide = [row for row in rows if row["baseline"]]
     out: Row = {"scene": scene.name, "pair": None, "method": "judge", "role": scene.role, "n_wide": len(wide)}
-    for way, tail in zip(WAYS, ("", "_far"), strict=True):
+    for way, tail in WAYS.items():
         for size, end in (("10", ""), ("5", "_5")):
             told = [row[f"{way}.{size}_{side}"] for row in wide for side in ("long", "short")]
             out[f"judge.scale_found{end}{tail}"] = mean([float(bool(x)) for x in told])
         out[f"judge.false_alarm{tail}"] = mean([float(bool(row[f"{way}.none"])) for row in wide])
-    for name, prefix in (("judge", ""), ("photometric", "peer_")):
+    for name, prefix in WHO.items():
         for key, column in (("jump_auroc", "auroc"), ("jump_auroc_all", "auroc_all")):
             out[f"{name}.{key}"] = mean([r[prefix + column] for r in wide if r.get(prefix + column) is not None])
         count = {k: sum(r[f"{prefix}{k}.{p}"] for r in rows for p in PIXELS) for k in ("consistent", "consistent_off")}
         out[f"{name}.called_right_wrong"] = (
             count["consistent_off"] / count["consistent"] if count["consistent"] else None
         )
+        n_cut, off_cut = (sum(row[f"{prefix}{k}.cut"] for row in rows) for k in ("consistent", "consistent_off"))
+        out[f"{name}.called_right_wrong_cut"] = off_cut / n_cut if n_cut else None
         n = sum(row[f"{prefix}n.none"] for row in wide)
         known, wrong = (sum(row[f"{prefix}{k}.none"] for row in wide) for k in ("known", "wrong"))
         out[f"{name}.known"] = known / n if n else None

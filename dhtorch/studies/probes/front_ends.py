@@ -17,7 +17,7 @@ from dhtorch.geometry import camera as cam
 from dhtorch.geometry.shapes import check
 from dhtorch.method import Method
 from dhtorch.records import NO_HINT, Frame, TrackHint
-from dhtorch.studies.baselines import dinov2
+from dhtorch.studies.baselines import dinov2, xfeat
 from dhtorch.transform import CHANNELS, ExtendDepth, grid
 
 #: Channels of a depth token that say something only where the patch has an answer.
@@ -139,6 +139,19 @@ class PatchTokens:
         return torch.cat(found).float()
 
 
+class DenseFeatures:
+    """XFeat: its descriptors of unit length, averaged over ``cells`` × ``cells`` parts of the picture."""
+
+    def __init__(self, network: torch.nn.Module, *, cells: int = 2, longest_px: int = 640) -> None:
+        self.network, self.cells, self.longest_px = network, cells, longest_px
+
+    @torch.no_grad()
+    def __call__(self, frame: Frame, other: Frame | None = None) -> Tensor:
+        """Features (1, cells² · 64)."""
+        (found,) = xfeat.features(self.network, frame.image, scale=1.0, longest_px=self.longest_px)
+        return torch.nn.functional.adaptive_avg_pool2d(found.D[None], self.cells).flatten(1).float()
+
+
 def visual(build: Callable[..., torch.nn.Module] | None, *, cells: int, device: str) -> tuple[PatchTokens | None, bool]:
     """The DINOv2 front end that the settings ask for, and whether its weights are real; None where left out.
 
@@ -154,6 +167,23 @@ def visual(build: Callable[..., torch.nn.Module] | None, *, cells: int, device: 
     options = getattr(build, "keywords", {})
     network = build().to(device)
     return PatchTokens(network, cells=cells, side=options.get("side", 224)), options.get("weights") is not None
+
+
+def networks(
+    dinov2: Callable[..., torch.nn.Module] | None, *, cells: int, xfeat_too: bool, device: str
+) -> tuple[dict[str, FrontEnd], bool]:
+    """The front ends of networks by the name of their block, and whether DINOv2's weights are real.
+
+    Args:
+        dinov2, cells, device: as :func:`visual` takes them.
+        xfeat_too: XFeat as well, with the weights of its package.
+
+    Raises:
+        ImportError: a network's package is missing; the message says what to install.
+    """
+    network, real = visual(dinov2, cells=cells, device=device)
+    found: dict[str, FrontEnd] = {} if network is None else {"dinov2": network}
+    return found | ({"xfeat": DenseFeatures(xfeat.packaged(device))} if xfeat_too else {}), real
 
 
 def adapted(method: Method, scene: Scene, **options: Any) -> DepthTokens:

