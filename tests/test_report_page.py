@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from dhtorch import archive, drawing
 from dhtorch.codes import Gate, Source
 from dhtorch.drawing import Axis, Panel, Stroke, colours
+from dhtorch.drawing.markup import Markup, escape, tag
 from dhtorch.studies import report
 from dhtorch.studies.report import cells, curves, layouts, page, plots, published, text
-from dhtorch.studies.report.markup import Markup, escape, tag
 from dhtorch.studies.report.reading import flatten, scene_rows
 from dhtorch.studies.report.tables import COLUMNS, every_number
 

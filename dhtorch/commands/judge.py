@@ -22,10 +22,11 @@ import torch
 from dhtorch import causes, storage
 from dhtorch.codes import State, names
 from dhtorch.data import depth_maps, files
+from dhtorch.data import intrinsics as told
 from dhtorch.data.depth_maps import DepthMaps
 from dhtorch.data.pairs import around
 from dhtorch.data.scene import Scene, scenes_of
-from dhtorch.drawing import draw_verdict
+from dhtorch.drawing import at_cutoff, draw_verdict, frame_of
 from dhtorch.evaluate.holdout import range_split
 from dhtorch.method import Method
 from dhtorch.records import Frame, Verdict
@@ -50,7 +51,7 @@ LIMITS = {
 }
 
 #: Columns of the page's table.
-COLUMNS = ("wrong", "known", "scale", "shift, m", "tilt")
+COLUMNS = ("wrong, of what is known", "known, of the depth", "scale", "shift, m", "tilt")
 
 _LIMIT = re.compile(r"\s*([a-z]+)\s*>\s*([0-9.eE+-]+)\s*")
 
@@ -80,7 +81,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     if settings["depth"] is not None and len(scenes) > 1:
         raise ValueError(f"depth: found {len(scenes)} recordings for one folder of maps, expected one (data.root=…)")
     folder = Path(str(settings["output"])).expanduser()
-    written, failed, told = [], [], []
+    written, failed, lines = [], [], []
     for scene in scenes:
         maps = None
         if settings["depth"] is not None:
@@ -90,11 +91,12 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         over = exceeded(whole, limits)
         place = folder if len(scenes) == 1 else folder / scene.name
         content = {"scene": scene.name, "source": "sensor" if maps is None else "maps", "fail_on": settings["fail_on"]}
+        content |= {"intrinsics_guessed": told.guessed(scene.recording.report)}
         content |= {"exceeded": over, "whole": whole, "windows": found.windows, "frames": found.rows}
         written += [storage.write_json(place / "judge.json", storage.strict(content)), _page(place, found, whole, over)]
-        told += [*_said(scene.name, whole), *(f"  exceeded: {line}" for line in over)]
+        lines += [*_said(scene.name, whole), *(f"  exceeded: {line}" for line in over)]
         failed += over
-    print("\n".join([*told, "wrote", *(f"  {path}" for path in written)]))
+    print("\n".join([*lines, "wrote", *(f"  {path}" for path in written)]))
     return int(bool(failed))
 
 
@@ -139,7 +141,7 @@ def _judged(found: Found, method: Method, settings: Mapping[str, Any], progress:
         verdict = _verdict(found, frame, i, method, settings)
         row = _row(int(found.scene.recording.number[i]), verdict)
         found.rows.append(row)
-        _keep_worst(found, i, frame, verdict, settings["pictures"])
+        _keep_worst(found, frame, verdict, settings)
     if settings["window"]:
         size = min(settings["window"], n)
         firsts = sorted({min(k, n - size) for k in range(0, max(frames[-1] + 1 - size, 0) + 1, size)}) if n > 1 else []
@@ -190,16 +192,17 @@ def _row(number: int, verdict: Verdict) -> Row:
     return row
 
 
-def _keep_worst(found: Found, i: int, frame: Frame, verdict: Verdict, most: int) -> None:
+def _keep_worst(found: Found, frame: Frame, verdict: Verdict, settings: Mapping[str, Any]) -> None:
     """The pictures of the worst frames so far."""
-    order = sorted(range(len(found.rows)), key=lambda k: -_worse(found.rows[k]))[:most]
+    order = sorted(range(len(found.rows)), key=lambda k: -_worse(found.rows[k]))[: settings["pictures"]]
     here = len(found.rows) - 1
     if here not in order:
         return
     out = io.BytesIO()
     one = verdict[0]
     number = found.rows[here]["frame"]
-    draw_verdict(out, frame.image[0].cpu(), one.depth, one.state, one.evidence, title=f"{found.scene.name} {number}")
+    title = at_cutoff(frame_of(found.scene.name, number), settings["cutoff"])
+    draw_verdict(out, frame.image[0].cpu(), one.depth, one.state, one.evidence, title=title)
     found.pictures[number] = out.getvalue()
     kept = {found.rows[k]["frame"] for k in order}
     found.pictures = {k: v for k, v in found.pictures.items() if k in kept}
@@ -242,14 +245,14 @@ def _whole(found: Found) -> Row:
     for name in ("scale", "ruler", "shift", "tilt"):
         values = [row[name]["value"] for row in rows if row[name] is not None]
         middle[name] = statistics.median(values) if values else None
-    told = [row for row in found.windows if row["pairs"] >= causes.FEWEST]
-    kinds = Counter(row["cause"] for row in told if row["cause"] is not None)
+    able = [row for row in found.windows if row["pairs"] >= causes.FEWEST]
+    kinds = Counter(row["cause"] for row in able if row["cause"] is not None)
     held = {
         "wrong": count["wrong"] / known if known else None,
         "scale": None if middle["scale"] is None else abs(middle["scale"] - 1),
         "shift": None if middle["shift"] is None else abs(middle["shift"]),
         "tilt": middle["tilt"],
-        "causes": sum(kinds.values()) / len(told) if told else None,
+        "causes": sum(kinds.values()) / len(able) if able else None,
         "unknown": count["cannot_know"] / pixels if pixels else None,
     }
     return {
@@ -257,7 +260,7 @@ def _whole(found: Found) -> Row:
         "pixels": pixels,
         "median": middle,
         "causes": dict(kinds),
-        "windows": len(told),
+        "windows": len(able),
         "held": held,
     }
 
@@ -268,9 +271,9 @@ def _said(name: str, whole: Row) -> list[str]:
     wrong = "nothing can be known" if held["wrong"] is None else f"{held['wrong']:.1%} of what is known is wrong"
     unknown = "no depth" if held["unknown"] is None else f"{held['unknown']:.1%} cannot be known"
     scale = "scale cannot be known" if middle["scale"] is None else f"scale {middle['scale']:.3f}"
-    lines = [f"{name}: {whole['frames']} frames: {wrong}, {unknown}; {scale}"]
+    lines = [f"{name}: {whole['frames']} frame{'s' * (whole['frames'] != 1)}: {wrong}, {unknown}; {scale}"]
     for cause, n in sorted(whole["causes"].items(), key=lambda item: -item[1]):
-        lines.append(f"  likely cause in {n} of {whole['windows']} windows: {cause}")
+        lines.append(f"  likely cause in {n} of {whole['windows']} window{'s' * (whole['windows'] != 1)}: {cause}")
     return lines
 
 
@@ -283,7 +286,8 @@ def _page(place: Path, found: Found, whole: Row, over: Sequence[str]) -> Path:
         cells += [pages.cell(row[name]) for name in ("scale", "shift", "tilt")]
         frames.append(pages.JudgedFrame(f"frame {row['frame']}", cells, found.pictures.get(row["frame"])))
     failed = [f"Exceeded: {line}" for line in over]
-    said = _said(found.scene.name, whole)
+    guess = told.guessed(found.scene.recording.report)
+    said = _said(found.scene.name, whole) + ([f"Its {guess}."] if guess else [])
     return pages.write(place / "judge.html", found.scene.name, said=said, columns=COLUMNS, frames=frames, failed=failed)
 
 

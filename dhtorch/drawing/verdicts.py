@@ -14,7 +14,7 @@ from dhtorch.codes import State
 from dhtorch.drawing import colours
 from dhtorch.drawing.axis import Axis
 from dhtorch.drawing.canvas import Canvas, save
-from dhtorch.drawing.maps import GAP, TITLE, WIDTH, as_array, coloured, depths, mapped, rgb_of
+from dhtorch.drawing.maps import GAP, HEAD, TITLE, WIDTH, as_array, coloured, depths, mapped, rgb_of
 
 #: Sigmas at the ends of the colour map of evidence.
 END = 6.0
@@ -36,17 +36,19 @@ def draw_verdict(
     z, code, sigmas = (as_array(x) for x in (depth, state, evidence))
     known = np.isfinite(z) & (z > 0)
     height = WIDTH * z.shape[0] / z.shape[1]
-    canvas = Canvas(2 * WIDTH + GAP, 2 * (height + TITLE), dpi=110)
+    top = 2 * (height + TITLE)
+    canvas = Canvas(2 * WIDTH + GAP, top + HEAD * bool(title), dpi=160)
+    canvas.title(title, 2 * WIDTH + GAP, top + HEAD)
     ground = np.array(colours.rgb(colours.PICTURE)) / 255
     states = np.array([colours.rgb(colours.STATES[k]) for k in sorted(colours.STATES)])[code.astype(np.int64)] / 255
     strength = mapped((np.nan_to_num(sigmas).clip(-END, END) + END) / (2 * END), colours.SIGNED)
-    wrong, fine = ((code == k).sum() for k in (State.WRONG, State.CONSISTENT))
+    wrong, fine = (((code == k) & known).sum() for k in (State.WRONG, State.CONSISTENT))
     strength = np.where(np.isnan(sigmas)[..., None], ground, strength)
     metres: Axis = depths(z[known])
     shown = [
-        (f"{title}: picture" if title else "Picture", 1, rgb_of(image)),
+        ("Picture", 1, rgb_of(image)),
         (f"Depth, {metres.low:.2g} to {metres.high:.2g} m", 1, coloured(z, known, metres, colours.DEPTH)),
-        (_said(int(wrong), int(fine), code.size), 0, states),
+        (_said(int(wrong), int(fine), int(known.sum())), 0, states),
         (
             f"Evidence to {END:g} sigmas: red too far, blue too near",
             0,
@@ -61,7 +63,8 @@ def draw_verdict(
 
 
 def _said(wrong: int, fine: int, size: int) -> str:
-    """The states in words: shares of wrong are of what is known, as in tables and limits."""
+    """The states in words: known is a share of the pixels with a depth, wrong one of what is known, as in tables and
+    limits."""
     known = wrong + fine
     told = f", of which {100 * wrong / known:.1f} % are wrong" if known else ""
-    return f"Known: {100 * known / size:.0f} % of the picture{told}"
+    return f"Known: {100 * known / size:.0f} % of the depth{told}" if size else "No depth"

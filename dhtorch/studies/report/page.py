@@ -7,11 +7,12 @@ from pathlib import Path
 
 from dhtorch import storage
 from dhtorch.drawing import Key, inline
-from dhtorch.drawing.colours import style_sheet, variable
+from dhtorch.drawing.colours import variable
+from dhtorch.drawing.document import document
+from dhtorch.drawing.markup import Markup, join, tag
 from dhtorch.studies.report import jobs, published
 from dhtorch.studies.report.figure import Figure
 from dhtorch.studies.report.layouts import SHOWN, in_layout
-from dhtorch.studies.report.markup import Markup, join, tag
 from dhtorch.studies.report.plots import figures
 from dhtorch.studies.report.reading import Result
 from dhtorch.studies.report.tables import INTERVAL, PUBLISHED, Table, every_number, generic
@@ -31,9 +32,6 @@ def page(results: Sequence[Result]) -> str:
         results: valid ones, as from :func:`dhtorch.archive.read`.
     """
     title = "dhtorch: results"
-    style = Markup(style_sheet() + STYLE.read_text(encoding="utf-8"))
-    metas = ({"charset": "utf-8"}, {"name": "viewport", "content": "width=device-width, initial-scale=1"})
-    head = tag("head", *(tag("meta", **m) for m in metas), tag("title", title), tag("style", style))
     names = _anchors(results)
     sections = [_section(result, name) for result, name in zip(results, names, strict=True)]
     skip = tag("a", "To the results", href=f"#{names[0]}" if names else "#", class_="skip")
@@ -42,11 +40,10 @@ def page(results: Sequence[Result]) -> str:
     overview = _overview(results, names)
     if any(in_layout(result) for result in results):
         top = tag("header", tag("h1", title), tag("p", _about(results), class_="lead"), sweep, overview)
-        body = tag("body", skip, top, tag("main", *sections))
-    else:  # no line of the paper stands here: the numbers begin
-        top = tag("header", tag("h1", title), sweep)
-        body = tag("body", skip, top, tag("main", *sections), tag("footer", overview))
-    return "<!doctype html>\n" + tag("html", head, body, lang="en") + "\n"
+        return document(title, skip, top, tag("main", *sections), own=STYLE)
+    # no line of the paper stands here: the numbers begin
+    top = tag("header", tag("h1", title), sweep)
+    return document(title, skip, top, tag("main", *sections), tag("footer", overview), own=STYLE)
 
 
 def _one_sweep(results: Sequence[Result]) -> bool:
