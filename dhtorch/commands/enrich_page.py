@@ -15,7 +15,7 @@ from dhtorch.drawing.colours import GATES, RECOVERED, SENSOR, SILENT, Stroke
 from dhtorch.drawing.document import document
 from dhtorch.drawing.markup import tag
 from dhtorch.studies.report.figure import Figure
-from dhtorch.studies.report.page import STYLE, figure_markup, table_markup
+from dhtorch.studies.report.page import STYLE, figures_markup, table_markup
 from dhtorch.studies.report.tables import Table
 
 Row = Mapping[str, Any]
@@ -56,7 +56,7 @@ def page(about: Row, owns: Sequence[Row]) -> str:
     lead = f"{episodes}; {step}; dhtorch {about['version']}, method {about['method']}"
     tables = [_cameras(owns), _worst(owns)]
     figures = [figure for figure in (_along(owns), _why(owns)) if figure is not None]
-    parts = [*(table_markup(t) for t in tables), *(figure_markup(figure) for figure in figures)]
+    parts = [*(table_markup(t) for t in tables), figures_markup(figures)]
     top = tag("header", tag("h1", title), tag("p", lead, class_="lead"))
     return document(title, top, tag("main", *parts), own=STYLE)
 

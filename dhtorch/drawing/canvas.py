@@ -14,8 +14,8 @@ from dhtorch.drawing.colours import GREY, INK, SOFT, THEIRS, Stroke
 
 #: Height of letters, points; their width by which words are cut, as a share of it.
 SMALL, TITLE, LETTER = 10.0, 11.0, 0.59
-#: Least height of the letters of a title, points.
-LEAST = 8.0
+#: Of a title: least height of its letters, points, and their width, as they are bold.
+LEAST, BOLD = 8.0, 0.66
 
 Place = tuple[float, float]
 
@@ -65,8 +65,8 @@ class Canvas:
     def title(self, text: str, width: float, height: float, left: float = 0.0) -> None:
         """Words along the upper edge: long ones are set smaller, then cut in their middle."""
         text = plain(text)
-        size = min(TITLE, max(LEAST, width / (LETTER * max(len(text), 1))))
-        shown = cut(text, width, size, end=len(text) // 3)
+        size = min(TITLE, max(LEAST, width / (BOLD * max(len(text), 1))))
+        shown = cut(text, width * LETTER / BOLD, size, end=len(text) // 3)
         self.text(shown, left + 2, height - 14, size=size, bold=True, said=text)
 
     def lines(self, segments: Iterable[Sequence[Place]], stroke: Stroke, said: str = "") -> None:

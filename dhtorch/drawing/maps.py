@@ -91,8 +91,8 @@ def _draw(
         left, bottom = (k % 2) * (WIDTH + GAP), SCALE + (k < 2) * (height + TITLE)
         canvas.title(words, WIDTH, bottom + height + TITLE, left)
         canvas.picture(pixels, (left, bottom, WIDTH, height))
-    _scale(canvas, metres, colours.DEPTH, 0.0)
-    _scale(canvas, share, colours.ERROR, WIDTH + GAP)
+    scale(canvas, metres, colours.DEPTH, 0.0)
+    scale(canvas, share, colours.ERROR, WIDTH + GAP)
     save(canvas.figure, path)
 
 
@@ -118,11 +118,12 @@ def mapped(places: np.ndarray, kind: str) -> np.ndarray:
     return colormaps[kind](places)[..., :3]
 
 
-def _scale(canvas: Canvas, axis: Axis, kind: str, left: float) -> None:
+def scale(canvas: Canvas, axis: Axis, kind: str, left: float) -> None:
     """A colour map from end to end under a picture, with round numbers and what they mean."""
     base, height = SCALE - 18.0, 9.0
     canvas.picture(mapped(np.linspace(0, 1, 256)[None].repeat(2, 0), kind), (left, base, WIDTH, height))
-    ticks = axis.ticks(8) if axis.high > DECADES * axis.low else Axis(axis.low, axis.high).ticks(8)
+    decades = axis.log and axis.high > DECADES * axis.low
+    ticks = axis.ticks(8) if decades else Axis(axis.low, axis.high).ticks(8)
     for tick in ticks:
         u = left + WIDTH * axis.place(tick)
         canvas.lines([((u, base), (u, base - 3))], Stroke(INK, 0.7))

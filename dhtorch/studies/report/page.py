@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import groupby
 from pathlib import Path
 
 from dhtorch import storage
@@ -123,7 +124,7 @@ def _section(result: Result, name: str) -> Markup:
     first = [] if paper or result["verdict"] else generics[:1]  # one's own numbers, before anything is explained
     parts = [heading, *map(table_markup, first), tag("p", facts, class_="facts"), _question(result)]
     parts += map(table_markup, paper)
-    parts += [figure_markup(figure) for figure in drawn if not figure.folded]
+    parts.append(figures_markup([figure for figure in drawn if not figure.folded]))
     folded = [figure_markup(figure) for figure in drawn if figure.folded]
     parts += [tag("details", tag("summary", "The same of the other variants"), *folded)] if folded else []
     tables = [table_markup(table) for table in generics[len(first) :]]
@@ -232,6 +233,15 @@ def figure_markup(figure: Figure) -> Markup:
     drawn = [Markup(inline(panel)) for panel in figure.panels]
     panels = tag("div", *drawn, class_="panels wide" if figure.wide else "panels")
     return tag("figure", below, tag("ul", *legend, class_="legend") if legend else "", panels)
+
+
+def figures_markup(drawn: Sequence[Figure]) -> Markup:
+    """Figures one below the other; those of one panel stand side by side where there is room."""
+    made = []
+    for alone, group in groupby(drawn, key=lambda figure: len(figure.panels) == 1 and not figure.wide):
+        each = [figure_markup(figure) for figure in group]
+        made.append(tag("div", *each, class_="figures") if alone else join(each))
+    return join(made)
 
 
 def _swatch(key: Key) -> Markup:
