@@ -11,7 +11,8 @@ WIDTH = 7.2
 
 #: For ``matplotlib.pyplot.rcParams``; sizes in points.
 SETTINGS: Mapping[str, Any] = {
-    "figure.dpi": 200,
+    "figure.dpi": 160,
+    "figure.labelsize": 8,
     "font.size": 8,
     "axes.titlesize": 8.5,
     "axes.linewidth": 0.6,
