@@ -18,7 +18,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from dhtorch import drawing
 from dhtorch.codes import Gate, Hole, Source, State, names
-from dhtorch.drawing import Axis, Key, Layer, Panel, Picture, colours, inline
+from dhtorch.drawing import Axis, Key, Layer, Panel, Picture, colours, inline, notebook
 from dhtorch.methods import METHODS
 from dhtorch.viewer import html as pages
 
@@ -231,3 +231,12 @@ def test_known_is_a_share_of_the_depth_in_the_figure_of_a_verdict(monkeypatch):
     depth, state = np.array([[1.0, 1.0], [1.0, 0.0]]), np.array([[State.CONSISTENT, State.WRONG], [0, 0]])
     drawing.draw_verdict(io.BytesIO(), np.zeros((1, 2, 2)), depth, state, np.zeros((2, 2)), title="room, frame 3")
     assert "room, frame 3" in said and "Known: 67 % of the depth, of which 50.0 % are wrong" in said
+
+
+def test_figures_of_all_notebooks_have_the_same_sizes():
+    assert set(notebook.SETTINGS) <= set(mpl.rcParams) and mpl.RcParams(notebook.SETTINGS)["figure.dpi"] >= 150
+    for file in (REPO / "notebooks").glob("*.ipynb"):
+        code = "".join("".join(c["source"]) for c in json.loads(file.read_text())["cells"] if c["cell_type"] == "code")
+        assert "rcParams |= notebook.SETTINGS" in code, file.name
+        widths = re.findall(r"figsize=\(([^,]*),", code)
+        assert widths and all("notebook.WIDTH" in width for width in widths), f"{file.name}: {widths}"
