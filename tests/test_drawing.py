@@ -1,6 +1,7 @@
 """The drawing module: small SVG that is the same every time, figures that leave nothing behind, one page of colours."""
 
 import gc
+import io
 import json
 import re
 import subprocess
@@ -16,8 +17,8 @@ from matplotlib import _pylab_helpers
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from dhtorch import drawing
-from dhtorch.codes import Gate, Hole, Source, names
-from dhtorch.drawing import Axis, Key, Layer, Panel, Picture, colours, inline
+from dhtorch.codes import Gate, Hole, Source, State, names
+from dhtorch.drawing import Axis, Key, Layer, Panel, Picture, colours, inline, notebook
 from dhtorch.methods import METHODS
 from dhtorch.viewer import html as pages
 
@@ -211,3 +212,31 @@ def test_the_page_of_colours_shows_them_all():
     assert all(f"`{c.lower()}`" in shown for c in [*wanted, *colours.OTHERS])
     for name in (colours.DEPTH, colours.SCORE, colours.ERROR, colours.SIGNED):
         assert f"`{name}`" in shown and colours.ramp(name, 33)[7] in shown
+
+
+def test_a_long_title_is_set_smaller_then_cut_in_its_middle():
+    canvas = drawing.Canvas(300, 100, 72)
+    for n in (10, 40, 400):
+        canvas.title(f"{'x' * n}, cutoff 3 m", 300, 100)
+    short, smaller, cut = canvas.figure.artists
+    assert short.get_fontsize() > smaller.get_fontsize() >= cut.get_fontsize() >= 8
+    assert smaller.get_text() == f"{'x' * 40}, cutoff 3 m", "whole"
+    assert "…" in cut.get_text() and cut.get_text().endswith("x, cutoff 3 m"), "what it ends in stays"
+    assert canvas.said == [f"{'x' * 400}, cutoff 3 m"]
+
+
+def test_known_is_a_share_of_the_depth_in_the_figure_of_a_verdict(monkeypatch):
+    said = []
+    monkeypatch.setattr(drawing.Canvas, "title", lambda self, text, *_: said.append(text))
+    depth, state = np.array([[1.0, 1.0], [1.0, 0.0]]), np.array([[State.CONSISTENT, State.WRONG], [0, 0]])
+    drawing.draw_verdict(io.BytesIO(), np.zeros((1, 2, 2)), depth, state, np.zeros((2, 2)), title="room, frame 3")
+    assert "room, frame 3" in said and "Known: 67 % of the depth, of which 50.0 % are wrong" in said
+
+
+def test_figures_of_all_notebooks_have_the_same_sizes():
+    assert set(notebook.SETTINGS) <= set(mpl.rcParams) and mpl.RcParams(notebook.SETTINGS)["figure.dpi"] >= 150
+    for file in (REPO / "notebooks").glob("*.ipynb"):
+        code = "".join("".join(c["source"]) for c in json.loads(file.read_text())["cells"] if c["cell_type"] == "code")
+        assert "rcParams |= notebook.SETTINGS" in code, file.name
+        widths = re.findall(r"figsize=\(([^,]*),", code)
+        assert widths and all("notebook.WIDTH" in width for width in widths), f"{file.name}: {widths}"

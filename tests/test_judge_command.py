@@ -9,6 +9,7 @@ import torch
 from sample_dicts import SIDE, frames
 from torch.utils.data import DataLoader
 
+from dhtorch import testing as writers
 from dhtorch.codes import State
 from dhtorch.commands import run
 from dhtorch.commands.judge import _cut, _off_at_least, _share_at_least, _wrong_at_least, exceeded, parse_limits
@@ -56,6 +57,18 @@ def test_files_are_written_and_limits_decide_the_exit_code(tmp_path, maps):
     assert code == run.DONE
     assert found["exceeded"] == []
     assert "data:image" not in (out / "judge.html").read_text()
+
+
+def test_a_guessed_camera_is_told_on_the_page_and_one_frame_is_one(tmp_path, room):
+    capture = tmp_path / "capture"
+    writers.write_counted_frames(capture, [room[0], room[3]])
+    (capture / "K.txt").unlink()
+    words = ["data=frames_dir", f"data.root={capture}", "data.fov=60", *LITTLE, "most=1", f"output={tmp_path / 'out'}"]
+    assert run.main(["judge", *words]) == run.DONE
+    page = (tmp_path / "out/judge.html").read_text()
+    assert "<p>Its intrinsics are a guess from a field of view of 60°" in page
+    assert "capture: 1 frame: " in page and "known, of the depth" in page
+    assert "60°" in json.loads((tmp_path / "out/judge.json").read_text())["intrinsics_guessed"]
 
 
 @pytest.mark.parametrize(

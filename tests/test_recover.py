@@ -1,5 +1,6 @@
 """``dhtorch PATH``: a capture of one's own, or one sentence that says why nothing comes of it."""
 
+import base64
 import json
 import shutil
 
@@ -42,6 +43,17 @@ def test_one_word_makes_maps_a_map_a_page_and_a_picture(made):
     assert b"comment up " in (made / "map.ply").read_bytes()[:2000]
     width, height = Image.open(made / "overview.png").size
     assert width > 600 and height > 400
+
+
+def test_the_page_begins_with_the_numbers_and_the_picture(made):
+    page = (made / "view.html").read_text(encoding="utf-8")
+    rows = [json.loads(p.read_text()) for p in (made / "meta").iterdir()]
+    pixels = sum(row["pixels"]["swept"] for row in rows) / len(rows)
+    opening = page[page.index('<section id="opening"') : page.index("<main>")]
+    assert f"<dd>{pixels:,.0f}</dd>" in opening and "Median stated error" in opening
+    assert base64.b64encode((made / "overview.png").read_bytes()).decode() in opening
+    assert "Recovered " in opening and "Silent, most often: " in opening and "no_track" not in opening
+    assert "kitchen, frame" in opening and ", with frame" in opening, "whose picture, and of which views"
 
 
 def test_it_says_what_it_is_what_was_recovered_and_what_to_do_next(capture, made, capsys):

@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 from dhtorch import archive, drawing
 from dhtorch.codes import Gate, Source
 from dhtorch.drawing import Axis, Panel, Stroke, colours
+from dhtorch.drawing.markup import Markup, escape, tag
 from dhtorch.studies import report
 from dhtorch.studies.report import cells, curves, layouts, page, plots, published, text
-from dhtorch.studies.report.markup import Markup, escape, tag
+from dhtorch.studies.report.figure import Figure
 from dhtorch.studies.report.reading import flatten, scene_rows
 from dhtorch.studies.report.tables import COLUMNS, every_number
 
@@ -431,3 +432,13 @@ def test_an_axis_takes_any_values(values, log):
     assert axis.low < axis.high and (not log or axis.low > 0)
     for v in values:
         assert v is None or 0 <= axis.place(v) <= 1
+
+
+def test_figures_of_one_panel_stand_side_by_side():
+    one, two = (Figure("t", "c", [Panel("t", Axis(0, 1), Axis(0, 1))] * n, []) for n in (1, 2))
+    made = ET.fromstring(f"<div>{page.figures_markup([one, one, two, one])}</div>")
+    assert [(part.get("class"), len(part.findall("figure"))) for part in made] == [
+        ("figures", 2),
+        (None, 0),
+        ("figures", 1),
+    ]

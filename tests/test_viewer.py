@@ -499,6 +499,22 @@ def test_points_of_a_file(tmp_path):
     assert "points" in data_of(pages.page(points.read(tmp_path / "p.ply")))["about"]
 
 
+def test_what_opens_a_page_is_text_and_stands_before_the_space(tmp_path):
+    evil = '</script><b onload="x">\udcff&'
+    export.write_ply(tmp_path / "p.ply", np.ones((1, 3)))
+    opening = viewer.Opening({evil: evil}, [evil], b"PNG", evil)
+    made = pages.page(replace(points.read(tmp_path / "p.ply"), name=evil, opening=opening))
+    made.encode("utf-8")
+    assert "<b onload" not in made and made.count("&lt;/script&gt;&lt;b onload=&quot;x&quot;&gt;?&amp;") >= 6
+    assert (
+        made.index("</header>")
+        < made.index("<dl class=")
+        < made.index("data:image/png;base64,UE5H")
+        < made.index("<main>")
+    )
+    assert '<section id="opening"' not in pages.page(points.read(tmp_path / "p.ply"))
+
+
 @pytest.mark.parametrize(
     "content",
     [

@@ -27,7 +27,7 @@ from dhtorch.data import files as data_files
 from dhtorch.data.pairs import by_choice
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene, scenes_of
-from dhtorch.drawing import draw_completed
+from dhtorch.drawing import at_cutoff, draw_completed, frame_of
 from dhtorch.evaluate.holdout import range_split
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
@@ -403,15 +403,21 @@ def _write_extras(task: Task, i: int) -> None:
     if not wanted:
         return
     maps, source = maps_of(task, i)
-    frame, name = task.recording[i], task.name(i)
+    frame = task.recording[i]
     picture = _picture(frame, source.shape)
     for path in wanted:
         if path.suffix == ".png":
             out = io.BytesIO()
-            draw_completed(out, frame.image[0], **maps, source=source, title=f"{task.scene.name} {name}")
+            draw_completed(out, frame.image[0], **maps, source=source, title=title_of(task, i))
             storage.replace_file(path, out.getvalue())
         else:
             _write_points(path, frame, picture, **maps, source=source)
+
+
+def title_of(task: Task, i: int) -> str:
+    """Scene, frame, those that it was completed from, and the cutoff."""
+    row = task.done[task.name(i)]
+    return at_cutoff(frame_of(task.scene.name, row["frame"], row.get("views", ())), task.settings["cutoff"])
 
 
 def maps_of(task: Task, i: int) -> tuple[dict[str, np.ndarray], np.ndarray]:

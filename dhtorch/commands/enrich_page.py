@@ -11,10 +11,11 @@ import numpy as np
 from dhtorch import storage
 from dhtorch.codes import Gate, Source, names, words
 from dhtorch.drawing import Axis, Key, Panel
-from dhtorch.drawing.colours import GATES, RECOVERED, SENSOR, SILENT, Stroke, style_sheet
+from dhtorch.drawing.colours import GATES, RECOVERED, SENSOR, SILENT, Stroke
+from dhtorch.drawing.document import document
+from dhtorch.drawing.markup import tag
 from dhtorch.studies.report.figure import Figure
-from dhtorch.studies.report.markup import Markup, tag
-from dhtorch.studies.report.page import STYLE, figure_markup, table_markup
+from dhtorch.studies.report.page import STYLE, figures_markup, table_markup
 from dhtorch.studies.report.tables import Table
 
 Row = Mapping[str, Any]
@@ -49,18 +50,15 @@ def page(about: Row, owns: Sequence[Row]) -> str:
         owns: what each amounts to, as :class:`dhtorch.extract.targets.Target` notes it.
     """
     title = f"{about['data']['source']}: what became of its pixels"
-    style = Markup(style_sheet() + STYLE.read_text(encoding="utf-8"))
-    metas = ({"charset": "utf-8"}, {"name": "viewport", "content": "width=device-width, initial-scale=1"})
-    head = tag("head", *(tag("meta", **m) for m in metas), tag("title", title), tag("style", style))
     frames = sum(own["length"] for own in owns)
     step = f"depth in steps of {1e3 * about['step_m']:.3g} mm" if about["step_m"] else "depth as it was found"
     episodes = f"{len(owns)} episode{'s' * (len(owns) != 1)}, {frames} frames"
     lead = f"{episodes}; {step}; dhtorch {about['version']}, method {about['method']}"
     tables = [_cameras(owns), _worst(owns)]
     figures = [figure for figure in (_along(owns), _why(owns)) if figure is not None]
-    parts = [*(table_markup(t) for t in tables), *(figure_markup(figure) for figure in figures)]
-    body = tag("body", tag("header", tag("h1", title), tag("p", lead, class_="lead")), tag("main", *parts))
-    return "<!doctype html>\n" + tag("html", head, body, lang="en") + "\n"
+    parts = [*(table_markup(t) for t in tables), figures_markup(figures)]
+    top = tag("header", tag("h1", title), tag("p", lead, class_="lead"))
+    return document(title, top, tag("main", *parts), own=STYLE)
 
 
 def _shares(cameras: Sequence[Row]) -> tuple[dict[str, float], dict[str, float]]:

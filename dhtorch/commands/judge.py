@@ -26,7 +26,7 @@ from dhtorch.data import intrinsics as told
 from dhtorch.data.depth_maps import DepthMaps
 from dhtorch.data.pairs import around
 from dhtorch.data.scene import Scene, scenes_of
-from dhtorch.drawing import draw_verdict
+from dhtorch.drawing import at_cutoff, draw_verdict, frame_of
 from dhtorch.evaluate.holdout import range_split
 from dhtorch.method import Method
 from dhtorch.records import Frame, Verdict
@@ -52,7 +52,7 @@ LIMITS = {
 }
 
 #: Columns of the page's table.
-COLUMNS = ("wrong", "known", "scale", "shift, m", "tilt")
+COLUMNS = ("wrong, of what is known", "known, of the depth", "scale", "shift, m", "tilt")
 
 _LIMIT = re.compile(r"\s*([a-z]+)\s*>\s*([0-9.eE+-]+)\s*")
 
@@ -147,7 +147,7 @@ def _judged(found: Found, method: Method, settings: Mapping[str, Any], progress:
         verdict = _verdict(found, frame, i, method, settings)
         row = _row(int(found.scene.recording.number[i]), verdict)
         found.rows.append(row)
-        _keep_worst(found, i, frame, verdict, settings["pictures"])
+        _keep_worst(found, frame, verdict, settings)
     if settings["window"]:
         size = min(settings["window"], n)
         firsts = sorted({min(k, n - size) for k in range(0, max(frames[-1] + 1 - size, 0) + 1, size)}) if n > 1 else []
@@ -199,16 +199,17 @@ def _row(number: int, verdict: Verdict) -> Row:
     return row | {"ceiling": None if math.isnan(ceiling) else ceiling}
 
 
-def _keep_worst(found: Found, i: int, frame: Frame, verdict: Verdict, most: int) -> None:
+def _keep_worst(found: Found, frame: Frame, verdict: Verdict, settings: Mapping[str, Any]) -> None:
     """The pictures of the worst frames so far."""
-    order = sorted(range(len(found.rows)), key=lambda k: -_worse(found.rows[k]))[:most]
+    order = sorted(range(len(found.rows)), key=lambda k: -_worse(found.rows[k]))[: settings["pictures"]]
     here = len(found.rows) - 1
     if here not in order:
         return
     out = io.BytesIO()
     one = verdict[0]
     number = found.rows[here]["frame"]
-    draw_verdict(out, frame.image[0].cpu(), one.depth, one.state, one.evidence, title=f"{found.scene.name} {number}")
+    title = at_cutoff(frame_of(found.scene.name, number), settings["cutoff"])
+    draw_verdict(out, frame.image[0].cpu(), one.depth, one.state, one.evidence, title=title)
     found.pictures[number] = out.getvalue()
     kept = {found.rows[k]["frame"] for k in order}
     found.pictures = {k: v for k, v in found.pictures.items() if k in kept}
@@ -316,9 +317,9 @@ def _said(name: str, whole: Row) -> list[str]:
     wrong = "nothing can be known" if whole["wrong"] is None else f"{whole['wrong']:.1%} of what is known is wrong"
     unknown = "no depth" if held["unknown"] is None else f"{held['unknown']:.1%} cannot be known"
     scale = "scale cannot be known" if middle["scale"] is None else f"scale {middle['scale']:.3f}"
-    lines = [f"{name}: {whole['frames']} frames: {wrong}, {unknown}; {scale}"]
+    lines = [f"{name}: {whole['frames']} frame{'s' * (whole['frames'] != 1)}: {wrong}, {unknown}; {scale}"]
     for cause, n in sorted(whole["causes"].items(), key=lambda item: -item[1]):
-        lines.append(f"  likely cause in {n} of {whole['windows']} windows: {cause}")
+        lines.append(f"  likely cause in {n} of {whole['windows']} window{'s' * (whole['windows'] != 1)}: {cause}")
     return lines
 
 
@@ -331,7 +332,8 @@ def _page(place: Path, found: Found, whole: Row, over: Sequence[str]) -> Path:
         cells += [pages.cell(row[name]) for name in ("scale", "shift", "tilt")]
         frames.append(pages.JudgedFrame(f"frame {row['frame']}", cells, found.pictures.get(row["frame"])))
     failed = [f"Exceeded: {line}" for line in over]
-    said = _said(found.scene.name, whole)
+    guess = told.guessed(found.scene.recording.report)
+    said = _said(found.scene.name, whole) + ([f"Its {guess}."] if guess else [])
     return pages.write(place / "judge.html", found.scene.name, said=said, columns=COLUMNS, frames=frames, failed=failed)
 
 

@@ -18,19 +18,21 @@ import numpy as np
 import torch
 
 from dhtorch import export, storage
-from dhtorch.codes import Gate, Source, names
-from dhtorch.commands import complete
-from dhtorch.commands.complete import Progress, Row, Task
+from dhtorch.codes import Source
+from dhtorch.commands import complete, recover_page
+from dhtorch.commands.complete import Progress, Task
 from dhtorch.commands.inspect import Found, classified, find
+from dhtorch.commands.recover_page import count
 from dhtorch.data import FORMATS, FormatError, files, open_all
 from dhtorch.data import intrinsics as told
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
-from dhtorch.drawing import at_cutoff, draw_completed
+from dhtorch.drawing import draw_completed
 from dhtorch.integrate.from_maps import FrameMap, join
 from dhtorch.integrate.mapping import meshed, voxel_of, write_surface
 from dhtorch.method import Method
 from dhtorch.viewer import html, points
+from dhtorch.viewer.exhibit import Opening
 
 #: Folder of what is made, where no other is said.
 OUT = Path("dhtorch_out")
@@ -126,7 +128,7 @@ def captured(path: Path, format: str = "auto") -> list[Found]:
     if depths:
         what = f"{len(pictures)} pictures and {len(depths)} depth maps of no known format"
         raise NothingToDo(f"{path}: {what}; a layout of docs/data.md is needed, as rgb/ beside depth/")
-    what = f"{_count(len(pictures), 'picture')} without depth"
+    what = f"{count(len(pictures), 'picture')} without depth"
     raise NothingToDo(f"{path}: {what}; a sensor's depth of what is near is needed, it gives the metre (docs/data.md)")
 
 
@@ -182,7 +184,7 @@ def _looked_at(recording: Recording) -> int:
     """
     if len(recording) < 2:
         help = "a second view from another place is needed for what the sensor lacks"
-        raise NothingToDo(f"{recording.name}: {_count(len(recording), 'frame')}; {help}")
+        raise NothingToDo(f"{recording.name}: {count(len(recording), 'frame')}; {help}")
     causes, blank = [], 0
     for k in coarse_to_fine(len(recording))[:TRIED]:
         try:
@@ -197,13 +199,9 @@ def _looked_at(recording: Recording) -> int:
             return k
         blank += 1
     if blank:
-        what = f"{_count(len(recording), 'frame')}, of {blank} looked at none has depth"
+        what = f"{count(len(recording), 'frame')}, of {blank} looked at none has depth"
         raise NothingToDo(f"{recording.name}: {what}; a sensor's depth of what is near is needed, it gives the metre")
     raise NothingToDo(f"{recording.name}: no frame can be read: {causes[0]}")
-
-
-def _count(n: int, word: str) -> str:
-    return f"{n} {word}{'s' * (n != 1)}"
 
 
 # --------------------------------------------------------------------------------------------------------- what is made
@@ -234,9 +232,11 @@ def _one(
         raise NothingToDo(f"{recording.name}: no frame could be completed: {reason}")
     rows = [task.done[task.name(i)] for i in made.frames]
     best = max(zip(rows, made.frames, strict=True), key=lambda each: each[0]["pixels"].get("swept", 0))[1]
-    _overview(task, best)
-    written = ["depth/", "overview.png", *_mapped(made, settings, progress)]
-    return [*_said(made, rows), f"Wrote {', '.join(written)} in {folder}."]
+    found = recover_page.numbers(task, made.frames)
+    said = recover_page.sentences(task, found, recording[made.frames[0]].hw)
+    opening = recover_page.opening(said, found, _overview(task, best), complete.title_of(task, best))
+    written = ["depth/", "overview.png", *_mapped(made, opening, settings, progress)]
+    return [*said, _next(made, written[-1]), f"Wrote {', '.join(written)} in {folder}."]
 
 
 def _make(task: Task, until: float | None, progress: Progress) -> Made:
@@ -289,17 +289,17 @@ def _unreadable(recording: Recording, k: int) -> str:
     return ""
 
 
-def _overview(task: Task, i: int) -> None:
-    """The picture that shows most: what the camera saw, the sensor, the completed map."""
+def _overview(task: Task, i: int) -> bytes:
+    """Write the picture that shows most: what the camera saw, the sensor, the completed map."""
     maps, source = complete.maps_of(task, i)
     out = io.BytesIO()
-    title = at_cutoff(f"{task.scene.name} {task.name(i)}", task.settings["cutoff"])
-    draw_completed(out, task.recording[i].image[0], **maps, source=source, title=title)
+    draw_completed(out, task.recording[i].image[0], **maps, source=source, title=complete.title_of(task, i))
     storage.replace_file(task.folder / "overview.png", out.getvalue())
+    return out.getvalue()
 
 
-def _mapped(made: Made, settings: Mapping[str, Any], progress: Progress) -> list[str]:
-    """The map of all frames, and the page; the names of what was written."""
+def _mapped(made: Made, opening: Opening, settings: Mapping[str, Any], progress: Progress) -> list[str]:
+    """The map of all frames, and the page, which begins with the numbers; the names of what was written."""
     task = made.task
     voxel = voxel_of(task.recording, made.frames) if settings["voxel"] is None else settings["voxel"]
 
@@ -318,81 +318,25 @@ def _mapped(made: Made, settings: Mapping[str, Any], progress: Progress) -> list
     values = {"sigma": surface.sigma, "source": surface.source}
     shape = export.Shape("map", surface.xyz, surface.features[:, :3], surface.normal, surface.face, values=values)
     export.write_glb(task.folder / "map.glb", [shape], up=up)
-    html.write(task.folder / "view.html", replace(points.read(ply), name=task.scene.name))
+    html.write(task.folder / "view.html", replace(points.read(ply), name=task.scene.name, opening=opening))
     return ["map.ply", "map.glb", "view.html"]
 
 
 # ------------------------------------------------------------------------------------------------------ what is said
 
 
-def _said(made: Made, rows: Sequence[Row]) -> list[str]:
-    """What it is, what was recovered, what to do next."""
-    task = made.task
-    recording = task.recording
-    h, w = recording[made.frames[0]].hw
-    kind = f"{task.scene.name}: a {recording.format} capture, {len(recording)} frames of {w}x{h}"
-    share = np.mean([row["pixels"].get("sensor", 0) / sum(row["pixels"].values()) for row in rows])
-    guess = told.guessed(recording.report)
-    what = f"{kind}; the sensor answers {share:.0%} of the pixels{f'; its {guess}' if guess else ''}."
-    depth, ratio = _recovered(task, made.frames)
-    n = sum(row["pixels"].get("swept", 0) for row in rows) / len(rows)
-    if len(depth):
-        low, high = np.percentile(depth, (2, 98))
-        found = (
-            f"Recovered {n:,.0f} pixels a frame that the sensor lacks, from {low:.1f} m to {high:.1f} m, "
-            f"median stated error {np.median(ratio):.1%} ({len(rows)} frames)."
-        )
-    else:
-        found = f"Nothing was recovered: {_why(rows)}."
-    return [what, found, _next(made)]
-
-
-def _recovered(task: Task, frames: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Depth and sigma / depth of swept pixels, of some frames."""
-    depth, ratio = [np.zeros(0)], [np.zeros(0)]
-    for i in frames[:MAPPED]:
-        maps, source = complete.maps_of(task, i)
-        swept = (source == Source.SWEPT) & (maps["depth"] > 0)
-        depth.append(maps["depth"][swept])
-        ratio.append(maps["sigma"][swept] / maps["depth"][swept])
-    return np.concatenate(depth), np.concatenate(ratio)
-
-
-#: Reason of silence → what would help.
-HELP = {
-    Gate.NO_BASELINE: "the camera only turned; moving it sideways by a tenth of the distance would help",
-    Gate.NO_POSE: "too few returns could be tracked; slower motion, more light and texture would help",
-    Gate.NO_TRACK: "what has no return could not be found in other views; texture and a view from the side would help",
-    Gate.UNCERTAIN: "the views lie too close together for what is far; moving sideways would help",
-    Gate.POSE_REFUTED: "the poses given contradict the near returns: see their axes, direction and unit",
-    Gate.CONTRADICTED: "what the sensor sees moves, or contradicts the pictures; a still scene would help",
-}
-
-
-def _why(rows: Sequence[Row]) -> str:
-    """Why frames are silent, by the reason that most silent pixels have."""
-    silent: dict[str, float] = {}
-    for row in rows:
-        for name, share in row["silent"].items():
-            silent[name] = silent.get(name, 0.0) + share
-    known = {name.lower(): text for code, name in names(Gate).items() if (text := HELP.get(code))}
-    some = {name: share for name, share in silent.items() if name in known and share > 0.01 * len(rows)}
-    if not some:
-        return "nothing lies beyond the sensor, which answers nearly everywhere; cutoff=2.0 shows what views can do"
-    return known[max(some, key=lambda name: some[name])]
-
-
-def _next(made: Made) -> str:
+def _next(made: Made, shown: str) -> str:
+    """What to do with what is there; ``shown`` is the file to open."""
     n, name = len(made.broken), made.task.scene.name
     cause = next(iter(made.broken.values()), "")
-    broken = f" {_count(n, 'frame')} of {name} could not be read ({cause})." if n else ""
+    broken = f" {count(n, 'frame')} of {name} could not be read ({cause})." if n else ""
     if made.left:
         more = f"the same command does more of the {made.left} frames left (minutes=null: all)"
-        return f"Next: open view.html; {more}.{broken}"
+        return f"Next: open {shown}; {more}.{broken}"
     read = {name: value for name, value in made.task.settings["data"].items() if name in told.OPTIONS}
     also = "".join(f" data.{name}={str(value).replace(' ', '')}" for name, value in read.items())
     judged = f"dhtorch run data=auto data.root={made.task.settings['path']}{also} holdout.cutoff={_middle(made):.2g}"
-    return f"Next: open view.html; {judged} says how good it is on yours.{broken}"
+    return f"Next: open {shown}; {judged} says how good it is on yours.{broken}"
 
 
 def _middle(made: Made) -> float:

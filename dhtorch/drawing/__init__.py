@@ -9,7 +9,7 @@ matplotlib is imported when something is drawn.
 from __future__ import annotations
 
 from dhtorch.drawing.axis import Axis, spanning
-from dhtorch.drawing.canvas import Canvas, Key, Mark, at_cutoff, headed, save
+from dhtorch.drawing.canvas import Canvas, Key, Mark, at_cutoff, frame_of, headed, save
 from dhtorch.drawing.colours import Stroke, series
 from dhtorch.drawing.maps import draw_anchored, draw_completed
 from dhtorch.drawing.panel import Panel
@@ -35,6 +35,7 @@ __all__ = [
     "draw_risk_coverage",
     "draw_samples",
     "draw_verdict",
+    "frame_of",
     "headed",
     "inline",
     "save",

@@ -14,6 +14,8 @@ from dhtorch.drawing.colours import GREY, INK, SOFT, THEIRS, Stroke
 
 #: Height of letters, points; their width by which words are cut, as a share of it.
 SMALL, TITLE, LETTER = 10.0, 11.0, 0.59
+#: Of a title: least height of its letters, points, and their width, as they are bold.
+LEAST, BOLD = 8.0, 0.66
 
 Place = tuple[float, float]
 
@@ -61,8 +63,11 @@ class Canvas:
         self._add(made, said if plain(said) != text else "")
 
     def title(self, text: str, width: float, height: float, left: float = 0.0) -> None:
-        """Words along the upper edge, as many as it has room for."""
-        self.text(cut(plain(text), width, TITLE), left + 2, height - 14, size=TITLE, bold=True, said=text)
+        """Words along the upper edge: long ones are set smaller, then cut in their middle."""
+        text = plain(text)
+        size = min(TITLE, max(LEAST, width / (BOLD * max(len(text), 1))))
+        shown = cut(text, width * LETTER / BOLD, size, end=len(text) // 3)
+        self.text(shown, left + 2, height - 14, size=size, bold=True, said=text)
 
     def lines(self, segments: Iterable[Sequence[Place]], stroke: Stroke, said: str = "") -> None:
         """Lines through places, all in one path."""
@@ -166,10 +171,23 @@ def plain(text: str) -> str:
     return " ".join("".join(c if c.isprintable() or c.isspace() else "\ufffd" for c in text).split())
 
 
-def cut(text: str, width: float, size: float) -> str:
-    """As much of a text as a width has room for, points."""
-    most = int(width / (LETTER * size))
-    return text if len(text) <= most else text[: most - 1] + "…"
+def cut(text: str, width: float, size: float, end: int = 0) -> str:
+    """As much of a text as a width has room for, points; with up to ``end`` letters of its end, a third of all."""
+    most = int(width / (LETTER * size) + 1e-6)
+    if len(text) <= most:
+        return text
+    last = min(end, most // 3)
+    return f"{text[: most - 1 - last]}…{text[len(text) - last :]}"
+
+
+def frame_of(scene: str, frame: object, views: Sequence[object] = ()) -> str:
+    """A frame of a scene, and those that were asked beside it, by their names."""
+    beside = f", with {_frames(views)}" if views else ""
+    return f"{scene}, frame {frame}{beside}"
+
+
+def _frames(views: Sequence[object]) -> str:
+    return f"frame{'s' * (len(views) > 1)} {', '.join(map(str, views))}"
 
 
 def at_cutoff(place: str, cutoff: float | None) -> str:

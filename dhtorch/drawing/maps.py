@@ -15,11 +15,13 @@ import numpy as np
 from dhtorch.codes import Source
 from dhtorch.drawing import colours
 from dhtorch.drawing.axis import Axis
-from dhtorch.drawing.canvas import SMALL, Canvas, headed, save
+from dhtorch.drawing.canvas import SMALL, Canvas, save
 from dhtorch.drawing.colours import INK, Stroke
 
 #: Width of a picture, between two of them, and the heights of a title and of a scale with its numbers, points.
 WIDTH, GAP, TITLE, SCALE = 340.0, 12.0, 20.0, 46.0
+#: Height of the title above all pictures, points.
+HEAD = 22.0
 #: Shares of the depths that the scale leaves out at its ends.
 NEAREST, FARTHEST = 0.01, 0.99
 #: Scale of sigma / depth.
@@ -46,9 +48,9 @@ def draw_completed(
     known = np.isfinite(z) & (z > 0) & (code != Source.NONE)
     sensed = known & (code == Source.SENSOR)
     metres = depths(z[known])
-    before = f"Sensor: {_percent(sensed)}", coloured(z, sensed, metres, colours.DEPTH)
+    before = f"Sensor: {_percent(sensed)} of the pixels", coloured(z, sensed, metres, colours.DEPTH)
     after = f"Completed: {_percent(known)}, the rest is silent", coloured(z, known, metres, colours.DEPTH)
-    _draw(path, ((headed("Picture", title), rgb_of(image)), before, after), (z, s, known))
+    _draw(path, title, (("Picture", rgb_of(image)), before, after), (z, s, known))
 
 
 def draw_anchored(
@@ -65,28 +67,32 @@ def draw_anchored(
     x, z, s = (as_array(q) for q in (given, depth, sigma))
     x = x.reshape(x.shape[-2:])
     there, known = np.isfinite(x) & (x > 0), np.isfinite(z) & (z > 0)
-    before = f"Map as given: {_percent(there)}", coloured(x, there, depths(x[there]), colours.DEPTH)
+    before = f"Map as given: {_percent(there)}, own range", coloured(x, there, depths(x[there]), colours.DEPTH)
     after = f"Anchored: {_percent(known)}, the rest is silent", coloured(z, known, depths(z[known]), colours.DEPTH)
-    _draw(path, ((headed("Picture", title), rgb_of(image)), before, after), (z, s, known))
+    _draw(path, title, (("Picture", rgb_of(image)), before, after), (z, s, known))
 
 
 def _draw(
     path: str | Path | IO[bytes],
+    title: str,
     shown: Sequence[tuple[str, np.ndarray]],
     found: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> None:
-    """Three pictures and sigma / depth of the depth, sigma and mask ``found``, with the scales of both below them."""
+    """Three pictures and sigma / depth of the depth, sigma and mask ``found``, with the scales of both below them
+    and the title above."""
     z, s, known = found
     metres, share = depths(z[known]), Axis(*SIGMA_REL, "sigma / depth, %", log=True, percent=True)
     ratio = np.where(known, s / np.where(known, z, 1), 1)
     height = WIDTH * z.shape[0] / z.shape[1]
-    canvas = Canvas(2 * WIDTH + GAP, 2 * (height + TITLE) + SCALE, dpi=160)
+    top = 2 * (height + TITLE) + SCALE
+    canvas = Canvas(2 * WIDTH + GAP, top + HEAD * bool(title), dpi=160)
+    canvas.title(title, 2 * WIDTH + GAP, top + HEAD)
     for k, (words, pixels) in enumerate((*shown, ("Sigma / depth", coloured(ratio, known, share, colours.ERROR)))):
         left, bottom = (k % 2) * (WIDTH + GAP), SCALE + (k < 2) * (height + TITLE)
         canvas.title(words, WIDTH, bottom + height + TITLE, left)
         canvas.picture(pixels, (left, bottom, WIDTH, height))
-    _scale(canvas, metres, colours.DEPTH, 0.0)
-    _scale(canvas, share, colours.ERROR, WIDTH + GAP)
+    scale(canvas, metres, colours.DEPTH, 0.0)
+    scale(canvas, share, colours.ERROR, WIDTH + GAP)
     save(canvas.figure, path)
 
 
@@ -112,11 +118,12 @@ def mapped(places: np.ndarray, kind: str) -> np.ndarray:
     return colormaps[kind](places)[..., :3]
 
 
-def _scale(canvas: Canvas, axis: Axis, kind: str, left: float) -> None:
+def scale(canvas: Canvas, axis: Axis, kind: str, left: float) -> None:
     """A colour map from end to end under a picture, with round numbers and what they mean."""
     base, height = SCALE - 18.0, 9.0
     canvas.picture(mapped(np.linspace(0, 1, 256)[None].repeat(2, 0), kind), (left, base, WIDTH, height))
-    ticks = axis.ticks(8) if axis.high > DECADES * axis.low else Axis(axis.low, axis.high).ticks(8)
+    decades = axis.log and axis.high > DECADES * axis.low
+    ticks = axis.ticks(8) if decades else Axis(axis.low, axis.high).ticks(8)
     for tick in ticks:
         u = left + WIDTH * axis.place(tick)
         canvas.lines([((u, base), (u, base - 3))], Stroke(INK, 0.7))

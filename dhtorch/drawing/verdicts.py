@@ -1,4 +1,4 @@
-"""A judged depth map: the picture, the map, what is said of every pixel, and how strongly.
+"""A judged depth map: the picture, what is said of every pixel, the map, and how strongly.
 
 Arrays may be torch tensors or numpy arrays, on any device, of one view (no batch dimension).
 """
@@ -14,7 +14,7 @@ from dhtorch.codes import State
 from dhtorch.drawing import colours
 from dhtorch.drawing.axis import Axis
 from dhtorch.drawing.canvas import Canvas, save
-from dhtorch.drawing.maps import GAP, TITLE, WIDTH, as_array, coloured, depths, mapped, rgb_of
+from dhtorch.drawing.maps import GAP, HEAD, SCALE, TITLE, WIDTH, as_array, coloured, depths, mapped, rgb_of, scale
 
 #: Sigmas at the ends of the colour map of evidence.
 END = 6.0
@@ -29,39 +29,39 @@ def draw_verdict(
     *,
     title: str = "",
 ) -> None:
-    """Draw the picture, the map by the logarithm of its depth, the states, and the evidence.
+    """Draw the picture, the states, the map by the logarithm of its depth, and the evidence.
 
     Evidence is red where the map is too far and blue where it is too near. What cannot be known is left blank.
     """
     z, code, sigmas = (as_array(x) for x in (depth, state, evidence))
     known = np.isfinite(z) & (z > 0)
     height = WIDTH * z.shape[0] / z.shape[1]
-    canvas = Canvas(2 * WIDTH + GAP, 2 * (height + TITLE), dpi=110)
+    top = 2 * (height + TITLE) + SCALE
+    canvas = Canvas(2 * WIDTH + GAP, top + HEAD * bool(title), dpi=160)
+    canvas.title(title, 2 * WIDTH + GAP, top + HEAD)
     ground = np.array(colours.rgb(colours.PICTURE)) / 255
     states = np.array([colours.rgb(colours.STATES[k]) for k in sorted(colours.STATES)])[code.astype(np.int64)] / 255
+    wrong, fine = (((code == k) & known).sum() for k in (State.WRONG, State.CONSISTENT))
+    metres, ends = depths(z[known]), Axis(-END, END, "evidence, sigmas")
     strength = mapped((np.nan_to_num(sigmas).clip(-END, END) + END) / (2 * END), colours.SIGNED)
-    wrong, fine = ((code == k).sum() for k in (State.WRONG, State.CONSISTENT))
-    strength = np.where(np.isnan(sigmas)[..., None], ground, strength)
-    metres: Axis = depths(z[known])
     shown = [
-        (f"{title}: picture" if title else "Picture", 1, rgb_of(image)),
-        (f"Depth, {metres.low:.2g} to {metres.high:.2g} m", 1, coloured(z, known, metres, colours.DEPTH)),
-        (_said(int(wrong), int(fine), code.size), 0, states),
-        (
-            f"Evidence to {END:g} sigmas: red too far, blue too near",
-            0,
-            np.where(np.isnan(sigmas)[..., None], ground, strength),
-        ),
+        ("Picture", 1, rgb_of(image)),
+        (_said(int(wrong), int(fine), int(known.sum())), 1, states),
+        ("Depth", 0, coloured(z, known, metres, colours.DEPTH)),
+        ("Evidence: red too far, blue too near", 0, np.where(np.isnan(sigmas)[..., None], ground, strength)),
     ]
     for k, (words, row, pixels) in enumerate(shown):
-        left, bottom = (k % 2) * (WIDTH + GAP), row * (height + TITLE)
+        left, bottom = (k % 2) * (WIDTH + GAP), SCALE + row * (height + TITLE)
         canvas.title(words, WIDTH, bottom + height + TITLE, left)
         canvas.picture(pixels, (left, bottom, WIDTH, height))
+    scale(canvas, metres, colours.DEPTH, 0.0)
+    scale(canvas, ends, colours.SIGNED, WIDTH + GAP)
     save(canvas.figure, path)
 
 
 def _said(wrong: int, fine: int, size: int) -> str:
-    """The states in words: shares of wrong are of what is known, as in tables and limits."""
+    """The states in words: known is a share of the pixels with a depth, wrong one of what is known, as in tables and
+    limits."""
     known = wrong + fine
     told = f", of which {100 * wrong / known:.1f} % are wrong" if known else ""
-    return f"Known: {100 * known / size:.0f} % of the picture{told}"
+    return f"Known: {100 * known / size:.0f} % of the depth{told}" if size else "No depth"

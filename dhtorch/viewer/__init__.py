@@ -5,6 +5,6 @@
 is to be seen of a recording is computed by ``dhtorch.studies.exhibits``.
 """
 
-from dhtorch.viewer.exhibit import Cloud, DepthImage, Exhibit, Picture, Shot, SweptCloud
+from dhtorch.viewer.exhibit import Cloud, DepthImage, Exhibit, Opening, Picture, Shot, SweptCloud
 
-__all__ = ["Cloud", "DepthImage", "Exhibit", "Picture", "Shot", "SweptCloud"]
+__all__ = ["Cloud", "DepthImage", "Exhibit", "Opening", "Picture", "Shot", "SweptCloud"]

@@ -89,6 +89,16 @@ class Shot:
 
 
 @dataclass(frozen=True)
+class Opening:
+    """What a page begins with, before anything can be turned."""
+
+    numbers: Mapping[str, str]  # what it is → how much
+    said: Sequence[str] = ()  # sentences
+    picture: bytes | None = None  # PNG
+    caption: str = ""
+
+
+@dataclass(frozen=True)
 class Exhibit:
     """All that is shown of one recording."""
 
@@ -97,6 +107,7 @@ class Exhibit:
     views: Sequence[Picture] = ()
     path: np.ndarray | None = None  # (n, 3) m, camera centres of the whole recording; None = no trajectory
     facts: Mapping[str, str] = field(default_factory=dict)
+    opening: Opening | None = None
 
     @property
     def placed(self) -> bool:

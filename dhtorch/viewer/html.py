@@ -7,7 +7,6 @@ base64. Names come from files of others: they enter as JSON text in which no mar
 from __future__ import annotations
 
 import base64
-import html
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,9 @@ from dhtorch import storage
 from dhtorch.codes import Gate, Hole, names, words
 from dhtorch.drawing import colours
 from dhtorch.drawing.colours import GATES, HOLES, RECOVERED, SENSOR
-from dhtorch.viewer.exhibit import Cloud, Exhibit, Picture, Shot, SweptCloud
+from dhtorch.drawing.document import sheet
+from dhtorch.drawing.markup import Markup, escape, png_address, tag
+from dhtorch.viewer.exhibit import Cloud, Exhibit, Opening, Picture, Shot, SweptCloud
 
 ENDINGS = (".html", ".htm")
 
@@ -50,8 +51,9 @@ def page(scene: Exhibit) -> str:
         raise ValueError(f"view: found no pair in {scene.name}, expected at least one")
     text = storage.dumps(_data(scene), ensure_ascii=True, separators=(",", ":"))
     parts = {
-        "title": html.escape(f"{scene.name} · dhtorch"),
-        "style": colours.style_sheet() + _file("page.css"),
+        "title": escape(f"{scene.name} · dhtorch"),
+        "style": sheet(_HERE / "page.css"),
+        "opening": _opening(scene.opening) if scene.opening is not None else "",
         # Neither "</script" nor "<!--" may stand in a script's text; in JSON strings an escape says the same.
         "data": text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"),
         "script": "\n".join(_file(name) for name in _SCRIPTS),
@@ -72,6 +74,17 @@ def write(path: Path, scene: Exhibit) -> Path:
         OSError: the file cannot be written.
     """
     return storage.replace_file(path, page(scene).encode("utf-8"))
+
+
+def _opening(opening: Opening) -> Markup:
+    """Numbers, sentences and a picture, above what can be turned."""
+    numbers = (tag("div", tag("dt", what), tag("dd", amount)) for what, amount in opening.numbers.items())
+    parts = [tag("dl", *numbers, class_="numbers"), *(tag("p", text) for text in opening.said)]
+    if opening.picture is not None:
+        shown = tag("img", alt=opening.caption, src=png_address(opening.picture))
+        below = tag("figcaption", opening.caption) if opening.caption else ""
+        parts.append(tag("figure", tag("div", shown, class_="scroll", tabindex="0"), below))
+    return tag("section", *parts, id="opening", aria_label="What was recovered")
 
 
 def _data(scene: Exhibit) -> dict[str, Any]:

@@ -50,8 +50,9 @@ function tellPair() {
 }
 
 function tellCoverage() {
-  const chosen = state.all ? shots : [shots[state.now]], total = { holes: 0, answers: 0, kept: 0 };
+  const chosen = state.all ? shots : [shots[state.now]], total = { holes: 0, answers: 0, kept: 0, swept: 0, stay: 0 };
   const risk = { scores: [], errors: [], candidates: 0 };
+  for (const s of chosen) for (let k = 0; k < s.swept.n; k++) { total.swept++; total.stay += s.swept.score[k] >= state.threshold; }
   for (const s of chosen) for (let k = 0; k < s.n; k++) {
     if (s.source[k] !== 1) total.holes++;
     if (s.source[k] >= 2) { total.answers++; total.kept += s.score[k] >= state.threshold; }
@@ -60,7 +61,7 @@ function tellCoverage() {
   }
   const left = risk.errors.filter((_, k) => risk.scores[k] >= state.threshold);
   const share = hasViews ? `: ${percent(total.kept / total.holes)} of the ${total.holes} samples without a usable return` : "";
-  const first = total.answers ? `${total.kept} of ${total.answers} answers stay${share}.` : "Nothing beyond the sensor was recovered here.";
+  const first = [total.answers ? `${total.kept} of ${total.answers} answers stay${share}.` : "", total.swept ? `${total.stay} of ${total.swept} swept points stay.` : ""].filter(Boolean).join(" ") || "Nothing beyond the sensor was recovered here.";
   const second = left.length ? ` Of ${risk.candidates} held-back returns ${percent(left.length / risk.candidates)} are answered, median error ${percent(quantile(left, 0.5))}.` : "";
   $("coverage").textContent = first + second;
   $("threshold-value").textContent = state.threshold.toFixed(2);
@@ -137,6 +138,15 @@ function play() {
   $("play").setAttribute("aria-pressed", String(Boolean(state.playing)));
 }
 
+// Turns of an overview: that is taken from which all is seen from nearest by, so that it fills the canvas.
+const OVER = [-0.55, -0.9, 0.55, 0.9].flatMap((yaw) => [9, 13, 17].map((pitch) => [yaw, pitch / 20]));
+
+// At most 400 of many, evenly.
+function everyFew(many) {
+  const step = Math.max(1, Math.ceil(many.length / 400));
+  return many.filter((_, k) => k % step === 0);
+}
+
 // The way the anchor looks, turned; then as far back as it takes to see nearly all points and the camera.
 function lookFrom(name) {
   const s = shots[state.now], l = layers[state.now], T = s.T_world_from_0, o = centre(T), ahead = axis(T, 2);
@@ -152,10 +162,13 @@ function lookFrom(name) {
     eye.target = add(o, ahead, size.depth);
     return redraw();
   }
-  eye.turn(...{ over: [-0.55, 0.45], above: [0, 1.5 - eye.pitch], side: [-1.3, 0.15], camera: [0, 0] }[name]);
-  const points = [...Array(s.n).keys()].filter((k) => s.source[k]).map((k) => l.world.subarray(3 * k, 3 * k + 3));
-  for (let k = 0; k < s.swept.n; k += 20) points.push(place(s.T_world_from_0, ...s.swept.xyz.subarray(3 * k, 3 * k + 3)));
-  eye.fit([...points, o], space.canvas.clientWidth / Math.max(space.canvas.clientHeight, 1), 0.07 * size.depth);
+  const points = everyFew([...Array(s.n).keys()].filter((k) => s.source[k])).map((k) => l.world.subarray(3 * k, 3 * k + 3));
+  for (const k of everyFew([...Array(s.swept.n).keys()])) points.push(place(s.T_world_from_0, ...s.swept.xyz.subarray(3 * k, 3 * k + 3)));
+  const aspect = space.canvas.clientWidth / Math.max(space.canvas.clientHeight, 1), { yaw, pitch } = eye;
+  const ways = { over: OVER, above: [[0, 1.5 - pitch]], side: [[-1.3, 0.15]], camera: [[0, 0]] }[name];
+  const from = (turn) => { Object.assign(eye, { yaw, pitch }); eye.turn(...turn); eye.fit([...points, o], aspect, 0.07 * size.depth); return eye.distance; };
+  const near = ways.map(from);
+  from(ways[near.indexOf(Math.min(...near))]);
   redraw();
 }
 

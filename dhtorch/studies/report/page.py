@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import groupby
 from pathlib import Path
 
 from dhtorch import storage
 from dhtorch.drawing import Key, inline
-from dhtorch.drawing.colours import style_sheet, variable
+from dhtorch.drawing.colours import variable
+from dhtorch.drawing.document import document
+from dhtorch.drawing.markup import Markup, join, tag
 from dhtorch.studies.report import jobs, published
 from dhtorch.studies.report.figure import Figure
 from dhtorch.studies.report.layouts import SHOWN, in_layout
-from dhtorch.studies.report.markup import Markup, join, tag
 from dhtorch.studies.report.plots import figures
 from dhtorch.studies.report.reading import Result
 from dhtorch.studies.report.tables import INTERVAL, PUBLISHED, Table, every_number, generic
@@ -31,9 +33,6 @@ def page(results: Sequence[Result]) -> str:
         results: valid ones, as from :func:`dhtorch.archive.read`.
     """
     title = "dhtorch: results"
-    style = Markup(style_sheet() + STYLE.read_text(encoding="utf-8"))
-    metas = ({"charset": "utf-8"}, {"name": "viewport", "content": "width=device-width, initial-scale=1"})
-    head = tag("head", *(tag("meta", **m) for m in metas), tag("title", title), tag("style", style))
     names = _anchors(results)
     sections = [_section(result, name) for result, name in zip(results, names, strict=True)]
     skip = tag("a", "To the results", href=f"#{names[0]}" if names else "#", class_="skip")
@@ -42,11 +41,10 @@ def page(results: Sequence[Result]) -> str:
     overview = _overview(results, names)
     if any(in_layout(result) for result in results):
         top = tag("header", tag("h1", title), tag("p", _about(results), class_="lead"), sweep, overview)
-        body = tag("body", skip, top, tag("main", *sections))
-    else:  # no line of the paper stands here: the numbers begin
-        top = tag("header", tag("h1", title), sweep)
-        body = tag("body", skip, top, tag("main", *sections), tag("footer", overview))
-    return "<!doctype html>\n" + tag("html", head, body, lang="en") + "\n"
+        return document(title, skip, top, tag("main", *sections), own=STYLE)
+    # no line of the paper stands here: the numbers begin
+    top = tag("header", tag("h1", title), sweep)
+    return document(title, skip, top, tag("main", *sections), tag("footer", overview), own=STYLE)
 
 
 def _one_sweep(results: Sequence[Result]) -> bool:
@@ -126,7 +124,7 @@ def _section(result: Result, name: str) -> Markup:
     first = [] if paper or result["verdict"] else generics[:1]  # one's own numbers, before anything is explained
     parts = [heading, *map(table_markup, first), tag("p", facts, class_="facts"), _question(result)]
     parts += map(table_markup, paper)
-    parts += [figure_markup(figure) for figure in drawn if not figure.folded]
+    parts.append(figures_markup([figure for figure in drawn if not figure.folded]))
     folded = [figure_markup(figure) for figure in drawn if figure.folded]
     parts += [tag("details", tag("summary", "The same of the other variants"), *folded)] if folded else []
     tables = [table_markup(table) for table in generics[len(first) :]]
@@ -235,6 +233,15 @@ def figure_markup(figure: Figure) -> Markup:
     drawn = [Markup(inline(panel)) for panel in figure.panels]
     panels = tag("div", *drawn, class_="panels wide" if figure.wide else "panels")
     return tag("figure", below, tag("ul", *legend, class_="legend") if legend else "", panels)
+
+
+def figures_markup(drawn: Sequence[Figure]) -> Markup:
+    """Figures one below the other; those of one panel stand side by side where there is room."""
+    made = []
+    for alone, group in groupby(drawn, key=lambda figure: len(figure.panels) == 1 and not figure.wide):
+        each = [figure_markup(figure) for figure in group]
+        made.append(tag("div", *each, class_="figures") if alone else join(each))
+    return join(made)
 
 
 def _swatch(key: Key) -> Markup:

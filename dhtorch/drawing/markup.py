@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import html
 import re
 from collections.abc import Iterable
@@ -51,5 +52,10 @@ def join(parts: Iterable[object], between: str = "") -> Markup:
     return Markup(between.join(escape(part) for part in parts))
 
 
+def png_address(picture: bytes) -> str:
+    """A picture as an address that holds it: a page needs nothing beside itself."""
+    return f"data:image/png;base64,{base64.b64encode(picture).decode('ascii')}"
+
+
 #: Elements that have no content; any other without content keeps its closing tag.
-_EMPTY = frozenset(["meta", "link", "br", "hr"])
+_EMPTY = frozenset(["meta", "link", "br", "hr", "img"])

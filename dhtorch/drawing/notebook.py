@@ -1,0 +1,26 @@
+"""How figures of a notebook are drawn: as wide as the text of a printed page, sharp on paper, in letters that are as
+large as those around them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+#: Width of a figure, inches.
+WIDTH = 7.2
+
+#: For ``matplotlib.pyplot.rcParams``; sizes in points.
+SETTINGS: Mapping[str, Any] = {
+    "figure.dpi": 160,
+    "figure.labelsize": 8,
+    "font.size": 8,
+    "axes.titlesize": 8.5,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "lines.linewidth": 1.2,
+    "lines.markersize": 3.5,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "scatter.edgecolors": "none",
+}
