@@ -108,7 +108,7 @@ def test_workers_give_the_same_bytes(robot, whole, tmp_path):
 
 @pytest.mark.slow
 def test_a_cluster_gives_the_same_bytes(robot, whole, tmp_path):
-    pytest.importorskip("ray")
+    pytest.importorskip("ray.data")
     assert tree(enrich(robot, tmp_path / "set", "engine=ray")) == tree(whole)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("ray")
+pytest.importorskip("ray.data")
 pytest.importorskip("pyarrow")
 
 from dhtorch.extract import Features

@@ -4,15 +4,18 @@ import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
+import hydra
 import numpy as np
 import pytest
 import torch
 
-from dhtorch import archive
+from dhtorch import archive, data
 from dhtorch import testing as writers
-from dhtorch.commands.run import main
+from dhtorch.commands.run import config_dir, main
 from dhtorch.integrate import mapping
+from dhtorch.methods import METHODS
 from dhtorch.studies import report
 from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.viewer import points
@@ -24,9 +27,12 @@ TINY = [
     "data.step_m=0.04",
     "data.gap=3",
     "pairs=gap",
+    "method=map",
     "method.n=512",
+    "dense=false",
     "voxel=0.06",
 ]
+SWEPT = [option for option in TINY if option not in ("method=map", "dense=false")]
 FILES = {"map.ply", "map.glb", "points.ply", "map.png", "cameras.txt", "images.txt", "points3D.txt"}
 
 
@@ -137,10 +143,10 @@ def test_a_recording_without_a_trajectory_asks_for_anchored_poses(command, tmp_p
     folder = tmp_path / "walk"
     writers.write_tum(folder, [room[i] for i in range(4)])
     (folder / "groundtruth.txt").unlink()
-    data = ["data=tum", f"data.root={folder}", "pairs.gap=3", "method.n=512", "voxel=0.06", "output=here"]
-    code, _, err = command(*data)
+    own = ["data=tum", f"data.root={folder}", "pairs.gap=3", "method=map", "method.n=512", "voxel=0.06", "output=here"]
+    code, _, err = command(*own)
     assert code == 2 and "walk has no trajectory of its own, expected poses=anchored" in err
-    code, out, err = command(*data, "poses=anchored", "mesh=false")
+    code, out, err = command(*own, "poses=anchored", "mesh=false")
     assert code == 0, err
     assert "2 of 2 frames placed by anchored poses, 1 fragment" in out and "triangles" not in out
 
@@ -184,7 +190,7 @@ def test_help_shows_every_option(command):
 
 
 def test_a_dense_map_says_what_the_sweep_added(command, tmp_path):
-    code, out, err = command(*TINY, "cutoff=2.0", "dense={planes: 32, size: 160}", "mesh=false", "output=here")
+    code, out, err = command(*SWEPT, "cutoff=2.0", "dense={planes: 32, size: 160}", "mesh=false", "output=here")
     assert code == 0, err
     assert "times those without a sweep" in out
     here = tmp_path / "here"
@@ -202,6 +208,54 @@ def test_a_dense_map_says_what_the_sweep_added(command, tmp_path):
     assert len(shot.swept.xyz) > 200 and len(shot.swept.xyz) + len(shot.samples["xyz"]) == scene["n_points"]
     glb = (here / "synthetic_room" / "map.glb").read_bytes()
     assert b'"name":"swept"' in glb and b'"_SOURCE"' in glb
+
+
+def composed(*overrides, word="integrate"):
+    """Settings of a word, and the choices of groups."""
+    with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
+        cfg = hydra.compose(word, list(overrides), return_hydra_config=True)
+    return cfg, cfg.hydra.runtime.choices
+
+
+def test_the_built_in_room_shows_what_views_add_and_a_recording_hides_nothing():
+    room, _ = composed()
+    assert room.cutoff == room.data.near == 2.0 and room.dense is True and room.pairs.stride == 2
+    own, _ = composed("data=auto", "data.root=x")
+    assert own.cutoff is None and own.dense is False and own.pairs.stride is None
+    plain, _ = composed("dense={size: 99}", "cutoff=null", "pairs.stride=1")
+    assert plain.cutoff is None and plain.dense == {"size": 99} and plain.pairs.stride == 1, "what is said wins"
+
+
+@pytest.mark.parametrize("word", ["integrate", "view"])
+def test_what_sweeps_is_a_method_of_several_views_unless_another_is_said(word):
+    assert composed("dense=true", word=word)[1].method == "auto"
+    assert composed("dense=true", "method=map", word=word)[1].method == "map"
+    assert METHODS[composed(word=word)[1].method].views > 1
+
+
+@pytest.mark.data
+@pytest.mark.skipif("DHTORCH_DATA" not in os.environ, reason="DHTORCH_DATA is unset")
+@pytest.mark.parametrize(
+    ("name", "least", "most"),
+    [
+        ("holo_a", 0.005, 0.02),
+        ("tum_fr1_desk9", 0.0025, 0.01),
+        ("r3d_door", 0.005, 0.005),
+        ("7s_redkitchen_000", 0.004, 0.012),
+    ],
+)
+def test_a_voxel_is_two_pixels_of_the_sensor(name, least, most):
+    recording = data.open(Path(os.environ["DHTORCH_DATA"]) / name)
+    voxel = mapping.voxel_of(recording)
+    assert least <= voxel <= most and voxel == float(f"{voxel:.2g}")
+    frames = [recording[k] for k in (0, len(recording) // 2, len(recording) - 1)]
+    sizes = []
+    for frame in frames:
+        depth = frame.depth[0].double().numpy()
+        side = float((frame.depth_camera or frame.camera).f.mean())
+        side *= 1 if frame.depth_camera is not None else depth.shape[1] / max(frame.hw[1], 1)
+        sizes.append(float(np.median(depth[np.isfinite(depth) & (depth > 0)])) / side)
+    assert voxel == pytest.approx(max(0.005, 2 * sorted(sizes)[1]), rel=0.06), "two digits"
 
 
 @pytest.mark.data

@@ -182,7 +182,21 @@ def test_a_job_and_a_map_without_a_gap(tmp_path, monkeypatch, capsys):
     assert said.count("dhtorch.offers: frame ") == 2 and "chosen of 2" in said
     result = archive.read(tmp_path / "job")
     assert [r["pair"][0] for r in result["rows"] if r["pair"]] == [0, 2]
-    assert run.main(["integrate", *tiny[:-1], "poses=anchored", "voxel=0.1", "mesh=false", "output=map"]) == 0
+    assert (
+        run.main(
+            [
+                "integrate",
+                *tiny[:-1],
+                "dense=false",
+                "pairs.stride=1",
+                "poses=anchored",
+                "voxel=0.1",
+                "mesh=false",
+                "output=map",
+            ]
+        )
+        == 0
+    )
     rows = archive.read(tmp_path / "map")["rows"]
     assert [r["pair"][0] for r in rows if r["pair"]] == [0, 1, 2] and all(r["views"] for r in rows if r["pair"])
     scene = next(r for r in rows if r["pair"] is None)

@@ -24,6 +24,7 @@ from rooms import Changed, noted
 from rooms import room as rendered
 
 from dhtorch import archive, closure, data, export, viewer
+from dhtorch import testing as writers
 from dhtorch.codes import Gate, Source, names
 from dhtorch.commands import run
 from dhtorch.data.pairs import by_choice, by_gap
@@ -73,6 +74,26 @@ def command(tmp_path, monkeypatch, capsys):
 
 
 # ----------------------------------------------------------------------------------------------- what there is to see
+
+
+def test_a_result_finds_its_data_wherever_it_is_and_is_called_from(command, tmp_path, monkeypatch):
+    room = SyntheticRoom(hw=(60, 80), n_frames=3, lidar="exact", supersample=1)
+    writers.write_counted_frames(tmp_path / "capture", [room[i] for i in range(3)])
+    options = ["data=auto", "data.root=capture", "pairs.gap=2", "method.n=256", "holdout=none", "figures=false"]
+    code, _, err = command(*options, "output=job")
+    assert code == 0, err
+    place = tmp_path / "far" / "away"
+    place.mkdir(parents=True)
+    (tmp_path / "job").rename(place / "job")
+    monkeypatch.chdir(place)
+    monkeypatch.delenv("DHTORCH_DATA", raising=False)
+    code, _, err = command("view", "job", "html=page.html")
+    assert code == 0 and "alone" not in err and (place / "page.html").stat().st_size > 1000, err
+    (tmp_path / "capture").rename(tmp_path / "moved")
+    code, _, err = command("view", "job", "html=lost.html")
+    assert code == 2 and "root=PATH" in err and not (place / "lost.html").exists(), err
+    code, _, err = command("view", "job", f"root={tmp_path / 'moved'}", "html=found.html")
+    assert code == 0 and (place / "found.html").is_file(), err
 
 
 def test_every_sample_has_one_fate(scene):

@@ -2,6 +2,7 @@
 
 import csv
 import re
+from types import SimpleNamespace
 
 import pytest
 from test_manners import ROOM, command  # noqa: F401  (a fixture)
@@ -103,3 +104,26 @@ def test_silence_comes_with_advice(gate, word):
     row = {"scene": "s", "pair": None, "method": "m", "gate_share": {"answer": 0.0, gate: 0.9, "residual": 0.1}}
     assert word in advice({"rows": [row]})[0]
     assert advice({"rows": [{**row, "gate_share": {"answer": 0.3, gate: 0.7}}]}) == []
+
+
+def test_one_bar_covers_all_jobs_and_scenes_of_every_process(command, tmp_path, monkeypatch):  # noqa: F811
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    seen, asked = [], []
+
+    def draw(notes, n_jobs, stop):
+        asked.append(n_jobs)
+        while not stop.wait(0.02):
+            seen.append(together.read(notes))
+        seen.append(together.read(notes))
+
+    monkeypatch.setattr(together, "_draw", draw)
+    monkeypatch.setattr(together, "sys", SimpleNamespace(stderr=SimpleNamespace(isatty=lambda: True)))
+    rooms = ["data=synthetic_seeds", "data.seed=[0,1]", "data.hw=[60,80]", "data.n_frames=3"]
+    options = ["method.n=256", "pairs.gap=1,2", "figures=false", "launch=joblib", "hydra.launcher.n_jobs=2"]
+    code, _, err = command("-m", *rooms, *options, "output=sweep")
+    assert code == 0, err
+    assert asked == [2], "jobs, which the bar is over"
+    done = [share for share, _, _ in seen]
+    assert done == sorted(done) and seen[-1] == (2.0, 2, []), "the notes of two workers are one growing sum"
+    assert any(0 < share < 2 for share in done), "it moves while they run"
+    assert not (tmp_path / "sweep" / together.NOTES).exists()

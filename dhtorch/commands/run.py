@@ -185,9 +185,6 @@ def _run_configured(word: str, argv: list[str]) -> int:
         return _show(word, argv)
     _refuse_flags(argv, SHOW)
     argv = _named(argv, FIRST_WORDS.get(word, ()))
-    names = {a.partition("=")[0] for a in argv if a not in ("dense=false", "dense=null")}
-    if word in ("integrate", "view") and "dense" in names and not {"method", "result"} & names:
-        argv = [*argv, "method=auto"]  # others sweep one view alone
     words.refuse_words(argv, ())
     argv = words.quoted(argv)
     try:

@@ -67,7 +67,7 @@ def _archived(target: Path, settings: Mapping[str, Any], progress: Progress) -> 
         scenes = result["data"]["scenes"]
         ply = folder / str(_chosen(scenes, name, str)) / "points.ply"
         if not ply.is_file():
-            raise
+            raise ValueError(f"{error}; root=PATH says where the data are") from error
         print(f"{error}; showing the points of {ply} alone (root=PATH says where the data are)", file=sys.stderr)
         return replace(points.read(ply), name=str(_chosen(scenes, name, str)))
     facts = {"experiment": result["experiment"], "data": result["data"]["name"], "made": result["meta"]["utc"]}

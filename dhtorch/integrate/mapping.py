@@ -110,9 +110,7 @@ def make(scene: Scene, method: Method, pairs: Pairs, settings: Mapping[str, Any]
         ValueError: as the readers, the method and the volume raise it; no frame that could be placed.
     """
     recording, chosen = scene.recording, list(pairs(scene))
-    hidden = settings["cutoff"] is None and recording.root is None  # the built-in room shows what views add
-    settings = {**settings, "cutoff": scene.near if hidden else settings["cutoff"]}
-    settings["voxel"] = voxel_of(recording) if settings["voxel"] is None else settings["voxel"]
+    settings = {**settings, "voxel": voxel_of(recording) if settings["voxel"] is None else settings["voxel"]}
     sweep = Sweep.asked(settings["dense"])
     options = {k: settings[k] for k in ("cutoff", "seed", "device")} | {"dtype": getattr(torch, settings["dtype"])}
     asked = recordings.ask(scene, method, chosen, sweep=sweep, shelf=Shelf(Path(settings["output"])), **options)
