@@ -53,6 +53,9 @@ SCATTERED, QUARTERS = 4, 4
 #: Relative error below which nobody asks which of two models fits a near return better.
 EXACT: Final = 0.002
 
+#: What is lost by a model that could not be fitted.
+LOST: Final = 10.0
+
 #: Bounds of what the anchors left out do to sigma, and how many leave it as it is.
 STRETCH, UNMOVED = (0.3, 4.0), 20
 
@@ -196,6 +199,8 @@ def _chosen(task: Task, names: tuple[str, ...]) -> tuple[Fit, Chosen]:
         simple = torch.tensor([names.index(head) for head in HEADS if head in names], device=place.device)
         asked = torch.cat((simple.expand(len(weight), -1), weight.argmax(-1, keepdim=True)), -1)
         left = _left_out(task, place[asked])
+        fitted = every.evidence.gather(1, asked).isfinite()
+        left = left._replace(r=torch.where(fitted[..., None, None], left.r, torch.nan))
         drifts = [list(MODELS.values())[k].head for k in place.tolist()]
         head = torch.tensor(drifts, device=place.device)[asked[:, -1]] - drifts[0]
         taken = _simplest(points, left, head)[:, None]
@@ -267,7 +272,8 @@ def _lost(points: Anchors, left: _Left) -> _Blocks:
     core = near.nan_to_num(torch.inf).amin(-1).clamp(EXACT, FLOOR)[:, None]
     alone = torch.where(points.near, core.square(), points.var + points.shared.square())
     loss = 0.5 * (r.square() / alone[:, None]).log1p()
-    known = loss.isfinite().all(1)[:, None]
+    known = loss.isfinite().any(1)[:, None]
+    loss = loss.nan_to_num(LOST)
     block = points.block[:, None]
     total = loss.new_zeros(*loss.shape[:2], 2 * BLOCKS[0] * BLOCKS[1])
     count = total[:, :1].scatter_add(2, block, known.to(loss))
