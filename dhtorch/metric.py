@@ -5,8 +5,8 @@
     anchors ┘             └─ and a smooth field ──┘        └─ its rivals, and anchors left out: sigma
 
 What a map lacks is a metre, then a shift, then a slow drift over picture and depth (:mod:`dhtorch.distortion`). More is
-believed only as far as it makes the anchors more probable than its freedom costs; where it does not, the map is left
-alone.
+believed only as far as it makes the anchors more probable than its freedom costs, and tells those that were left out
+better; where it does not, the map is left alone.
 
 Alphabet: ``x`` value of the map, ``r`` residual of log depth, ``K`` models, ``M`` the most probable ones.
 """
@@ -21,7 +21,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch import distortion
-from dhtorch.anchors import BLOCKS, Anchors, at_anchors, gathered, nugget
+from dhtorch.anchors import BLOCKS, CORRELATED, FLOOR, Anchors, at_anchors, gathered, nugget
 from dhtorch.codes import Gate, Source, first_reason
 from dhtorch.distortion import HEADS, MODELS, WITHIN, Fit, Task
 from dhtorch.geometry.covariance import median
@@ -49,6 +49,12 @@ STRIDE: Final = 8
 
 #: Anchors are left out in so many turns: scattered blocks, and quarters of the picture.
 SCATTERED, QUARTERS = 4, 4
+
+#: Relative error below which nobody asks which of two models fits a near return better.
+EXACT: Final = 0.002
+
+#: What is lost by a model that could not be fitted.
+LOST: Final = 10.0
 
 #: Bounds of what the anchors left out do to sigma, and how many leave it as it is.
 STRETCH, UNMOVED = (0.3, 4.0), 20
@@ -86,7 +92,8 @@ def anchor(
     Robust fits (Student's t) tie the map to the anchors: nothing, a scale, a scale and a shift; on top a tilt or a
     field over the picture and a correction over depth, both Gaussian processes, so that they are zero away from
     anchors. How far anchors are off by themselves is found with each fit, and how probable they are under it (its
-    evidence) decides which is taken; its two nearest rivals are part of sigma. An error that all far answers share (the
+    evidence) says which may be taken; it is, in place of a plain head, only where anchors that were left out bear it
+    out. Its two nearest rivals are part of sigma. An error that all far answers share (the
     motion's) is an unknown of the fit and no part of the answer.
 
     Sigma is the covariance of what was fitted, stretched until anchors that were left out (scattered blocks, and whole
@@ -173,8 +180,15 @@ def _starts(x: Tensor, y: Tensor, points: Anchors) -> Tensor:
     return torch.stack((none, scale, line), 1)
 
 
+class _Left(NamedTuple):
+    """Anchors left out in turns T, as C models predict them."""
+
+    r: Tensor  # (B, C, T, N) residuals of log depth, NaN where they were not left out
+    var: Tensor  # (B, C, T, N) of the residual, as the model states it
+
+
 def _chosen(task: Task, names: tuple[str, ...]) -> tuple[Fit, Chosen]:
-    """The most probable models (B, M), best first, with their shares as evidence, and how probable all are."""
+    """The chosen model and its likeliest rivals (B, M) with their shares as evidence, and how probable all are."""
     points = task.points
     place = torch.tensor([list(MODELS).index(name) for name in names], device=points.x.device)
     with torch.no_grad():
@@ -182,27 +196,96 @@ def _chosen(task: Task, names: tuple[str, ...]) -> tuple[Fit, Chosen]:
         some = every.evidence.isfinite().any(-1) & (points.used.sum(-1) >= FEWEST)
         prior = every.evidence.new_tensor([MODELS[name].prior for name in names])
         weight = torch.softmax(torch.where(some[:, None], every.evidence + prior, 0.0), -1)
-        top = weight.topk(min(RIVALS, len(names)), -1).indices
-        model = torch.where(some, top[:, 0], -1)
-        factor = _stretch(task, place[top[:, :1]])
-    best = distortion.fit(task, place[top], points.used, distortion.MANY)
-    return best._replace(evidence=weight.gather(1, top).log()), Chosen(model, names, weight, factor)
+        simple = torch.tensor([names.index(head) for head in HEADS if head in names], device=place.device)
+        asked = torch.cat((simple.expand(len(weight), -1), weight.argmax(-1, keepdim=True)), -1)
+        left = _left_out(task, place[asked])
+        fitted = every.evidence.gather(1, asked).isfinite()
+        left = left._replace(r=torch.where(fitted[..., None, None], left.r, torch.nan))
+        drifts = [list(MODELS.values())[k].head for k in place.tolist()]
+        head = torch.tensor(drifts, device=place.device)[asked[:, -1]] - drifts[0]
+        taken = _simplest(points, left, head)[:, None]
+        factor = _stretch(points, left, taken)
+        best = asked.gather(1, taken)
+        # What the anchors left out do not tell from the most probable model shares alike with it.
+        weight = weight.scatter(1, best, weight.amax(-1, keepdim=True))
+        weight = weight / weight.sum(-1, keepdim=True)
+        rivals = weight.scatter(1, best, 2.0).topk(min(RIVALS, len(names)), -1).indices
+        model = torch.where(some, best[:, 0], -1)
+    fits = distortion.fit(task, place[rivals], points.used, distortion.MANY)
+    return fits._replace(evidence=weight.gather(1, rivals).log()), Chosen(model, names, weight, factor)
 
 
-def _stretch(task: Task, model: Tensor) -> Tensor:
-    """By how much sigma (B,) must grow or shrink for 68 % of the near anchors left out to lie within one."""
+def _left_out(task: Task, model: Tensor) -> _Left:
+    """Anchors as models (B, C) predict them that were fitted without them."""
     points = task.points
     cell = points.block // 2
     row, column = cell // BLOCKS[1], cell % BLOCKS[1]
     quarter = 2 * (2 * row // BLOCKS[0]) + 2 * column // BLOCKS[1]
     turns = [(row * 2 + column) % SCATTERED == k for k in range(SCATTERED)] + [quarter == k for k in range(QUARTERS)]
     out = torch.stack(turns, 1)
-    fit = distortion.fit(task, model.expand(-1, len(turns)), points.used[:, None] & ~out)
+    every = out.repeat(1, model.shape[1], 1)
+    fit = distortion.fit(task, model.repeat_interleave(len(turns), 1), points.used[:, None] & ~every)
     mean, var = distortion.predicted(fit, task)
     noise = (WITHIN * fit.noise[..., :1]).clamp_max(1.0).square() * points.var[:, None]
-    ratio = (points.depth.log()[:, None] - mean).abs() / (var + noise).sqrt()
-    asked = out & (points.used & points.near)[:, None] & fit.evidence.isfinite()[..., None]
-    ratio = torch.where(asked, ratio, torch.nan).flatten(1)
+    asked = every & points.used[:, None] & fit.evidence.isfinite()[..., None]
+    r = torch.where(asked, points.depth.log()[:, None] - mean, torch.nan)
+    return _Left(*(part.unflatten(1, (model.shape[1], len(turns))) for part in (r, var + noise)))
+
+
+def _simplest(points: Anchors, left: _Left, head: Tensor) -> Tensor:
+    """Place (B,) of the first model whose loss is within one standard error of the least, blocks of the picture being
+    the unit (Breiman's rule): one error bar in favour of what changes the map less. The last one has the head at the
+    places ``head`` (B,) and perhaps a drift. The metre is the near returns'; what bends the map beyond a scale, far
+    answers must bear out, too, where there are any."""
+    block = _lost(points, left)
+    n = block.mean.shape[1]
+    of_far = block.mass * (torch.arange(block.mass.shape[-1], device=block.mass.device) % 2 == 0)
+    far = (of_far * block.mean).sum(-1)
+    below = torch.arange(n, device=far.device) - 1
+    below = torch.cat((below[:-1].expand(len(far), -1), head[:, None]), -1)
+    least_below = far.cummin(-1).values.gather(1, below.clamp_min(0))
+    bends = torch.arange(n, device=far.device) >= max(1, n - 2)
+    told = (points.used & ~points.near).sum(-1, keepdim=True) >= FEWEST
+    refused = bends & told & (far >= least_below)
+    mean = (block.mass * block.mean).sum(-1).masked_fill(refused, torch.inf)
+    least = mean.argmin(-1)[:, None, None]
+    more = block.mean - block.mean.gather(1, least.expand(-1, 1, block.mean.shape[-1]))
+    middle = (block.mass * more).sum(-1, keepdim=True)
+    error = (block.mass.square() * (more - middle).square()).sum(-1).sqrt()
+    good = (middle[..., 0] <= error) & mean.isfinite()
+    return good.to(torch.int8).argmax(-1)
+
+
+class _Blocks(NamedTuple):
+    """What models lose in blocks of the picture, near and far ones being two."""
+
+    mean: Tensor  # (B, C, blocks)
+    mass: Tensor  # (B, 1, blocks) share of all, as far as anchors of one block count as fewer
+
+
+def _lost(points: Anchors, left: _Left) -> _Blocks:
+    """The loss of an anchor is the logarithm of how far it is off, above what it may be off by itself: for far answers
+    what they state, for near returns the least median that any model leaves, since returns are often better than they
+    say. A core that a model fits exactly so outweighs a tail that another makes shorter."""
+    r = left.r.square().nanmean(2).sqrt()
+    near = torch.where(points.near[:, None], r, torch.nan).nanmedian(-1).values
+    core = near.nan_to_num(torch.inf).amin(-1).clamp(EXACT, FLOOR)[:, None]
+    alone = torch.where(points.near, core.square(), points.var + points.shared.square())
+    loss = 0.5 * (r.square() / alone[:, None]).log1p()
+    known = loss.isfinite().any(1)[:, None]
+    loss = loss.nan_to_num(LOST)
+    block = points.block[:, None]
+    total = loss.new_zeros(*loss.shape[:2], 2 * BLOCKS[0] * BLOCKS[1])
+    count = total[:, :1].scatter_add(2, block, known.to(loss))
+    mean = total.scatter_add(2, block.expand_as(loss), torch.where(known, loss, 0.0)) / count.clamp_min(1)
+    mass = count / (1 + CORRELATED * (count - 1).clamp_min(0))
+    return _Blocks(mean, mass / mass.sum(-1, keepdim=True).clamp_min(1e-9))
+
+
+def _stretch(points: Anchors, left: _Left, taken: Tensor) -> Tensor:
+    """By how much sigma (B,) must grow or shrink for 68 % of the near anchors left out to lie within one."""
+    r, var = (part.gather(1, taken[..., None, None].expand(-1, 1, *part.shape[2:]))[:, 0] for part in left)
+    ratio = torch.where(points.near[:, None], r.abs() / var.sqrt(), torch.nan).flatten(1)
     n = ratio.isfinite().sum(-1)
     found = ratio.nanquantile(0.683, -1).nan_to_num(1.0).clamp_min(1e-3)
     return (found.log() * n / (n + UNMOVED)).exp().clamp(*STRETCH)

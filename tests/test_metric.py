@@ -183,3 +183,58 @@ def test_summary_and_verdict_of_the_study():
     assert found["anchor.worst_ratio_to_better"]["value"] == pytest.approx(0.2)
     assert anchor_study.verdict(found) == (True, "5 of 5 bars met")
     assert anchor_study.verdict({})[0] is None
+
+
+def test_exact_returns_outweigh_edges_that_an_affine_map_would_hide():
+    """What blurs the edges of a map leaves most returns exact: the map is not bent until its edges look better."""
+    truth, near, far = world(noise=0.0, n=600)
+    g = torch.Generator().manual_seed(1)
+    off = torch.rand(near.depth.shape, generator=g) < 0.45
+    edge = near.depth + torch.where(off, 0.25 * (1.6 - near.depth), 0.0)
+    near = near.replace(depth=torch.where(near.usable, edge, near.depth))
+    few = far.replace(gate=torch.where(torch.arange(600) % 20 > 0, Gate.NO_TRACK, far.gate).to(torch.int32))
+    assert error(anchor(truth, [near, few]), truth) < 0.005
+
+
+def test_maps_of_a_batch_may_have_anchors_of_their_own_number():
+    truth, near, far = world(batch=2)
+    fewer = torch.tensor([[1], [0]], dtype=torch.bool) | (torch.arange(near.depth.shape[1]) % 4 == 0)
+    some = near.replace(xyz=torch.where(fewer[..., None], near.xyz, torch.nan))
+    both = anchor(0.8 * truth, [some, far])
+    for k in range(2):
+        one = anchor(0.8 * truth[k : k + 1], [some[k : k + 1], far[k : k + 1]])
+        assert torch.allclose(one.depth, both.depth[k : k + 1], rtol=1e-9)
+
+
+@pytest.mark.parametrize("left", [2, 7])
+def test_a_handful_of_anchors_is_no_answer(left):
+    truth, near, _ = world()
+    first = near.usable & (near.usable.cumsum(-1) <= left)
+    some = near.replace(xyz=torch.where(first[..., None], near.xyz, torch.nan))
+    assert (anchor(truth, some).gate == Gate.NO_POSE).all()
+
+
+def test_near_returns_alone_are_enough():
+    truth, near, far = world()
+    none = far.replace(gate=torch.full_like(far.gate, Gate.NO_BASELINE))
+    found = anchor(0.8 * truth, [near, none])
+    assert found.keep.all() and error(found, truth) < 0.01
+    assert torch.allclose(found.depth, anchor(0.8 * truth, near).depth, rtol=1e-6)
+
+
+def test_anchors_that_are_all_wrong_are_no_reason_to_be_sure():
+    truth, near, far = world()
+    g = torch.Generator().manual_seed(5)
+    factor = (2 * torch.rand(near.depth.shape, generator=g) - 1).mul(0.7).exp()
+    found = anchor(truth, [near.replace(depth=near.depth * factor), far.replace(depth=far.depth * factor)])
+    kept = found.keep
+    assert not kept.any() or float((found.sigma / found.depth)[kept].median()) > 0.1
+
+
+def test_disparity_may_have_zeros_and_holes():
+    truth, near, far = world()
+    x = 40 / truth - 40 / truth.max()
+    x[:, :, :3] = torch.nan
+    found = anchor(x, [near, far], kind="inverse")
+    assert (found.gate[:, :, :3] == Gate.NO_TRACK).all() and (x == 0).any()
+    assert found.keep[:, :, 3:].double().mean() > 0.99 and error(found, truth) < 0.01

@@ -157,15 +157,17 @@ def summary(rows: Sequence[Row], names: Sequence[str]) -> Row:
         key = by.replace(" ", "_")
         for name in names:
             found[f"{key}.{name}_median"] = bootstrap.interval(errors(name, by)).entry("1")
-    ratios, worst = [], []
-    for name in (n for n in names if n in OF_NETWORKS):
-        for ours, raw, near in zip(*(errors(name, by) for by in (OURS, RAW, NEAR_ONLY)), strict=True):
-            if ours is None or raw is None or near is None:
+    ratios, worst = torch.full((len(scenes), len(names)), torch.nan, dtype=torch.float64), []
+    for column, name in enumerate(names):
+        for row, (ours, raw, near) in enumerate(zip(*(errors(name, by) for by in (OURS, RAW, NEAR_ONLY)), strict=True)):
+            if name not in OF_NETWORKS or ours is None or raw is None or near is None:
                 continue
-            ratios.append(ours / max(near, 1e-6))
+            ratios[row, column] = ours / max(near, 1e-6)
             worst.append((ours - TOO_SMALL) / max(min(raw, near), 1e-6))
     networks = [r for (_, name, by), r in at.items() if by == OURS and name in OF_NETWORKS]
-    found["anchor.ratio_to_near_affine"] = bootstrap.single(_median(ratios), len(scenes))
+    some = ratios[ratios.isfinite().any(1)]
+    of_scenes = bootstrap.interval_of(lambda index: some[index].flatten(1).nanquantile(0.5, -1), len(some))
+    found["anchor.ratio_to_near_affine"] = of_scenes.entry("1")
     found["anchor.worst_ratio_to_better"] = bootstrap.single(max(worst) if worst else None, len(scenes))
     for key in ("within_sigma", "within_2sigma"):
         means = [_mean([r[key] for r in networks if r["scene"] == scene]) for scene in scenes]
@@ -297,7 +299,3 @@ def _row(scene: Scene, method: str, fault: str | None) -> Row:
 
 def _mean(values: Sequence[float]) -> float | None:
     return sum(values) / len(values) if values else None
-
-
-def _median(values: Sequence[float]) -> float | None:
-    return float(torch.tensor(values, dtype=torch.float64).quantile(0.5)) if values else None
