@@ -92,7 +92,7 @@ def row(name: str, path: Path, told: Sequence[str], target: str, folder: Path) -
     before = digest(path)
     done, seconds = run(words)
     if done.returncode:
-        why = " ".join(done.stderr.split()).removeprefix("dhtorch: ").replace(f"{path.parent}{os.sep}", "")
+        why = " ".join(done.stderr.split()).rpartition("dhtorch: ")[2].replace(f"{path.parent}{os.sep}", "")
         return found | {"refused": why}
     again, idle = run(words)
     frames = sum(min(FRAMES, len(each)) for each in source)

@@ -335,7 +335,8 @@ def enriched() -> str:
     for found in sorted(json.loads(file.read_text()), key=lambda found: (found["source"], found["data"])):
         name = f"`{found['data']}`" if found["made"] == "real" else "written"
         if "refused" in found:
-            rows.append([found["refused"], found["source"], name, found["target"], "refused", "", "", ""])
+            why = found["refused"].rpartition("dhtorch: ")[2]  # what stands before it are warnings
+            rows.append([why, found["source"], name, found["target"], "refused", "", "", ""])
             continue
         weight = "" if found["mb_per_minute"] is None else f"{found['mb_per_minute']:.1f}"
         same = f"{found['compared']:,} values" if found["source_untouched"] and found["done_again"] else "no"
