@@ -74,7 +74,7 @@ class Chosen(NamedTuple):
 
     model: Tensor  # (B,) int64, the most probable one's place in ``names``; -1 where there is none
     names: tuple[str, ...]
-    weight: Tensor  # (B, K) probability
+    weight: Tensor  # (B, K) probability; the chosen one's is that of the likeliest
     factor: Tensor  # (B,) by which sigma was stretched
 
 
