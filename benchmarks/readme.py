@@ -247,8 +247,9 @@ def how_good() -> str:
 
 
 def milliseconds(file: str, name: str) -> float:
-    """What a row of a timing script took on one thread."""
-    found = [r["ours_ms"] for r in speed_tables.timings(file) if (r["name"], r["threads"]) == (name, 1)]
+    """What a row of a timing script took on one thread, in torch."""
+    wanted = (name, 1, "eager")
+    found = [r["ours_ms"] for r in speed_tables.timings(file) if (r["name"], r["threads"], r["mode"]) == wanted]
     return float(found[0])
 
 
@@ -273,14 +274,21 @@ TIMED = (
 
 def loader_times() -> str:
     """What the transform costs in a loader, in one sentence."""
-    rows = {r["name"]: r for r in speed_tables.timings("loader") if r["peer"] == "plain_loader"}
+    rows = {(r["name"], r["mode"]): r for r in speed_tables.timings("loader") if r["threads"] == 1}
+
+    def taken(views: str, mode: str) -> list[dict[str, Any]]:
+        names = (f"loader_{views}_640x480_workers0{kind}" for kind in ("", "_by_batch"))
+        return [rows[name, mode] for name in names if (name, mode) in rows]
+
     said = []
     for views, words in (("single", "one view"), ("pair", "two views")):
-        alone, batch = (rows[f"loader_{views}_640x480_workers0{kind}"] for kind in ("", "_by_batch"))
+        alone, batch = taken(views, "eager")
         said.append(f"{alone['ours_ms']:.0f} ms with {words} ({batch['ours_ms']:.0f} by batch)")
-    plain = rows["loader_single_640x480_workers0"]
+    plain, _ = taken("single", "eager")
+    compiled = [f"{r['ours_ms']:.0f}" for r in taken("pair", "native")]
+    native = f"; after `python -m dhtorch.native`, which compiles the search, {' and '.join(compiled)}" * bool(compiled)
     return (
-        f"A sample of 640×480 takes {' and '.join(said)}, {plain['peer_ms']:.0f} ms of which is decoding\n"
+        f"A sample of 640×480 takes {' and '.join(said)}{native}; {plain['peer_ms']:.0f} ms of it is decoding\n"
         f"(`python benchmarks/loader.py`; one thread, {plain['processor']})."
     )
 

@@ -29,6 +29,8 @@ BARS = (
     ("pair", "pair_map_b1", "eager", 2.0, "`map`, whole pair, B = 1"),
     ("pair", "pair_map_b8", "eager", 1.3, "`map`, whole pair, B = 8"),
     ("pair", "pair_map_b8.per_far_answer", "eager", 0.2, "`map`, a far answer within 5 %, B = 8"),
+    ("pair", "every_pixel.per_far_answer", "eager", 0.2, "every pixel, a far answer within 5 %"),
+    ("pair", "every_pixel.per_far_answer", "native", 0.2, "every pixel, a far answer within 5 %"),
     ("pair", "anchor_auto", "eager", 0.7, "`auto`, an anchor, beside `WINDOW_1`"),
     ("loader", "loader_single_640x480_workers0", "eager", 1.2, "loader with one view, 640×480"),
     ("loader", "loader_single_640x480_workers0_by_batch", "eager", 1.1, "the same, a batch at once"),
