@@ -236,24 +236,32 @@ def _simplest(points: Anchors, left: _Left, head: Tensor) -> Tensor:
     """Place (B,) of the first model whose loss is within one standard error of the least, blocks of the picture being
     the unit (Breiman's rule): one error bar in favour of what changes the map less. The last one has the head at the
     places ``head`` (B,) and perhaps a drift. The metre is the near returns'; what bends the map beyond a scale, far
-    answers must bear out, too, where there are any."""
+    answers must not refute, where there are any: not lose more by it than one standard error."""
     block = _lost(points, left)
     n = block.mean.shape[1]
     of_far = block.mass * (torch.arange(block.mass.shape[-1], device=block.mass.device) % 2 == 0)
     far = (of_far * block.mean).sum(-1)
     below = torch.arange(n, device=far.device) - 1
-    below = torch.cat((below[:-1].expand(len(far), -1), head[:, None]), -1)
-    least_below = far.cummin(-1).values.gather(1, below.clamp_min(0))
+    below = torch.cat((below[:-1].expand(len(far), -1), head[:, None]), -1).clamp_min(0)
+    simpler = far.cummin(-1).indices.gather(1, below)
+    worse, error = _against(block.mean, simpler, of_far)
     bends = torch.arange(n, device=far.device) >= max(1, n - 2)
     told = (points.used & ~points.near).sum(-1, keepdim=True) >= FEWEST
-    refused = bends & told & (far >= least_below)
+    refused = bends & told & (worse > error)
     mean = (block.mass * block.mean).sum(-1).masked_fill(refused, torch.inf)
-    least = mean.argmin(-1)[:, None, None]
-    more = block.mean - block.mean.gather(1, least.expand(-1, 1, block.mean.shape[-1]))
-    middle = (block.mass * more).sum(-1, keepdim=True)
-    error = (block.mass.square() * (more - middle).square()).sum(-1).sqrt()
-    good = (middle[..., 0] <= error) & mean.isfinite()
+    more, error = _against(block.mean, mean.argmin(-1, keepdim=True).expand(-1, n), block.mass)
+    good = (more <= error) & mean.isfinite()
     return good.to(torch.int8).argmax(-1)
+
+
+def _against(loss: Tensor, other: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
+    """By how much models (B, C) lose more in blocks of a ``mass`` than models at places ``other`` (B, C), and the
+    standard error of that."""
+    more = loss - loss.gather(1, other[..., None].expand_as(loss))
+    total = mass.sum(-1, keepdim=True).clamp_min(1e-9)
+    middle = (mass * more).sum(-1, keepdim=True) / total
+    error = ((mass / total).square() * (more - middle).square()).sum(-1).sqrt()
+    return middle[..., 0], error
 
 
 class _Blocks(NamedTuple):
