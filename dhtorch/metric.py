@@ -235,8 +235,9 @@ def _left_out(task: Task, model: Tensor) -> _Left:
 def _simplest(points: Anchors, left: _Left, head: Tensor) -> Tensor:
     """Place (B,) of the first model whose loss is within one standard error of the least, blocks of the picture being
     the unit (Breiman's rule): one error bar in favour of what changes the map less. The last one has the head at the
-    places ``head`` (B,) and perhaps a drift. The metre is the near returns'; what bends the map beyond a scale, far
-    answers must not refute, where there are any: not lose more by it than one standard error."""
+    places ``head`` (B,) and perhaps a drift. The metre is the near returns'; where there are far answers, they must
+    not refute a shift (lose more by it than one standard error), and bear a drift out: what near returns alone ask for
+    in their part of the picture is no evidence of the far part."""
     block = _lost(points, left)
     n = block.mean.shape[1]
     of_far = block.mass * (torch.arange(block.mass.shape[-1], device=block.mass.device) % 2 == 0)
@@ -245,9 +246,11 @@ def _simplest(points: Anchors, left: _Left, head: Tensor) -> Tensor:
     below = torch.cat((below[:-1].expand(len(far), -1), head[:, None]), -1).clamp_min(0)
     simpler = far.cummin(-1).indices.gather(1, below)
     worse, error = _against(block.mean, simpler, of_far)
-    bends = torch.arange(n, device=far.device) >= max(1, n - 2)
+    place = torch.arange(n, device=far.device)
     told = (points.used & ~points.near).sum(-1, keepdim=True) >= FEWEST
-    refused = bends & told & (worse > error)
+    bent = (place == max(1, n - 2)) & (worse > error)
+    drifts = (place == n - 1) & (worse >= 0)
+    refused = told & (bent | drifts)
     mean = (block.mass * block.mean).sum(-1).masked_fill(refused, torch.inf)
     more, error = _against(block.mean, mean.argmin(-1, keepdim=True).expand(-1, n), block.mass)
     good = (more <= error) & mean.isfinite()
