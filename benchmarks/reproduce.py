@@ -90,6 +90,7 @@ SCRIPTS |= {
     "judge_speed": "--clock cpu --repeats 9",
     "judge_real": "",
     "fuzz": "--full",
+    "kills": "--times 50",
     "clients": "",  # interpreters of the loaders in DHTORCH_CLIENTS
 }
 
