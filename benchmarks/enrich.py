@@ -8,7 +8,7 @@ other work beside it matters little, less that of the same command once more, wh
 
 ``compared`` counts the values of the result that were held against the source's, one by one: pictures, depth where the
 sensor has one (within half a step), intrinsics, poses, columns, bytes of videos. What loaders of others make of the
-sets is in ``benchmarks/clients/results.json``, by the same names of source and target.
+sets is in ``benchmarks/results/clients.json``, by the same names of source and target.
 """
 
 from __future__ import annotations

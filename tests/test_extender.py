@@ -245,6 +245,20 @@ def test_rows_of_a_batch_without_a_view_are_silent_beside_the_others():
     assert added(tiny(Told([4, 4]), batched=True)(given))["pose_code"].tolist() == [4, 0]
 
 
+@pytest.mark.parametrize("padded", [True, False])
+@pytest.mark.parametrize("batched", [True, False])
+def test_a_padded_view_of_a_nested_sample_is_no_view(padded, batched):
+    given = batch(2) if batched else sample()
+    where = {"image": "observation.images.front", "other_image": "observation.images.before"}
+    pictures = {"front": given.pop("image"), "before": given.pop("before")}
+    pictures["before_is_pad"] = torch.tensor([[False], [padded]]) if batched else torch.tensor([padded])
+    mine = added(
+        tiny(Told([0, 0] if batched else [0]), batched=batched, **where)({**given, "observation": {"images": pictures}})
+    )
+    alone = SampleProblem.NO_SECOND_VIEW if padded else SampleProblem.NONE
+    assert mine["problem"].flatten().tolist() == ([SampleProblem.NONE, alone] if batched else [alone])
+
+
 def test_the_worst_problem_is_told():
     none = 0 * sample()["depth"]
     for changes, options, problem in (

@@ -43,6 +43,15 @@ def find(sample: Mapping[str, Any], key: str) -> Any:
     return value
 
 
+def has(sample: Mapping[str, Any], key: str) -> bool:
+    """Whether there is a value under a key, as :func:`find` looks for it."""
+    try:
+        find(sample, key)
+    except SampleError:
+        return False
+    return True
+
+
 def to_tensor(value: Any, key: str, *, signed: bool = True) -> Tensor:
     """A plain tensor of an array, a picture, numbers or a tensor of any class; unsigned words made ``signed``.
 
@@ -84,7 +93,8 @@ def check_sample(sample: Any, image: str, intrinsics: Numbers, batched: bool | N
     except SampleError:
         return  # said where it is read
     n = len(images) if getattr(images, "ndim", 0) == 4 else 1
-    if tuple(getattr(sample.get(f"{image}_is_pad"), "shape", ())) == (n,):
+    flag = f"{image}_is_pad"
+    if has(sample, flag) and tuple(getattr(find(sample, flag), "shape", ())) == (n,):
         return  # LeRobot's delta_timestamps: time
     keys: tuple[Any, ...] = () if n < 2 else (intrinsics, *_COUNTED, *sample)
     for key in keys:
@@ -185,7 +195,7 @@ class Leaves:
         """(B, T) whether a frame only pads the start or end of an episode: LeRobot's ``<key>_is_pad``."""
         assert self.like is not None
         name = f"{key}_is_pad"
-        if name not in self.sample:
+        if not has(self.sample, name):
             return torch.zeros(self.like.shape[0], T, dtype=torch.bool, device=self.like.device)
         x = self.get(name).bool().flatten(1)
         if x.shape[1] != T:
