@@ -62,7 +62,7 @@ def main() -> int:
             folder = Path(options.pages or scratch).resolve() / name
             folder.mkdir(parents=True, exist_ok=True)
             found += [{"name": name} | row for row in rows(data / name, asked, folder)]
-    options.json.write_text(storage.dumps(storage.strict(found), indent=1) + "\n")
+    storage.write_json(options.json, storage.strict(found))
     return 0
 
 

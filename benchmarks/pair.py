@@ -130,26 +130,24 @@ def measure_every_pixel(threads: int, options: Any, n: int = 2048) -> list[dict[
     harness.set_threads(threads)
     _, near, other, _, _ = pair = load(1)
 
-    def ours() -> DepthMap:
-        with torch.no_grad():
+    def ours(mode: str = "eager") -> DepthMap:
+        with torch.no_grad(), MODES[mode]():
             return dense.complete(near, other, method=MAP, partners=1)
-
-    def compiled() -> DepthMap:
-        with harness.natively():
-            return ours()
 
     def peer() -> None:
         with torch.no_grad():
             PEER(near, other, n=n)
 
-    *sides, theirs = harness.in_turn([ours, compiled, peer], repeats=options.repeats, clock=options.clock)
+    *sides, theirs = harness.in_turn(
+        [*(partial(ours, mode) for mode in MODES), peer], repeats=options.repeats, clock=options.clock
+    )
     error, their_error = pixel_errors(ours(), pair), answers(PEER, pair).answered().error
     good, their_good = (int((e <= GOOD).sum()) for e in (error, their_error))
     common = {"n": n, "batch": 1, "ours_error": float(error.median()), "peer_error": float(their_error.median())}
     b = [t / their_good for t in theirs]
     return [
         harness.row("every_pixel.per_far_answer", [t / good / EVERY**2 for t in side], "opencv", b, mode=mode, **common)
-        for mode, side in zip(("eager", "native"), sides, strict=True)
+        for mode, side in zip(MODES, sides, strict=True)
     ]
 
 

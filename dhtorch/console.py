@@ -27,6 +27,11 @@ EPILOG = (
 )
 
 
+def many(n: int, word: str) -> str:
+    """A number of things, the word with an s unless there is one."""
+    return f"{n} {word}{'s' * (n != 1)}"
+
+
 def plain(text: str) -> str:
     """The text without what a terminal would obey: control characters, and marks that turn the direction of writing,
     are spelt out. Line ends and tabs stay."""

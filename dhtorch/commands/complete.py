@@ -407,11 +407,16 @@ def _write_extras(task: Task, i: int) -> None:
     picture = _picture(frame, source.shape)
     for path in wanted:
         if path.suffix == ".png":
-            out = io.BytesIO()
-            draw_completed(out, frame.image[0], **maps, source=source, title=title_of(task, i))
-            storage.replace_file(path, out.getvalue())
+            storage.replace_file(path, drawn(task, i, frame, maps, source))
         else:
             _write_points(path, frame, picture, **maps, source=source)
+
+
+def drawn(task: Task, i: int, frame: Frame, maps: Mapping[str, np.ndarray], source: np.ndarray) -> bytes:
+    """The figure of a whole frame, PNG; ``maps`` and ``source`` as of :func:`maps_of`."""
+    out = io.BytesIO()
+    draw_completed(out, frame.image[0], **maps, source=source, title=title_of(task, i))
+    return out.getvalue()
 
 
 def title_of(task: Task, i: int) -> str:

@@ -21,6 +21,7 @@ import torch
 
 from dhtorch import causes, storage
 from dhtorch.codes import State, names
+from dhtorch.console import many
 from dhtorch.data import depth_maps, files
 from dhtorch.data import intrinsics as told
 from dhtorch.data.depth_maps import DepthMaps
@@ -317,9 +318,9 @@ def _said(name: str, whole: Row) -> list[str]:
     wrong = "nothing can be known" if whole["wrong"] is None else f"{whole['wrong']:.1%} of what is known is wrong"
     unknown = "no depth" if held["unknown"] is None else f"{held['unknown']:.1%} cannot be known"
     scale = "scale cannot be known" if middle["scale"] is None else f"scale {middle['scale']:.3f}"
-    lines = [f"{name}: {whole['frames']} frame{'s' * (whole['frames'] != 1)}: {wrong}, {unknown}; {scale}"]
+    lines = [f"{name}: {many(whole['frames'], 'frame')}: {wrong}, {unknown}; {scale}"]
     for cause, n in sorted(whole["causes"].items(), key=lambda item: -item[1]):
-        lines.append(f"  likely cause in {n} of {whole['windows']} window{'s' * (whole['windows'] != 1)}: {cause}")
+        lines.append(f"  likely cause in {n} of {many(whole['windows'], 'window')}: {cause}")
     return lines
 
 

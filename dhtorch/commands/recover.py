@@ -7,7 +7,6 @@ there soon and the same command does more. What cannot work is said in one sente
 from __future__ import annotations
 
 import inspect
-import io
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,12 +21,11 @@ from dhtorch.codes import Source
 from dhtorch.commands import complete, recover_page
 from dhtorch.commands.complete import Progress, Task
 from dhtorch.commands.inspect import Found, classified, find
-from dhtorch.commands.recover_page import count
+from dhtorch.console import many
 from dhtorch.data import FORMATS, FormatError, files, open_all
 from dhtorch.data import intrinsics as told
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
-from dhtorch.drawing import draw_completed
 from dhtorch.integrate.from_maps import FrameMap, join
 from dhtorch.integrate.mapping import meshed, voxel_of, write_surface
 from dhtorch.method import Method
@@ -128,7 +126,7 @@ def captured(path: Path, format: str = "auto") -> list[Found]:
     if depths:
         what = f"{len(pictures)} pictures and {len(depths)} depth maps of no known format"
         raise NothingToDo(f"{path}: {what}; a layout of docs/data.md is needed, as rgb/ beside depth/")
-    what = f"{count(len(pictures), 'picture')} without depth"
+    what = f"{many(len(pictures), 'picture')} without depth"
     raise NothingToDo(f"{path}: {what}; a sensor's depth of what is near is needed, it gives the metre (docs/data.md)")
 
 
@@ -184,7 +182,7 @@ def _looked_at(recording: Recording) -> int:
     """
     if len(recording) < 2:
         help = "a second view from another place is needed for what the sensor lacks"
-        raise NothingToDo(f"{recording.name}: {count(len(recording), 'frame')}; {help}")
+        raise NothingToDo(f"{recording.name}: {many(len(recording), 'frame')}; {help}")
     causes, blank = [], 0
     for k in coarse_to_fine(len(recording))[:TRIED]:
         try:
@@ -199,7 +197,7 @@ def _looked_at(recording: Recording) -> int:
             return k
         blank += 1
     if blank:
-        what = f"{count(len(recording), 'frame')}, of {blank} looked at none has depth"
+        what = f"{many(len(recording), 'frame')}, of {blank} looked at none has depth"
         raise NothingToDo(f"{recording.name}: {what}; a sensor's depth of what is near is needed, it gives the metre")
     raise NothingToDo(f"{recording.name}: no frame can be read: {causes[0]}")
 
@@ -291,11 +289,9 @@ def _unreadable(recording: Recording, k: int) -> str:
 
 def _overview(task: Task, i: int) -> bytes:
     """Write the picture that shows most: what the camera saw, the sensor, the completed map."""
-    maps, source = complete.maps_of(task, i)
-    out = io.BytesIO()
-    draw_completed(out, task.recording[i].image[0], **maps, source=source, title=complete.title_of(task, i))
-    storage.replace_file(task.folder / "overview.png", out.getvalue())
-    return out.getvalue()
+    picture = complete.drawn(task, i, task.recording[i], *complete.maps_of(task, i))
+    storage.replace_file(task.folder / "overview.png", picture)
+    return picture
 
 
 def _mapped(made: Made, opening: Opening, settings: Mapping[str, Any], progress: Progress) -> list[str]:
@@ -329,7 +325,7 @@ def _next(made: Made, shown: str) -> str:
     """What to do with what is there; ``shown`` is the file to open."""
     n, name = len(made.broken), made.task.scene.name
     cause = next(iter(made.broken.values()), "")
-    broken = f" {count(n, 'frame')} of {name} could not be read ({cause})." if n else ""
+    broken = f" {many(n, 'frame')} of {name} could not be read ({cause})." if n else ""
     if made.left:
         more = f"the same command does more of the {made.left} frames left (minutes=null: all)"
         return f"Next: open {shown}; {more}.{broken}"

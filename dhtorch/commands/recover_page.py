@@ -11,6 +11,7 @@ import numpy as np
 from dhtorch.codes import Gate, Source, names, words
 from dhtorch.commands import complete
 from dhtorch.commands.complete import Row, Task
+from dhtorch.console import many
 from dhtorch.data import intrinsics as told
 from dhtorch.viewer.exhibit import Opening
 
@@ -103,13 +104,13 @@ def _silent(rows: Sequence[Row]) -> dict[str, float]:
 def sentences(task: Task, found: Numbers, hw: tuple[int, int]) -> list[str]:
     """What it is, and what was recovered; of pictures (h, w)."""
     recording, (h, w) = task.recording, hw
-    kind = f"{task.scene.name}: a {recording.format} capture, {count(len(recording), 'frame')} of {w}x{h}"
+    kind = f"{task.scene.name}: a {recording.format} capture, {many(len(recording), 'frame')} of {w}x{h}"
     guess = told.guessed(recording.report)
     what = f"{kind}; the sensor answers {found.sensor:.0%} of the pixels{f'; its {guess}' if guess else ''}."
     if found.error is None:
         return [what, f"Nothing was recovered: {_why(found)}."]
     amount = f"Recovered {found.pixels:,.0f} pixels a frame that the sensor lacks, from {found.near:.1f} m to"
-    of = f"({count(found.frames, 'frame')})"
+    of = f"({many(found.frames, 'frame')})"
     return [what, f"{amount} {found.far:.1f} m, median stated error {found.error:.1%} {of}."]
 
 
@@ -138,8 +139,3 @@ def _why(found: Numbers) -> str:
         if name in known and share > 0.01:
             return "; ".join(known[name])
     return "nothing lies beyond the sensor, which answers nearly everywhere; cutoff=2.0 shows what views can do"
-
-
-def count(n: int, word: str) -> str:
-    """A number of things."""
-    return f"{n} {word}{'s' * (n != 1)}"

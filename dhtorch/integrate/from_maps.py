@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial, reduce
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import reduce
 from typing import Any, NamedTuple
 
 import torch
@@ -17,7 +17,7 @@ from dhtorch.integrate.recording import mapped
 from dhtorch.integrate.scales import REACH, TOLD_BY, coarse, union
 from dhtorch.integrate.surface import Surface, mesh, points
 from dhtorch.integrate.sweeps import edges
-from dhtorch.integrate.volume import Volume, confirmed, empty, fuse, reserve
+from dhtorch.integrate.volume import View, Volume, confirmed, empty, fuse, reserve
 from dhtorch.records import Pose
 
 #: Swept maps that must agree on a surface of which nothing else speaks; of fewer maps all.
@@ -65,11 +65,8 @@ def join(
     if not poses:
         raise ValueError(f"{recording.name}: found no frame with a finite pose, expected one at least")
     wide = coarse(voxel, _sigmas([read(k) for k in list(poses)[:TOLD_BY]]))
-    views = partial(_fused, recording, poses, read, progress=progress)
-    if wide is None:
-        volumes = [views(empty(voxel), (Source.SENSOR, Source.SWEPT))]
-    else:
-        volumes = [views(empty(voxel), (Source.SENSOR,)), views(empty(wide), (Source.SENSOR, Source.SWEPT))]
+    volumes = [empty(voxel), *([] if wide is None else [empty(wide)])]
+    volumes = _fused(recording, poses, read, volumes, progress=progress)
     surface = reduce(union, map(points, volumes))
     placed = list(poses.values())
     up = upwards(recording, placed, surface.xyz, 2 * voxel) if len(surface.xyz) else mean_upwards(placed).tolist()
@@ -80,21 +77,27 @@ def _fused(
     recording: Recording,
     poses: Mapping[int, Pose],
     read: Callable[[int], FrameMap],
-    volume: Volume,
-    sources: Sequence[int],
+    volumes: Sequence[Volume],
     *,
     progress: Progress,
-) -> Volume:
-    """The volume after these sources of all frames."""
-    if Source.SWEPT in sources:
-        for k in poses:
-            volume = reserve(volume, _view(recording, k, read(k), Source.SWEPT, poses[k]), max_reach=REACH)
-    for source in sources:
+) -> list[Volume]:
+    """The volumes after all frames: what the sensor says in each of them, what was swept in the last."""
+
+    def views(source: int) -> Iterator[View]:
         name = "sensor" if source == Source.SENSOR else "swept"
         for k in progress(list(poses), f"{recording.name}: {name}", len(poses)):
-            view = _view(recording, k, read(k), source, poses[k])
-            volume = fuse(volume, view, source=source, max_reach=REACH)
-    return confirmed(volume, min(MIN_MAPS, len(poses)))
+            yield _view(recording, k, read(k), source, poses[k])
+
+    *finer, last = volumes
+    for k in poses:
+        last = reserve(last, _view(recording, k, read(k), Source.SWEPT, poses[k]), max_reach=REACH)
+    volumes = [*finer, last]
+    for view in views(Source.SENSOR):
+        volumes = [fuse(volume, view, max_reach=REACH) for volume in volumes]
+    *finer, last = volumes
+    for view in views(Source.SWEPT):
+        last = fuse(last, view, source=Source.SWEPT, max_reach=REACH)
+    return [*finer, confirmed(last, min(MIN_MAPS, len(poses)))]
 
 
 def _sigmas(maps: Sequence[FrameMap]) -> Tensor:
@@ -109,7 +112,7 @@ def _places(recording: Recording, frames: Sequence[int]) -> dict[int, Pose]:
     return {k: T for k, T in poses.items() if bool(T.R.isfinite().all() and T.t.isfinite().all())}
 
 
-def _view(recording: Recording, k: int, found: FrameMap, source: int, T_world_from_cam: Pose) -> Any:
+def _view(recording: Recording, k: int, found: FrameMap, source: int, T_world_from_cam: Pose) -> View:
     """The pixels of one source, but for those beside a step."""
     depth, sigma = found.depth[None], found.sigma[None]
     keep = (found.source[None] == source) & (depth > 0) & (sigma > 0) & (edges(depth) <= EDGE_REL)

@@ -58,11 +58,9 @@ class ExtendedDataset(Dataset[Any]):
         if gap is not None and (gap < 1 or transform.views.other_image is None):
             raise ValueError(f"gap is {gap}: expected a positive one, and a transform with other_image")
         if transform.batched != by_batch:
-            single, batches = (
-                "single samples, expected ExtendDepth(batched=True)",
-                "batches, expected one for single samples",
-            )
-            raise ValueError(f"found a transform for {single if by_batch else f'{batches}, or by_batch=True'}")
+            single = "single samples, expected ExtendDepth(batched=True)"
+            batches = "batches, expected one for single samples, or by_batch=True"
+            raise ValueError(f"found a transform for {single if by_batch else batches}")
         if by_batch and transform.on_error != "raise":
             raise ValueError(f"on_error is {transform.on_error!r}, expected raise where by_batch is set")
         self.by_batch = by_batch

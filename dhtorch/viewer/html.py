@@ -15,6 +15,7 @@ import numpy as np
 
 from dhtorch import storage
 from dhtorch.codes import Gate, Hole, names, words
+from dhtorch.console import many
 from dhtorch.drawing import colours
 from dhtorch.drawing.colours import GATES, HOLES, RECOVERED, SENSOR
 from dhtorch.drawing.document import sheet
@@ -93,7 +94,7 @@ def _data(scene: Exhibit) -> dict[str, Any]:
     outcomes += [(name, words(name), GATES[code]) for code, name in names(Gate).items() if code != Gate.ANSWER]
     n = sum(len(shot.samples["depth"]) for shot in scene.shots)
     swept = sum(len(shot.swept.xyz) for shot in scene.shots)
-    said = f"{_many(len(scene.shots), 'pair')}, {n} samples" if scene.views else f"{n + swept} points"
+    said = f"{many(len(scene.shots), 'pair')}, {n} samples" if scene.views else f"{n + swept} points"
     said += f", {swept} swept pixels" if scene.views and swept else ""
     return {
         "title": scene.name,
@@ -162,10 +163,6 @@ def _packed(values: np.ndarray, kind: str) -> dict[str, str]:
 
 def _code(code: int, name: str, of: Mapping[int, str]) -> dict[str, Any]:
     return {"code": code, "name": words(name), "colour": of[code]}
-
-
-def _many(n: int, word: str) -> str:
-    return f"{n} {word}{'s' * (n != 1)}"
 
 
 def _file(name: str) -> str:

@@ -61,9 +61,11 @@ def _fewer(vertex: np.ndarray) -> np.ndarray:
     """So many of them as a page can hold: what was recovered first, up to half, as the sensor's lie closer together."""
     draw = np.random.default_rng(0)
     ours = vertex["source"] != Source.SENSOR if "source" in (vertex.dtype.names or ()) else np.zeros(len(vertex), bool)
-    n = min(int(ours.sum()), max(MOST_POINTS // 2, MOST_POINTS - int((~ours).sum())))
-    parts = (ours.nonzero()[0], n), ((~ours).nonzero()[0], min(int((~ours).sum()), MOST_POINTS - n))
-    return vertex[np.sort(np.concatenate([draw.choice(which, count, replace=False) for which, count in parts]))]
+    first = ours.nonzero()[0]
+    rest = (~ours).nonzero()[0]
+    n = min(len(first), max(MOST_POINTS // 2, MOST_POINTS - len(rest)))
+    chosen = [draw.choice(which, k, replace=False) for which, k in ((first, n), (rest, MOST_POINTS - n))]
+    return vertex[np.sort(np.concatenate(chosen))]
 
 
 def _up(path: Path) -> list[float] | None:

@@ -7,6 +7,7 @@ from itertools import groupby
 from pathlib import Path
 
 from dhtorch import storage
+from dhtorch.console import many
 from dhtorch.drawing import Key, inline
 from dhtorch.drawing.colours import variable
 from dhtorch.drawing.document import document
@@ -83,7 +84,7 @@ def _about(results: Sequence[Result]) -> Markup:
     if same:
         said.append(f"Of its benchmarks the paper does not name the sequences; ours are {', '.join(same)}.")
     said.append("The two stand side by side for orientation: no line reproduces a line of the paper.")
-    count = f"Everything on this page comes from {_many(len(results), 'archived result file')}. "
+    count = f"Everything on this page comes from {many(len(results), 'archived result file')}. "
     return join((count, tag("span", PUBLISHED, class_="theirs-word"), " ".join(said)))
 
 
@@ -116,8 +117,8 @@ def _section(result: Result, name: str) -> Markup:
     data, meta = result["data"], result["meta"]
     title = result["experiment"].replace("_", " ")
     heading = tag("h2", title, " ", tag("small", f"on {data['name']}"), id=f"{name}-title")
-    machine = f"{meta['device']}, {meta['dtype']}, {_many(meta['threads'], 'thread')}, seed {meta['seed']}"
-    counts = f"{_many(len(data['scenes']), 'scene')}, {_many(data['n_pairs'], 'pair')}"
+    machine = f"{meta['device']}, {meta['dtype']}, {many(meta['threads'], 'thread')}, seed {meta['seed']}"
+    counts = f"{many(len(data['scenes']), 'scene')}, {many(data['n_pairs'], 'pair')}"
     facts = f"{counts} · {meta['utc']} · code {meta['git'] or 'unknown'} · {machine}"
     paper, drawn = in_layout(result), figures(result)
     generics = generic(result, SHOWN)
@@ -140,10 +141,6 @@ def _section(result: Result, name: str) -> Markup:
         _settings(result),
     ]
     return tag("section", *parts, id=name, aria_labelledby=f"{name}-title")
-
-
-def _many(n: int, word: str) -> str:
-    return f"{n} {word}{'s' * (n != 1)}"
 
 
 def _question(result: Result) -> Markup:
