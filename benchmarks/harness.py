@@ -7,7 +7,10 @@ peer_error, bar}``; ``ratio`` is ours / peer of medians, below 1 = ours is faste
 from __future__ import annotations
 
 import argparse
+import os
 import statistics
+import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -23,6 +26,16 @@ from dhtorch import archive, native, storage
 
 #: Clocks by name: what a wall shows, or (on a busy machine) the time this process was really given.
 CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
+
+#: What holds torch, oneDNN, MKL, OpenCV and (through torch's) our compiled code to AVX2; each library reads its own.
+#: torch.compile keeps what it made for wider vectors and would use it wrongly, so that its cache is another one.
+AVX2 = {
+    "TORCHINDUCTOR_CACHE_DIR": f"{tempfile.gettempdir()}/torchinductor-avx2-{os.getuid()}",
+    "ATEN_CPU_CAPABILITY": "avx2",
+    "ONEDNN_MAX_CPU_ISA": "AVX2",
+    "MKL_ENABLE_INSTRUCTIONS": "AVX2",
+    "OPENCV_CPU_DISABLE": "AVX512-SKX",
+}
 
 
 def in_turn(
@@ -114,6 +127,14 @@ def set_threads(threads: int) -> None:
     cv2.setNumThreads(threads)
 
 
+class _Held(argparse.Action):
+    """Begin the script again in a process whose libraries use no wider vectors than those of AVX2."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        if any(os.environ.get(name) != value for name, value in AVX2.items()):
+            os.execve(sys.executable, [sys.executable, *sys.argv], {**os.environ, **AVX2})
+
+
 def arguments(description: str) -> argparse.ArgumentParser:
     """The options every script has."""
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -121,6 +142,7 @@ def arguments(description: str) -> argparse.ArgumentParser:
     parser.add_argument("--full", action="store_true", help="the whole grid instead of the default few minutes")
     parser.add_argument("--repeats", type=int, default=15)
     parser.add_argument("--clock", choices=[*CLOCKS], default="wall", help="cpu: on a machine that others use too")
+    parser.add_argument("--avx2", action=_Held, nargs=0, help="torch, oneDNN, MKL and OpenCV without AVX-512")
     parser.add_argument("--device", default="cpu", help="cpu, or cuda where the script knows how")
     return parser
 

@@ -340,9 +340,12 @@ def meta(*, device: str, dtype: str, threads: int, seed: int) -> dict[str, Any]:
 def processor(info: str | Path = "/proc/cpuinfo") -> str:
     """The processor by its maker's name, family and model, and the widest vectors it has: speeds depend on them.
 
+    Where ATEN_CPU_CAPABILITY holds torch to narrower ones, that is said as well.
+
     Args:
         info: where Linux describes it; elsewhere only what Python knows is said.
     """
+    held = os.environ.get("ATEN_CPU_CAPABILITY", "").upper()
     try:
         lines = Path(info).read_text(encoding="utf-8", errors="replace").split("\n\n")[0].splitlines()
     except OSError:
@@ -351,6 +354,7 @@ def processor(info: str | Path = "/proc/cpuinfo") -> str:
     flags = known.get("flags", "").split()
     vectors = next((word for flag, word in _VECTORS.items() if flag in flags), platform.machine())
     model = f"family {known['cpu family']} model {known['model']}" if {"cpu family", "model"} <= set(known) else ""
+    vectors = f"{vectors} held to {held}" if held and vectors != held else vectors
     return ", ".join(word for word in (known.get("model name", ""), model, vectors) if word)
 
 

@@ -33,6 +33,9 @@ SOURCES = tuple(Path(__file__).with_name(name) for name in ("native.cpp", "nativ
 #: A product that is fused with a sum would round once where torch rounds twice.
 FLAGS = ("-O3", "-std=c++20", "-fPIC", "-shared", "-ffp-contract=off")
 
+#: What ATEN_CPU_CAPABILITY may hold torch to → the level of x86-64 that has no wider vectors.
+_LEVELS = {"avx2": "x86-64-v3", "default": "x86-64-v2"}
+
 #: The command that makes the file, as errors tell it.
 COMMAND = "python -m dhtorch.native"
 
@@ -119,8 +122,11 @@ def _plain(x: Tensor) -> bool:
 
 
 def _vectors() -> tuple[str, ...]:
-    """What tells the compiler to use all that this processor has; nothing where that is another word."""
-    return ("-march=native",) if platform.machine().lower() in ("x86_64", "amd64") else ()
+    """What tells the compiler to use all that this processor has, or what torch is held to; nothing on other makes."""
+    if platform.machine().lower() not in ("x86_64", "amd64"):
+        return ()
+    held = os.environ.get("ATEN_CPU_CAPABILITY", "").lower()
+    return (f"-march={_LEVELS.get(held, 'native')}",)
 
 
 def _compiler() -> list[str]:

@@ -1,6 +1,7 @@
 """Compiled code answers as torch does, the sweep bit for bit and a search for points up to the rounding of its sums;
 nothing is compiled, loaded or used that nobody asked for."""
 
+import platform
 import shutil
 import subprocess
 import sys
@@ -241,6 +242,15 @@ def test_nothing_is_compiled_silently(tmp_path, monkeypatch):
     with pytest.raises(FileNotFoundError, match=f"not compiled .*; {native.COMMAND} does it"):
         sweep.aggregate(volume(1, 2, 2, 3, most=31))
     assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.skipif(platform.machine().lower() not in ("x86_64", "amd64"), reason="levels are those of x86-64")
+def test_a_torch_held_to_narrower_vectors_has_a_file_of_its_own(monkeypatch):
+    monkeypatch.delenv("ATEN_CPU_CAPABILITY", raising=False)
+    own, flags = native.library(), native._vectors()
+    monkeypatch.setenv("ATEN_CPU_CAPABILITY", "avx2")
+    assert (flags, native._vectors()) == (("-march=native",), ("-march=x86-64-v3",))
+    assert native.library() != own
 
 
 def test_a_compiler_that_is_missing_or_fails_is_told(tmp_path, monkeypatch):

@@ -62,10 +62,15 @@ def test_a_speed_is_told_with_its_processor():
     assert meta["processor"]
 
 
-def test_a_processor_is_named_by_maker_model_and_vectors(tmp_path):
+def test_a_processor_is_named_by_maker_model_and_vectors(tmp_path, monkeypatch):
+    monkeypatch.delenv("ATEN_CPU_CAPABILITY", raising=False)
     told = "processor : 0\nmodel name\t: A. Maker 9000 @ 2 GHz\ncpu family\t: 6\nmodel\t\t: 85\nflags\t: fpu avx2{}\n\nmodel : 2"
     info = tmp_path / "cpuinfo"
     for more, vectors in (("", "AVX2"), (" avx512f", "AVX-512"), (" avx512f amx_tile", "AVX-512 and AMX")):
         info.write_text(told.format(more))
         assert archive.processor(info) == f"A. Maker 9000 @ 2 GHz, family 6 model 85, {vectors}"
     assert archive.processor(tmp_path / "none")
+    monkeypatch.setenv("ATEN_CPU_CAPABILITY", "avx2")
+    assert archive.processor(info).endswith("AVX-512 and AMX held to AVX2")
+    info.write_text(told.format(""))
+    assert archive.processor(info).endswith("model 85, AVX2")
