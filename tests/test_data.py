@@ -271,8 +271,9 @@ def test_scenes_need_their_root(named: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert (first.near, first.gap, second.levels, second.gap) == (2.0, 1, 6, None)
     with pytest.raises(FormatError, match="scenes: found none"):
         data.open_scenes(named)
-    with pytest.raises(FormatError, match=r"scenes: .*expected an entry with a path"):
-        data.open_scenes(named, [{"near": 2.0}])
+    for scene in ({"near": 2.0}, "holo_a"):
+        with pytest.raises(FormatError, match=r"scenes: found .*expected entries with a path, as \{path:holo_a"):
+            data.open_scenes(named, [scene])
 
 
 def test_damaged_pictures(named: Path) -> None:

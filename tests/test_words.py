@@ -57,6 +57,13 @@ def test_an_option_of_a_function_may_be_added_and_no_other(command):  # noqa: F8
     assert command(*TINY, "+method.nothing=1")[0] == 2
 
 
+def test_the_folder_of_what_is_made_is_out_or_output_to_every_command(command, tmp_path):  # noqa: F811
+    assert command(*TINY, "out=a=b")[0] == 0 and (tmp_path / "a=b/result.json").is_file()
+    (line,) = command("complete", "nowhere", "output=o")[2].splitlines()
+    assert "nowhere" in line and "out" not in line
+    assert "nowhere" in command("judge", "nowhere", "out=o")[2]
+
+
 def test_names_of_places_are_one_text():
     assert words.quoted(["output=a=b,c=1/x"]) == ["output='a=b,c=1/x'"]
     assert words.quoted(["out=/tmp/a=b (1)/c"]) == ["out='/tmp/a=b (1)/c'"]

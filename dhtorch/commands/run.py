@@ -184,7 +184,7 @@ def _run_configured(word: str, argv: list[str]) -> int:
     if SHOW & {a.split("=")[0] for a in argv}:
         return _show(word, argv)
     _refuse_flags(argv, SHOW)
-    argv = _named(argv, FIRST_WORDS.get(word, ()))
+    argv = _placed(word, _named(argv, FIRST_WORDS.get(word, ())))
     words.refuse_words(argv, ())
     argv = words.quoted(argv)
     try:
@@ -242,6 +242,12 @@ def _named(argv: list[str], options: Sequence[str]) -> list[str]:
     return argv
 
 
+def _placed(name: str, argv: Iterable[str]) -> list[str]:
+    """The words with the settings' own name of the folder of what is made, ``out`` or ``output``."""
+    own = "out" if "out" in _settings(config_dir() / f"{name}.yaml") else "output"
+    return [f"{own}={a.partition('=')[2]}" if a.startswith(("out=", "output=")) else a for a in argv]
+
+
 def _show(name: str, argv: list[str]) -> int:
     """Hydra's own flags: help, the composed settings, shell completion."""
     import hydra  # noqa: PLC0415
@@ -270,7 +276,7 @@ def _run_hydra(argv: list[str]) -> int:
         return _show("run", argv)
     _refuse_flags(argv, SWEEP | SHOW)
     sweep = bool({*SWEEP, "hydra.mode=MULTIRUN"} & set(argv))
-    overrides = words.quoted([a for a in argv if a not in SWEEP], sweep)
+    overrides = words.quoted(_placed("run", [a for a in argv if a not in SWEEP]), sweep)
     if console.verbosity() == "quiet":
         overrides.append("hydra/hydra_logging=disabled")  # what a launcher says of its jobs
     try:

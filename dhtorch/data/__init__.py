@@ -208,9 +208,9 @@ def open_scenes(root: str | Path | None = None, scenes: Sequence[Mapping[str, An
         raise FormatError(root, "scenes", "none", "a list of scenes, each with a path")
     found: list[Scene] = []
     for scene in scenes:
-        options = dict(scene)
+        options = dict(scene) if isinstance(scene, Mapping) else {}
         if "path" not in options:
-            raise FormatError(root, "scenes", options, "an entry with a path")
+            raise FormatError(root, "scenes", scene, "entries with a path, as {path:holo_a,near:2.5}")
         found += open_capture(root / str(options.pop("path")), **options)
     return found
 
