@@ -8,7 +8,7 @@ import pytest
 from test_manners import ROOM, command  # noqa: F401  (a fixture)
 
 from dhtorch import archive
-from dhtorch.commands import job, together, words
+from dhtorch.commands import job, run, together, view, words
 from dhtorch.studies.report import advice, jobs
 
 TINY = [*ROOM, "method.n=256", "figures=false"]
@@ -62,6 +62,21 @@ def test_the_folder_of_what_is_made_is_out_or_output_to_every_command(command, t
     (line,) = command("complete", "nowhere", "output=o")[2].splitlines()
     assert "nowhere" in line and "out" not in line
     assert "nowhere" in command("judge", "nowhere", "out=o")[2]
+
+
+def test_the_first_word_of_view_may_be_a_capture(command, tmp_path, monkeypatch):  # noqa: F811
+    asked = []
+    monkeypatch.setattr(view, "run", lambda settings, *_, **__: asked.append(settings))
+    monkeypatch.setattr(run, "_parts", lambda *_: {})
+    for name in ("capture", "view", "job", "sweep/1"):
+        (tmp_path / name).mkdir(parents=True)
+    for name in ("job", "sweep/1"):
+        (tmp_path / name / "result.json").write_text("{}")
+    for words_ in (["capture"], ["view"], ["view", "data=tum"], ["job"], ["sweep"], ["nowhere"]):
+        assert command("view", *words_)[0] == 0
+    assert [s["result"] for s in asked] == [None, None, None, "job", "sweep", "nowhere"]
+    assert [s["choices"]["data"] for s in asked] == ["auto", "auto", "tum", *["synthetic"] * 3]
+    assert [s["data"]["root"] for s in asked[:3]] == ["capture", "view", "view"]
 
 
 def test_names_of_places_are_one_text():

@@ -184,6 +184,8 @@ def _run_configured(word: str, argv: list[str]) -> int:
     if SHOW & {a.split("=")[0] for a in argv}:
         return _show(word, argv)
     _refuse_flags(argv, SHOW)
+    if word == "view" and _without_result(argv[:1]):
+        argv = [f"data.root={quote(argv[0])}", *(argv[1:] if _chosen(argv, "data") else ["data=auto", *argv[1:]])]
     argv = _placed(word, _named(argv, FIRST_WORDS.get(word, ())))
     words.refuse_words(argv, ())
     argv = words.quoted(argv)
@@ -240,6 +242,18 @@ def _named(argv: list[str], options: Sequence[str]) -> list[str]:
             break
         argv = [*argv[:k], f"{option}={quote(argv[k])}", *argv[k + 1 :]]
     return argv
+
+
+def _without_result(first: Sequence[str]) -> bool:
+    """Whether a first word, if there is one, is a place that holds no result."""
+    place = Path(first[0]) if first and not first[0].startswith("-") else None
+    if place is None or not place.exists() or place.suffix in (".json", ".ply"):
+        return False
+    return not any(place.glob("result.json")) and not any(place.glob("*/result.json"))
+
+
+def _chosen(argv: Sequence[str], group: str) -> bool:
+    return any(a.startswith(f"{group}=") for a in argv)
 
 
 def _placed(name: str, argv: Iterable[str]) -> list[str]:
