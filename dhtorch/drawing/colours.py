@@ -3,8 +3,8 @@
 Blue is the sensor, orange is what was recovered, purple is what was swept, and nothing else is drawn in them. A method
 has one colour in every figure. Depth has one colour map, blue near and red far, also where a viewer brings its own
 (Rerun's has the same name).
-Colours stay apart for the colour-blind where they can (Okabe and Ito, Tol); those of methods and series are seen on
-light and on dark ground alike. Only what belongs to a page, as its ink and its ground, has a counterpart in the dark.
+Colours stay apart for the colour-blind where they can (Okabe and Ito, Tol); those of methods, series and gates are seen
+on light and on dark ground alike. Only what belongs to a page, as its ink and its ground, has a counterpart in the dark.
 """
 
 from __future__ import annotations
@@ -61,12 +61,12 @@ DASHES: tuple[tuple[float, ...], ...] = ((), (5.0, 2.5), (1.5, 1.8), (7.0, 2.0, 
 GATES = {
     Gate.NO_TRACK: "#9A9A9A",
     Gate.NO_TEXTURE: "#5E5E5E",
-    Gate.NO_POSE: BLACK,
-    Gate.NO_BASELINE: "#4B0082",
-    Gate.BEHIND: "#F0E442",
+    Gate.NO_POSE: "#5C7391",
+    Gate.NO_BASELINE: "#8068D8",
+    Gate.BEHIND: "#C9A400",
     Gate.PARALLAX: "#CC79A7",
     Gate.RESIDUAL: "#D55E00",
-    Gate.INCONSISTENT: "#882255",
+    Gate.INCONSISTENT: "#A8376E",
     Gate.UNCERTAIN: "#44AA99",
     Gate.LOW_SCORE: "#999933",
     Gate.CONTRADICTED: "#6B4A1F",
