@@ -1,6 +1,6 @@
 """``dhtorch PATH`` on every capture below DHTORCH_DATA: how long it took, and what came of it or why nothing did.
 
-    python benchmarks/captures.py --json benchmarks/results/captures.json
+    python benchmarks/captures.py --json benchmarks/results/captures.json --pictures docs/assets/captures
 
 As a user has it, a process each, but for half a minute a capture instead of four, and at most two recordings of one.
 ``first_s`` is when the first picture lay there.
@@ -18,10 +18,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
+
 from dhtorch import archive, storage
 
 #: Options that are not as they come.
 SHORT = ("minutes=0.5", "recordings=2")
+
+#: Captures whose licences let pictures of them be shown (MIT, MIT, CC BY 4.0), and how wide they are.
+SHOWN, WIDTH = ("dgp_drive6cam", "holo_a", "tum_fr1_desk9"), 640
 
 #: Sentences that say what was made, and what to do next, not what was recovered.
 ASIDE = ("Wrote ", "Next: ")
@@ -45,16 +50,28 @@ def row(path: Path, folder: Path, asked: Sequence[str] = SHORT) -> dict[str, Any
     return found | {"why": wrong.strip().removeprefix("dhtorch: ").replace(f"{path.parent}{os.sep}", "")}
 
 
+def picture(folder: Path, file: Path) -> None:
+    """Keep a smaller copy of the first overview below ``folder``, if there is one."""
+    for made in sorted(folder.rglob("overview.png"))[:1]:
+        whole = cv2.imread(str(made))
+        size = (WIDTH, round(whole.shape[0] * WIDTH / whole.shape[1]))
+        file.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(file), cv2.resize(whole, size, interpolation=cv2.INTER_AREA), [cv2.IMWRITE_JPEG_QUALITY, 85])
+
+
 def main() -> int:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, required=True)
+    parser.add_argument("--pictures", type=Path, help="keep the overviews of captures that may be shown in this folder")
     options = parser.parse_args()
     data = Path(os.environ["DHTORCH_DATA"])
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         for path in sorted(p for p in data.iterdir() if p.is_dir()):
             rows.append(row(path, Path(folder)) | {"processor": archive.processor(), "cores": os.cpu_count()})
+            if options.pictures is not None and path.name in SHOWN:
+                picture(Path(folder) / path.name, options.pictures / f"{path.name}.jpg")
             print(rows[-1], flush=True)
             options.json.write_text(storage.dumps(storage.strict(rows), indent=1) + "\n")
     return 0

@@ -320,17 +320,18 @@ HEAD |= {"coverage_at_5": "answered at 5 % mean error", "ms": "ms"}
 
 
 def captures() -> str:
-    """Every capture that was given to ``dhtorch PATH``: what came of it, and how long it took."""
-    file = RESULTS / "captures.json"
-    if not file.is_file():
-        return "Not measured yet: `benchmarks/results/captures.json` is not there."
-    rows = []
-    for found in json.loads(file.read_text()):
+    """Every capture that was given to ``dhtorch PATH``: what came of it, and how long it took; last the phone's."""
+    rows, files = [], (RESULTS / f"{name}.json" for name in ("captures", "phone"))
+    for found in [each for file in files for each in json.loads(file.read_text())]:
         first = "" if found["first_s"] is None else f"{found['first_s']:.0f}"
         said = (found.get("said") or found.get("why") or "").removeprefix(f"{found['name']}: ")
         rows.append([said, f"`{found['name']}`", first, f"{found['seconds']:.0f}"])
     grid = text.grid(Table("", ["what came out", "capture", "first picture, s", "all, s"], rows))
-    return f"{grid}\n\n{found['processor']}, {found['cores']} cores, beside other work."
+    shown = "".join(
+        f"\n\n![{file.stem}: picture, sensor, completed](../assets/captures/{file.name})\n\n`{file.stem}`"
+        for file in sorted((HERE.parent / "docs/assets/captures").glob("*.jpg"))
+    )
+    return f"{grid}\n\n{found['processor']}, {found['cores']} cores.{shown}"
 
 
 def enriched() -> str:

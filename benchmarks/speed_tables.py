@@ -56,8 +56,9 @@ SCRIPTS = ("frontend", "lk", "pnp", "triangulate", "pair", "loader", "judge_spee
 
 
 def timings(file: str) -> list[dict[str, Any]]:
-    """Rows of a benchmark's result file."""
-    rows: list[dict[str, Any]] = json.loads((RESULTS / f"{file}.json").read_text())
+    """Rows of a benchmark's result file; none where it was not made with AVX2 alone."""
+    path = RESULTS / f"{file}.json"
+    rows: list[dict[str, Any]] = [] if file.endswith("_avx2") and not path.is_file() else json.loads(path.read_text())
     return rows
 
 
@@ -77,21 +78,27 @@ def on(file: str, shown: str) -> str:
     return f"{shown}\n\nMeasured on: {', '.join(sorted(names))}." if names else shown
 
 
+def _barred(file: str, name: str, mode: str) -> dict[str, Any] | None:
+    """The row of one thread that a bar is about; of several peers the one that it names."""
+    found = [r for r in timings(file) if (r["name"], r["mode"], r["threads"]) == (name, mode, 1)]
+    return next((r for r in found if r["bar"]), found[0] if found else None)
+
+
 def bars() -> str:
-    """Each speed that has a bar, one thread, beside that bar."""
+    """Each speed that has a bar, one thread, beside that bar; last its ratio without vectors wider than AVX2's."""
     rows = []
     for file, name, mode, bar, words in BARS:
-        found = [r for r in timings(file) if (r["name"], r["mode"], r["threads"]) == (name, mode, 1)]
+        r, slower = _barred(file, name, mode), _barred(f"{file}_avx2", name, mode)
         called = words if mode == "eager" else f"{words}, {mode}"
-        if not found:
-            rows.append([called, "–", "–", "–", f"≤ {bar:g}", "not measured", "–", "–"])
+        if r is None:
+            rows.append([called, "–", "–", "–", f"≤ {bar:g}", "not measured", "–", "–", "–"])
             continue
-        r = next((r for r in found if r["bar"]), found[0])  # of several peers the one that the bar is about
         cells = [called, f"{r['ours_ms']:.2f}", f"{r['peer_ms']:.2f}"]
         verdict = "met" if r["ratio"] <= bar else "missed"
         maker = r["processor"].partition("(")[0].partition(",")[0]
-        rows.append([*cells, ratio(r["ratio"]), f"≤ {bar:g}", verdict, errors(r), maker])
-    head = ["", "ours, ms", "peer, ms", "ratio", "bar", "", "errors, ours / peer", "on"]
+        narrow = "–" if slower is None else ratio(slower["ratio"])
+        rows.append([*cells, ratio(r["ratio"]), f"≤ {bar:g}", verdict, errors(r), maker, narrow])
+    head = ["", "ours, ms", "peer, ms", "ratio", "bar", "", "errors, ours / peer", "on", "ratio held to AVX2"]
     return text.grid(Table("", head, rows))
 
 
@@ -134,6 +141,16 @@ def scaling() -> str:
     return on("scaling", text.grid(Table("", head, rows)))
 
 
+def memory() -> str:
+    """How far a long stream's memory rises above that of its first frames."""
+    rows = [
+        [f"{r['frames']:,}", f"{r['first_mib']:.0f}", str(r["first"]), f"{r['above_mib']:.1f}", "≤ 50"]
+        for r in timings("memory")
+    ]
+    head = ["frames", "peak, MiB", "after", "then, MiB more", "bar"]
+    return on("memory", text.grid(Table("", head, rows)))
+
+
 #: Tables by marker.
-TABLES: dict[str, Callable[[], str]] = {"bars": bars, "scaling": scaling}
+TABLES: dict[str, Callable[[], str]] = {"bars": bars, "scaling": scaling, "memory": memory}
 TABLES |= {f"rows {file}": partial(every_row, file) for file in SCRIPTS}

@@ -4,7 +4,7 @@ Blue is the sensor, orange is what was recovered, purple is what was swept, and 
 has one colour in every figure. Depth has one colour map, blue near and red far, also where a viewer brings its own
 (Rerun's has the same name).
 Colours stay apart for the colour-blind where they can (Okabe and Ito, Tol); those of methods, series and gates are seen
-on light and on dark ground alike. Only what belongs to a page, as its ink and its ground, has a counterpart in the dark.
+on light and on dark ground alike. Only what belongs to a page, as its ink and ground, has a counterpart in the dark.
 """
 
 from __future__ import annotations
