@@ -341,6 +341,25 @@ def test_several_captures_in_one_folder(tmp_path: Path) -> None:
     assert [found.path.name for found in capture.find(tmp_path)] == ["a", "b"]
 
 
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        (None, "an empty folder"),
+        ("room.zip", "room.zip: an archive, to be unpacked first"),
+        ("clip.mp4", "clip.mp4: a video without depth"),
+        ("notes.txt", "no capture here or two folders below"),
+    ],
+)
+def test_what_lies_there_instead_of_a_capture_is_said(tmp_path: Path, name: str | None, said: str) -> None:
+    if name is not None:
+        (tmp_path / name).write_bytes(b"nothing of use")
+        alone = said.partition(": ")[2] or "a .txt file, which no reader knows"
+        with pytest.raises(FormatError, match=f"{name}: content: found {alone}"):
+            capture.find(tmp_path / name)
+    with pytest.raises(FormatError, match=f"content: found {said}"):
+        capture.find(tmp_path)
+
+
 def test_nothing_there_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     (tmp_path / "a" / "b" / "c").mkdir(parents=True)
     writers.write_named_frames(tmp_path / "a" / "b" / "c", walk(1))

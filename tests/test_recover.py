@@ -94,6 +94,15 @@ def refusal(words, capsys):
     return said.err
 
 
+def test_one_capture_that_cannot_be_opened_does_not_stop_the_others(capture, tmp_path, capsys):
+    room = SyntheticRoom(hw=(48, 64), n_frames=3)
+    writers.write_stray(tmp_path / "both" / "alone", list(room), video=False)
+    shutil.copytree(capture, tmp_path / "both" / "kitchen")
+    assert main([str(tmp_path / "both"), f"out={tmp_path / 'out'}", "minutes=0.01", *SMALL]) == 0
+    said = capsys.readouterr().out
+    assert "kitchen" in said and "alone: depth only" in said and (tmp_path / "out/overview.png").is_file()
+
+
 def test_what_cannot_work_is_one_sentence(capture, tmp_path, capsys):
     single = tmp_path / "single"
     single.mkdir()
@@ -102,7 +111,7 @@ def test_what_cannot_work_is_one_sentence(capture, tmp_path, capsys):
     Image.fromarray(np.full((20, 30), 900, np.uint16)).save(single / "b.png")
     assert "one frame" in refusal([single], capsys)
     (tmp_path / "empty").mkdir()
-    assert "no capture here" in refusal([tmp_path / "empty"], capsys)
+    assert "found an empty folder" in refusal([tmp_path / "empty"], capsys)
     assert "lies in the capture" in refusal([capture, f"out={capture}/out"], capsys)
     assert refusal([capture, "minutes=-1"], capsys).startswith("dhtorch: minutes: found -1, expected")
     alone = tmp_path / "alone"

@@ -40,6 +40,9 @@ _STAND_IN = 60.0  # degrees, to look at what has no K
 _SPARSE = 0.1  # share of returns below which they are drawn larger
 _ARCHIVES = (".r3d", ".mp4", ".mov", ".tar", ".h5", ".hdf5")  # files that may be a whole capture
 _PICTURES = (".png", ".jpg", ".jpeg")
+_PACKED = (".zip", ".gz", ".tgz", ".xz", ".bz2", ".zst", ".7z", ".rar")  # nothing is unpacked unasked
+_VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
+_VIDEO_ALONE = "a video without depth; the sensor's depth of what is near gives the metre"
 
 
 @dataclass(frozen=True)
@@ -112,7 +115,21 @@ def find(path: Path, follow_links: bool = False) -> list[Found]:
                 return found
         level = [entry for entry in inside if entry.is_dir()]
     known = ", ".join((*data.FORMATS, *formats.STACK_FORMATS))
-    raise FormatError(path, "content", "no capture here or two folders below", f"one of {known}, or pictures")
+    raise FormatError(path, "content", _instead(path), f"one of {known}, or pictures")
+
+
+def _instead(path: Path) -> str:
+    """What there is where no capture is, and what would make it one, in words."""
+    if path.is_file():
+        kinds = {**dict.fromkeys(_PACKED, "an archive, to be unpacked first"), **dict.fromkeys(_VIDEOS, _VIDEO_ALONE)}
+        return kinds.get(path.suffix.lower(), f"a {path.suffix or 'plain'} file, which no reader knows")
+    if not any(path.iterdir()):
+        return "an empty folder"
+    below = {file.suffix.lower(): file.name for file in path.iterdir() if file.is_file()}
+    for suffix in (*_PACKED, *_VIDEOS):
+        if suffix in below:
+            return f"{below[suffix]}: {_VIDEO_ALONE if suffix in _VIDEOS else 'an archive, to be unpacked first'}"
+    return "no capture here or two folders below"
 
 
 def surveys(capture: Found, frames: int = 8) -> Iterator[Survey]:

@@ -78,10 +78,9 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     reading = {name: value for name, value in settings["data"].items() if value is not None}
     found = [replace(capture, options=reading) for capture in captured(path, settings["format"])]
     out = _place(path, settings["out"])
-    recordings = [r for capture in found for r in opened(capture)]
+    recordings, refused = all_opened(found)
     chosen = recordings[: settings["recordings"]]
-    refused: list[str] = []
-    began = time.monotonic()
+    began, made = time.monotonic(), 0
     for n, recording in enumerate(chosen):
         minutes = settings["minutes"]
         until = None if minutes is None else began + 60 * minutes * (n + 1) / len(chosen)
@@ -91,8 +90,9 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         except NothingToDo as nothing:
             refused.append(str(nothing))
             continue
+        made += 1
         print("\n".join(said), flush=True)
-    if len(refused) == len(chosen):
+    if made == 0:
         raise NothingToDo("; ".join(refused[:3]))
     for line in refused:
         print(line)
@@ -128,6 +128,24 @@ def captured(path: Path, format: str = "auto") -> list[Found]:
         raise NothingToDo(f"{path}: {what}; a layout of docs/data.md is needed, as rgb/ beside depth/")
     what = f"{many(len(pictures), 'picture')} without depth"
     raise NothingToDo(f"{path}: {what}; a sensor's depth of what is near is needed, it gives the metre (docs/data.md)")
+
+
+def all_opened(found: Sequence[Found]) -> tuple[list[Recording], list[str]]:
+    """The recordings of several captures, and in a sentence each why others cannot be opened.
+
+    Raises:
+        NothingToDo, FormatError: the only capture cannot.
+    """
+    recordings: list[Recording] = []
+    refused: list[str] = []
+    for capture in found:
+        try:
+            recordings += opened(capture)
+        except (NothingToDo, FormatError) as error:
+            if len(found) == 1:
+                raise
+            refused.append(str(error))
+    return recordings, refused
 
 
 def opened(capture: Found) -> Sequence[Recording]:
