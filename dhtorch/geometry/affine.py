@@ -12,6 +12,8 @@ so gain and bias need no iteration of their own. T is never read between pixels,
 Such steps shrink by a factor that is nearly constant and, where the noise in T's gradient passes for texture, not
 small. Two of them tell it, and the third takes part of what would follow at once (Anderson 1965, with a memory of one
 step).
+
+The steps on one level in compiled code: :mod:`dhtorch.native`.
 """
 
 from __future__ import annotations
