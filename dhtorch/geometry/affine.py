@@ -262,7 +262,7 @@ def _compilable(views: _Views, level: int, *points: Tensor) -> bool:
     source, target, o = views
     levels = source.levels[0], target.levels[level]
     room = min(source.pad, target.pad) >= o.window // 2 + REACH
-    told = room and len(levels[0][0]) > GRAD_Y and all(y.dtype == torch.float32 for y in (*levels, *points[:3]))
+    told = room and source.levels[0].shape[1] > GRAD_Y and all(y.dtype == torch.float32 for y in (*levels, *points[:3]))
     return told and native.serves(*levels, *points)
 
 
