@@ -2,26 +2,18 @@
 // and sums of products in torch's order (-ffp-contract=off: none is fused). One thread, no gradient. Callers check shapes,
 // types and that everything is contiguous; see dhtorch/native.py.
 
+#include "native_vectors.h"
+
 #include <torch/csrc/stable/library.h>
-#include <torch/csrc/stable/tensor.h>
 
 #include <algorithm>
 #include <cmath>
-#include <cstdint>
-#include <cstring>
 #include <limits>
 #include <vector>
-
-using torch::stable::Tensor;
 
 namespace {
 
 constexpr int16_t NOWHERE = std::numeric_limits<int16_t>::max() / 2;
-
-template <typename T>
-T* data(const Tensor& x) {
-  return static_cast<T*>(x.data_ptr());
-}
 
 inline int32_t bits(int32_t code) {  // of the lower 31, as count_bits: vectors have no such instruction everywhere
   uint32_t x = static_cast<uint32_t>(code);

@@ -3,16 +3,13 @@
 // rounding and not bit for bit; what a point is told depends on no other. One thread, no gradient. Callers check shapes,
 // types and that everything is contiguous; see dhtorch/native.py.
 
+#include "native_vectors.h"
+
 #include <torch/csrc/stable/library.h>
-#include <torch/csrc/stable/tensor.h>
 
 #include <algorithm>
 #include <cmath>
-#include <cstdint>
-#include <cstring>
 #include <vector>
-
-using torch::stable::Tensor;
 
 namespace {
 
@@ -21,36 +18,6 @@ constexpr int64_t STEPS = 8, LEAP = 6, MARGIN = 4;
 constexpr float RATIO = 0.9f, LEAST_GAIN = 0.2f, MOST_GAIN = 5.0f;
 constexpr int64_t MOST_NODES = 6;  // along a side of a map of radius 2
 enum Normalise : int64_t { NONE, BIAS, GAIN_BIAS };
-
-#ifdef __AVX512F__
-constexpr int64_t LANES = 16;
-#else
-constexpr int64_t LANES = 8;
-#endif
-typedef float Vector __attribute__((vector_size(LANES * sizeof(float))));
-typedef int32_t Bits __attribute__((vector_size(LANES * sizeof(int32_t))));
-
-template <typename T>
-T* data(const Tensor& x) {
-  return static_cast<T*>(x.data_ptr());
-}
-
-inline Vector load(const float* from) {
-  Vector found;
-  std::memcpy(&found, from, sizeof(found));
-  return found;
-}
-
-inline void store(Vector x, float* to) { std::memcpy(to, &x, sizeof(x)); }
-
-inline float total(Vector x) {
-  float part[LANES];
-  store(x, part);
-  for (int64_t half = LANES / 2; half; half /= 2) {
-    for (int64_t i = 0; i < half; ++i) part[i] += part[i + half];
-  }
-  return part[0];
-}
 
 inline Vector between(Vector a, Vector b, float weight) {  // as torch.lerp
   return weight < 0.5f ? a + weight * (b - a) : b - (b - a) * (1.0f - weight);

@@ -12,6 +12,8 @@ so gain and bias need no iteration of their own. T is never read between pixels,
 Such steps shrink by a factor that is nearly constant and, where the noise in T's gradient passes for texture, not
 small. Two of them tell it, and the third takes part of what would follow at once (Anderson 1965, with a memory of one
 step).
+
+The steps on one level in compiled code: :mod:`dhtorch.native`.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from dhtorch import native
 from dhtorch.geometry import small
 from dhtorch.geometry.exact import CHUNK
 from dhtorch.geometry.graphless import spared
@@ -239,6 +242,8 @@ def _search(
     """Steps of all points, a chunk at a time, reading image 1 from one level."""
     source, target, o = views
     zoom = 0.5**level
+    if _compilable(views, level, q, place, warp, batch):
+        return _compiled(views, level, q, place, warp * zoom, batch)
     fine = o._replace(epsilon_px=o.epsilon_px * zoom)
     memory = None if is_static(warp) else warp.new_empty(2, min(CHUNK, len(batch)), 8, o.window * o.window)
     parts = []
@@ -250,6 +255,42 @@ def _search(
         inverse = (state.inverse[:6].unflatten(0, (3, 2)) * place_[:, None, None]).sum(0)
         parts.append(state._replace(warp=_from(-corner, state.warp) / zoom, inverse=inverse))
     return _State(*(torch.cat(field, -1) for field in zip(*parts, strict=True)))
+
+
+def _compilable(views: _Views, level: int, *points: Tensor) -> bool:
+    """Whether compiled code may search: it takes these tensors, and finds a window wherever it looks."""
+    source, target, o = views
+    levels = source.levels[0], target.levels[level]
+    room = min(source.pad, target.pad) >= o.window // 2 + REACH
+    told = room and source.levels[0].shape[1] > GRAD_Y and all(y.dtype == torch.float32 for y in (*levels, *points[:3]))
+    return told and native.serves(*levels, *points)
+
+
+def _compiled(views: _Views, level: int, q: Tensor, place: Tensor, begin: Tensor, batch: Tensor) -> _State:
+    """:func:`_search` in compiled code (:mod:`dhtorch.native`), the same up to the rounding of sums over a window."""
+    source, target, o = views
+    zoom, textured = 0.5**level, torch.empty_like(batch, dtype=torch.bool)
+    warp, fit, first = torch.empty_like(begin), torch.empty_like(place), torch.empty_like(place)
+    inverse = begin.new_empty(2, 8, len(batch))
+    torch.ops.dhtorch.align(
+        source=source.levels[0],
+        target=target.levels[level],
+        q=q,
+        place=place,
+        begin=begin,
+        batch=batch,
+        warp=warp,
+        textured=textured,
+        fit=fit,
+        first=first,
+        inverse=inverse,
+        window=o.window,
+        steps=o.steps,
+        source_pad=source.pad,
+        target_pad=target.pad,
+        epsilon=o.epsilon_px * zoom,
+    )
+    return _State(warp / zoom, textured, fit, first, inverse)
 
 
 def _descend(

@@ -1,0 +1,45 @@
+// What the parts of the compiled code share: a tensor's numbers, and vectors of as many floats as this processor adds at
+// once; see dhtorch/native.py.
+
+#pragma once
+
+#include <torch/csrc/stable/tensor.h>
+
+#include <cstdint>
+#include <cstring>
+
+using torch::stable::Tensor;
+
+namespace {
+
+#ifdef __AVX512F__
+constexpr int64_t LANES = 16;
+#else
+constexpr int64_t LANES = 8;
+#endif
+typedef float Vector __attribute__((vector_size(LANES * sizeof(float))));
+typedef int32_t Bits __attribute__((vector_size(LANES * sizeof(int32_t))));
+
+template <typename T>
+T* data(const Tensor& x) {
+  return static_cast<T*>(x.data_ptr());
+}
+
+inline Vector load(const float* from) {
+  Vector found;
+  std::memcpy(&found, from, sizeof(found));
+  return found;
+}
+
+inline void store(Vector x, float* to) { std::memcpy(to, &x, sizeof(x)); }
+
+inline float total(Vector x) {
+  float part[LANES];
+  store(x, part);
+  for (int64_t half = LANES / 2; half; half /= 2) {
+    for (int64_t i = 0; i < half; ++i) part[i] += part[i + half];
+  }
+  return part[0];
+}
+
+}  // namespace
