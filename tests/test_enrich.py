@@ -19,7 +19,7 @@ from dhtorch import data, storage
 from dhtorch import testing as writers
 from dhtorch.commands.run import main
 from dhtorch.extract import shards
-from dhtorch.extract.targets import RobotTarget
+from dhtorch.extract.robot_target import RobotTarget
 from dhtorch.synthetic.recording import SyntheticRoom
 
 HW, LENGTHS, NEAR = (48, 64), (4, 3), 2.5

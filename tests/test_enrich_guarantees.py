@@ -266,6 +266,23 @@ def test_the_sources_poses_are_used(robot, tmp_path):
     assert recovered[1] > 0 and recovered[0] == 0
 
 
+def test_poses_that_near_returns_refute_are_said_everywhere_with_their_reading(tmp_path, capsys):
+    source, out = tmp_path / "source", tmp_path / "set"
+    poses = [shot.T_world_from_cam for shot in shots(3)]
+    in_mm = [shot.replace(T_world_from_cam=T.replace(t=1000 * T.t)) for shot, T in zip(shots(3), poses, strict=True)]
+    source.mkdir()
+    writers.write_lerobot(source, [in_mm], depth="tiff")
+    enrich(source, out, "method.n=256", "pose=device")
+    said = "front: the poses given contradict the near returns in 2 of 3 frames; they look like millimetres"
+    assert said in capsys.readouterr().out
+    about = json.loads((out / "meta" / "report.json").read_text())
+    (camera,) = (episode["cameras"]["front"] for episode in about["episodes"])
+    assert camera["refuted"] == {"millimetres": 2} and camera["frames"] == 3
+    page = (out / "meta" / "report.html").read_text()
+    assert "millimetres" in page and "Poses given that the near returns contradict" in page
+    assert "the poses given contradict the near returns" in page and "no track" not in page
+
+
 def test_a_name_that_leads_elsewhere_is_refused(robot, tmp_path, capsys):
     source = tmp_path / "source"
     shutil.copytree(robot, source)

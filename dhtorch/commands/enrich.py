@@ -24,9 +24,11 @@ from dhtorch.data.scene import Scene, scenes_of
 from dhtorch.extract import columns, cut, engines, plan, shards
 from dhtorch.extract.enriched import MapRows, View, camera_key
 from dhtorch.extract.enriched import columns as map_columns
+from dhtorch.extract.nerf_target import NerfTarget
 from dhtorch.extract.origin import NO_RATE, Origin, RobotSet, knows_rate, rate
+from dhtorch.extract.robot_target import RobotTarget
 from dhtorch.extract.step_set import StepSet
-from dhtorch.extract.targets import NerfTarget, RobotTarget, Target
+from dhtorch.extract.targets import Target
 from dhtorch.transform import given
 
 Progress = Callable[..., Iterable[Any]]
@@ -102,7 +104,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
             before, complaints = _make(work, settings, progress)
             owns = [own for k in range(len(_episodes(work.whole))) if (own := work.target.own(k)) is not None]
             if settings["report"]:
-                enrich_page.write(_report(work), work.shared, owns)
+                enrich_page.write(work.out / "meta", work.shared, owns)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"what is whole in {work.out} stays; the same command does the rest") from None
     except OSError as error:
@@ -350,10 +352,6 @@ def _key(work: Work, n: int) -> str:
 # ------------------------------------------------------------------------------------------------------ what is said
 
 
-def _report(work: Work) -> Path:
-    return work.out / "meta" / "report.html"
-
-
 def _said(work: Work, owns: Sequence[Row], before: int, complaints: Sequence[str]) -> list[str]:
     """The whole in words."""
     size = sum(path.stat().st_size for path in work.out.rglob("*") if path.is_file())
@@ -364,7 +362,7 @@ def _said(work: Work, owns: Sequence[Row], before: int, complaints: Sequence[str
         kinds = ", ".join(f"{kind} {share:.1%}" for kind, share in shares.items())
         why = ", ".join(f"{words(gate)} {share:.1%}" for gate, share in reasons.items())
         lines.append(f"  {name}: {kinds}" + (f" ({why})" if why else ""))
-    lines += [f"  {line}" for line in work.notes]
+    lines += [f"  {line}" for line in (*enrich_page.refuted(owns), *work.notes)]
     lines += [f"  {complaint}" for complaint in complaints[:_SHOWN]]
     lines += [f"  and {len(complaints) - _SHOWN} more frames"] if len(complaints) > _SHOWN else []
     return lines

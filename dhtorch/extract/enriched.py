@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from dhtorch import dense
-from dhtorch.codes import Gate, Source, names
+from dhtorch.codes import Gate, PoseCode, Source, names
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
 from dhtorch.export import png
@@ -106,6 +106,7 @@ def columns(pictures: bool) -> dict[str, Column]:
         "pose": Column(f, (16,), "1, m", "T_world_from_cam by rows; NaN = none"),
         "pixels": Column(whole, (_N_SOURCES,), "1", "by source"),
         "silent": Column(whole, (_N_GATES,), "1", "silent ones by gate"),
+        "refuted": Column(whole, (), "code", "0 = no pose is, else 1 + which of CONVENTIONS it looks like"),
         "moments": Column(f, _MOMENTS, "m, 1", "of depth, sigma, red, green, blue"),
         "problem": Column("uint8", (), "code", "what was wrong with the frame"),
     }
@@ -150,6 +151,7 @@ class MapRows(Rows):
             "pose": pose,
             "pixels": np.bincount(source.ravel(), minlength=_N_SOURCES),
             "silent": np.bincount(gate[source == Source.NONE], minlength=_N_GATES),
+            "refuted": _refuted(added),
             "moments": _moments(depth, sigma, image),
             "problem": added["problem"].numpy(),
         }
@@ -185,6 +187,15 @@ def _maps(added: Mapping[str, Tensor], view: View) -> tuple[np.ndarray, ...]:
         field[at[:, 1], at[:, 0]] = added[name].numpy()
         found.append(field)
     return tuple(found)
+
+
+def _refuted(added: Mapping[str, Tensor]) -> np.ndarray:
+    """Whether the near returns refute a pose that was given, and what it looks like, as the column has it."""
+    looks = int(added.get("pose_looks", torch.zeros(())))
+    refuted = (
+        looks > 0 or int(added["pose_code"]) == PoseCode.REFUTED or bool((added["gate"] == Gate.POSE_REFUTED).any())
+    )
+    return np.asarray(1 + looks if refuted else 0)
 
 
 def _stepped(x: np.ndarray, step: float) -> np.ndarray:
