@@ -182,6 +182,22 @@ def test_a_recording_becomes_a_set_and_a_nerfstudio_folder(tmp_path, capsys):
     assert "no writer" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("kind", ["stray", "record3d", "frames_dir", "rlds"])
+def test_a_format_that_nothing_writes_is_refused_in_a_line(kind, shots, tmp_path, capsys):
+    source = {"record3d": tmp_path / "room.r3d", "rlds": tmp_path / "1.0.0"}.get(kind, tmp_path / "room")
+    {
+        "stray": lambda: writers.write_stray(source, shots[:2]),
+        "record3d": lambda: writers.write_r3d(source, shots[:2]),
+        "frames_dir": lambda: writers.write_counted_frames(source, shots[:2]),
+        "rlds": lambda: writers.write_rlds(source, [shots[:2]]),
+    }[kind]()
+    out = tmp_path / "out"
+    assert main(["enrich", str(source), str(out), *ASKED, "format=same"]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and not out.exists()
+    assert said.startswith(f"dhtorch: format=same: found {kind}, which has no writer here; expected lerobot, ")
+
+
 def test_a_table_without_frame_index_counts_its_rows(shots, tmp_path):
     """As GR00T's sets: the first row bears a time that the video does not know."""
     source = robot_set(tmp_path / "set", shots, 2)

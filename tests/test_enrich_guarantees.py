@@ -25,10 +25,12 @@ from test_enrich import map_of, rows, tree
 from dhtorch import data, lock
 from dhtorch import testing as writers
 from dhtorch.commands.run import main
+from dhtorch.data.codecs import tfrecord
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
 from dhtorch.extract import cut, plan
 from dhtorch.extract.enriched import MapRows, View, camera_key, columns
+from dhtorch.extract.step_set import StepSet
 from dhtorch.methods import PAPER
 from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.synthetic.two_cameras import open_two_cameras
@@ -217,6 +219,36 @@ def test_steps_of_robots_keep_what_they_say(tmp_path):
     ]
     again = data.open_all(out, depth="observation.images.image_0_depth")
     assert [len(each) for each in again] == [3, 2, 2]
+
+
+def test_the_record_of_an_episode_is_read_once(tmp_path, monkeypatch):
+    writers.write_rlds(tmp_path / "1.0.0", [shots(7), shots(5)])
+    recordings = data.open_all(tmp_path / "1.0.0")
+    read, opened = [], []
+    record, stream = tfrecord.read_record, tfrecord.opened
+    monkeypatch.setattr(tfrecord, "read_record", lambda file, span: read.append(span) or record(file, span))
+    monkeypatch.setattr(tfrecord, "opened", lambda file: opened.append(file) or stream(file))
+    held = [recordings[0], recordings[1]]
+    read.clear(), opened.clear()
+    steps = StepSet(held, [0, 1], 30.0)
+    tables = [list(steps.batches(k, [])) for k in (0, 1)]
+    assert [sum(t.num_rows for t in found) for found in tables] == [7, 5] and steps.about(1)["split"] == "train"
+    assert len(read) == 2, "one an episode"
+    columns = sum(len(t.column_names) for found in tables for t in found)
+    assert len(opened) <= 2 + columns, "one a column and group at most, not one a step"
+
+
+def test_an_episode_of_which_nothing_can_be_read_is_said(tmp_path, capsys):
+    source = tmp_path / "source"
+    source.mkdir()
+    writers.write_lerobot(source, [shots(2), shots(2, 2)], depth="tiff", version=2)
+    gone = source / "videos" / "chunk-000" / FRONT / "episode_000001.mp4"
+    gone.unlink()
+    for more, helps in (((), "on_error=flag the rest"), (("on_error=flag",), "the video of episode 1")):
+        assert main(["enrich", str(source), str(tmp_path / "set"), *ASKED, *more]) == 2
+        said = capsys.readouterr().err
+        assert gone.name in said and helps in said and said.count("\n") == 1, said
+        shutil.rmtree(tmp_path / "set")
 
 
 def pair_of_cameras():

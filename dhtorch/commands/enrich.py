@@ -101,8 +101,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     rest = "what is whole stays; the same command does the rest"
     try:
         with lock.held(home.parent / f".{home.name}.lock", f"out: {work.out}"):
-            before, complaints = _make(work, settings, progress)
-            owns = [own for k in range(len(_episodes(work.whole))) if (own := work.target.own(k)) is not None]
+            before, owns, complaints = _make(work, settings, progress)
             if settings["report"]:
                 enrich_page.write(work.out / "meta", work.shared, owns)
     except KeyboardInterrupt:
@@ -115,8 +114,8 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     return 0
 
 
-def _make(work: Work, settings: Mapping[str, Any], progress: Progress) -> tuple[int, list[str]]:
-    """Make what is missing; how many episodes were whole before, and what could not be read."""
+def _make(work: Work, settings: Mapping[str, Any], progress: Progress) -> tuple[int, list[Row], list[str]]:
+    """Make what is missing; how many episodes were whole before, what all amount to, and what could not be read."""
     of_episode = _episodes(work.whole)
     owns = [work.target.own(k) for k in range(len(of_episode))]
     before = sum(own is not None for own in owns)
@@ -134,15 +133,16 @@ def _make(work: Work, settings: Mapping[str, Any], progress: Progress) -> tuple[
         for k, each in todo.items():
             for piece in (piece for files in each.values() for piece in files if piece.name not in done):
                 made = islice(answers, len(piece.rows))
-                kept = engines.kept(made, settings["on_error"], work.rows, complaints, "on_error")
+                kept = engines.kept(made, settings["on_error"], work.rows, complaints, "on_error=flag")
                 shards.write(work.waiting, piece, kept, work.rows.wanted, work.shared)
             files = {_key(work, n): [work.waiting / p.name for p in own_pieces] for n, own_pieces in each.items()}
             owns[k] = work.target.assemble(k, [own for own in owns[:k] if own is not None], files)
             for path in (path for paths in files.values() for path in paths):
                 path.unlink(missing_ok=True)
-    work.target.finish([own for own in owns if own is not None])
+    every_own = [own for own in owns if own is not None]
+    work.target.finish(every_own)
     shutil.rmtree(work.waiting, ignore_errors=True)
-    return before, complaints
+    return before, every_own, complaints
 
 
 def _work(settings: Mapping[str, Any], parts: Mapping[str, Any]) -> Work:

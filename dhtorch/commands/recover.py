@@ -23,7 +23,6 @@ from dhtorch.commands.complete import Progress, Task
 from dhtorch.commands.inspect import Found, classified, find
 from dhtorch.console import many
 from dhtorch.data import FORMATS, FormatError, files, open_all
-from dhtorch.data import intrinsics as told
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
 from dhtorch.integrate.from_maps import FrameMap, join
@@ -329,10 +328,16 @@ def _next(made: Made, shown: str) -> str:
     if made.left:
         more = f"the same command does more of the {made.left} frames left (minutes=null: all)"
         return f"Next: open {shown}; {more}.{broken}"
-    read = {name: value for name, value in made.task.settings["data"].items() if name in told.OPTIONS}
-    also = "".join(f" data.{name}={str(value).replace(' ', '')}" for name, value in read.items())
+    read = {name: value for name, value in made.task.settings["data"].items() if value is not None}
+    also = "".join(f" data.{name}={_written(value)}" for name, value in read.items())
     judged = f"dhtorch run data=auto data.root={made.task.settings['path']}{also} holdout.cutoff={_middle(made):.2g}"
     return f"Next: open {shown}; {judged} says how good it is on yours.{broken}"
+
+
+def _written(value: Any) -> str:
+    """A value as it is typed."""
+    listed = isinstance(value, list)
+    return f"[{','.join(map(str, value))}]" if listed else str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _middle(made: Made) -> float:

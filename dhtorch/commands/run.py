@@ -189,7 +189,7 @@ def _run_configured(word: str, argv: list[str]) -> int:
     argv = words.quoted(argv)
     try:
         with hydra.initialize_config_dir(str(config_dir()), version_base="1.3", job_name="dhtorch"):
-            usual = _refuse_names(word, argv)
+            usual, argv = _looked_over(word, argv)
             cfg = hydra.compose(word, argv, return_hydra_config=True)
             HydraConfig.instance().set_config(cfg)  # for what the settings take from Hydra, as the folder's name
             groups = {k: v for k, v in cfg.hydra.runtime.choices.items() if k.isidentifier()}
@@ -210,8 +210,13 @@ def _run_configured(word: str, argv: list[str]) -> int:
         return _fail(error, show=settings.get("traceback", False))
 
 
-def _refuse_names(name: str, argv: Sequence[str]) -> Any:
-    """Refuse choices and options that the settings ``name`` do not have; returns what the choices alone compose to."""
+def _looked_over(name: str, argv: Sequence[str]) -> tuple[Any, list[str]]:
+    """Refuse choices and options that the settings ``name`` do not have.
+
+    Returns:
+        What the choices alone compose to, and the words as Hydra takes them: with a format that is yet to be
+        recognised, options of its reader are added to the settings.
+    """
     import hydra  # noqa: PLC0415
     from omegaconf import OmegaConf  # noqa: PLC0415
 
@@ -223,8 +228,17 @@ def _refuse_names(name: str, argv: Sequence[str]) -> Any:
     composed: Any = OmegaConf.to_container(hydra.compose(name, first))
     swept = [(group, choice) for group, _, some in (a.partition("=") for a in chosen) for choice in some.split(",")[1:]]
     more = [f"{g}.{k}" for g, c in swept for k in words.names(_settings(folder / g / f"{c.strip()}.yaml"))]
-    words.refuse_keys(argv, composed, groups, more, IMPLIED)
-    return composed
+    readers = _reader_options(folder) if any(a.startswith("data.") for a in argv) else []
+    words.refuse_keys(argv, composed, groups, [*more, *words.reader_names(composed, readers)], IMPLIED)
+    return composed, words.for_reader(argv, composed, readers)
+
+
+def _reader_options(folder: Path) -> list[str]:
+    """Names of all options that readers of captures have, by the settings of each; those of all are no reader's."""
+    every = [_settings(path) for path in sorted((folder / "data").glob("*.yaml"))]
+    reading = [each for each in every if str(each.get("_target_", "")).endswith(".open_capture")]
+    common = set.intersection(*map(set, reading))
+    return list(dict.fromkeys(name for each in reading for name in each if name not in common))
 
 
 def _settings(path: Path) -> Any:
@@ -253,7 +267,7 @@ def _show(name: str, argv: list[str]) -> int:
 
 def _refuse_flags(argv: Iterable[str], known: set[str]) -> None:
     for flag in (a for a in argv if a.startswith("-") and a not in known):
-        near = words.suggestion(flag, {*known, *console.FLAGS, "--version"})
+        near = console.suggestion(flag, {*known, *console.FLAGS, "--version"})
         raise ValueError(f"{flag}: found an unknown flag{near}, expected {', '.join(sorted(known))}")
 
 
@@ -278,7 +292,7 @@ def _run_hydra(argv: list[str]) -> int:
             engine: Any = GlobalHydra.instance().hydra
             mode = RunMode.MULTIRUN if sweep else RunMode.RUN
             # What is misspelt, or cannot be, fails here, in one line, before anything is run.
-            usual = _refuse_names("run", overrides)
+            usual, overrides = _looked_over("run", overrides)
             cfg = engine.compose_config("run", overrides, run_mode=mode, with_log_configuration=False)
             own: Any = OmegaConf.masked_copy(cfg, [k for k in cfg if k not in ("hydra", "output")])
             plain: Any = OmegaConf.to_container(own)

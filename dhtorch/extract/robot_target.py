@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -147,11 +148,11 @@ class RobotTarget:
         clean = self.file(k)
         clean.parent.mkdir(parents=True, exist_ok=True)
         length, writer = 0, None
-        with storage.whole(clean, clean.with_name(f".{clean.name}.tmp")) as sink:
+        with storage.whole(clean, clean.with_name(f".{clean.name}.tmp")) as sink, ExitStack() as closing:
             for table in self._joined(k, start, parts, tallies, tasks):
                 if writer is None:
                     layout = lerobot.schema(self.features(table.column_names), _types(table), {})
-                    writer = parquet.ParquetWriter(sink, layout, compression="zstd")
+                    writer = closing.enter_context(parquet.ParquetWriter(sink, layout, compression="zstd"))
                 writer.write_table(table.select(layout.names).cast(layout))
                 length += table.num_rows
                 seen |= dict.fromkeys(table.column("task_index").to_pylist())
@@ -161,7 +162,6 @@ class RobotTarget:
             said = [tasks[i] for i in seen if i is not None and 0 <= i < len(tasks)]
             own = self._summary(k, start, length, said, moments, tallies)
             writer.add_key_value_metadata({OWN: storage.dumps(own)})
-            writer.close()
             self._copy_videos(k, length)
         return own
 
@@ -335,7 +335,7 @@ class RobotTarget:
             n_tasks=len(tasks),
             robot="unknown" if self.origin is None else self.origin.robot,
         )
-        about["splits"] |= self._splits()
+        about["splits"] |= self._splits(owns)
         lerobot.write_meta(self.root, self.version, about, episodes, tasks, self._stats(owns, features))
 
     def _stats(self, owns: Sequence[Row], features: Mapping[str, Feature]) -> dict[str, Any]:
@@ -355,10 +355,14 @@ class RobotTarget:
                 found[name] = entry
         return found
 
-    def _splits(self) -> dict[str, str]:
+    def _splits(self, owns: Sequence[Row]) -> dict[str, str]:
         """The origin's splits in this set's numbers, where the episodes of each follow one another."""
-        found = {}
-        for name, numbers in ({} if self.origin is None else self.origin.splits).items():
+        found: dict[str, str] = {}
+        splits: dict[str, list[int]] = {} if self.origin is None else dict(self.origin.splits)
+        for own in owns:
+            if "split" in own["about"]:
+                splits.setdefault(own["about"]["split"], []).append(own["number"])
+        for name, numbers in splits.items():
             places = [self.number(k) for k, number in enumerate(self.numbers) if number in set(numbers)]
             if places and places == list(range(places[0], places[-1] + 1)):
                 found[name] = f"{places[0]}:{places[-1] + 1}"

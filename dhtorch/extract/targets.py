@@ -62,11 +62,10 @@ class Tally:
 
     def summary(self) -> Row:
         """Pixels by source and by reason, in all and along time; frames with refuted poses, by what these look like."""
-        pixels = np.array(self.pixels).reshape(len(self.pixels), -1)
-        silent = np.array(self.silent).reshape(len(self.silent), -1)
-        if not len(pixels):
+        if not self.pixels:
             nothing: Row = {key: [] for key in ("pixels", "silent", "over_time", "silent_over_time")}
             return {**nothing, "unread": self.unread, "frames": 0, "refuted": {}}
+        pixels, silent = np.stack(self.pixels), np.stack(self.silent)
         parts = np.array_split(np.arange(len(pixels)), min(PARTS, len(pixels)))
         along, why = ([x[at].sum(0) / max(1, pixels[at].sum()) for at in parts] for x in (pixels, silent))
         found = {"over_time": along, "silent_over_time": why, "unread": self.unread}
