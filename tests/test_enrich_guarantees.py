@@ -309,10 +309,16 @@ def test_poses_that_near_returns_refute_are_said_everywhere_with_their_reading(t
     assert said in capsys.readouterr().out
     about = json.loads((out / "meta" / "report.json").read_text())
     (camera,) = (episode["cameras"]["front"] for episode in about["episodes"])
+    alone = [code for code, name in about["codes"]["silent"].items() if name == "NO_OTHER_VIEW"]
+    assert sum(camera["silent"]) == camera["pixels"][0] and 0 < camera["silent"][int(*alone)] < camera["pixels"][0]
     assert camera["refuted"] == {"millimetres": 2} and camera["frames"] == 3
     page = (out / "meta" / "report.html").read_text()
     assert "millimetres" in page and "Poses given that the near returns contradict" in page
-    assert "the poses given contradict the near returns" in page and "no track" not in page
+    assert (
+        "there was no other view" in page
+        and "the poses given contradict the near returns" in page
+        and "no track" not in page
+    )
 
 
 def test_a_name_that_leads_elsewhere_is_refused(robot, tmp_path, capsys):

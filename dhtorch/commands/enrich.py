@@ -22,7 +22,7 @@ from dhtorch.data.files import need
 from dhtorch.data.rig import Rig
 from dhtorch.data.scene import Scene, scenes_of
 from dhtorch.extract import columns, cut, engines, plan, shards
-from dhtorch.extract.enriched import MapRows, View, camera_key
+from dhtorch.extract.enriched import SILENCE, MapRows, View, camera_key
 from dhtorch.extract.enriched import columns as map_columns
 from dhtorch.extract.nerf_target import NerfTarget
 from dhtorch.extract.origin import NO_RATE, Origin, RobotSet, knows_rate, rate
@@ -301,7 +301,7 @@ def _described(settings: Mapping[str, Any], whole: plan.Plan, wanted: Mapping[st
             "data": {"name": name, "source": source, "digest": digest, "frames": len(whole)},
             "step_m": settings["step"],
             "columns": {k: c._asdict() for k, c in wanted.items()},
-            "codes": {**columns.code_tables(), "source": names(Source), "gate": names(Gate)},
+            "codes": {**columns.code_tables(), "source": names(Source), "gate": names(Gate), "silent": SILENCE},
         }
     )
     return found

@@ -14,9 +14,10 @@ from dhtorch.codes import Gate, Source, names
 from dhtorch.commands.reasons import meaning
 from dhtorch.console import many
 from dhtorch.drawing import Axis, Key, Panel
-from dhtorch.drawing.colours import GATES, RECOVERED, SENSOR, SILENT, Stroke
+from dhtorch.drawing.colours import GATES, RECOVERED, SENSOR, SILENT, SOFT, Stroke
 from dhtorch.drawing.document import document
 from dhtorch.drawing.markup import tag
+from dhtorch.extract.enriched import NO_VIEW, SILENCE
 from dhtorch.extract.targets import UNKNOWN
 from dhtorch.studies.report.figure import Figure
 from dhtorch.studies.report.page import STYLE, figures_markup, table_markup
@@ -33,8 +34,12 @@ WORST = 10
 #: Reasons of silence that are drawn, the most frequent.
 REASONS = 4
 
+#: Least share of the pixels of a reason that is named.
+LEAST = 5e-4
+
 #: Kind of a pixel → its codes.
 KINDS = {"sensor": (Source.SENSOR,), "recovered": (Source.RECOVERED, Source.SWEPT), "silent": (Source.NONE,)}
+_REASON_COLOURS = {**GATES, NO_VIEW: SOFT}
 _COLOURS = {"sensor": SENSOR, "recovered": RECOVERED, "silent": SILENT}
 
 
@@ -58,7 +63,7 @@ def refuted(owns: Sequence[Row]) -> list[str]:
 def write(folder: Path, about: Row, owns: Sequence[Row]) -> Path:
     """Write the page and, beside it, what it says as numbers; where the page is."""
     listed = [{k: own[k] for k in ("number", "length", "cameras")} for own in owns]
-    codes = {"pixels": names(Source), "silent": names(Gate)}
+    codes = {"pixels": names(Source), "silent": SILENCE}
     storage.write_json(folder / f"{NAME}.json", {"data": about["data"], "codes": codes, "episodes": listed})
     return storage.replace_file(folder / f"{NAME}.html", page(about, owns).encode("utf-8"))
 
@@ -89,8 +94,8 @@ def _shares(cameras: Sequence[Row]) -> tuple[dict[str, float], dict[str, float]]
     if not np.size(pixels):
         return dict.fromkeys(KINDS, 0.0) | {"silent": 1.0}, {}
     kinds = {kind: float(sum(pixels[code] for code in codes)) / total for kind, codes in KINDS.items()}
-    gates = {name: float(silent[code]) / total for code, name in names(Gate).items() if code != Gate.ANSWER}
-    return kinds, {name: share for name, share in sorted(gates.items(), key=lambda x: -x[1]) if share}
+    gates = {name: float(silent[code]) / total for code, name in SILENCE.items() if code != Gate.ANSWER}
+    return kinds, {name: share for name, share in sorted(gates.items(), key=lambda x: -x[1]) if share >= LEAST}
 
 
 def _names(owns: Sequence[Row]) -> list[str]:
@@ -162,15 +167,15 @@ def _along(owns: Sequence[Row]) -> Figure | None:
 def _why(owns: Sequence[Row]) -> Figure | None:
     """The reasons of silence that are most frequent, along the episodes."""
     found = _means(owns, "silent_over_time")
-    gates = [gate for gate in GATES if any(mean[gate].max() > 0 for _, mean in found)]
+    gates = [gate for gate in _REASON_COLOURS if any(mean[gate].max() > 0 for _, mean in found)]
     gates = sorted(gates, key=lambda gate: -max(float(mean[gate].mean()) for _, mean in found))[:REASONS]
     panels = []
     for name, mean in found if gates else []:
         panel = _panel(name)
         for gate in gates:
-            _draw(panel, mean[gate], GATES[gate])
+            _draw(panel, mean[gate], _REASON_COLOURS[gate])
         panels.append(panel)
-    keys = [Key(meaning(names(Gate)[gate]), GATES[gate], "line") for gate in gates]
+    keys = [Key(meaning(SILENCE[gate]), _REASON_COLOURS[gate], "line") for gate in gates]
     return Figure("Why silent, along time", "Share of all pixels, by camera.", panels, keys) if panels else None
 
 

@@ -30,14 +30,17 @@ MEANING = {
     Gate.LOW_SCORE: "answers that are not sure enough",
 }
 
+#: What no gate says → what it means.
+_FURTHER = {"unfit": "farther than the files can say", "no_other_view": "there was no other view"}
+
 _BY_NAME = {name.lower(): code for code, name in names(Gate).items()}
 
 
 def meaning(name: str) -> str:
-    """What a reason means; ``name`` is a gate's, as code tables or files write it, or ``unfit``."""
+    """What a reason means; ``name`` is a gate's, as code tables or files write it, or of what no gate says."""
     code = _BY_NAME.get(name.lower())
     if code is None:
-        return "farther than the files can say" if name == "unfit" else words(name.upper())
+        return _FURTHER.get(name.lower(), words(name.upper()))
     return HELP[code][0] if code in HELP else MEANING.get(code, words(name.upper()))
 
 

@@ -206,7 +206,7 @@ def colour_keys(meta: Meta, asked: str | Sequence[str] | None = None) -> list[st
     unknown = [key for key in keys if key not in colour]
     if unknown or not keys:
         raise FormatError(
-            meta.root / "meta" / "info.json", "cameras", ", ".join(unknown) or "none", f"of {', '.join(colour)}"
+            meta.root / "meta" / "info.json", "cameras", ", ".join(unknown) or "none", f"some of {', '.join(colour)}"
         )
     return keys
 

@@ -31,7 +31,10 @@ SIGMA_STEPS: Final = 8
 MAPS = {"depth": "depth as TIFF, m", "sigma": "its standard deviation as TIFF, m", "source": "codes as PNG"}
 
 #: Columns of the counts: pixels by source, and silent ones by reason.
-_N_SOURCES, _N_GATES = max(names(Source)) + 1, max(names(Gate)) + 1
+_N_SOURCES, NO_VIEW = max(names(Source)) + 1, max(names(Gate)) + 1
+
+#: Why a pixel is silent: gates, and that there was no other view, as before the first frame of an episode.
+SILENCE = {**names(Gate), NO_VIEW: "NO_OTHER_VIEW"}
 
 #: Numbers of :class:`dhtorch.export.lerobot.Moments`, over depth, sigma, and the colours of the picture.
 _MOMENTS = (5, 5)
@@ -105,7 +108,7 @@ def columns(pictures: bool) -> dict[str, Column]:
         "K": Column(f, (9,), "px", "of the picture"),
         "pose": Column(f, (16,), "1, m", "T_world_from_cam by rows; NaN = none"),
         "pixels": Column(whole, (_N_SOURCES,), "1", "by source"),
-        "silent": Column(whole, (_N_GATES,), "1", "silent ones by gate"),
+        "silent": Column(whole, (len(SILENCE),), "1", "silent ones by SILENCE"),
         "refuted": Column(whole, (), "code", "0 = no pose is, else 1 + which of CONVENTIONS it looks like"),
         "moments": Column(f, _MOMENTS, "m, 1", "of depth, sigma, red, green, blue"),
         "problem": Column("uint8", (), "code", "what was wrong with the frame"),
@@ -136,8 +139,10 @@ class MapRows(Rows):
         if lens_of(anchor) != view.lens:
             expected = list(view.lens) or "none"
             raise SampleError(f"lens {list(lens_of(anchor)) or 'none'}, expected {expected} as of the first frame")
-        added = opened.answer(anchor, i)
+        others = opened.others(i)
+        added = opened.answer(anchor, others)
         depth, sigma, source, gate = _maps(added, view)
+        why = gate if any(other is not None for other in others) else np.full_like(gate, NO_VIEW)
         depth = _stepped(depth, self.step)
         sigma = _stepped(sigma, self.step / SIGMA_STEPS)
         image = pixels(anchor)
@@ -150,7 +155,7 @@ class MapRows(Rows):
             "K": cam.to_matrix(anchor.camera)[0].double().flatten().numpy(),
             "pose": pose,
             "pixels": np.bincount(source.ravel(), minlength=_N_SOURCES),
-            "silent": np.bincount(gate[source == Source.NONE], minlength=_N_GATES),
+            "silent": np.bincount(why[source == Source.NONE], minlength=len(SILENCE)),
             "refuted": _refuted(added),
             "moments": _moments(depth, sigma, image),
             "problem": added["problem"].numpy(),
