@@ -18,8 +18,9 @@ import torch
 
 from dhtorch import export, storage
 from dhtorch.codes import Source
-from dhtorch.commands import complete, recover_page
-from dhtorch.commands.complete import Progress, Task
+from dhtorch.commands import complete, completed, recover_page
+from dhtorch.commands.complete import Progress
+from dhtorch.commands.completed import Task
 from dhtorch.commands.inspect import Found, classified, find
 from dhtorch.console import many
 from dhtorch.data import FORMATS, FormatError, files, open_all
@@ -219,10 +220,10 @@ def _one(
     own["choices"] = {**settings["choices"], "data": recording.format}
     scene = Scene.of(recording)
     first = _looked_at(recording)
-    task = complete.task_of(scene, folder, method, own, complete.digest_of(scene, own, folder), sized_as=first)
+    task = complete.task_of(scene, folder, method, own, completed.digest_of(scene, own, folder), sized_as=first)
     order = [i for i in coarse_to_fine(len(recording)) if i in task.offers]
     task = replace(task, frames=order, offers={i: list(offered) for i, offered in task.offers.items()})
-    complete.take_up(task)
+    completed.take_up(task)
     made = _make(task, until, progress)
     if not made.frames:
         reason = next(iter(made.broken.values()), "no time for a single frame (minutes=)")
@@ -231,7 +232,7 @@ def _one(
     best = max(zip(rows, made.frames, strict=True), key=lambda each: each[0]["pixels"].get("swept", 0))[1]
     found = recover_page.numbers(task, made.frames)
     said = recover_page.sentences(task, found, recording[made.frames[0]].hw)
-    opening = recover_page.opening(said, found, _overview(task, best), complete.title_of(task, best))
+    opening = recover_page.opening(said, found, _overview(task, best), completed.title_of(task, best))
     written = ["depth/", "overview.png", *_mapped(made, opening, settings, progress)]
     return [*said, _next(made, written[-1]), f"Wrote {', '.join(written)} in {folder}."]
 
@@ -288,7 +289,7 @@ def _unreadable(recording: Recording, k: int) -> str:
 
 def _overview(task: Task, i: int) -> bytes:
     """Write the picture that shows most: what the camera saw, the sensor, the completed map."""
-    picture = complete.drawn(task, i, task.recording[i], *complete.maps_of(task, i))
+    picture = complete.drawn(task, i, task.recording[i], *completed.maps_of(task, i))
     storage.replace_file(task.folder / "overview.png", picture)
     return picture
 
@@ -299,7 +300,7 @@ def _mapped(made: Made, opening: Opening, settings: Mapping[str, Any], progress:
     voxel = voxel_of(task.recording, made.frames) if settings["voxel"] is None else settings["voxel"]
 
     def read(k: int) -> FrameMap:
-        maps, source = complete.maps_of(task, k)
+        maps, source = completed.maps_of(task, k)
         depth, sigma = (torch.from_numpy(np.ascontiguousarray(maps[x])).float() for x in ("depth", "sigma"))
         return FrameMap(depth, sigma, torch.from_numpy(np.ascontiguousarray(source)))
 
@@ -342,6 +343,6 @@ def _written(value: Any) -> str:
 
 def _middle(made: Made) -> float:
     """Median depth of the returns of the first frame, m: what is hidden beyond it tells how good the rest is."""
-    maps, source = complete.maps_of(made.task, made.frames[0])
+    maps, source = completed.maps_of(made.task, made.frames[0])
     near = maps["depth"][(source == Source.SENSOR) & (maps["depth"] > 0)]
     return float(np.median(near)) if len(near) else 2.0

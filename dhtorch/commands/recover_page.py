@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from dhtorch.codes import Source
-from dhtorch.commands import complete, reasons
-from dhtorch.commands.complete import Row, Task
+from dhtorch.commands import completed, reasons
+from dhtorch.commands.completed import Row, Task
 from dhtorch.console import many
 from dhtorch.data import intrinsics as told
 from dhtorch.viewer.exhibit import Opening
@@ -58,7 +58,7 @@ def _recovered(task: Task, frames: Sequence[int]) -> tuple[np.ndarray, np.ndarra
     """Depth and sigma / depth of swept pixels, of some frames."""
     depth, ratio = [np.zeros(0)], [np.zeros(0)]
     for i in frames[:MEASURED]:
-        maps, source = complete.maps_of(task, i)
+        maps, source = completed.maps_of(task, i)
         swept = (source == Source.SWEPT) & (maps["depth"] > 0)
         depth.append(maps["depth"][swept])
         ratio.append(maps["sigma"][swept] / maps["depth"][swept])

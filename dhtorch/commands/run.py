@@ -26,7 +26,7 @@ from typing import Any
 
 import dhtorch
 from dhtorch import console, leash, lock
-from dhtorch.commands import signals, together, words
+from dhtorch.commands import errors, signals, together, words
 from dhtorch.commands.words import quote
 
 #: Sub-command → module with ``main(argv) -> int``.
@@ -73,9 +73,6 @@ EXIT_CODES = {
 
 _LOG = logging.getLogger("dhtorch.commands.run")
 
-#: What bad input raises: reported in one line, without a traceback.
-USER_ERRORS = (ValueError, OSError, KeyError, ImportError)
-
 #: Options that only one choice of the group ``pairs`` has: said alone they choose it.
 IMPLIED = {"pairs.gap": "pairs=gap", "pairs.seconds": "pairs=time", "pairs.metres": "pairs=baseline"}
 
@@ -114,7 +111,7 @@ def _outcome(argv: list[str]) -> int:
     except BrokenPipeError:  # as of `dhtorch report … | head`
         console.leave_the_pipe()
         return UNHEARD
-    except USER_ERRORS as error:
+    except errors.USER_ERRORS as error:
         return _fail(error, show="--traceback" in argv)
     except KeyboardInterrupt as stop:  # a sub-command may say how to go on
         print(": ".join(["dhtorch: interrupted", *map(str, stop.args)]), file=sys.stderr)
@@ -200,13 +197,13 @@ def _run_configured(word: str, argv: list[str]) -> int:
         named = [k for k, v in settings.items() if isinstance(v, dict) and "_target_" in v]
         parts = _parts(cfg, named)
     except (HydraException, OmegaConfBaseException) as error:
-        return _fail(_cause(error), show="traceback=true" in argv)
+        return _fail(errors.cause(error), show="traceback=true" in argv)
     module = importlib.import_module(CONFIGURED[word])
     _LOG.debug("%s: %s", word, ", ".join(f"{k}={v}" for k, v in groups.items()))
     try:
         with console.unsaid():
             return int(module.run({**settings, "choices": groups}, parts, progress=console.progress) or DONE)
-    except USER_ERRORS as error:
+    except errors.USER_ERRORS as error:
         return _fail(error, show=settings.get("traceback", False))
 
 
@@ -403,12 +400,12 @@ def _run_job(cfg: Any) -> Any:
             print(Path(ended.folder) / "result.json", flush=True)
         return ended
     except Exception as error:
-        cause = _cause(error)
-        expected = isinstance(cause, (*USER_ERRORS, OmegaConfBaseException, InstantiationException))
+        cause = errors.cause(error)
+        expected = isinstance(cause, (*errors.USER_ERRORS, OmegaConfBaseException, InstantiationException))
         _fail(cause, show=cfg.traceback or not expected)
         with contextlib.suppress(OSError):
             Path(runtime.output_dir).rmdir()  # where nothing is in it
-        return job.Ended(runtime.output_dir, "failed", _line(cause))
+        return job.Ended(runtime.output_dir, "failed", errors.line(cause))
     finally:
         if swept:
             together.finished(sweep, name)
@@ -421,7 +418,7 @@ def _parts(cfg: Any, names: Iterable[str]) -> dict[str, Any]:
     try:
         return {name: instantiate(cfg[name], _convert_="all") for name in names}
     except Exception as error:
-        _refuse_stacks(_cause(error), cfg.data.get("root"))
+        _refuse_stacks(errors.cause(error), cfg.data.get("root"))
         raise
 
 
@@ -453,36 +450,8 @@ def _again(argv: Iterable[str], folder: Path) -> str:
     return shlex.join(["dhtorch", *words, "resume=true", *([] if own else [f"output={quote(str(place))}"])])
 
 
-def _cause(error: BaseException) -> BaseException:
-    """What a part of the settings raised while Hydra built it."""
-    named = type(error).__name__ == "InstantiationException"
-    return error.__cause__ if named and error.__cause__ else error
-
-
 def _fail(error: BaseException, show: bool = False) -> int:
     if show:
         traceback.print_exception(error)
-    print(f"dhtorch: {_line(error)}", file=sys.stderr)
+    print(f"dhtorch: {errors.line(error)}", file=sys.stderr)
     return FAILED
-
-
-def _line(error: BaseException) -> str:
-    """An error in one line."""
-    lines = [line for line in str(error).splitlines() if line.strip()]
-    if any("Original Traceback" in line for line in lines):  # a data-loader worker sends its whole traceback along
-        lines = lines[-1:]
-    message = " ".join(" ".join(lines).split())
-    if type(error).__name__ == "MissingMandatoryValue":
-        return f"{getattr(error, 'full_key', '')}: found no value, expected {getattr(error, 'full_key', '')}=VALUE"
-    if "hydra/launcher/" in message:
-        message += " (launchers come with the extras: pip install 'dhtorch[scale]', for Ray 'dhtorch[ray-launcher]')"
-    if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        return f"{error.filename}: {error.strerror}"
-    if isinstance(error, KeyError) and len(error.args) == 1:
-        return str(error.args[0])
-    return message if isinstance(error, USER_ERRORS) or _from_settings(error) else f"{type(error).__name__}: {message}"
-
-
-def _from_settings(error: BaseException) -> bool:
-    """What Hydra says of settings names the option itself."""
-    return type(error).__module__.startswith(("hydra.", "omegaconf."))
