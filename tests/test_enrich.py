@@ -99,6 +99,9 @@ def test_statistics_are_of_what_is_known(enriched):
     for name, value in want.items():
         assert np.ravel(found[name])[0] == pytest.approx(value, rel=1e-6)
     assert np.shape(stats[CAMERA]["mean"]) == (3, 1, 1) and found["count"] == [sum(LENGTHS)]
+    features = json.loads((enriched / "meta" / "info.json").read_text())["features"]
+    stated = [features[f"{DEPTH}{end}"]["info"]["quantiser_step_m"] for end in ("", "_sigma")]
+    assert stated == [STEP, STEP / 8], "metres"
 
 
 def test_it_reads_back_as_a_recording(enriched, shots):
