@@ -201,6 +201,18 @@ def test_a_format_that_nothing_writes_is_refused_in_a_line(kind, shots, tmp_path
     assert said.startswith(f"dhtorch: format=same: found {kind}, which has no writer here; expected lerobot, ")
 
 
+def test_every_format_that_is_read_was_written_in_every_format_or_refused():
+    """``same`` among them: docs/enrich.md says so of its table."""
+    file = Path(__file__).parent.parent / "benchmarks" / "results" / "enrich.json"
+    found = json.loads(file.read_text())
+    targets = {row["target"] for row in found}
+    assert len(targets) == 4 and {row["source"] for row in found} == set(data.FORMATS)
+    assert {(row["source"], row["target"]) for row in found} == set(itertools.product(data.FORMATS, targets))
+    for row in (row for row in found if row["target"] == "the source's own"):
+        assert ("refused" in row) == (row["source"] != "lerobot"), row["data"]
+        assert "no writer here; expected lerobot" in row["refused"] if "refused" in row else row["compared"] > 0
+
+
 def test_a_table_without_frame_index_counts_its_rows(shots, tmp_path):
     """As GR00T's sets: the first row bears a time that the video does not know."""
     source = robot_set(tmp_path / "set", shots, 2)
