@@ -38,7 +38,7 @@ from dhtorch.synthetic.recording import SyntheticRoom
 
 FRAMES, STEP = 3, 2.0**-10
 SHORT = (f"frames={FRAMES}", "dense={size: 160}")
-TARGETS = {"lerobot v3.0": "lerobot", "lerobot v2.1": "v2.1", "nerfstudio": "nerfstudio"}
+TARGETS = {"lerobot v3.0": "lerobot", "lerobot v2.1": "v2.1", "nerfstudio": "nerfstudio", "the source's own": "same"}
 
 #: Sources in DHTORCH_DATA: name → what the command is told beside the path.
 REAL = {
@@ -92,8 +92,10 @@ def row(name: str, path: Path, told: Sequence[str], target: str, folder: Path) -
     before = digest(path)
     done, seconds = run(words)
     if done.returncode:
-        why = " ".join(done.stderr.split()).rpartition("dhtorch: ")[2].replace(f"{path.parent}{os.sep}", "")
-        return found | {"refused": why}
+        said = [line for line in done.stderr.splitlines() if not line.startswith("dhtorch: warning: ")]
+        if len(said) != 1 or out.exists():
+            raise ValueError(f"{name} as {target}: found {said} and {out.exists()=}, expected one line and no folder")
+        return found | {"refused": said[0].removeprefix("dhtorch: ").replace(f"{path.parent}{os.sep}", "")}
     again, idle = run(words)
     frames = sum(min(FRAMES, len(each)) for each in source)
     sizes = [p.stat().st_size for p in out.rglob("*") if p.is_file() and p.suffix != ".mp4" and p.parent.name != "meta"]

@@ -7,6 +7,7 @@ stands in the environment variable ``VERBOSITY``, so that the processes of a lau
 from __future__ import annotations
 
 import contextlib
+import difflib
 import io
 import logging
 import os
@@ -30,6 +31,15 @@ EPILOG = (
 def many(n: int, word: str) -> str:
     """A number of things, the word with an s unless there is one."""
     return f"{n} {word}{'s' * (n != 1)}"
+
+
+def suggestion(found: str, known: Iterable[str]) -> str:
+    """The name nearest to what was found, as a question; nothing where none is near."""
+    names = list(dict.fromkeys(known))
+    ends = {name.rpartition(".")[2]: name for name in reversed(names)}
+    near = difflib.get_close_matches(found, names, 1, 0.6)
+    near = near or [ends[k] for k in difflib.get_close_matches(found.rpartition(".")[2], list(ends), 1, 0.7)]
+    return f" (did you mean {near[0]}?)" if near else ""
 
 
 def plain(text: str) -> str:

@@ -23,7 +23,7 @@ from PIL import Image
 from dhtorch import MAP, archive, data, dense, export, storage
 from dhtorch import testing as writers
 from dhtorch.codes import Gate, Source, names
-from dhtorch.commands import complete, layouts, run
+from dhtorch.commands import complete, completed, layouts, run
 from dhtorch.data.pairs import around
 from dhtorch.data.recording import Recording
 from dhtorch.drawing import draw_completed
@@ -145,7 +145,7 @@ def test_the_folder_is_read_again_as_numbered_frames(captures, numbered):
 
 
 def test_figure_and_points_are_of_the_first_frame(room, numbered):
-    files = [p.relative_to(numbered).as_posix() for k in complete.EXTRAS for p in sorted((numbered / k).iterdir())]
+    files = [p.relative_to(numbered).as_posix() for k in completed.EXTRAS for p in sorted((numbered / k).iterdir())]
     assert files == ["figures/000000.png", "points/000000.glb", "points/000000.ply"]
     assert pixels(numbered / "figures" / "000000.png").shape[1] > 1000
     head, _, body = (numbered / "points" / "000000.ply").read_bytes().partition(b"end_header\n")

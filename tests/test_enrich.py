@@ -19,7 +19,7 @@ from dhtorch import data, storage
 from dhtorch import testing as writers
 from dhtorch.commands.run import main
 from dhtorch.extract import shards
-from dhtorch.extract.targets import RobotTarget
+from dhtorch.extract.robot_target import RobotTarget
 from dhtorch.synthetic.recording import SyntheticRoom
 
 HW, LENGTHS, NEAR = (48, 64), (4, 3), 2.5
@@ -99,6 +99,9 @@ def test_statistics_are_of_what_is_known(enriched):
     for name, value in want.items():
         assert np.ravel(found[name])[0] == pytest.approx(value, rel=1e-6)
     assert np.shape(stats[CAMERA]["mean"]) == (3, 1, 1) and found["count"] == [sum(LENGTHS)]
+    features = json.loads((enriched / "meta" / "info.json").read_text())["features"]
+    stated = [features[f"{DEPTH}{end}"]["info"]["quantiser_step_m"] for end in ("", "_sigma")]
+    assert stated == [STEP, STEP / 8], "metres"
 
 
 def test_it_reads_back_as_a_recording(enriched, shots):
@@ -180,6 +183,34 @@ def test_a_recording_becomes_a_set_and_a_nerfstudio_folder(tmp_path, capsys):
     assert np.allclose(np.array(about["frames"][1]["transform_matrix"]) @ np.diag([1, -1, -1, 1]), pose)
     assert main(["enrich", "out=" + str(tmp_path / "x"), "data=synthetic", "format=same", *ASKED]) == 2
     assert "no writer" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["stray", "record3d", "frames_dir", "rlds"])
+def test_a_format_that_nothing_writes_is_refused_in_a_line(kind, shots, tmp_path, capsys):
+    source = {"record3d": tmp_path / "room.r3d", "rlds": tmp_path / "1.0.0"}.get(kind, tmp_path / "room")
+    {
+        "stray": lambda: writers.write_stray(source, shots[:2]),
+        "record3d": lambda: writers.write_r3d(source, shots[:2]),
+        "frames_dir": lambda: writers.write_counted_frames(source, shots[:2]),
+        "rlds": lambda: writers.write_rlds(source, [shots[:2]]),
+    }[kind]()
+    out = tmp_path / "out"
+    assert main(["enrich", str(source), str(out), *ASKED, "format=same"]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and not out.exists()
+    assert said.startswith(f"dhtorch: format=same: found {kind}, which has no writer here; expected lerobot, ")
+
+
+def test_every_format_that_is_read_was_written_in_every_format_or_refused():
+    """``same`` among them: docs/enrich.md says so of its table."""
+    file = Path(__file__).parent.parent / "benchmarks" / "results" / "enrich.json"
+    found = json.loads(file.read_text())
+    targets = {row["target"] for row in found}
+    assert len(targets) == 4 and {row["source"] for row in found} == set(data.FORMATS)
+    assert {(row["source"], row["target"]) for row in found} == set(itertools.product(data.FORMATS, targets))
+    for row in (row for row in found if row["target"] == "the source's own"):
+        assert ("refused" in row) == (row["source"] != "lerobot"), row["data"]
+        assert "no writer here; expected lerobot" in row["refused"] if "refused" in row else row["compared"] > 0
 
 
 def test_a_table_without_frame_index_counts_its_rows(shots, tmp_path):

@@ -25,10 +25,12 @@ from test_enrich import map_of, rows, tree
 from dhtorch import data, lock
 from dhtorch import testing as writers
 from dhtorch.commands.run import main
+from dhtorch.data.codecs import tfrecord
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
 from dhtorch.extract import cut, plan
 from dhtorch.extract.enriched import MapRows, View, camera_key, columns
+from dhtorch.extract.step_set import StepSet
 from dhtorch.methods import PAPER
 from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.synthetic.two_cameras import open_two_cameras
@@ -219,6 +221,36 @@ def test_steps_of_robots_keep_what_they_say(tmp_path):
     assert [len(each) for each in again] == [3, 2, 2]
 
 
+def test_the_record_of_an_episode_is_read_once(tmp_path, monkeypatch):
+    writers.write_rlds(tmp_path / "1.0.0", [shots(7), shots(5)])
+    recordings = data.open_all(tmp_path / "1.0.0")
+    read, opened = [], []
+    record, stream = tfrecord.read_record, tfrecord.opened
+    monkeypatch.setattr(tfrecord, "read_record", lambda file, span: read.append(span) or record(file, span))
+    monkeypatch.setattr(tfrecord, "opened", lambda file: opened.append(file) or stream(file))
+    held = [recordings[0], recordings[1]]
+    read.clear(), opened.clear()
+    steps = StepSet(held, [0, 1], 30.0)
+    tables = [list(steps.batches(k, [])) for k in (0, 1)]
+    assert [sum(t.num_rows for t in found) for found in tables] == [7, 5] and steps.about(1)["split"] == "train"
+    assert len(read) == 2, "one an episode"
+    columns = sum(len(t.column_names) for found in tables for t in found)
+    assert len(opened) <= 2 + columns, "one a column and group at most, not one a step"
+
+
+def test_an_episode_of_which_nothing_can_be_read_is_said(tmp_path, capsys):
+    source = tmp_path / "source"
+    source.mkdir()
+    writers.write_lerobot(source, [shots(2), shots(2, 2)], depth="tiff", version=2)
+    gone = source / "videos" / "chunk-000" / FRONT / "episode_000001.mp4"
+    gone.unlink()
+    for more, helps in (((), "on_error=flag the rest"), (("on_error=flag",), "the video of episode 1")):
+        assert main(["enrich", str(source), str(tmp_path / "set"), *ASKED, *more]) == 2
+        said = capsys.readouterr().err
+        assert gone.name in said and helps in said and said.count("\n") == 1, said
+        shutil.rmtree(tmp_path / "set")
+
+
 def pair_of_cameras():
     rig = open_two_cameras(n_frames=3, hw=(96, 128), depth_hw=(48, 64), supersample=1)[0].recording
     fields = ("name", "format", "number", "times", "poses", "rate_hz")
@@ -264,6 +296,29 @@ def test_the_sources_poses_are_used(robot, tmp_path):
     out = enrich(robot, tmp_path / "set", "pose=device")
     recovered = [int((map_of(row, f"{FRONT}_dhtorch_source") == 2).sum()) for row in rows(out)]
     assert recovered[1] > 0 and recovered[0] == 0
+
+
+def test_poses_that_near_returns_refute_are_said_everywhere_with_their_reading(tmp_path, capsys):
+    source, out = tmp_path / "source", tmp_path / "set"
+    poses = [shot.T_world_from_cam for shot in shots(3)]
+    in_mm = [shot.replace(T_world_from_cam=T.replace(t=1000 * T.t)) for shot, T in zip(shots(3), poses, strict=True)]
+    source.mkdir()
+    writers.write_lerobot(source, [in_mm], depth="tiff")
+    enrich(source, out, "method.n=256", "pose=device")
+    said = "front: the poses given contradict the near returns in 2 of 3 frames; they look like millimetres"
+    assert said in capsys.readouterr().out
+    about = json.loads((out / "meta" / "report.json").read_text())
+    (camera,) = (episode["cameras"]["front"] for episode in about["episodes"])
+    alone = [code for code, name in about["codes"]["silent"].items() if name == "NO_OTHER_VIEW"]
+    assert sum(camera["silent"]) == camera["pixels"][0] and 0 < camera["silent"][int(*alone)] < camera["pixels"][0]
+    assert camera["refuted"] == {"millimetres": 2} and camera["frames"] == 3
+    page = (out / "meta" / "report.html").read_text()
+    assert "millimetres" in page and "Poses given that the near returns contradict" in page
+    assert (
+        "there was no other view" in page
+        and "the poses given contradict the near returns" in page
+        and "no track" not in page
+    )
 
 
 def test_a_name_that_leads_elsewhere_is_refused(robot, tmp_path, capsys):

@@ -114,7 +114,7 @@ def test_thousands_of_episodes_are_listed_and_none_is_opened(
         rewrite(tmp_path / "data/chunk-000/file-000.parquet", lambda t: with_column("episode_index", n - 1, t.slice(2)))
     opened: list[Path] = []
     read = lerobot_rows.read_columns
-    monkeypatch.setattr(lerobot_rows, "read_columns", lambda f, *a: opened.append(f) or read(f, *a))
+    monkeypatch.setattr(lerobot_rows, "read_columns", lambda f, *a, **k: opened.append(f) or read(f, *a, **k))
     recordings = data.open_all(tmp_path)
     assert opened == []
     assert len(recordings) == n and recordings.names[7].endswith("/episode_000007/front")
@@ -342,8 +342,8 @@ def test_a_shorter_video_is_an_error_where_it_ends(tmp_path: Path) -> None:
 def test_opening_decodes_no_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_lerobot(tmp_path, episodes(), image="image", depth="tiff")
     asked: list[str] = []
-    read = codec_parquet.read_columns
-    monkeypatch.setattr(codec_parquet, "read_columns", lambda f, c, r=None: asked.extend(c) or read(f, c, r))
+    read = codec_parquet._columns
+    monkeypatch.setattr(codec_parquet, "_columns", lambda f, t, c, r: asked.extend(c) or read(f, t, c, r))
     recording = data.open(tmp_path, episode=1)
     assert KEY not in asked
     for frame in recording:

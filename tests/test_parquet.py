@@ -46,6 +46,18 @@ def test_a_file_that_changed_is_read_again(tmp_path):
         assert parquet.read_columns(file, ["x"])["x"].tolist() == list(range(n))
 
 
+def test_a_cell_costs_one_footer_and_columns_that_are_not_there_none(tmp_path, monkeypatch):
+    file, opened, real = tmp_path / "x.parquet", [], parquet._open
+    arrow.write_table(table(), file, row_group_size=50)
+    monkeypatch.setattr(parquet, "_open", lambda path: opened.append(path) or real(path))
+    assert [parquet.read_cell(file, "number", row) for row in (60, 61, 99)] == [60, 61, 99] and len(opened) == 1
+    assert parquet.read_cell(file, "number", 100) == 100 and len(opened) == 2, "another group"
+    read = parquet.read_columns(file, ["number"], (0, 2), optional=["text", "gone"])
+    assert list(read) == ["number", "text"] and read["text"] == ["a" * 50, "b"] and len(opened) == 3
+    with pytest.raises(FormatError, match="gone"):
+        parquet.read_columns(file, ["gone"])
+
+
 @pytest.mark.parametrize(
     "damaged", [b"", b"\x15", b"\x19\xfc\xff\xff\xff\xff\x07", b"\x1c" * 40, b"\x15\x02\x00", b"\x1b\x00\x00"]
 )

@@ -18,7 +18,7 @@ from dhtorch.studies import report
 from dhtorch.studies.report import cells, curves, layouts, page, plots, published, text
 from dhtorch.studies.report.figure import Figure
 from dhtorch.studies.report.reading import flatten, scene_rows
-from dhtorch.studies.report.tables import COLUMNS, every_number
+from dhtorch.studies.report.tables import COLUMNS, Table, every_number
 
 REPO = Path(__file__).resolve().parents[1]
 RESULTS = [make() for make in archived.ALL]
@@ -311,6 +311,15 @@ def test_what_was_not_measured_says_why():
     assert by_scene.rows[0][3:] == ["too short"] * len(by_scene.head[3:]) and len(COLUMNS) <= len(by_scene.head[3:])
     assert ["0 of 2 scenes", "gated"] in [row[:2] for row in by_scene.rows]
     assert "too short" in report.markdown(result) and "not run" in report.markdown(result)
+
+
+def test_a_reason_in_all_columns_is_said_once_and_long_words_are_broken():
+    table = Table("t", ["scene", "why", "pairs", "median", "p90"], [["a", "w" * 90, "3", "too short", "too short"]], 2)
+    made = page.table_markup(table)
+    assert made.count("too short") == 1 and '<td class="word" colspan="2">too short</td>' in made
+    assert f'<td class="why">{"w" * 90}</td>' in made and '<td class="num">3</td>' in made
+    dashes = page.table_markup(Table("t", ["scene", "median", "p90"], [["a", "–", "–"]]))
+    assert dashes.count("–") == 2, "nothing is no reason"
 
 
 def test_the_cohort_that_the_summary_leaves_unnamed_decides():

@@ -1,6 +1,7 @@
 """What is typed is looked over before any work: words, names, values; and a sweep ends with one table."""
 
 import csv
+import importlib
 import re
 from types import SimpleNamespace
 
@@ -8,8 +9,10 @@ import pytest
 from test_manners import ROOM, command  # noqa: F401  (a fixture)
 
 from dhtorch import archive
+from dhtorch import testing as writers
 from dhtorch.commands import job, run, together, view, words
 from dhtorch.studies.report import advice, jobs
+from dhtorch.synthetic.recording import SyntheticRoom
 
 TINY = [*ROOM, "method.n=256", "figures=false"]
 
@@ -37,6 +40,10 @@ TINY = [*ROOM, "method.n=256", "figures=false"]
         (["figures=maybe"], "figures", "true"),
         (["threads=0"], "threads", "at least 1"),
         (["data=auto"], "data.root", "data.root=VALUE"),
+        (["data=auto", "data.root=x", "data.camra=front"], "data.camra", "data.camera"),
+        (["data=tum", "data.root=x", "data.registr=false"], "data.registr", "such option"),
+        (["data.camera=front"], "data.camera", "such option"),
+        (["recover", "nowhere", "data.format=tum"], "data.format", "format"),
         (["--multrun"], "--multrun", "--multirun"),
         (["integrate", "voxel=abc"], "voxel", "positive"),
         (["integrate", "vxel=1"], "vxel", "voxel"),
@@ -77,6 +84,48 @@ def test_the_first_word_of_view_may_be_a_capture(command, tmp_path, monkeypatch)
     assert [s["result"] for s in asked] == [None, None, None, "job", "sweep", "nowhere"]
     assert [s["choices"]["data"] for s in asked] == ["auto", "auto", "tum", *["synthetic"] * 3]
     assert [s["data"]["root"] for s in asked[:3]] == ["capture", "view", "view"]
+
+
+@pytest.mark.parametrize(
+    ("first", "module"),
+    [
+        (["enrich", "{}", "out=o"], "dhtorch.commands.enrich"),
+        (["judge", "{}", "depth=d"], "dhtorch.commands.judge"),
+        (["anchor", "{}", "depth=d", "out=o"], "dhtorch.commands.anchor"),
+        (["complete", "{}", "out=o"], "dhtorch.commands.complete"),
+        (["extract", "data=auto", "data.root={}", "out=o"], "dhtorch.extract"),
+        (["{}"], "dhtorch.commands.recover"),
+        (["run", "data=auto", "data.root={}"], "dhtorch.commands.job"),
+    ],
+)
+def test_options_of_the_reader_that_is_recognised_are_options(command, monkeypatch, tmp_path, first, module):  # noqa: F811
+    """``data=auto`` lists none of them: those of the capture's own format are taken, of another refused."""
+    room = SyntheticRoom(hw=(24, 32), n_frames=2, lidar="exact", supersample=1)
+    writers.write_counted_frames(tmp_path / "one", [room[i] for i in range(2)])
+    typed = [word.format(tmp_path / "one") for word in first]
+    asked = []
+
+    def run(settings, parts, *_, **__):
+        opened = parts.get("data")
+        asked.append((settings["data"]["register"], opened is None or len(opened) == 1))
+        raise ValueError("seen")
+
+    monkeypatch.setattr(importlib.import_module(module), "run", run)
+    code, _, err = command(*typed, "data.register=false")
+    assert code != 0 and "seen" in err and asked == [(False, True)]
+    if module.endswith("recover"):  # opens the capture itself
+        monkeypatch.undo()
+        monkeypatch.chdir(tmp_path)
+    code, _, err = command(*typed, "data.camera=front")
+    assert code != 0 and "format frames_dir has no option 'camera', expected one of intrinsics" in err
+
+
+def test_inspect_takes_the_options_of_the_reader_too(command, tmp_path):  # noqa: F811
+    room = SyntheticRoom(hw=(24, 32), n_frames=2, lidar="exact", supersample=1)
+    writers.write_counted_frames(tmp_path / "one", [room[i] for i in range(2)])
+    assert command("inspect", str(tmp_path / "one"), "data.register=false", "--out", str(tmp_path / "sheet"))[0] == 0
+    code, _, err = command("inspect", str(tmp_path / "one"), "data.registr=false")
+    assert code == 2 and "did you mean register?" in err
 
 
 def test_names_of_places_are_one_text():

@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from dhtorch import archive, metric, storage
-from dhtorch.commands import complete
-from dhtorch.commands.complete import Task
+from dhtorch.commands import complete, completed
+from dhtorch.commands.completed import Task
 from dhtorch.commands.judge import exceeded, parse_limits
 from dhtorch.commands.layouts import layout_of
 from dhtorch.data import depth_maps
@@ -77,7 +77,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     scene, out = scenes[0], Path(str(settings["out"])).expanduser()
     maps = depth_maps.open_maps(settings["depth"], scene.recording, settings["depth_unit"])
     task = _task(scene, maps, parts["method"], settings, out)
-    complete.take_up(task)
+    completed.take_up(task)
     before = sum(task.name(i) in task.done for i in task.frames)
     todo = [i for i in task.frames if task.name(i) not in task.done]
     with complete.closing(task):
@@ -112,7 +112,7 @@ def _task(scene: Scene, maps: DepthMaps, method: Method, settings: Mapping[str, 
     assert first is not None
     layout = layout_of(recording, settings["format"], settings["unit"], same=first.shape[-2:] == hw)
     digest = archive.data_digest(_files(scene, maps, frames))
-    options = {**settings, **dict.fromkeys(complete.EXTRAS, False)}
+    options = {**settings, **dict.fromkeys(completed.EXTRAS, False)}
     return Task(
         scene=scene,
         folder=out,
@@ -121,7 +121,7 @@ def _task(scene: Scene, maps: DepthMaps, method: Method, settings: Mapping[str, 
         settings=options,
         frames=frames,
         offers={},
-        shared=complete.shared(
+        shared=completed.shared(
             scene, layout, settings, digest, keyed=KEYED, roots=ROOTS, calibration=None, word="anchor"
         ),
     )
@@ -251,7 +251,7 @@ def _cell(value: Any) -> str:
 def _picture(task: Task, maps: DepthMaps, i: int) -> bytes:
     """PNG of a frame as its files have it."""
     out, given = io.BytesIO(), maps[i]
-    found, _ = complete.maps_of(task, i)
+    found, _ = completed.maps_of(task, i)
     draw_anchored(out, task.recording[i].image[0], given, **found, title=f"{task.scene.name} {task.name(i)}")
     return out.getvalue()
 

@@ -22,11 +22,13 @@ from dhtorch.data.files import need
 from dhtorch.data.rig import Rig
 from dhtorch.data.scene import Scene, scenes_of
 from dhtorch.extract import columns, cut, engines, plan, shards
-from dhtorch.extract.enriched import MapRows, View, camera_key
+from dhtorch.extract.enriched import SILENCE, MapRows, View, camera_key
 from dhtorch.extract.enriched import columns as map_columns
+from dhtorch.extract.nerf_target import NerfTarget
 from dhtorch.extract.origin import NO_RATE, Origin, RobotSet, knows_rate, rate
+from dhtorch.extract.robot_target import RobotTarget
 from dhtorch.extract.step_set import StepSet
-from dhtorch.extract.targets import NerfTarget, RobotTarget, Target
+from dhtorch.extract.targets import Target
 from dhtorch.transform import given
 
 Progress = Callable[..., Iterable[Any]]
@@ -99,10 +101,9 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     rest = "what is whole stays; the same command does the rest"
     try:
         with lock.held(home.parent / f".{home.name}.lock", f"out: {work.out}"):
-            before, complaints = _make(work, settings, progress)
-            owns = [own for k in range(len(_episodes(work.whole))) if (own := work.target.own(k)) is not None]
+            before, owns, complaints = _make(work, settings, progress)
             if settings["report"]:
-                enrich_page.write(_report(work), work.shared, owns)
+                enrich_page.write(work.out / "meta", work.shared, owns)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"what is whole in {work.out} stays; the same command does the rest") from None
     except OSError as error:
@@ -113,8 +114,8 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     return 0
 
 
-def _make(work: Work, settings: Mapping[str, Any], progress: Progress) -> tuple[int, list[str]]:
-    """Make what is missing; how many episodes were whole before, and what could not be read."""
+def _make(work: Work, settings: Mapping[str, Any], progress: Progress) -> tuple[int, list[Row], list[str]]:
+    """Make what is missing; how many episodes were whole before, what all amount to, and what could not be read."""
     of_episode = _episodes(work.whole)
     owns = [work.target.own(k) for k in range(len(of_episode))]
     before = sum(own is not None for own in owns)
@@ -132,15 +133,16 @@ def _make(work: Work, settings: Mapping[str, Any], progress: Progress) -> tuple[
         for k, each in todo.items():
             for piece in (piece for files in each.values() for piece in files if piece.name not in done):
                 made = islice(answers, len(piece.rows))
-                kept = engines.kept(made, settings["on_error"], work.rows, complaints, "on_error")
+                kept = engines.kept(made, settings["on_error"], work.rows, complaints, "on_error=flag")
                 shards.write(work.waiting, piece, kept, work.rows.wanted, work.shared)
             files = {_key(work, n): [work.waiting / p.name for p in own_pieces] for n, own_pieces in each.items()}
             owns[k] = work.target.assemble(k, [own for own in owns[:k] if own is not None], files)
             for path in (path for paths in files.values() for path in paths):
                 path.unlink(missing_ok=True)
-    work.target.finish([own for own in owns if own is not None])
+    every_own = [own for own in owns if own is not None]
+    work.target.finish(every_own)
     shutil.rmtree(work.waiting, ignore_errors=True)
-    return before, complaints
+    return before, every_own, complaints
 
 
 def _work(settings: Mapping[str, Any], parts: Mapping[str, Any]) -> Work:
@@ -299,7 +301,7 @@ def _described(settings: Mapping[str, Any], whole: plan.Plan, wanted: Mapping[st
             "data": {"name": name, "source": source, "digest": digest, "frames": len(whole)},
             "step_m": settings["step"],
             "columns": {k: c._asdict() for k, c in wanted.items()},
-            "codes": {**columns.code_tables(), "source": names(Source), "gate": names(Gate)},
+            "codes": {**columns.code_tables(), "source": names(Source), "gate": names(Gate), "silent": SILENCE},
         }
     )
     return found
@@ -350,10 +352,6 @@ def _key(work: Work, n: int) -> str:
 # ------------------------------------------------------------------------------------------------------ what is said
 
 
-def _report(work: Work) -> Path:
-    return work.out / "meta" / "report.html"
-
-
 def _said(work: Work, owns: Sequence[Row], before: int, complaints: Sequence[str]) -> list[str]:
     """The whole in words."""
     size = sum(path.stat().st_size for path in work.out.rglob("*") if path.is_file())
@@ -364,7 +362,7 @@ def _said(work: Work, owns: Sequence[Row], before: int, complaints: Sequence[str
         kinds = ", ".join(f"{kind} {share:.1%}" for kind, share in shares.items())
         why = ", ".join(f"{words(gate)} {share:.1%}" for gate, share in reasons.items())
         lines.append(f"  {name}: {kinds}" + (f" ({why})" if why else ""))
-    lines += [f"  {line}" for line in work.notes]
+    lines += [f"  {line}" for line in (*enrich_page.refuted(owns), *work.notes)]
     lines += [f"  {complaint}" for complaint in complaints[:_SHOWN]]
     lines += [f"  and {len(complaints) - _SHOWN} more frames"] if len(complaints) > _SHOWN else []
     return lines

@@ -18,12 +18,12 @@ import torch
 
 from dhtorch import export, storage
 from dhtorch.codes import Source
-from dhtorch.commands import complete, recover_page
-from dhtorch.commands.complete import Progress, Task
+from dhtorch.commands import complete, completed, recover_page
+from dhtorch.commands.complete import Progress
+from dhtorch.commands.completed import Task
 from dhtorch.commands.inspect import Found, classified, find
 from dhtorch.console import many
 from dhtorch.data import FORMATS, FormatError, files, open_all
-from dhtorch.data import intrinsics as told
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
 from dhtorch.integrate.from_maps import FrameMap, join
@@ -238,10 +238,10 @@ def _one(
     own["choices"] = {**settings["choices"], "data": recording.format}
     scene = Scene.of(recording)
     first = _looked_at(recording)
-    task = complete.task_of(scene, folder, method, own, complete.digest_of(scene, own, folder), sized_as=first)
+    task = complete.task_of(scene, folder, method, own, completed.digest_of(scene, own, folder), sized_as=first)
     order = [i for i in coarse_to_fine(len(recording)) if i in task.offers]
     task = replace(task, frames=order, offers={i: list(offered) for i, offered in task.offers.items()})
-    complete.take_up(task)
+    completed.take_up(task)
     made = _make(task, until, progress)
     if not made.frames:
         reason = next(iter(made.broken.values()), "no time for a single frame (minutes=)")
@@ -250,7 +250,7 @@ def _one(
     best = max(zip(rows, made.frames, strict=True), key=lambda each: each[0]["pixels"].get("swept", 0))[1]
     found = recover_page.numbers(task, made.frames)
     said = recover_page.sentences(task, found, recording[made.frames[0]].hw)
-    opening = recover_page.opening(said, found, _overview(task, best), complete.title_of(task, best))
+    opening = recover_page.opening(said, found, _overview(task, best), completed.title_of(task, best))
     written = ["depth/", "overview.png", *_mapped(made, opening, settings, progress)]
     return [*said, _next(made, written[-1]), f"Wrote {', '.join(written)} in {folder}."]
 
@@ -307,7 +307,7 @@ def _unreadable(recording: Recording, k: int) -> str:
 
 def _overview(task: Task, i: int) -> bytes:
     """Write the picture that shows most: what the camera saw, the sensor, the completed map."""
-    picture = complete.drawn(task, i, task.recording[i], *complete.maps_of(task, i))
+    picture = complete.drawn(task, i, task.recording[i], *completed.maps_of(task, i))
     storage.replace_file(task.folder / "overview.png", picture)
     return picture
 
@@ -318,7 +318,7 @@ def _mapped(made: Made, opening: Opening, settings: Mapping[str, Any], progress:
     voxel = voxel_of(task.recording, made.frames) if settings["voxel"] is None else settings["voxel"]
 
     def read(k: int) -> FrameMap:
-        maps, source = complete.maps_of(task, k)
+        maps, source = completed.maps_of(task, k)
         depth, sigma = (torch.from_numpy(np.ascontiguousarray(maps[x])).float() for x in ("depth", "sigma"))
         return FrameMap(depth, sigma, torch.from_numpy(np.ascontiguousarray(source)))
 
@@ -347,14 +347,20 @@ def _next(made: Made, shown: str) -> str:
     if made.left:
         more = f"the same command does more of the {made.left} frames left (minutes=null: all)"
         return f"Next: open {shown}; {more}.{broken}"
-    read = {name: value for name, value in made.task.settings["data"].items() if name in told.OPTIONS}
-    also = "".join(f" data.{name}={str(value).replace(' ', '')}" for name, value in read.items())
+    read = {name: value for name, value in made.task.settings["data"].items() if value is not None}
+    also = "".join(f" data.{name}={_written(value)}" for name, value in read.items())
     judged = f"dhtorch run data=auto data.root={made.task.settings['path']}{also} holdout.cutoff={_middle(made):.2g}"
     return f"Next: open {shown}; {judged} says how good it is on yours.{broken}"
 
 
+def _written(value: Any) -> str:
+    """A value as it is typed."""
+    listed = isinstance(value, list)
+    return f"[{','.join(map(str, value))}]" if listed else str(value).lower() if isinstance(value, bool) else str(value)
+
+
 def _middle(made: Made) -> float:
     """Median depth of the returns of the first frame, m: what is hidden beyond it tells how good the rest is."""
-    maps, source = complete.maps_of(made.task, made.frames[0])
+    maps, source = completed.maps_of(made.task, made.frames[0])
     near = maps["depth"][(source == Source.SENSOR) & (maps["depth"] > 0)]
     return float(np.median(near)) if len(near) else 2.0

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from dhtorch.codes import Gate, Source, names, words
-from dhtorch.commands import complete
-from dhtorch.commands.complete import Row, Task
+from dhtorch.codes import Source
+from dhtorch.commands import completed, reasons
+from dhtorch.commands.completed import Row, Task
 from dhtorch.console import many
 from dhtorch.data import intrinsics as told
 from dhtorch.viewer.exhibit import Opening
@@ -20,32 +19,6 @@ MEASURED = 40
 
 #: Reasons of silence that are named on the page, the most frequent; the least share of the pixels that one must have.
 REASONS, LEAST_SHARE = 3, 0.005
-
-#: Reason of silence → what it means and what would help; of others nothing would.
-HELP = {
-    Gate.NO_BASELINE: ("the camera only turned", "moving it sideways by a tenth of the distance would help"),
-    Gate.NO_POSE: ("too few returns could be tracked", "slower motion, more light and texture would help"),
-    Gate.NO_TRACK: (
-        "what has no return could not be found in other views",
-        "texture and a view from the side would help",
-    ),
-    Gate.UNCERTAIN: ("the views lie too close together for what is far", "moving sideways would help"),
-    Gate.POSE_REFUTED: ("the poses given contradict the near returns", "see their axes, direction and unit"),
-    Gate.CONTRADICTED: ("what the sensor sees moves, or contradicts the pictures", "a still scene would help"),
-}
-
-#: Reason of silence that no help belongs to → what it means.
-MEANING = {
-    Gate.NO_TEXTURE: "blank surfaces, on which nothing can be followed",
-    Gate.BEHIND: "what would lie behind a camera",
-    Gate.PARALLAX: "seen from nearly the same direction in all views",
-    Gate.RESIDUAL: "the views do not meet in one point",
-    Gate.INCONSISTENT: "the views do not agree",
-    Gate.LOW_SCORE: "answers that are not sure enough",
-}
-
-_REASONS = {name.lower(): HELP[code][0] if code in HELP else MEANING.get(code) for code, name in names(Gate).items()}
-_REASONS["unfit"] = "farther than the files can say"
 
 
 @dataclass(frozen=True)
@@ -85,7 +58,7 @@ def _recovered(task: Task, frames: Sequence[int]) -> tuple[np.ndarray, np.ndarra
     """Depth and sigma / depth of swept pixels, of some frames."""
     depth, ratio = [np.zeros(0)], [np.zeros(0)]
     for i in frames[:MEASURED]:
-        maps, source = complete.maps_of(task, i)
+        maps, source = completed.maps_of(task, i)
         swept = (source == Source.SWEPT) & (maps["depth"] > 0)
         depth.append(maps["depth"][swept])
         ratio.append(maps["sigma"][swept] / maps["depth"][swept])
@@ -122,20 +95,17 @@ def opening(said: Sequence[str], found: Numbers, picture: bytes, place: str) -> 
         shown |= {"Median stated error": f"{found.error:.1%}"}
     shares = {"Sensor": found.sensor, "Recovered": found.recovered, "Silent": found.silent}
     shown |= {f"{kind}, of the pixels": f"{share:.1%}" for kind, share in shares.items()}
-    reasons = [
-        f"{meant} ({share:.1%} of the pixels)"
-        for name, share in found.reasons
-        if share >= LEAST_SHARE and (meant := _REASONS.get(name, words(name.upper())))
+    silent = [
+        f"{reasons.meaning(name)} ({share:.1%} of the pixels)" for name, share in found.reasons if share >= LEAST_SHARE
     ]
-    silence = [f"Silent, most often: {'; '.join(reasons[:REASONS])}."] if reasons else []
+    silence = [f"Silent, most often: {'; '.join(silent[:REASONS])}."] if silent else []
     told_of = "picture, the sensor's depth and the completed one on one scale in metres, and sigma / depth"
     return Opening(shown, [*said, *silence], picture, f"{place}: {told_of}.")
 
 
 def _why(found: Numbers) -> str:
     """Why frames are silent, by the reason that most silent pixels have and that something helps against."""
-    known: Mapping[str, Any] = {name.lower(): HELP[code] for code, name in names(Gate).items() if code in HELP}
     for name, share in found.reasons:
-        if name in known and share > 0.01:
-            return "; ".join(known[name])
+        if share > 0.01 and (said := reasons.advice(name)) is not None:
+            return said
     return "nothing lies beyond the sensor, which answers nearly everywhere; cutoff=2.0 shows what views can do"

@@ -26,7 +26,7 @@ from typing import Any
 
 import dhtorch
 from dhtorch import console, leash, lock
-from dhtorch.commands import signals, together, words
+from dhtorch.commands import errors, signals, together, words
 from dhtorch.commands.words import quote
 
 #: Sub-command → module with ``main(argv) -> int``.
@@ -73,9 +73,6 @@ EXIT_CODES = {
 
 _LOG = logging.getLogger("dhtorch.commands.run")
 
-#: What bad input raises: reported in one line, without a traceback.
-USER_ERRORS = (ValueError, OSError, KeyError, ImportError)
-
 #: Options that only one choice of the group ``pairs`` has: said alone they choose it.
 IMPLIED = {"pairs.gap": "pairs=gap", "pairs.seconds": "pairs=time", "pairs.metres": "pairs=baseline"}
 
@@ -114,7 +111,7 @@ def _outcome(argv: list[str]) -> int:
     except BrokenPipeError:  # as of `dhtorch report … | head`
         console.leave_the_pipe()
         return UNHEARD
-    except USER_ERRORS as error:
+    except errors.USER_ERRORS as error:
         return _fail(error, show="--traceback" in argv)
     except KeyboardInterrupt as stop:  # a sub-command may say how to go on
         print(": ".join(["dhtorch: interrupted", *map(str, stop.args)]), file=sys.stderr)
@@ -191,7 +188,7 @@ def _run_configured(word: str, argv: list[str]) -> int:
     argv = words.quoted(argv)
     try:
         with hydra.initialize_config_dir(str(config_dir()), version_base="1.3", job_name="dhtorch"):
-            usual = _refuse_names(word, argv)
+            usual, argv = _looked_over(word, argv)
             cfg = hydra.compose(word, argv, return_hydra_config=True)
             HydraConfig.instance().set_config(cfg)  # for what the settings take from Hydra, as the folder's name
             groups = {k: v for k, v in cfg.hydra.runtime.choices.items() if k.isidentifier()}
@@ -202,18 +199,23 @@ def _run_configured(word: str, argv: list[str]) -> int:
         named = [k for k, v in settings.items() if isinstance(v, dict) and "_target_" in v]
         parts = _parts(cfg, named)
     except (HydraException, OmegaConfBaseException) as error:
-        return _fail(_cause(error), show="traceback=true" in argv)
+        return _fail(errors.cause(error), show="traceback=true" in argv)
     module = importlib.import_module(CONFIGURED[word])
     _LOG.debug("%s: %s", word, ", ".join(f"{k}={v}" for k, v in groups.items()))
     try:
         with console.unsaid():
             return int(module.run({**settings, "choices": groups}, parts, progress=console.progress) or DONE)
-    except USER_ERRORS as error:
+    except errors.USER_ERRORS as error:
         return _fail(error, show=settings.get("traceback", False))
 
 
-def _refuse_names(name: str, argv: Sequence[str]) -> Any:
-    """Refuse choices and options that the settings ``name`` do not have; returns what the choices alone compose to."""
+def _looked_over(name: str, argv: Sequence[str]) -> tuple[Any, list[str]]:
+    """Refuse choices and options that the settings ``name`` do not have.
+
+    Returns:
+        What the choices alone compose to, and the words as Hydra takes them: with a format that is yet to be
+        recognised, options of its reader are added to the settings.
+    """
     import hydra  # noqa: PLC0415
     from omegaconf import OmegaConf  # noqa: PLC0415
 
@@ -225,8 +227,17 @@ def _refuse_names(name: str, argv: Sequence[str]) -> Any:
     composed: Any = OmegaConf.to_container(hydra.compose(name, first))
     swept = [(group, choice) for group, _, some in (a.partition("=") for a in chosen) for choice in some.split(",")[1:]]
     more = [f"{g}.{k}" for g, c in swept for k in words.names(_settings(folder / g / f"{c.strip()}.yaml"))]
-    words.refuse_keys(argv, composed, groups, more, IMPLIED)
-    return composed
+    readers = _reader_options(folder) if any(a.startswith("data.") for a in argv) else []
+    words.refuse_keys(argv, composed, groups, [*more, *words.reader_names(composed, readers)], IMPLIED)
+    return composed, words.for_reader(argv, composed, readers)
+
+
+def _reader_options(folder: Path) -> list[str]:
+    """Names of all options that readers of captures have, by the settings of each; those of all are no reader's."""
+    every = [_settings(path) for path in sorted((folder / "data").glob("*.yaml"))]
+    reading = [each for each in every if str(each.get("_target_", "")).endswith(".open_capture")]
+    common = set.intersection(*map(set, reading))
+    return list(dict.fromkeys(name for each in reading for name in each if name not in common))
 
 
 def _settings(path: Path) -> Any:
@@ -273,7 +284,7 @@ def _show(name: str, argv: list[str]) -> int:
 
 def _refuse_flags(argv: Iterable[str], known: set[str]) -> None:
     for flag in (a for a in argv if a.startswith("-") and a not in known):
-        near = words.suggestion(flag, {*known, *console.FLAGS, "--version"})
+        near = console.suggestion(flag, {*known, *console.FLAGS, "--version"})
         raise ValueError(f"{flag}: found an unknown flag{near}, expected {', '.join(sorted(known))}")
 
 
@@ -298,7 +309,7 @@ def _run_hydra(argv: list[str]) -> int:
             engine: Any = GlobalHydra.instance().hydra
             mode = RunMode.MULTIRUN if sweep else RunMode.RUN
             # What is misspelt, or cannot be, fails here, in one line, before anything is run.
-            usual = _refuse_names("run", overrides)
+            usual, overrides = _looked_over("run", overrides)
             cfg = engine.compose_config("run", overrides, run_mode=mode, with_log_configuration=False)
             own: Any = OmegaConf.masked_copy(cfg, [k for k in cfg if k not in ("hydra", "output")])
             plain: Any = OmegaConf.to_container(own)
@@ -409,12 +420,12 @@ def _run_job(cfg: Any) -> Any:
             print(Path(ended.folder) / "result.json", flush=True)
         return ended
     except Exception as error:
-        cause = _cause(error)
-        expected = isinstance(cause, (*USER_ERRORS, OmegaConfBaseException, InstantiationException))
+        cause = errors.cause(error)
+        expected = isinstance(cause, (*errors.USER_ERRORS, OmegaConfBaseException, InstantiationException))
         _fail(cause, show=cfg.traceback or not expected)
         with contextlib.suppress(OSError):
             Path(runtime.output_dir).rmdir()  # where nothing is in it
-        return job.Ended(runtime.output_dir, "failed", _line(cause))
+        return job.Ended(runtime.output_dir, "failed", errors.line(cause))
     finally:
         if swept:
             together.finished(sweep, name)
@@ -427,7 +438,7 @@ def _parts(cfg: Any, names: Iterable[str]) -> dict[str, Any]:
     try:
         return {name: instantiate(cfg[name], _convert_="all") for name in names}
     except Exception as error:
-        _refuse_stacks(_cause(error), cfg.data.get("root"))
+        _refuse_stacks(errors.cause(error), cfg.data.get("root"))
         raise
 
 
@@ -459,36 +470,8 @@ def _again(argv: Iterable[str], folder: Path) -> str:
     return shlex.join(["dhtorch", *words, "resume=true", *([] if own else [f"output={quote(str(place))}"])])
 
 
-def _cause(error: BaseException) -> BaseException:
-    """What a part of the settings raised while Hydra built it."""
-    named = type(error).__name__ == "InstantiationException"
-    return error.__cause__ if named and error.__cause__ else error
-
-
 def _fail(error: BaseException, show: bool = False) -> int:
     if show:
         traceback.print_exception(error)
-    print(f"dhtorch: {_line(error)}", file=sys.stderr)
+    print(f"dhtorch: {errors.line(error)}", file=sys.stderr)
     return FAILED
-
-
-def _line(error: BaseException) -> str:
-    """An error in one line."""
-    lines = [line for line in str(error).splitlines() if line.strip()]
-    if any("Original Traceback" in line for line in lines):  # a data-loader worker sends its whole traceback along
-        lines = lines[-1:]
-    message = " ".join(" ".join(lines).split())
-    if type(error).__name__ == "MissingMandatoryValue":
-        return f"{getattr(error, 'full_key', '')}: found no value, expected {getattr(error, 'full_key', '')}=VALUE"
-    if "hydra/launcher/" in message:
-        message += " (launchers come with the extras: pip install 'dhtorch[scale]', for Ray 'dhtorch[ray-launcher]')"
-    if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        return f"{error.filename}: {error.strerror}"
-    if isinstance(error, KeyError) and len(error.args) == 1:
-        return str(error.args[0])
-    return message if isinstance(error, USER_ERRORS) or _from_settings(error) else f"{type(error).__name__}: {message}"
-
-
-def _from_settings(error: BaseException) -> bool:
-    """What Hydra says of settings names the option itself."""
-    return type(error).__module__.startswith(("hydra.", "omegaconf."))

@@ -8,7 +8,6 @@ Values of options that a function takes are held against its annotations; those 
 from __future__ import annotations
 
 import collections.abc
-import difflib
 import importlib
 import inspect
 import math
@@ -18,6 +17,8 @@ import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from dhtorch import console
 
 #: Options whose value is a place: whatever stands in it, it is one text.
 PLACES = ("output", "out", "depth", "html", "save", "result", "root", "data.root", "path")
@@ -103,18 +104,8 @@ MEASURES = re.compile(r".*_(px|m|rel|hz)|(min|max|sigma)_.*|metres|seconds|toler
 #: Numbers below zero that switch a test off, or point somewhere.
 SIGNED = ("max_rise", "min_score", "min_correlation")
 
-
 #: Annotations of lists.
 LISTS = (list, tuple, collections.abc.Sequence, collections.abc.Iterable)
-
-
-def suggestion(found: str, known: Iterable[str]) -> str:
-    """The name nearest to what was found, as a question; nothing where none is near."""
-    names = list(dict.fromkeys(known))
-    ends = {name.rpartition(".")[2]: name for name in reversed(names)}
-    near = difflib.get_close_matches(found, names, 1, 0.6)
-    near = near or [ends[k] for k in difflib.get_close_matches(found.rpartition(".")[2], list(ends), 1, 0.7)]
-    return f" (did you mean {near[0]}?)" if near else ""
 
 
 def refuse_words(argv: Sequence[str], known: Sequence[str]) -> None:
@@ -126,7 +117,7 @@ def refuse_words(argv: Sequence[str], known: Sequence[str]) -> None:
     for k, word in enumerate(argv):
         if "=" in word or word.startswith(("-", "~")):
             continue
-        near = f" (did you mean {USUAL[word]}?)" if word in USUAL else suggestion(word, known if k == 0 else ())
+        near = f" (did you mean {USUAL[word]}?)" if word in USUAL else console.suggestion(word, known if k == 0 else ())
         if not near and Path(word).exists():
             near = f" (a capture is named as data=auto data.root={word})"
         expected = f"one of {', '.join(known)}, or option=value" if k == 0 and not near else "option=value"
@@ -176,7 +167,7 @@ def refuse_choices(argv: Sequence[str], folder: Path) -> None:
         known = sorted(p.stem for p in (folder / key).glob("*.yaml"))
         for choice in value.strip("'\"").split(","):
             if choice.strip() not in known and not choice.strip().startswith(("[", "{", "choice(", "glob(")):
-                found = f"{key}: found {choice!r}{suggestion(choice, known)}"
+                found = f"{key}: found {choice!r}{console.suggestion(choice, known)}"
                 raise ValueError(f"{found}, expected one of {', '.join(known)}")
 
 
@@ -207,8 +198,29 @@ def refuse_keys(
             continue
         if plain in known or plain.startswith(("hydra.", "hydra/")) or (key != plain and _taken(plain, settings)):
             continue
-        near = suggestion(plain, [*elsewhere, *known])
+        near = console.suggestion(plain, [*elsewhere, *known])
         raise ValueError(f"{plain}: found no such option{near}, expected one that --help lists")
+
+
+def for_reader(argv: Sequence[str], settings: Mapping[str, Any], readers: Iterable[str]) -> list[str]:
+    """The words with those of a reader's options added that the settings do not list, as it is yet to be recognised.
+
+    Args:
+        argv: the words.
+        settings: as composed from the words that choose a group.
+        readers: names of all options that any reader has; :func:`dhtorch.data.open_all` refuses those of another.
+    """
+    mine = reader_names(settings, readers)
+    return [f"++{word}" if word.partition("=")[0] in mine else word for word in argv]
+
+
+def reader_names(settings: Mapping[str, Any], readers: Iterable[str]) -> set[str]:
+    """Dotted names of the readers' options that may be said although the settings do not list them."""
+    data = settings.get("data")
+    if not isinstance(data, Mapping):
+        return set()
+    recognised = data.get("format") == "auto" if "_target_" in data else True  # without: options of a reader alone
+    return {f"data.{name}" for name in readers if name not in data} if recognised else set()
 
 
 def names(settings: Mapping[str, Any], above: str = "") -> Iterator[str]:

@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final, Protocol
 
+from dhtorch import console
 from dhtorch.data import arkitscenes, ca1m, driving, frames_dir, lerobot, record3d, rectified, rh20t, rlds, stray, tum
 from dhtorch.data import intrinsics as told
 from dhtorch.data.files import FormatError, inside
@@ -126,7 +127,8 @@ def open_all(
     options = {name: value for name, value in options.items() if (name, value) not in _UNSAID}
     for option in options:
         if option not in known:
-            raise ValueError(f"data: format {format} has no option {option!r}, expected one of {', '.join(known)}")
+            shown = f"{option!r}{console.suggestion(option, known)}"
+            raise ValueError(f"data: format {format} has no option {shown}, expected one of {', '.join(known)}")
     with inside(bounds):
         found = read(root, **options)
     if isinstance(found, Recordings):

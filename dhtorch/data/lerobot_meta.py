@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dhtorch.data import files
-from dhtorch.data.codecs.parquet import parquet_header, read_columns
+from dhtorch.data.codecs.parquet import read_columns
 from dhtorch.data.files import FormatError
 
 _MAX_EPISODES = 10_000_000
@@ -170,11 +170,10 @@ def _columns_v3(meta: Meta) -> dict[str, np.ndarray]:
     found: list[dict[str, np.ndarray]] = []
     for table in tables:
         spans = ["dataset_from_index", "dataset_to_index"]
-        spans = spans if {*spans} <= {*parquet_header(table).columns} else []
-        read = read_columns(table, [*counts, *starts, *spans])
+        read = read_columns(table, [*counts, *starts], optional=spans)
         columns = {name: _counts(read[name], table, name) for name in counts}
         columns |= {name: _numbers(read[name], table, name, np.isfinite) for name in starts}
-        if spans:
+        if {*spans} <= {*read}:
             first, end = (_counts(read[name], table, name, 2**53) for name in spans)
             columns["length"] = end - first
         found.append(columns)
@@ -207,7 +206,7 @@ def colour_keys(meta: Meta, asked: str | Sequence[str] | None = None) -> list[st
     unknown = [key for key in keys if key not in colour]
     if unknown or not keys:
         raise FormatError(
-            meta.root / "meta" / "info.json", "cameras", ", ".join(unknown) or "none", f"of {', '.join(colour)}"
+            meta.root / "meta" / "info.json", "cameras", ", ".join(unknown) or "none", f"some of {', '.join(colour)}"
         )
     return keys
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from dhtorch.data import files
-from dhtorch.data.codecs.parquet import parquet_header, read_columns
+from dhtorch.data.codecs.parquet import read_columns
 from dhtorch.data.files import FormatError
 from dhtorch.data.lerobot_meta import Episode, Meta
 
@@ -29,10 +29,9 @@ def read_table(file: Path, more: tuple[str, ...]) -> dict[str, np.ndarray]:
 
 @lru_cache(maxsize=1)
 def _read_table(file: Path, _changed: int, more: tuple[str, ...]) -> dict[str, np.ndarray]:
-    have = parquet_header(file).columns
     table: dict[str, np.ndarray] = {}
-    places = [name for name in ("timestamp", "frame_index", "episode_index") if name in have or name == "timestamp"]
-    for name, values in read_columns(file, [*places, *more]).items():
+    places = "timestamp", "frame_index", "episode_index"
+    for name, values in read_columns(file, [places[0], *more], optional=places[1:]).items():
         if not isinstance(values, np.ndarray):
             raise FormatError(file, name, "no numbers", "numbers")
         if name in places and values.size != len(values):

@@ -7,7 +7,7 @@ encoded bytes, cannot be told from others and is left out.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,7 @@ class Steps:
     n: int
     features: Mapping[str, rlds.Described]  # those that can be read
     found: Mapping[str, tfrecord.Feature]  # of the record
+    numbers: dict[str, np.ndarray] = field(default_factory=dict)  # that can only be read all at once
 
     @classmethod
     def of(cls, recording: Recording) -> Steps:
@@ -69,7 +70,7 @@ class Steps:
         feature, described = self.found[f"{_STEPS}{name}"], self.features[name]
         if described.kind == "tensor":
             return self._numbers(name, steps)
-        content = [tfrecord.read_span(self.place.file, feature.spans[i]) for i in steps]
+        content = tfrecord.read_spans(self.place.file, [feature.spans[i] for i in steps])
         return content if described.kind == "image" else [text.decode("utf-8", "replace") for text in content]
 
     def _numbers(self, name: str, steps: range) -> np.ndarray:
@@ -81,11 +82,17 @@ class Steps:
             data = tfrecord.read_span(self.place.file, tfrecord.Span(at, 4 * size * len(steps)))
             read = np.frombuffer(data, "<f4")
         else:
+            read = self._whole(name, feature, size)[size * steps.start : size * steps.stop]
+        return read.astype(described.dtype).reshape(len(steps), size)
+
+    def _whole(self, name: str, feature: tfrecord.Feature, size: int) -> np.ndarray:
+        """The numbers of all steps, decoded once."""
+        if name not in self.numbers:
             whole = tfrecord.numbers(self.place.file, name, feature, size * self.n)
             if len(whole) != size * self.n:
                 raise FormatError(self.place.file, name, f"{len(whole)} numbers", f"{size} for each of {self.n} steps")
-            read = whole[size * steps.start : size * steps.stop]
-        return read.astype(described.dtype).reshape(len(steps), size)
+            self.numbers[name] = whole.astype(self.features[name].dtype)
+        return self.numbers[name]
 
     @property
     def about(self) -> dict[str, Any]:

@@ -99,7 +99,8 @@ class Rows(Dataset[Extracted]):
 
     def features(self, opened: Opened, i: int) -> Row:
         """The columns of frame ``i`` of an opened recording, beside those of its place."""
-        added = opened.answer(opened.frame(i), i)
+        anchor = opened.frame(i)
+        added = opened.answer(anchor, opened.others(i))
         _check_shapes(added, self.wanted)
         keep = {k: c for k, c in self.wanted.items() if k not in PLACE}
         return {k: added[k].numpy().astype(c.kind) for k, c in keep.items()}
@@ -135,9 +136,9 @@ class Opened:
         self._forget()
         return frame
 
-    def answer(self, anchor: Frame, i: int) -> dict[str, Tensor]:
-        """What the transform adds to the sample of frame ``i``, which is ``anchor``."""
-        sample = _sample(anchor, self._others(i))
+    def answer(self, anchor: Frame, others: Sequence[Frame | None]) -> dict[str, Tensor]:
+        """What the transform adds to the sample of a frame and its other views."""
+        sample = _sample(anchor, others)
         optional = tuple(key for key in ("confidence", "distortion", "depth_intrinsics") if key in sample)
         kind = (len(sample["image"]), *optional)
         if kind not in self.transforms:
@@ -147,7 +148,8 @@ class Opened:
         assert out is not None  # on_error is raise
         return {k.removeprefix(transform.prefix): v for k, v in out.items() if k.startswith(transform.prefix)}
 
-    def _others(self, i: int) -> list[Frame | None]:
+    def others(self, i: int) -> list[Frame | None]:
+        """The other views of frame ``i``; None = one that is not there, or cannot be read."""
         if self.offers is None:
             number = int(self.recording.number[i])
             return [self._frame(self.position.get(number - step)) for step in self.steps]

@@ -43,16 +43,20 @@ def run(
 
 
 def kept(
-    answers: Iterable[Extracted], on_error: str, rows: Rows, complaints: list[str], option: str = "extract.on_error"
+    answers: Iterable[Extracted],
+    on_error: str,
+    rows: Rows,
+    complaints: list[str],
+    otherwise: str = "extract.on_error=skip or flag",
 ) -> Iterator[columns.Row]:
     """Rows to write: what becomes of a frame that cannot be read is decided here, for every engine alike.
 
     Raises:
-        SampleError: one that cannot be read, where ``on_error`` is raise; ``option`` is what to set otherwise.
+        SampleError: one that cannot be read, where ``on_error`` is raise; ``otherwise`` is what to set.
     """
     for place, features, complaint in answers:
         if features is None and on_error == "raise":
-            raise SampleError(f"{complaint} (with {option}=skip or flag the rest goes on)")
+            raise SampleError(f"{complaint} (with {otherwise} the rest goes on)")
         if features is None:
             complaints.append(complaint)
         if features is not None or on_error == "flag":

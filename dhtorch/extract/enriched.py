@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from dhtorch import dense
-from dhtorch.codes import Gate, Source, names
+from dhtorch.codes import Gate, PoseCode, Source, names
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
 from dhtorch.export import png
@@ -31,7 +31,10 @@ SIGMA_STEPS: Final = 8
 MAPS = {"depth": "depth as TIFF, m", "sigma": "its standard deviation as TIFF, m", "source": "codes as PNG"}
 
 #: Columns of the counts: pixels by source, and silent ones by reason.
-_N_SOURCES, _N_GATES = max(names(Source)) + 1, max(names(Gate)) + 1
+_N_SOURCES, NO_VIEW = max(names(Source)) + 1, max(names(Gate)) + 1
+
+#: Why a pixel is silent: gates, and that there was no other view, as before the first frame of an episode.
+SILENCE = {**names(Gate), NO_VIEW: "NO_OTHER_VIEW"}
 
 #: Numbers of :class:`dhtorch.export.lerobot.Moments`, over depth, sigma, and the colours of the picture.
 _MOMENTS = (5, 5)
@@ -105,7 +108,8 @@ def columns(pictures: bool) -> dict[str, Column]:
         "K": Column(f, (9,), "px", "of the picture"),
         "pose": Column(f, (16,), "1, m", "T_world_from_cam by rows; NaN = none"),
         "pixels": Column(whole, (_N_SOURCES,), "1", "by source"),
-        "silent": Column(whole, (_N_GATES,), "1", "silent ones by gate"),
+        "silent": Column(whole, (len(SILENCE),), "1", "silent ones by SILENCE"),
+        "refuted": Column(whole, (), "code", "0 = no pose is, else 1 + which of CONVENTIONS it looks like"),
         "moments": Column(f, _MOMENTS, "m, 1", "of depth, sigma, red, green, blue"),
         "problem": Column("uint8", (), "code", "what was wrong with the frame"),
     }
@@ -135,8 +139,10 @@ class MapRows(Rows):
         if lens_of(anchor) != view.lens:
             expected = list(view.lens) or "none"
             raise SampleError(f"lens {list(lens_of(anchor)) or 'none'}, expected {expected} as of the first frame")
-        added = opened.answer(anchor, i)
+        others = opened.others(i)
+        added = opened.answer(anchor, others)
         depth, sigma, source, gate = _maps(added, view)
+        why = gate if any(other is not None for other in others) else np.full_like(gate, NO_VIEW)
         depth = _stepped(depth, self.step)
         sigma = _stepped(sigma, self.step / SIGMA_STEPS)
         image = pixels(anchor)
@@ -149,7 +155,8 @@ class MapRows(Rows):
             "K": cam.to_matrix(anchor.camera)[0].double().flatten().numpy(),
             "pose": pose,
             "pixels": np.bincount(source.ravel(), minlength=_N_SOURCES),
-            "silent": np.bincount(gate[source == Source.NONE], minlength=_N_GATES),
+            "silent": np.bincount(why[source == Source.NONE], minlength=len(SILENCE)),
+            "refuted": _refuted(added),
             "moments": _moments(depth, sigma, image),
             "problem": added["problem"].numpy(),
         }
@@ -185,6 +192,15 @@ def _maps(added: Mapping[str, Tensor], view: View) -> tuple[np.ndarray, ...]:
         field[at[:, 1], at[:, 0]] = added[name].numpy()
         found.append(field)
     return tuple(found)
+
+
+def _refuted(added: Mapping[str, Tensor]) -> np.ndarray:
+    """Whether the near returns refute a pose that was given, and what it looks like, as the column has it."""
+    looks = int(added.get("pose_looks", torch.zeros(())))
+    refuted = (
+        looks > 0 or int(added["pose_code"]) == PoseCode.REFUTED or bool((added["gate"] == Gate.POSE_REFUTED).any())
+    )
+    return np.asarray(1 + looks if refuted else 0)
 
 
 def _stepped(x: np.ndarray, step: float) -> np.ndarray:

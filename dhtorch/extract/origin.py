@@ -67,7 +67,7 @@ class Origin(Protocol):
         """The tasks that are noted for an episode; None = those of its rows."""
 
     def about(self, i: int) -> dict[str, Any]:
-        """What else is said of an episode."""
+        """What else is said of an episode; ``split`` is the one that it belongs to."""
 
 
 @dataclass(frozen=True, eq=False)

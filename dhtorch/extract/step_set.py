@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,7 @@ class StepSet:
     numbers: Sequence[int]
     fps: float
     limit: int | None = None
+    held: dict[int, Steps] = field(default_factory=dict, repr=False)  # of the episode that was asked for last
 
     version = None
     tasks = None
@@ -48,7 +49,7 @@ class StepSet:
     @property
     def features(self) -> dict[str, out.Feature]:
         """Of its columns: arrays of several dimensions by rows, with their shape in the info."""
-        steps = Steps.of(self.recordings[0])
+        steps = self._steps(0)
         found: dict[str, out.Feature] = {}
         for name, described in steps.features.items():
             if described.kind == "image":
@@ -68,11 +69,8 @@ class StepSet:
 
     @property
     def splits(self) -> dict[str, list[int]]:
-        """As :attr:`Origin.splits`."""
-        found: dict[str, list[int]] = {}
-        for number, recording in zip(self.numbers, self.recordings, strict=True):
-            found.setdefault(recording.load.place.split, []).append(number)  # type: ignore[attr-defined]
-        return found
+        """None but what is said of each episode."""
+        return {}
 
     @property
     def more(self) -> dict[str, Path]:
@@ -82,7 +80,7 @@ class StepSet:
     def batches(self, i: int, tasks: list[str]) -> Iterator[Any]:
         """As :meth:`Origin.batches`."""
         pyarrow = need("pyarrow", extra="scale")
-        steps = Steps.of(self.recordings[i])
+        steps = self._steps(i)
         n = steps.n if self.limit is None else min(steps.n, self.limit)
         for start in range(0, n, GROUP_ROWS):
             part = range(start, min(start + GROUP_ROWS, n))
@@ -106,7 +104,14 @@ class StepSet:
 
     def about(self, i: int) -> dict[str, Any]:
         """The split, the number in it, and the episode's metadata."""
-        return Steps.of(self.recordings[i]).about
+        return self._steps(i).about
+
+    def _steps(self, i: int) -> Steps:
+        """Of episode ``i``, whose record is read once."""
+        if i not in self.held:
+            self.held.clear()
+            self.held[i] = Steps.of(self.recordings[i])
+        return self.held[i]
 
 
 def _column(name: str, picture: bool = False) -> str:

@@ -157,7 +157,8 @@ class ExtendDepth(torch.nn.Module):
 
     def _answer(self, read: Read, seed: int | Tensor) -> dict[str, Tensor]:
         frame, paired, bad = read.anchor, read.paired, read.bad
-        samples, estimate, fit, dense = self._asked(read, seed)
+        samples, estimate, fits, dense = self._asked(read, seed)
+        fit = fits[-1] if fits else None
         found = merge(samples, estimate)
         pooled = (found, samples.hole) if dense is None else maps.as_samples(dense, frame, self.method)
         tokens, known = patch_tokens(*pooled, frame.hw, patch=self.patch, tokens_hw=self.tokens_hw, fit=self.fit)
@@ -177,7 +178,7 @@ class ExtendDepth(torch.nn.Module):
             "hole": samples.hole,
             "gate": estimate.gate,
             **_pose(fit, paired, found.depth),
-            **({} if self.views.pose is None else given.keys(fit, paired, given.name_of(self.views.pose))),
+            **({} if self.views.pose is None else given.keys(fits, paired, given.name_of(self.views.pose))),
             "tokens": tokens,
             "tokens_valid": known,
             **({} if dense is None else maps.as_keys(dense)),
@@ -187,12 +188,13 @@ class ExtendDepth(torch.nn.Module):
             problem = torch.where(bad, SampleProblem.UNREADABLE, problem)
         return {**added, "problem": problem}
 
-    def _asked(self, read: Read, seed: int | Tensor) -> tuple[Samples, Estimate, PoseFit | None, DepthMap | None]:
-        """What the method says, and the maps where they are wanted; the front end alone where nothing is paired."""
+    def _asked(self, read: Read, seed: int | Tensor) -> tuple[Samples, Estimate, list[PoseFit], DepthMap | None]:
+        """What the method says, and of which views' poses, the last of which stands for all, and the maps where they
+        are wanted; the front end alone where nothing is paired."""
         if read.other is None or not bool(read.paired.any()):
             samples = self.method.look(read.anchor)
             dense = None if self.maps is None else self.maps.sensed(read.anchor, self.method)
-            return samples, Estimate.silent(samples, Gate.NO_TRACK, n_views=0), None, dense
+            return samples, Estimate.silent(samples, Gate.NO_TRACK, n_views=0), [], dense
         trace: dict[str, Any] = {}
         told: dict[str, Any] = {"seed": seed, "hint": self.hint, "trace": trace}
         told |= {} if read.given is None else {"fit": read.given}
@@ -203,7 +205,7 @@ class ExtendDepth(torch.nn.Module):
             dense = self.maps.swept(read, self.method, **told)
             estimate = trace["sparse"]
         estimate = estimate.replace(gate=torch.where(read.paired[:, None], estimate.gate, Gate.NO_TRACK))
-        return trace["samples"], estimate, trace["fit"], dense
+        return trace["samples"], estimate, [view["fit"] for view in trace.get("views", [trace])], dense
 
     def _seeds(self, sample: Mapping[str, Any], batch: int) -> int | Tensor:
         if self.index_key is None:

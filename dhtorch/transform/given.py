@@ -111,12 +111,21 @@ def motions(
     return stack(found).to(leaves.dtype)
 
 
-def keys(fit: PoseFit | None, paired: Tensor, name: str) -> dict[str, Tensor]:
-    """What is added to a sample beside its pose: which convention a refuted one looks like; with a warning."""
-    if fit is None or fit.looks is None:
-        return {"pose_looks": torch.zeros_like(paired, dtype=torch.int32)}
-    looks = torch.where(paired, fit.looks, torch.zeros_like(fit.looks))
-    refuted = paired & (fit.code == PoseCode.REFUTED)
+def keys(fits: Sequence[PoseFit], paired: Tensor, name: str) -> dict[str, Tensor]:
+    """What is added to a sample beside its pose: which convention a refuted one looks like; with a warning.
+
+    Args:
+        fits: of the views that were asked; the first that is refuted and looks like something counts.
+        paired: (B,) whether a sample has another view.
+        name: of the pose, for the warning.
+    """
+    looks = torch.zeros_like(paired, dtype=torch.int32)
+    refuted = torch.zeros_like(paired)
+    for fit in fits:
+        here = paired & (fit.code == PoseCode.REFUTED)
+        refuted = refuted | here
+        if fit.looks is not None:
+            looks = torch.where(here & (looks == 0), fit.looks.to(looks.dtype), looks)
     if bool(refuted.any()):
         seen = [conventions.CONVENTIONS[i] for i in sorted(set(looks[refuted].tolist())) if i]
         like = f"; looks like {' or '.join(seen)}" if seen else ""

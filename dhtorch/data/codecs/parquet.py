@@ -52,8 +52,16 @@ def read_columns(
     file: Path,
     columns: Sequence[str],
     rows: tuple[int, int] | None = None,
+    *,
+    optional: Sequence[str] = (),
 ) -> dict[str, np.ndarray | list[Any]]:
     """Columns of the rows ``first`` to ``end`` (exclusive), decoding only the row groups that hold them.
+
+    Args:
+        file: a table.
+        columns: names.
+        rows: ``first`` and ``end``; None = all.
+        optional: further columns, of which those are read that are there.
 
     Returns:
         For each name an array (rows, …) of numbers, or a list where the column holds texts, bytes or structures. Lists
@@ -64,7 +72,15 @@ def read_columns(
         ImportError: no decoder is installed.
     """
     table, header = _open(file)
-    first, end = rows or (0, header.rows)
+    columns = [*columns, *(name for name in optional if name in header.columns and name not in columns)]
+    return _columns(file, (table, header), columns, rows or (0, header.rows))
+
+
+def _columns(
+    file: Path, found: tuple[Any, ParquetHeader], columns: Sequence[str], rows: tuple[int, int]
+) -> dict[str, np.ndarray | list[Any]]:
+    """As :func:`read_columns`, of a table that was opened."""
+    (table, header), (first, end) = found, rows
     missing = [name for name in columns if name not in header.columns]
     if missing:
         raise FormatError(file, "columns", ", ".join(header.columns), ", ".join(missing))
@@ -99,11 +115,13 @@ def read_cell(file: Path, column: str, row: int) -> Any:
         _held.pop(key, None)
         while len(_held) >= _MAX_HELD:
             _held.popitem(last=False)
-        starts = parquet_header(file).groups
+        table, header = _open(file)
+        starts = header.groups
         if not 0 <= row < starts[-1]:
             raise FormatError(file, "rows", starts[-1], f"row {row}")
         group = int(np.searchsorted(starts, row, "right")) - 1
-        first, values = starts[group], read_columns(file, [column], (starts[group], starts[group + 1]))[column]
+        rows = starts[group], starts[group + 1]
+        first, values = rows[0], _columns(file, (table, header), [column], rows)[column]
         _held[key] = (first, values)
     return values[row - first]
 

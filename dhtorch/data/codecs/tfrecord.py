@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -90,16 +90,28 @@ def read_span(file: Path, span: Span) -> bytes:
     Raises:
         FormatError: unreadable, too long, or cut off.
     """
-    if span.length > MAX_BYTES:
-        raise FormatError(file, f"record at byte {span.offset}", f"{span.length} bytes", f"at most {MAX_BYTES}")
+    return read_spans(file, [span])[0]
+
+
+def read_spans(file: Path, spans: Sequence[Span]) -> list[bytes]:
+    """Bytes of several places of a file, which is opened once.
+
+    Raises:
+        FormatError: as :func:`read_span`.
+    """
+    found = []
     try:
         with opened(file) as stream:
-            data = os.pread(stream.fileno(), span.length, span.offset)
+            for offset, length in spans:
+                if length > MAX_BYTES:
+                    raise FormatError(file, f"record at byte {offset}", f"{length} bytes", f"at most {MAX_BYTES}")
+                data = os.pread(stream.fileno(), length, offset)
+                if len(data) != length:
+                    raise FormatError(file, f"record at byte {offset}", f"{len(data)} bytes", f"{length} bytes")
+                found.append(data)
     except OSError as error:
         raise unreadable(file, error) from None
-    if len(data) != span.length:
-        raise FormatError(file, f"record at byte {span.offset}", f"{len(data)} bytes", f"{span.length} bytes")
-    return data
+    return found
 
 
 def example(body: bytes, file: Path, start: int) -> dict[str, Feature]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
 
@@ -20,6 +20,9 @@ from dhtorch.studies.report.reading import Result
 from dhtorch.studies.report.tables import INTERVAL, PUBLISHED, Table, every_number, generic
 
 STYLE = Path(__file__).with_name("page.css")
+
+#: Letters of a text that a column of words is not widened for.
+LONG = 60
 
 #: Data settings that list sequences of a benchmark that the paper uses.
 BENCHMARKS = ("tum11", "arkit5")
@@ -165,19 +168,23 @@ def _settings(result: Result) -> Markup:
 
 
 def table_markup(table: Table) -> Markup:
-    """A table with caption, headings and its note; wide ones scroll inside their own frame."""
+    """A table with caption, headings and its note; wide ones scroll inside their own frame.
+
+    A reason that stands in several columns in a row is said once, over all of them; long words are broken into lines.
+    """
     theirs = {k for k, name in enumerate(table.head) if name == PUBLISHED}
     first = table.n_label
 
     def cells(at: int, row: Sequence[str], kind: str) -> Markup:
         made = []
-        for k, text in enumerate(row):
+        for k, text, span in _runs(row, first):
             cell = tag("strong", text) if (at, k) in table.best else text
             if k == 0:
                 made.append(tag("th", cell, scope="row"))
                 continue
-            style = "" if k < first else "num " if _short(text) else "word "
-            made.append(tag("td", cell, class_=(style + "theirs-cell" * (k in theirs)).strip() or None))
+            style = ("why " if len(text) > LONG else "") if k < first else "num " if _short(text) else "word "
+            style = (style + "theirs-cell" * (k in theirs)).strip()
+            made.append(tag("td", cell, class_=style or None, colspan=span if span > 1 else None))
         return tag("tr", *made, class_=kind or None)
 
     n_body = len(table.rows) - table.footer - table.quoted
@@ -212,6 +219,17 @@ def _heading(k: int, name: str, n_label: int, theirs: bool) -> Markup:
         return tag("td")
     style = ("num " if k >= n_label else "") + ("theirs-cell" if theirs else "")
     return tag("th", name, scope="col", class_=style.strip() or None)
+
+
+def _runs(row: Sequence[str], first: int) -> Iterator[tuple[int, str, int]]:
+    """Column, text and width of the cells of a row: equal words in a row, from column ``first`` on, are one."""
+    k = 0
+    while k < len(row):
+        end = k + 1
+        while end < len(row) and k >= first and row[end] == row[k] and not _short(row[k]):
+            end += 1
+        yield k, row[k], end - k
+        k = end
 
 
 def _short(cell: str) -> bool:
