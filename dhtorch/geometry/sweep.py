@@ -14,6 +14,7 @@ All costs are whole numbers: they depend on no order of summation, so not on bat
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -448,10 +449,20 @@ def window_sum(x: Tensor, radius: int) -> Tensor:
 
 def spread(q: Tensor, radius: int) -> Tensor:
     """Largest minus smallest value (B, h, w) of a map in the window around each pixel. Gradient: none."""
-    side = 2 * radius + 1
-    both = torch.stack([q, -q], 1).detach()
-    both = F.max_pool2d(both, (1, side), 1, (0, radius))
-    return F.max_pool2d(both, (side, 1), 1, (radius, 0)).sum(1)
+    q = q.detach()
+    return _extreme(q, radius, torch.maximum) - _extreme(q, radius, torch.minimum)
+
+
+def _extreme(x: Tensor, radius: int, pick: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    """What ``pick`` chooses (B, h, w) in the window around each pixel, of two windows half as wide, and so on."""
+    for dim in (1, 2):
+        first, last = (x.narrow(dim, k, 1) for k in (0, x.shape[dim] - 1))
+        x, width = torch.cat([first] * radius + [x] + [last] * radius, dim), 1
+        while width < 2 * radius + 1:
+            more = min(width, 2 * radius + 1 - width)
+            length = x.shape[dim] - more
+            x, width = pick(x.narrow(dim, 0, length), x.narrow(dim, more, length)), width + more
+    return x
 
 
 def hidden(go: Travel, q: Tensor, tolerance: Tensor) -> Tensor:
