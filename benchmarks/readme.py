@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import re
+import statistics
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -494,6 +495,63 @@ def client(name: str) -> str:
     return f"```python\n{(HERE / 'clients' / f'{name}.py').read_text(encoding='utf-8').rstrip()}\n```"
 
 
+#: Uses of a given pose, in words.
+USED = {"as it is": "as it is", "stated": "0.005 rad, 0.01 m stated", "refined": "`refine=True`"}
+
+
+def given_poses(method: str) -> str:
+    """What is answered under right poses of every capture, by what is made of them, beside near returns alone."""
+    rows = []
+    for scene, found in by_capture(method).items():
+        right = {row["use"]: row for row in found if row["pose"] in ("right", "none")}
+        name = f"`{scene}`" + (" (turns only)" if found[0]["role"] == "rotation" else "")
+        uses = [right["near returns"], *(right[use] for use in USED)]
+        cells = [" / ".join(percent(row[key]) for row in uses) for key in ("coverage", "median_rel")]
+        honest = [f"{percent(row['within_sigma'])}, {percent(row['within_2sigma'])}" for row in uses[:2] + uses[3:]]
+        rows.append([name, str(right["near returns"]["n_candidates"]), *cells, *honest])
+    head = [f"{first}: near returns / {' / '.join(USED.values())}" for first in ("answered", "median error")]
+    ends = ("near returns", "as it is", "refined")
+    return table(["capture", "held back", *head, *(f"within 1, 2 sigma: {end}" for end in ends)], rows)
+
+
+def misread_poses(method: str) -> str:
+    """What becomes of late and misread poses, over all captures that do not only turn."""
+    found = [row for rows in by_capture(method).values() for row in rows if row["role"] is None]
+    rows = []
+    for pose in dict.fromkeys(row["pose"] for row in found if row["pose"] != "none"):
+        cells = []
+        for use in ("as it is", "refined"):
+            of = [row for row in found if (row["pose"], row["use"]) == (pose, use)]
+            n, ok, refuted = (sum(row[key] for row in of) for key in ("n_pairs", "n_ok", "n_refuted"))
+            looks = sum(n for row in of for said, n in row["looks"].items() if said and pose.lower() in said.lower())
+            cells += [f"{ok} / {refuted} / {n - ok - refuted} of {n}"]
+            cells += [*([str(looks or "")] if use == "as it is" else []), answered_numbers(of)]
+        rows.append([pose, *cells])
+    used = "used / refuted / not known"
+    answers = "median error (near returns'), within 1 and 2 sigma"
+    return table(["poses", used, "named right", answers, f"refined: {used}", f"refined: {answers}"], rows)
+
+
+def answered_numbers(rows: list[dict[str, Any]]) -> str:
+    """Medians over captures that answered twenty times at least."""
+    of = [row for row in rows if row["n_candidates"] * (row["coverage"] or 0) >= 20]
+    if not of:
+        return "hardly an answer"
+    keys = ("median_rel", "within_sigma", "within_2sigma")
+    error, one, two = (percent(statistics.median(row[key] for row in of)) for key in keys)
+    near = [row["near"]["median_rel"] for row in of if row["near"]["median_rel"] is not None]
+    return f"{error} ({percent(statistics.median(near)) if near else '–'}), {one}, {two}; {len(of)} captures"
+
+
+def by_capture(method: str) -> dict[str, list[dict[str, Any]]]:
+    """Capture → its rows of one method."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for row in json.loads((RESULTS / "given_poses.json").read_text()):
+        if row.get("method") == method:
+            found.setdefault(row["scene"], []).append(row)
+    return found
+
+
 TABLES = {"room": room, "room seeds": room_by_seed, "shared": shared, "truths": truths, "comparison": comparison}
 TABLES |= {"comparison scenes": partial(by_scene, "method_comparison"), "stress": partial(by_scene, "stress")}
 TABLES |= {"chosen views": partial(chosen_views, "method_comparison", "streams"), "beside chosen": beside_chosen}
@@ -503,6 +561,8 @@ TABLES |= {
     "clients": clients,
     "anchor": partial(anchored, "anchor_study", "anchor_study_streams"),
 }
+TABLES |= {f"given poses {m}": partial(given_poses, m) for m in ("map", "paper")}
+TABLES["misread poses"] = partial(misread_poses, "map")
 TABLES |= {"every pixel": partial(every_pixel, "dense", "dense_streams")}
 TABLES |= {"pixels by scene": partial(pixels_by_scene, "dense")}
 TABLES |= {"speed": speed_tables.stages, "mutants": caught} | speed_tables.TABLES | kornia_tables.TABLES

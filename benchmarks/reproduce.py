@@ -89,6 +89,7 @@ SCRIPTS |= {
     "enrich": "",
     "judge_speed": "--clock cpu --repeats 9",
     "judge_real": "",
+    "given_poses": "",
     "fuzz": "--full",
     "kills": "--times 50",
     "clients": "",  # interpreters of the loaders in DHTORCH_CLIENTS
