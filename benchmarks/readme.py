@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import json
 import re
-import statistics
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -22,7 +21,9 @@ from typing import Any
 
 import kornia_tables
 import mutants
+import pose_tables
 import speed_tables
+from cells import number, percent, table
 
 from dhtorch import archive
 from dhtorch.studies.compare import method_comparison
@@ -42,21 +43,6 @@ DEFAULT_ROOM = "synthetic_walk_2"
 
 #: Methods that are compared with the paper's.
 COMPARED = ("map", "window", "auto")
-
-
-def percent(value: float | None) -> str:
-    """A share as text."""
-    return "–" if value is None else f"{100 * value:.1f} %"
-
-
-def number(value: float | None) -> str:
-    """Two decimals."""
-    return "–" if value is None else f"{value:.2f}"
-
-
-def table(head: list[str], rows: list[list[str]]) -> str:
-    """A Markdown table, words left and numbers right."""
-    return text.grid(Table("", head, rows))
 
 
 def scenes(name: str, truth: str) -> dict[str, dict[str, dict[str, Any]]]:
@@ -495,63 +481,6 @@ def client(name: str) -> str:
     return f"```python\n{(HERE / 'clients' / f'{name}.py').read_text(encoding='utf-8').rstrip()}\n```"
 
 
-#: Uses of a given pose, in words.
-USED = {"as it is": "as it is", "stated": "0.005 rad, 0.01 m stated", "refined": "`refine=True`"}
-
-
-def given_poses(method: str) -> str:
-    """What is answered under right poses of every capture, by what is made of them, beside near returns alone."""
-    rows = []
-    for scene, found in by_capture(method).items():
-        right = {row["use"]: row for row in found if row["pose"] in ("right", "none")}
-        name = f"`{scene}`" + (" (turns only)" if found[0]["role"] == "rotation" else "")
-        uses = [right["near returns"], *(right[use] for use in USED)]
-        cells = [" / ".join(percent(row[key]) for row in uses) for key in ("coverage", "median_rel")]
-        honest = [f"{percent(row['within_sigma'])}, {percent(row['within_2sigma'])}" for row in uses[:2] + uses[3:]]
-        rows.append([name, str(right["near returns"]["n_candidates"]), *cells, *honest])
-    head = [f"{first}: near returns / {' / '.join(USED.values())}" for first in ("answered", "median error")]
-    ends = ("near returns", "as it is", "refined")
-    return table(["capture", "held back", *head, *(f"within 1, 2 sigma: {end}" for end in ends)], rows)
-
-
-def misread_poses(method: str) -> str:
-    """What becomes of late and misread poses, over all captures that do not only turn."""
-    found = [row for rows in by_capture(method).values() for row in rows if row["role"] is None]
-    rows = []
-    for pose in dict.fromkeys(row["pose"] for row in found if row["pose"] != "none"):
-        cells = []
-        for use in ("as it is", "refined"):
-            of = [row for row in found if (row["pose"], row["use"]) == (pose, use)]
-            n, ok, refuted = (sum(row[key] for row in of) for key in ("n_pairs", "n_ok", "n_refuted"))
-            looks = sum(n for row in of for said, n in row["looks"].items() if said and pose.lower() in said.lower())
-            cells += [f"{ok} / {refuted} / {n - ok - refuted} of {n}"]
-            cells += [*([str(looks or "")] if use == "as it is" else []), answered_numbers(of)]
-        rows.append([pose, *cells])
-    used = "used / refuted / not known"
-    answers = "median error (near returns'), within 1 and 2 sigma"
-    return table(["poses", used, "named right", answers, f"refined: {used}", f"refined: {answers}"], rows)
-
-
-def answered_numbers(rows: list[dict[str, Any]]) -> str:
-    """Medians over captures that answered twenty times at least."""
-    of = [row for row in rows if row["n_candidates"] * (row["coverage"] or 0) >= 20]
-    if not of:
-        return "hardly an answer"
-    keys = ("median_rel", "within_sigma", "within_2sigma")
-    error, one, two = (percent(statistics.median(row[key] for row in of)) for key in keys)
-    near = [row["near"]["median_rel"] for row in of if row["near"]["median_rel"] is not None]
-    return f"{error} ({percent(statistics.median(near)) if near else '–'}), {one}, {two}; {len(of)} captures"
-
-
-def by_capture(method: str) -> dict[str, list[dict[str, Any]]]:
-    """Capture → its rows of one method."""
-    found: dict[str, list[dict[str, Any]]] = {}
-    for row in json.loads((RESULTS / "given_poses.json").read_text()):
-        if row.get("method") == method:
-            found.setdefault(row["scene"], []).append(row)
-    return found
-
-
 TABLES = {"room": room, "room seeds": room_by_seed, "shared": shared, "truths": truths, "comparison": comparison}
 TABLES |= {"comparison scenes": partial(by_scene, "method_comparison"), "stress": partial(by_scene, "stress")}
 TABLES |= {"chosen views": partial(chosen_views, "method_comparison", "streams"), "beside chosen": beside_chosen}
@@ -561,11 +490,11 @@ TABLES |= {
     "clients": clients,
     "anchor": partial(anchored, "anchor_study", "anchor_study_streams"),
 }
-TABLES |= {f"given poses {m}": partial(given_poses, m) for m in ("map", "paper")}
-TABLES["misread poses"] = partial(misread_poses, "map")
 TABLES |= {"every pixel": partial(every_pixel, "dense", "dense_streams")}
 TABLES |= {"pixels by scene": partial(pixels_by_scene, "dense")}
-TABLES |= {"speed": speed_tables.stages, "mutants": caught} | speed_tables.TABLES | kornia_tables.TABLES
+TABLES |= (
+    {"speed": speed_tables.stages, "mutants": caught} | speed_tables.TABLES | kornia_tables.TABLES | pose_tables.TABLES
+)
 TABLES |= {
     "how good": how_good,
     "sweep": swept,
