@@ -55,11 +55,16 @@ def test_walls_tell_where_no_floor_is_seen():
     assert standing(normal[:50], guess / guess.norm()) is None
 
 
-def held(kind: str, rotation: tuple[float, float, float]) -> list[float]:
-    """Which way is up in a world with a level floor, y up, whose camera was turned by a rotation vector."""
+def held(kind: str, rotation: tuple[float, float, float], chained: bool = False) -> list[float]:
+    """Which way is up in a world with a level floor, y up, whose camera was turned by a rotation vector.
+
+    ``chained``: the map stands in the world of its first camera.
+    """
     turn = se3.exp(torch.tensor([[*rotation, 0.0, 0.0, 0.0]], dtype=torch.float64)).R
     pose = Pose(torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64)) @ turn, torch.zeros(1, 3).double())
     recording = Recording(kind, kind, load=lambda _i: None, number=torch.tensor([0]), poses=pose)  # type: ignore[arg-type]
+    if chained:
+        return upwards(recording, [se3.identity(1, pose.t)], level_floor(), 0.02)
     return upwards(recording, [pose], level_floor() * torch.tensor([1.0, -1, -1]), 0.02)
 
 
@@ -67,6 +72,7 @@ def held(kind: str, rotation: tuple[float, float, float]) -> list[float]:
 def test_a_phones_world_is_level_however_it_is_held(rotation):
     """Lying, upright either way round with pictures that lie, and above a table, straight down."""
     assert held("stray", rotation) == [0.0, 1.0, 0.0]
+    assert held("stray", rotation, chained=True) == pytest.approx([0, -1, 0], abs=0.01), "a world of its own"
 
 
 def test_a_trajectory_that_begins_in_its_first_camera_is_not_taken_for_level():

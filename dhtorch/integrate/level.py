@@ -63,7 +63,7 @@ def upwards(
     """
     mean = mean_upwards(poses)
     known = GRAVITY.get(recording.format)
-    if known is not None and recording.poses is not None:
+    if known is not None and _own_world(recording, poses):
         axis = torch.tensor(known, dtype=torch.float64)
         if recording.format in ALWAYS or float(axis @ mean) > LEAST_COSINE:
             return axis.tolist()
@@ -71,6 +71,14 @@ def upwards(
     if found is None and normal is not None:
         found = standing(normal.double(), mean)
     return (mean if found is None else found).tolist()
+
+
+def _own_world(recording: Recording, poses: Sequence[Pose]) -> bool:
+    """Whether frames stand where the recording says, not where a chain of pairs has put them."""
+    if recording.poses is None or not poses:
+        return False
+    off = (recording.poses.R - poses[0].R.to(recording.poses.R)).abs().flatten(1).amax(1)
+    return bool((off < 1e-5).any())
 
 
 def mean_upwards(poses: Sequence[Pose]) -> Tensor:
