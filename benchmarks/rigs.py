@@ -64,7 +64,7 @@ class Pairing:
 
 
 def pairings() -> Iterator[Pairing]:
-    """All rigs, both ways round where there are two cameras with depth."""
+    """Every two cameras of all rigs."""
     for scene in open_rig(data.scenes_root(None) / "dgp_drive6cam", near=20.0, levels=6, crop_bottom=0.25):
         yield from of_rig(scene)
     for name, near, levels in (("eth3d_terrace", 3.8, None), ("middlebury_motorcycle", 2.8, 6)):
