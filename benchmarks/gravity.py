@@ -43,7 +43,7 @@ STEP, BIN_DEG, AROUND_DEG = 0.05, 8.0, 45.0
 LEAST = 0.1
 
 #: Options under which the command's files are written: few frames, small maps.
-QUICK = ("minutes=0.1", "method=map", "size=160", "planes=16", "mesh=false", "recordings=3")
+QUICK = ("minutes=0.2", "method=map", "size=160", "planes=16", "mesh=false", "recordings=3")
 
 #: Options that a capture needs to open.
 OPENED: dict[str, dict[str, Any]] = {"stray_room": {"images": False}}
