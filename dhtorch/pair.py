@@ -26,7 +26,7 @@ from dhtorch.records import (
     TrackHint,
     Tracks,
 )
-from dhtorch.stages.given import hold
+from dhtorch.stages.given import hold, without
 from dhtorch.stages.pose import map_pose
 from dhtorch.tree import in_pieces
 
@@ -39,6 +39,9 @@ STILL_SHARE, STILL_TRACKS, STILL_PX = 0.7, 16, 0.25
 
 #: Residual of near returns that a pose may leave from which a search only starts, of a ray with z = 1.
 START_MISS = 0.04
+
+#: Near returns that must lie where a search ends, if they have no pose of their own: fewer fit almost anywhere.
+MIN_NEAR = 8
 
 
 def ask_pair(
@@ -131,7 +134,11 @@ def _held(
         return hold(given, samples, tracks, camera_0, camera_1, found)
     held = hold(given.replace(cov=None), samples, tracks, camera_0, camera_1, found, max_miss=START_MISS)
     unused = samples.uv.new_zeros(len(samples.uv), 1, 3)
-    return map_pose(samples, tracks, camera_0, camera_1, unused, start=lambda *_: held).replace(looks=held.looks)
+    refined = map_pose(samples, tracks, camera_0, camera_1, unused, start=lambda *_: held).replace(looks=held.looks)
+    # From far off a search may end where near returns do not: they are asked again, now as of any pose.
+    end = GivenPose(refined.T_1_from_0)
+    ended = hold(end, samples, tracks, camera_0, camera_1, found, min_confirmed=MIN_NEAR)
+    return without(refined, ended)
 
 
 def merge(samples: Samples, estimate: Estimate) -> Map:

@@ -11,9 +11,9 @@ from typing import Any
 from torch import Tensor
 
 from dhtorch.geometry.rigid import RigidMean, rigid_mean
-from dhtorch.method import Method
+from dhtorch.method import Method, Trace
 from dhtorch.methods import MAP
-from dhtorch.records import Frame, GivenPose, Pose
+from dhtorch.records import NO_HINT, Frame, GivenPose, Pose, TrackHint
 from dhtorch.stages.given import stated
 
 
@@ -23,14 +23,21 @@ def rig_pose(
     *,
     method: Method = MAP,
     seed: int | Tensor = 0,
+    places: int = 1,
+    hint: TrackHint = NO_HINT,
+    trace: Trace | None = None,
     **options: Any,
 ) -> RigidMean:
     """The pose of the other camera relative to the anchors', ``T`` (1) with its covariance, from B instants.
 
+    Instants that look at one place share most of their errors: those of the sensor there, of tracks on its edges. So
+    their mean is called no surer than one of them is; only other ``places`` make it surer.
+
     Args:
         anchors, others: views of the two cameras; both may move, together.
         method: whose seats 1 to 5 are asked. Where the cameras see the scene very differently a learned tracker helps.
-        seed: as :class:`Method` takes it.
+        seed, hint, trace: as :class:`Method` takes them.
+        places: that the instants look at, in about equal shares.
         options: of :func:`dhtorch.geometry.rigid.rigid_mean`.
 
     Returns:
@@ -38,15 +45,19 @@ def rig_pose(
         rigid, or most poses are wrong. ``agree`` tells which instants hold the mean.
 
     Raises:
-        ValueError: wrong shapes.
+        ValueError: wrong shapes, or places below 1.
 
     Gradient: none; a calibration.
     """
-    trace: dict[str, Any] = {}
-    method(anchors, others, seed=seed, trace=trace)
+    if places < 1:
+        raise ValueError(f"rig_pose: places is {places}, expected at least 1")
+    trace = {} if trace is None else trace
+    method(anchors, others, seed=seed, hint=hint, trace=trace)
     fit = trace["fit"]
     T = fit.T_1_from_0.map(lambda x: x[None])
-    return rigid_mean(T, fit.cov[None], fit.ok[None], **options)
+    mean = rigid_mean(T, fit.cov[None], fit.ok[None], **options)
+    shared = (mean.agree.sum(-1) / places).clamp_min(1)
+    return mean._replace(cov=mean.cov * shared[:, None, None].to(mean.cov))
 
 
 @dataclass(frozen=True, eq=False)

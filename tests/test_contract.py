@@ -492,7 +492,7 @@ ROWS = [
 #: Functions without a batch of points: samplers, loops over a callable, flat lists of pooled points. Their promises are
 #: tested where they are at home (test_front_end.py, test_pose.py, test_evaluate.py, test_integrate.py).
 ELSEWHERE = {
-    "dhtorch.stages.given.from_frames",
+    *(f"dhtorch.stages.given.{name}" for name in ("from_frames", "without")),
     "dhtorch.geometry.graphless.spared",
     *(f"dhtorch.stages.sample.{name}" for name in ("spiral", "vogel", "grid")),
     *(f"dhtorch.geometry.shapes.{name}" for name in ("check", "is_static", "is_transformed")),
@@ -513,7 +513,7 @@ ELSEWHERE = {
     "dhtorch.integrate.from_maps.join",
     *(f"dhtorch.integrate.scales.{name}" for name in ("coarse", "union")),
     *(f"dhtorch.integrate.mapping.{name}" for name in ("make", "run", "voxel_of", "meshed", "write", "write_surface")),
-    *(f"dhtorch.integrate.level.{name}" for name in ("upwards", "mean_upwards", "floor")),
+    *(f"dhtorch.integrate.level.{name}" for name in ("upwards", "mean_upwards", "floor", "standing")),
     "dhtorch.geometry.se3.turn_between",
     *(
         f"dhtorch.integrate.recording.{name}"

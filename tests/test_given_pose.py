@@ -83,11 +83,48 @@ def test_a_covariance_that_is_not_stated_is_taken_from_the_near_returns(pairs):
     spread = lambda fit: fit.cov.diagonal(dim1=1, dim2=2).sum(-1)  # noqa: E731
     assert (spread(off) > 1.5 * spread(right)).all() and (z.abs() < 2).float().mean() > 0.6
     dark = pairs[0].replace(depth=torch.zeros_like(pairs[0].depth))
-    _, fit, *_ = asked((dark, *pairs[1:]), given.stated(T))
-    want = torch.tensor([0.01**2] * 3 + [0.02**2] * 3)
-    assert fit.ok.all() and torch.allclose(fit.cov.diagonal(dim1=1, dim2=2).float(), want), "what is assumed"
     _, fit, *_ = asked((dark, *pairs[1:]), given.stated(T, sigma=(0.0, 0.0)))
     assert fit.ok.all() and (fit.cov == 0).all() and fit.t_snr.isinf().all(), "exact because it is said"
+
+
+@pytest.fixture(scope="module")
+def few_returns(pairs):
+    """The method where so many near returns are found again: fewer than a pose of their own takes."""
+    trace = {}
+    METHODS["map"](pairs[0], pairs[1], n=N, trace=trace)
+    samples, tracks = trace["samples"], trace["tracks"]
+    found = tracks.valid & samples.usable & trace["fit"].inlier
+
+    def method(count):
+        xyz = torch.where((found & (found.cumsum(1) <= count))[..., None], samples.xyz, torch.nan)
+        seen = samples.replace(xyz=xyz)
+        return METHODS["map"].replace(n=N, classify=lambda *_: seen, track=lambda *_, hint: tracks)
+
+    return method
+
+
+def test_a_pose_for_which_nobody_vouches_is_not_used(pairs, few_returns):
+    """Without a covariance and with hardly a near return, sigma would be anybody's guess."""
+    T = se3.relative(*pairs[3])
+
+    def fit(count, motion, **options):
+        trace = {}
+        few_returns(count)(pairs[0], pairs[1], fit=given.stated(motion, **options).to(torch.float32), trace=trace)
+        return trace["fit"]
+
+    want = torch.tensor([0.01**2] * 3 + [0.02**2] * 3)
+    confirmed = fit(6, T)
+    assert confirmed.ok.all() and torch.allclose(confirmed.cov.diagonal(dim1=1, dim2=2).float(), want), "assumed"
+    for count, motion in (
+        (0, T),
+        (3, T),
+        (6, T.replace(t=1000 * T.t)),
+        (6, se3.invert(T)),
+        (0, T.replace(t=1000 * T.t)),
+    ):
+        for refine in (False, True):
+            assert (fit(count, motion, refine=refine).code == PoseCode.TOO_FEW).all(), (count, refine)
+    assert fit(0, T, sigma=SIGMA).ok.all(), "it is vouched for"
 
 
 WRONG = {
@@ -141,6 +178,15 @@ def test_refining_starts_from_the_given_pose(pairs):
     assert (distance(fit.T_1_from_0) < distance(rough)).all()
     _, refuted, *_ = asked(pairs, given.stated(se3.invert(T), refine=True))
     assert (refuted.code == PoseCode.REFUTED).all() and (refuted.looks > 0).all()
+
+
+def test_where_a_search_ends_is_held_against_the_near_returns(pairs):
+    _, fit, *_ = asked(pairs, given.stated(se3.relative(*pairs[3]), refine=True))
+    codes = torch.tensor([PoseCode.REFUTED, PoseCode.OK, PoseCode.TOO_FEW])
+    left = given.without(fit, fit.replace(code=codes))
+    assert left.code.tolist() == codes.tolist() and left.ok.tolist() == [False, True, False]
+    assert left.T_1_from_0.t.isnan().all(1).tolist() == [True, False, True] and not left.inlier[0].any()
+    assert torch.equal(left.shutter.cov[1], fit.shutter.cov[1]) and left.shutter.turn[2].isnan().all()
 
 
 def test_a_pose_without_translation_or_unknown_is_not_used(pairs):

@@ -7,7 +7,10 @@ import pytest
 import torch
 
 from dhtorch import MAP, data
-from dhtorch.integrate.level import WITHIN, floor
+from dhtorch.data.recording import Recording
+from dhtorch.geometry import se3
+from dhtorch.integrate.level import WITHIN, floor, standing, upwards
+from dhtorch.records import Pose
 
 GUESSES = torch.nn.functional.normalize(torch.randn(12, 3, dtype=torch.float64, generator=torch.manual_seed(0)), dim=-1)
 
@@ -35,3 +38,45 @@ def test_a_door_is_no_floor_far_from_the_guess():
     found = [floor(xyz, guess, 0.05) for guess in GUESSES]
     assert any(axis is None for axis in found)
     assert all(float(axis @ guess) > WITHIN for axis, guess in zip(found, GUESSES, strict=True) if axis is not None)
+
+
+def test_walls_tell_where_no_floor_is_seen():
+    """Two walls at any angle and a little furniture; the camera looks down by 20°."""
+    draw = torch.manual_seed(2)
+    turn = torch.rand(3000, dtype=torch.float64, generator=draw) < 0.5
+    walls = torch.where(turn[:, None], torch.tensor([1.0, 0, 0]).double(), torch.tensor([0.6, 0, 0.8]).double())
+    walls = walls + 0.03 * torch.randn(3000, 3, dtype=torch.float64, generator=draw)
+    clutter = torch.randn(1500, 3, dtype=torch.float64, generator=draw)
+    normal = torch.cat((walls, clutter, clutter[:50] * torch.nan))
+    guess = torch.tensor([0.0, -0.94, 0.34], dtype=torch.float64)
+    found = standing(normal, guess / guess.norm())
+    assert found is not None and float(found @ torch.tensor([0.0, -1, 0]).double()) > 0.9986, "3°"
+    assert standing(clutter, guess / guess.norm()) is None, "what stands anyhow tells nothing"
+    assert standing(normal[:50], guess / guess.norm()) is None
+
+
+def held(kind: str, rotation: tuple[float, float, float], chained: bool = False) -> list[float]:
+    """Which way is up in a world with a level floor, y up, whose camera was turned by a rotation vector.
+
+    ``chained``: the map stands in the world of its first camera.
+    """
+    turn = se3.exp(torch.tensor([[*rotation, 0.0, 0.0, 0.0]], dtype=torch.float64)).R
+    pose = Pose(torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64)) @ turn, torch.zeros(1, 3).double())
+    recording = Recording(kind, kind, load=lambda _i: None, number=torch.tensor([0]), poses=pose)  # type: ignore[arg-type]
+    if chained:
+        return upwards(recording, [se3.identity(1, pose.t)], level_floor(), 0.02)
+    return upwards(recording, [pose], level_floor() * torch.tensor([1.0, -1, -1]), 0.02)
+
+
+@pytest.mark.parametrize("rotation", [(0.0, 0, 0), (0, 0, torch.pi / 2), (0, 0, -torch.pi / 2), (-torch.pi / 2, 0, 0)])
+def test_a_phones_world_is_level_however_it_is_held(rotation):
+    """Lying, upright either way round with pictures that lie, and above a table, straight down."""
+    assert held("stray", rotation) == [0.0, 1.0, 0.0]
+    assert held("stray", rotation, chained=True) == pytest.approx([0, -1, 0], abs=0.01), "a world of its own"
+
+
+def test_a_trajectory_that_begins_in_its_first_camera_is_not_taken_for_level():
+    assert held("record3d", (0.0, 0, 0)) == [0.0, 1.0, 0.0]
+    assert held("tum", (0.2, 0, 0)) == pytest.approx([0, 1, 0], abs=0.01), (
+        "z is up by the format; the floor knows better"
+    )

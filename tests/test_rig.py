@@ -17,7 +17,7 @@ from dhtorch.data.files import FormatError
 from dhtorch.data.pairs import between, by_cameras
 from dhtorch.data.recording import Recording, TruthRecording
 from dhtorch.data.rig import Rig, joined, open_rig
-from dhtorch.geometry import se3
+from dhtorch.geometry import covariance, se3
 from dhtorch.geometry.rigid import rigid_mean
 from dhtorch.methods import MAP, PAPER
 from dhtorch.records import Frame, Pose
@@ -179,7 +179,13 @@ def test_a_robots_cameras_are_measured_once() -> None:
     xi = se3.log(se3.compose(found.T.to(torch.float64), se3.invert(TRUE)))[0]
     assert found.ok.all() and found.agree.float().mean() > 0.6
     assert xi[:3].norm() < 0.003 and xi[3:].norm() < 0.006, "0.15 m apart"
-    assert (xi.abs() < 6 * found.cov[0].diagonal().sqrt()).all()
+    off = covariance.mahalanobis(xi[None], found.cov.to(torch.float64))
+    assert off < 4.74, "one rig in a thousand"
+    surer = rig_pose(left, right, method=MAP.replace(n=400), places=3)
+    share = found.agree.sum() / (found.agree.sum() / 3).clamp_min(1)
+    torch.testing.assert_close(found.cov / share, surer.cov, rtol=1e-4, atol=0)
+    with pytest.raises(ValueError, match="places is 0"):
+        rig_pose(left, right, places=0)
     trace: dict[str, Any] = {}
     given = PAPER.replace(n=300, given=Rigid(found.T, found.cov))
     estimate = given(left, right, trace=trace)

@@ -69,7 +69,8 @@ def join(
     volumes = _fused(recording, poses, read, volumes, progress=progress)
     surface = reduce(union, map(points, volumes))
     placed = list(poses.values())
-    up = upwards(recording, placed, surface.xyz, 2 * voxel) if len(surface.xyz) else mean_upwards(placed).tolist()
+    shown = surface.xyz, 2 * voxel, surface.normal
+    up = upwards(recording, placed, *shown) if len(surface.xyz) else mean_upwards(placed).tolist()
     return (reduce(union, map(mesh, volumes)) if meshed and len(surface.xyz) else surface), up
 
 

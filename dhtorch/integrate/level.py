@@ -1,7 +1,8 @@
-"""Which way is up: asked here, and nowhere else. The format's own gravity axis, else the floor, else the cameras."""
+"""Which way is up: asked here, and nowhere else. The format's own gravity axis, else floor, walls, or the cameras."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -19,7 +20,12 @@ GRAVITY = {
     "arkitscenes": (0.0, 0.0, 1.0),
 }
 
-#: A direction farther from the cameras' own upward one is not believed, cosine of the angle.
+#: Formats whose world is level by the way it is made, however the camera was held: a phone upright keeps its pictures
+#: lying, one above a table looks straight down.
+ALWAYS = frozenset({"stray", "arkitscenes", "synthetic"})
+
+#: In the other formats a trajectory may have been moved to its first camera: a direction farther from the cameras' own
+#: upward one is not believed, cosine of the angle.
 LEAST_COSINE = 0.5
 
 #: Planes that are tried, and the share of the points that the floor must hold.
@@ -28,28 +34,51 @@ TRIALS, LEAST_SHARE = 300, 0.1
 #: How near a floor's normal is to the direction that is guessed, cosine of 40°.
 WITHIN = 0.77
 
+#: Directions that are tried on the whole sphere, about 2° apart; how far a surface may lean, rad (5°).
+DIRECTIONS, LEAN = 12000, 0.087
 
-def upwards(recording: Recording, poses: Sequence[Pose], xyz: Tensor, thickness: float) -> list[float]:
+#: Score of an upward direction that walls and levels must reach: twice that of surfaces that stand anyhow.
+LEAST_SCORE = 0.25
+
+
+def upwards(
+    recording: Recording,
+    poses: Sequence[Pose],
+    xyz: Tensor,
+    thickness: float,
+    normal: Tensor | None = None,
+) -> list[float]:
     """The upward direction of a map, a unit vector in its world.
 
     The format's gravity axis where it has one and the map stands in the recording's own world; else the normal of the
-    largest plane that cameras held upright could stand on; else the cameras' mean upward direction; camera axes where
-    that cancels out.
+    largest plane that cameras held upright could stand on; else the direction to which most surfaces stand upright;
+    else the cameras' mean upward direction; camera axes where that cancels out.
 
     Args:
         recording: that was mapped.
         poses: T_world_from_cam (1) of its frames.
         xyz: (P, 3) m, points of the map.
         thickness: m, of the floor.
+        normal: (P, 3) of the map's surfaces; NaN where unknown. None = no walls are asked.
     """
     mean = mean_upwards(poses)
     known = GRAVITY.get(recording.format)
-    if known is not None and recording.poses is not None:
+    if known is not None and _own_world(recording, poses):
         axis = torch.tensor(known, dtype=torch.float64)
-        if float(axis @ mean) > LEAST_COSINE:
+        if recording.format in ALWAYS or float(axis @ mean) > LEAST_COSINE:
             return axis.tolist()
     found = floor(xyz.double(), mean, thickness)
+    if found is None and normal is not None:
+        found = standing(normal.double(), mean)
     return (mean if found is None else found).tolist()
+
+
+def _own_world(recording: Recording, poses: Sequence[Pose]) -> bool:
+    """Whether frames stand where the recording says, not where a chain of pairs has put them."""
+    if recording.poses is None or not poses:
+        return False
+    off = (recording.poses.R - poses[0].R.to(recording.poses.R)).abs().flatten(1).amax(1)
+    return bool((off < 1e-5).any())
 
 
 def mean_upwards(poses: Sequence[Pose]) -> Tensor:
@@ -80,3 +109,32 @@ def floor(xyz: Tensor, guess: Tensor, thickness: float) -> Tensor | None:
     axis = torch.linalg.eigh((held - held.mean(0)).T @ (held - held.mean(0))).eigenvectors[:, 0]
     axis = axis if float(axis @ guess) > 0 else -axis
     return axis if float(axis @ guess) > WITHIN else None  # the fit to all that it holds may have turned away
+
+
+def standing(normal: Tensor, guess: Tensor) -> Tensor | None:
+    """Unit direction (3,) within 40° of ``guess`` to which most surfaces lie level or stand upright; None = too few do.
+
+    Args:
+        normal: (P, 3) of surfaces of one size each; those that are not finite are left out.
+        guess: unit direction.
+    """
+    normal = normal[normal.isfinite().all(-1)]
+    if len(normal) < 100:
+        return None
+    draw = torch.Generator().manual_seed(0)
+    some = torch.nn.functional.normalize(normal[torch.randint(len(normal), (min(len(normal), 5000),), generator=draw)])
+    axes = _sphere(DIRECTIONS)
+    axes = axes[axes @ guess > WITHIN]
+    upright = torch.asin((some @ axes.T).abs().clamp(max=1))  # angle from the plane at right angles to the axis
+    level = torch.pi / 2 - upright
+    score = (torch.exp(-0.5 * (upright / LEAN) ** 2) + torch.exp(-0.5 * (level / LEAN) ** 2)).mean(0)
+    best = int(score.argmax())
+    return axes[best] if float(score[best]) >= LEAST_SCORE else None
+
+
+def _sphere(count: int) -> Tensor:
+    """Directions (count, 3) spread evenly, along a spiral."""
+    k = torch.arange(count, dtype=torch.float64) + 0.5
+    z, turn = 1 - 2 * k / count, k * math.pi * (3 - math.sqrt(5))
+    r = (1 - z * z).sqrt()
+    return torch.stack((r * turn.cos(), r * turn.sin(), z), -1)

@@ -59,7 +59,7 @@ class MappedScene:
     def up(self) -> list[float]:
         """The upward direction of the map."""
         poses = list(self.places.poses.values())
-        return upwards(self.recording, poses, self.surface.xyz, 2 * self.voxel)
+        return upwards(self.recording, poses, self.surface.xyz, 2 * self.voxel, self.surface.normal)
 
 
 def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:

@@ -56,6 +56,7 @@ def hold(
     max_miss: float = 0.01,
     min_near: int = 8,
     min_explained: float = 0.5,
+    min_confirmed: int = 4,
     max_deviation: float = 4.74,
     assumed: tuple[float, float] = (0.01, 0.02),
 ) -> PoseFit:
@@ -67,8 +68,9 @@ def hold(
     that no rigid motion explains, or too few of them, refute nothing.
 
     A covariance that is not stated is taken from the near returns: their own, and the square of how far they say the
-    pose is off. Where they have no pose of their own either, nobody knows it: it is ``assumed``. Exact is a pose only
-    where that is stated, as a covariance of zero.
+    pose is off. Where they have no pose of their own, it is ``assumed`` if a few of them, and most of those there are,
+    confirm the pose: one that nobody confirms and for which nobody vouches is not used. Exact is a pose only where
+    that is stated, as a covariance of zero.
 
     Args:
         given: B poses.
@@ -77,12 +79,14 @@ def hold(
         max_miss: residual of a near return that is forgiven in any case, of a ray with z = 1; a pixel at least.
         min_near: fewer near returns refute nothing.
         min_explained: share of them that a pose must explain.
+        min_confirmed: near returns that must be explained by a pose whose covariance nobody knows.
         max_deviation: length of xi in standard deviations, those of ``found`` counted threefold; as it is, one right
             pose in a thousand is refuted.
-        assumed: standard deviations (rad, m) of a pose of which neither is known.
+        assumed: standard deviations (rad, m) of a pose that near returns confirm and do not measure.
 
     Returns:
-        PoseFit with the given pose. Codes: TOO_FEW: not a finite pose; REFUTED, and ``looks`` then tells in which of
+        PoseFit with the given pose. Codes: TOO_FEW: not a finite pose, or too few near returns to know a covariance
+        that is not stated; REFUTED, and ``looks`` then tells in which of
         :data:`dhtorch.geometry.conventions.CONVENTIONS` the numbers would fit (0 = in none, or not asked);
         NO_BASELINE: no translation, or one within its own noise. ``sigma_px`` is that of ``found``, and ``t_snr``
         too where it is the larger: whoever sees a baseline, there is one.
@@ -114,6 +118,9 @@ def hold(
         rigid = rigid | (near.used & still[:, None])
         enough = rigid.sum(-1) >= min_near
         refuted = enough & ((explained & rigid).sum(-1) < min_explained * rigid.sum(-1))
+        count = (explained & near.used).sum(-1)
+        unknown = (count < min_confirmed) | (count < min_explained * near.used.sum(-1))
+        unknown = unknown & ~found.ok & (stated is None)
         if stated is None:
             spread = torch.tensor([assumed[0] ** 2] * 3 + [assumed[1] ** 2] * 3).to(T.t)
             cov = torch.where(found.ok[:, None, None], own_cov + xi[:, :, None] * xi[:, None], torch.diag(spread))
@@ -127,6 +134,7 @@ def hold(
             (~finite, PoseCode.TOO_FEW),
             (refuted, PoseCode.REFUTED),
             (still | ~(t_snr >= MIN_T_SNR), PoseCode.NO_BASELINE),
+            (unknown, PoseCode.TOO_FEW),
             otherwise=PoseCode.OK,
         )
         ok, inlier = code == PoseCode.OK, explained & near.used
@@ -149,6 +157,29 @@ def hold(
         t_snr=answer(t_snr),
         code=code,
         looks=looks,
+    )
+
+
+def without(fit: PoseFit, held: PoseFit) -> PoseFit:
+    """A fit without the poses that, ``held`` as given ones, were refuted or that nobody confirms, for that reason.
+
+    Raises ValueError for wrong shapes. Gradient: to the poses that stay.
+    """
+    check("without", R=(fit.T_1_from_0.R, "B 3 3"), code=(fit.code, "B"), code_held=(held.code, "B"))
+    gone = fit.ok & ((held.code == PoseCode.REFUTED) | (held.code == PoseCode.TOO_FEW))
+
+    def left(x: Tensor) -> Tensor:
+        return torch.where(gone.view(-1, *[1] * (x.dim() - 1)), torch.nan, x)
+
+    return fit.replace(
+        T_1_from_0=fit.T_1_from_0.map(left),
+        cov=left(fit.cov),
+        inlier=fit.inlier & ~gone[:, None],
+        rms_px=left(fit.rms_px),
+        sigma_px=left(fit.sigma_px),
+        t_snr=left(fit.t_snr),
+        shutter=None if fit.shutter is None else fit.shutter.map(left),
+        code=torch.where(gone, held.code, fit.code).to(fit.code.dtype),
     )
 
 

@@ -1,0 +1,226 @@
+"""Poses from elsewhere on real captures: right ones, late ones and misread ones, held against the near returns.
+
+    python benchmarks/given_poses.py --json benchmarks/results/given_poses.json
+
+Of every pair the sensor's returns beyond a cutoff are held back, and answers there are held against them. Tracks and
+the near returns' own pose are found once; what changes is the pose that is given and what is made of it. A row for
+each capture, method, pose and use.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dhtorch import data, storage
+from dhtorch.codes import PoseCode
+from dhtorch.data.recording import Recording
+from dhtorch.data.scene import Scene
+from dhtorch.evaluate import errors, holdout
+from dhtorch.geometry import se3
+from dhtorch.geometry.conventions import CONVENTIONS, STATED, camera_axes
+from dhtorch.method import Method
+from dhtorch.methods import METHODS
+from dhtorch.records import Frame, GivenPose, Pose, PoseFit
+from dhtorch.stages import given
+from dhtorch.synthetic import SyntheticRoom
+from dhtorch.tree import collate
+
+#: Pieces of one room.
+KITCHEN = ("000", "200", "400", "600")
+
+#: Captures whose poses come from a device or a tracker, with cutoff (m), frames between two views, and what they need.
+CAPTURES: tuple[dict[str, Any], ...] = (
+    {"path": "holo_a", "near": 2.5, "gap": 3},
+    *(
+        {"path": f"7s_redkitchen_{k}", "near": 2.0, "gap": 20, "room": "redkitchen"}
+        for k in ("000", "200", "400", "600")
+    ),
+    {"path": "tum_fr1_desk9", "near": 1.0, "gap": 4},
+    {"path": "r3d_door", "near": 0.25, "gap": 10},
+    {"path": "slambook_rgbd", "near": 2.5, "gap": 1},
+    {"path": "dgp_drive6cam", "near": 20.0, "gap": 1, "levels": 6, "crop_bottom": 0.25},
+    {"path": "tum_fr1_rpy_a", "near": 1.5, "gap": 8, "role": "rotation"},
+)
+
+#: Captures that would belong here, and why they are not.
+MISSING = {
+    "stray_room": "no pictures in it: nothing to track",
+    "ARKitScenes": "no capture at hand",
+    "CA-1M": "no capture at hand",
+}
+
+#: Methods, pairs a capture, and frames by which poses are late.
+ASKED = ("paper", "map")
+PAIRS = 8
+LATE = range(1, 6)
+
+#: What is made of a pose: standard deviations that are stated with it (rad, m), and whether it only starts a search.
+USES: dict[str, dict[str, Any]] = {
+    "as it is": {},
+    "stated": {"sigma": (0.005, 0.01)},
+    "exact": {"sigma": (0.0, 0.0)},
+    "refined": {"refine": True},
+}
+
+#: Uses of a pose that is misread; of late ones all but the exact.
+OF_WRONG = ("as it is", "refined")
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Pairs of a scene, tracked, and the answers that were held back."""
+
+    scene: Scene
+    pairs: list[tuple[int, int]]
+    anchor: Frame  # with the returns up to the cutoff
+    others: Frame
+    truth: holdout.Truth
+    method: Method  # its tracks and near returns' pose are known
+    found: PoseFit
+
+    def points(self, fit: GivenPose | None, at: Tensor) -> tuple[errors.Points, PoseFit]:
+        """What is answered in the pairs ``at``, under a pose or the near returns' own."""
+        trace: dict[str, Any] = {}
+        method = self.method.replace(
+            track=lambda *_, hint: self.method.track(*_, hint=hint)[at],
+            pose=lambda *_: self.found[at],
+        )
+        estimate = method(self.anchor[at], self.others[at], fit=fit, trace=trace)
+        return errors.select(estimate, self.truth[at]), trace["fit"]
+
+
+def pairs_of(recording: Recording, gap: int) -> list[tuple[int, int]]:
+    """Pairs (i, i + gap), evenly thinned; the first frames are left to poses that are late, where there are enough."""
+    last = len(recording) - gap
+    first = LATE[-1] if last - LATE[-1] >= PAIRS else 0
+    count = min(PAIRS, last - first)
+    return [(i, i + gap) for i in (first + k * (last - 1 - first) // max(count - 1, 1) for k in range(count))]
+
+
+def tracked(scene: Scene, method: Method) -> Asked:
+    """The pairs of a scene under the near returns' own pose."""
+    assert scene.gap is not None
+    pairs = pairs_of(scene.recording, scene.gap)
+    whole, others = (collate(scene.recording[k] for k in side) for side in zip(*pairs, strict=True))
+    anchor, others = (holdout.range_split(frame, scene.near) for frame in (whole, others))
+    trace: dict[str, Any] = {}
+    method(anchor, others, hint=scene.hint, trace=trace)
+    truth = holdout.candidates(trace["samples"], holdout.truth_at(whole, trace["samples"].uv), scene.near)
+    known = method.replace(track=lambda *_, hint: trace["tracks"])
+    return Asked(scene, pairs, anchor, others, truth, known, trace["fit"])
+
+
+def stated(world: Pose) -> Iterator[tuple[str, Pose, list[int] | None]]:
+    """What a trajectory may be taken for, and the frame whose pose each frame gets (None = its own)."""
+    n = len(world.t)
+    yield "right", world, None
+    for d in LATE:
+        yield f"late by {d}", world, [k - d for k in range(n)]
+    yield "OpenGL axes", camera_axes(world, STATED["gl"]), None
+    yield "inverse", se3.invert(world), None
+    yield "millimetres", world.replace(t=1000 * world.t), None
+    yield "order of letters", world, sorted(range(n), key=str)
+    yield "backwards", world, [n - 1 - k for k in range(n)]
+
+
+def motions(asked: Asked, world: Pose, source: list[int] | None, **use: Any) -> tuple[GivenPose | None, Tensor]:
+    """The motions of those pairs whose poses are there and not right by chance, and which pairs these are."""
+    place = list(range(len(world.t))) if source is None else source
+    there = [b for b, (i, j) in enumerate(asked.pairs) if min(place[i], place[j]) >= 0]
+    if source is not None:
+        there = [b for b in there if (place[asked.pairs[b][0]], place[asked.pairs[b][1]]) != asked.pairs[b]]
+    if not there:
+        return None, torch.tensor(there)
+    ends = ([place[asked.pairs[b][side]] for b in there] for side in (0, 1))
+    T_0, T_1 = (world.map(lambda x, k=k: x[k]) for k in ends)
+    return given.between(T_0, T_1, **use).to(asked.anchor.camera.f.dtype), torch.tensor(there)
+
+
+def off(asked: Asked, motion: GivenPose, world: Pose, at: Tensor) -> dict[str, float]:
+    """By how much a motion differs from that of the capture's own poses, medians over pairs."""
+    i, j = (torch.tensor(side)[at] for side in zip(*asked.pairs, strict=True))
+    right = se3.relative(world.map(lambda x: x[i]), world.map(lambda x: x[j]))
+    xi = se3.log(se3.compose(motion.T_1_from_0.to(torch.float64), se3.invert(right)))
+    return {
+        "off_deg": math.degrees(float(xi[:, :3].norm(dim=1).median())),
+        "off_m": float(xi[:, 3:].norm(dim=1).median()),
+    }
+
+
+def numbers(points: errors.Points, fit: PoseFit) -> dict[str, Any]:
+    """A row's numbers."""
+    refuted = fit.code == PoseCode.REFUTED
+    looks = (
+        Counter("" if fit.looks is None else CONVENTIONS[int(k)] for k in fit.looks[refuted]) if refuted.any() else {}
+    )
+    return {
+        "n_pairs": len(fit.code),
+        "n_ok": int(fit.ok.sum()),
+        "n_refuted": int(refuted.sum()),
+        "looks": dict(looks),
+        "sigma_rel": None if not points.keep.any() else float((points.sigma / points.depth)[points.keep].median()),
+        **said(points),
+    }
+
+
+def said(points: errors.Points) -> dict[str, Any]:
+    """How far answers are from what was held back."""
+    found = errors.measure(points)
+    return {k: found[k] for k in ("n_candidates", "coverage", "median_rel", "p90_rel", "within_sigma", "within_2sigma")}
+
+
+def rows(scene: Scene, name: str) -> Iterator[dict[str, Any]]:
+    """All rows of one scene under one method."""
+    asked, world = tracked(scene, METHODS[name]), scene.recording.poses
+    assert world is not None
+    head = {"scene": scene.name, "room": scene.place, "role": scene.role, "cutoff_m": scene.near, "method": name}
+    everything = torch.arange(len(asked.pairs))
+    yield head | {"pose": "none", "use": "near returns"} | numbers(*asked.points(None, everything))
+    for pose, poses, source in stated(world):
+        true = pose == "right" or pose.startswith("late")
+        for use, options in USES.items():
+            if not (true or use in OF_WRONG) or (use == "exact" and pose != "right"):
+                continue
+            motion, at = motions(asked, poses, source, **options)
+            if motion is None:
+                continue
+            away = off(asked, motion, world, at) if true else {}
+            row = numbers(*asked.points(motion, at))
+            yield head | {"pose": pose, "use": use} | away | row | {"near": said(asked.points(None, at)[0])}
+
+
+def scenes() -> Iterator[Scene]:
+    """The captures, and the built-in room, whose poses are exact."""
+    for capture in CAPTURES:
+        yield from data.open_scenes(scenes=[capture])
+    yield Scene(SyntheticRoom(n_frames=40, hw=(360, 480), step_m=0.02), near=2.0, gap=8)
+
+
+def main() -> int:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, required=True)
+    parser.add_argument("--only", help="one scene")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    found: list[Mapping[str, Any]] = [{"scene": name, "why": why} for name, why in MISSING.items()]
+    for scene in scenes():
+        if options.only in (None, scene.name):
+            for method in ASKED:
+                found += rows(scene, method)
+            print(scene.name, flush=True)
+    storage.write_json(options.json, storage.strict([*found]))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,154 @@
+"""Tables of poses from elsewhere, of rigs and of gravity; see readme.py."""
+
+from __future__ import annotations
+
+import json
+import statistics
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from cells import percent, table
+
+RESULTS = Path(__file__).resolve().parent / "results"
+
+#: Uses of a given pose, in words.
+USED = {"as it is": "as it is", "stated": "0.005 rad, 0.01 m stated", "refined": "`refine=True`"}
+
+
+def given_poses(method: str) -> str:
+    """What is answered under right poses of every capture, by what is made of them, beside near returns alone."""
+    rows = []
+    for scene, found in by_capture(method).items():
+        right = {row["use"]: row for row in found if row["pose"] in ("right", "none")}
+        name = f"`{scene}`" + (" (turns only)" if found[0]["role"] == "rotation" else "")
+        uses = [right["near returns"], *(right[use] for use in USED)]
+        cells = [" / ".join(percent(row[key]) for row in uses) for key in ("coverage", "median_rel")]
+        honest = [f"{percent(row['within_sigma'])}, {percent(row['within_2sigma'])}" for row in uses[:2] + uses[3:]]
+        rows.append([name, str(right["near returns"]["n_candidates"]), *cells, *honest])
+    head = [f"{first}: near returns / {' / '.join(USED.values())}" for first in ("answered", "median error")]
+    ends = ("near returns", "as it is", "refined")
+    return table(["capture", "held back", *head, *(f"within 1, 2 sigma: {end}" for end in ends)], rows)
+
+
+def misread_poses(method: str) -> str:
+    """What becomes of late and misread poses, over all captures that do not only turn."""
+    found = [row for rows in by_capture(method).values() for row in rows if row["role"] is None]
+    rows = []
+    for pose in dict.fromkeys(row["pose"] for row in found if row["pose"] != "none"):
+        cells = []
+        for use in ("as it is", "refined"):
+            of = [row for row in found if (row["pose"], row["use"]) == (pose, use)]
+            n, ok, refuted = (sum(row[key] for row in of) for key in ("n_pairs", "n_ok", "n_refuted"))
+            looks = sum(n for row in of for said, n in row["looks"].items() if said and pose.lower() in said.lower())
+            cells += [f"{ok} / {refuted} / {n - ok - refuted} of {n}"]
+            cells += [*([str(looks or "")] if use == "as it is" else []), answered_numbers(of)]
+        rows.append([pose, *cells])
+    used = "used / refuted / not known"
+    answers = "median error (near returns'), within 1 and 2 sigma"
+    return table(["poses", used, "named right", answers, f"refined: {used}", f"refined: {answers}"], rows)
+
+
+def answered_numbers(rows: list[dict[str, Any]]) -> str:
+    """Medians over captures that answered twenty times at least."""
+    of = [row for row in rows if row["n_candidates"] * (row["coverage"] or 0) >= 20]
+    if not of:
+        return "hardly an answer"
+    keys = ("median_rel", "within_sigma", "within_2sigma")
+    error, one, two = (percent(statistics.median(row[key] for row in of)) for key in keys)
+    near = [row["near"]["median_rel"] for row in of if row["near"]["median_rel"] is not None]
+    return f"{error} ({percent(statistics.median(near)) if near else '–'}), {one}, {two}; {len(of)} captures"
+
+
+def by_capture(method: str) -> dict[str, list[dict[str, Any]]]:
+    """Capture → its rows of one method."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for row in json.loads((RESULTS / "given_poses.json").read_text()):
+        if row.get("method") == method:
+            found.setdefault(row["scene"], []).append(row)
+    return found
+
+
+def rigs(kind: str) -> list[dict[str, Any]]:
+    """Rows of one kind, those of all robots as one of medians."""
+    found = [row for row in json.loads((RESULTS / "rigs.json").read_text()) if row["kind"] == kind]
+    rows = [row for row in found if not row["rig"].startswith("robot")]
+    groups: dict[tuple[str, ...], list[dict[str, Any]]] = {}
+    for row in found:
+        if row["rig"].startswith("robot"):
+            groups.setdefault(tuple(row.get(k, "") for k in ("seat", "pose", "pairs")), []).append(row)
+    for of in groups.values():
+        joined = {
+            key: median([row.get(key) for row in of]) for key, value in of[0].items() if not isinstance(value, str)
+        }
+        rows.append({**of[0], **joined, "rig": f"{len(of)} robots, medians", "all": of})
+    return rows
+
+
+def median(values: list[Any]) -> Any:
+    """Of numbers, the rest left out."""
+    some = [v for v in values if isinstance(v, int | float) and not isinstance(v, bool)]
+    return statistics.median(some) if some else None
+
+
+def rig_poses() -> str:
+    """A rig's pose from all instants against its calibration."""
+    rows = []
+    for row in rigs("pose"):
+        several = row.get("all", [row])
+        head = [row["rig"], row["seat"], f"{row['n_ok']:g} of {row['n_instants']:g}"]
+        if row.get("baseline_m") is None:
+            reached = ", ".join(code.lower().replace("_", " ") for code in row["codes"])
+            rows.append([*head, f"– / {1e3 * row['calibrated_m']:.1f}", "", "", f"none: {reached}"])
+            continue
+        off = f"{row['off_deg']:.3f}°, {1e3 * row['off_m']:.2f} mm"
+        stated = f"{row['sigma_deg']:.3f}°, {1e3 * row['sigma_m']:.2f} mm"
+        worst = "" if len(several) == 1 else f" (largest {max(r['deviation'] for r in several):.1f})"
+        baseline = f"{1e3 * row['baseline_m']:.1f} / {1e3 * row['calibrated_m']:.1f}"
+        rows.append([*head, baseline, off, stated, f"{row['deviation']:.1f}{worst}"])
+    head = ["rig", "seat 4", "instants with a pose", "baseline, mm: found / calibrated"]
+    return table([*head, "off", "stated sigma", "off in sigmas (2.3 expected, 4.7 once in a thousand)"], rows)
+
+
+def rig_answers() -> str:
+    """What pairs of cameras answer, by where their pose comes from."""
+    rows = []
+    for row in rigs("answers"):
+        n = row["n_candidates"]
+        cells = [row["rig"], row["seat"], row["pairs"], row["pose"], f"{n:g}", percent(row["coverage"])]
+        cells += [percent(row["median_rel"]), percent(row["p90_rel"])]
+        rows.append([*cells, f"{percent(row['within_sigma'])}, {percent(row['within_2sigma'])}"])
+    head = ["rig", "seat 4", "pairs in", "pose from", "held back", "answered", "median error", "p90"]
+    return table([*head, "within 1, 2 sigma"], rows)
+
+
+def upwards() -> str:
+    """Which way is up in every capture: stated, shown by its surfaces, written."""
+    rows = []
+    for row in json.loads((RESULTS / "gravity.json").read_text()):
+        stated, why = row.get("stated"), row.get("why", "")
+        if "format" not in row:
+            rows.append([f"`{row['capture']}`", "", "", "", "", "", f"not opened: {why.partition(': ')[2]}"])
+            continue
+        said = "–" if stated is None else "xyz"[max(range(3), key=lambda k: abs(stated[k]))]
+        sign = "" if stated is None else "−" if sum(stated) < 0 else "+"
+        plane = f"{percent(row['share'])} of the area" if "plane" in row else "–"
+        cells = [f"`{row['capture']}`", row["format"], sign + said, plane]
+        cells += [degrees(row.get(key)) for key in ("stated_from_plane_deg", "written_from_plane_deg")]
+        if "largest_from_stated_deg" in row and "plane" not in row:
+            why = f"{why}; the largest one is {degrees(row['largest_from_stated_deg'])} from the stated axis"
+        if row.get("written") is None:
+            why = "; ".join(filter(None, (why, "no map is written")))
+        rows.append([*cells, why])
+    head = ["capture", "format", "stated", "level surface", "stated axis from it", "`up` in the files from it", ""]
+    return table(head, rows)
+
+
+def degrees(value: float | None) -> str:
+    """An angle as text."""
+    return "–" if value is None else f"{value:.1f}°"
+
+
+TABLES = {f"given poses {method}": partial(given_poses, method) for method in ("map", "paper")}
+TABLES |= {"misread poses": partial(misread_poses, "map"), "rig poses": rig_poses, "rig answers": rig_answers}
+TABLES["upwards"] = upwards
