@@ -1,4 +1,4 @@
-"""Scripts of this folder one after the other in one process, which imports a loader once: a request a line, and an answer.
+"""Scripts of this folder one after the other in one process, which imports a loader once: a request a line, an answer.
 
 A request is ``["torch_loader.py", "DST"]``, an answer ``[what it said in its last line or null, why not]``.
 """
