@@ -467,7 +467,9 @@ def clients() -> str:
     rows = []
     for row in json.loads((RESULTS / "clients.json").read_text()):
         off = (row["compared"] or {}).get("largest_difference", {})
-        compared = ", ".join(f"{name} {off[name]:.1g}" for name in ("depth", "sigma", "numbers") if name in off)
+        compared = ", ".join(
+            f"{name} {off[name]:.1g}" for name in ("depth", "depth in video", "sigma", "numbers") if name in off
+        )
         took = row["step"]
         step = "–" if took is None else f"{took['target'].rpartition('.')[2]}, {took['tokens_known']}"
         cells = [row["source"], row["target"], row["loader"], "yes" if row["opened"] else "no", compared or "–", step]

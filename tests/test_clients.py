@@ -5,10 +5,12 @@ import json
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("pyarrow")
 
+from pyarrow import parquet
 from sample_dicts import room
 
 from dhtorch.commands.run import main
@@ -16,8 +18,9 @@ from dhtorch.testing import write_rlds
 
 CLIENTS = Path(__file__).resolve().parents[1] / "benchmarks" / "clients"
 ROOM = ["data=synthetic", "data.hw=[64,80]", "data.n_frames=4", "method=paper", "method.n=32", "method.hypotheses=8"]
-SETS = {"torch_loader": (), "openpi_transforms": (), "hf_datasets": ("datasets",), "webdataset_stream": ("webdataset",)}
+SETS = {"torch_loader": (), "hf_datasets": ("datasets",), "webdataset_stream": ("webdataset",)}
 SETS |= {"lerobot_policy": ("lerobot",), "compare_lerobot": ("lerobot",)}
+SETS["openpi_transforms"] = ("openpi_client",)
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +56,57 @@ def test_a_client_takes_its_step(name, enriched, client, tmp_path):
         assert max(said["largest_difference"].values()) < 1e-6
     else:
         assert said["loss"] > 0 and said["tokens_known"] > 5 and said["target"].endswith("T_world_from_cam")
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    """The set of two cameras with actions and depth, as it is written and enriched."""
+    folder = tmp_path_factory.mktemp("robot")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.syspath_prepend(str(CLIENTS))
+        importlib.import_module("written").write_robot(folder / "source")
+    more = ["data=lerobot", "method=paper", "method.n=32", "method.hypotheses=8", "dense={size: 40}", "report=false"]
+    assert main(["enrich", str(folder / "source"), str(folder / "set"), *more, "gap=1", "format=lerobot"]) == 0
+    return folder
+
+
+def test_actions_and_depth_of_two_cameras_arrive_together(robot, client):
+    said = client("torch_loader", robot / "set", 0)
+    assert said["target"] == "action" and said["frames"] == 12 and said["tokens_known"] > 5
+
+
+def test_actions_state_and_statistics_are_kept(robot):
+    """What LeRobot normalises by is there for both cameras, and the arm's numbers are the source's."""
+    stats = json.loads((robot / "set" / "meta" / "stats.json").read_text())
+    cameras = [f"observation.images.{side}{kind}" for side in ("left", "right") for kind in ("", "_depth_enriched")]
+    assert set(cameras) | {"observation.state", "action"} <= stats.keys()
+    states, found = (
+        np.concatenate(
+            [
+                np.stack(parquet.read_table(f)["action"].to_numpy())
+                for f in sorted((robot / name / "data").rglob("*.parquet"))
+            ]
+        )
+        for name in ("source", "set")
+    )
+    assert found.shape == (12, 8) and np.array_equal(states, found)
+    assert np.allclose(stats["action"]["mean"], found.mean(0)) and np.ptp(found, 0).min() >= 0
+
+
+def test_a_picture_that_is_video_ends_a_loader_of_tables_in_a_sentence(robot, client, tmp_path):
+    info = json.loads((robot / "set" / "meta" / "info.json").read_text())
+    for name in ("observation.images.left", "observation.images.right"):
+        info["features"][name]["dtype"] = "video"
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta" / "info.json").write_text(json.dumps(info))
+    with pytest.raises(SystemExit, match=r"observation.images.left is video: found no picture in the tables"):
+        client("torch_loader", tmp_path, 0)
+
+
+def test_nerfstudio_parses_its_folder(enriched, client):
+    pytest.importorskip("nerfstudio")
+    said = client("nerfstudio_parser", enriched / "nerfstudio")
+    assert said["frames"] == 4 and max(said["largest_difference"].values()) < 1e-5
 
 
 def test_rlds_steps_without_tensorflow(client, tmp_path):

@@ -2,9 +2,10 @@
 
 python benchmarks/clients/all.py --lerobot PYTHON --lerobot PYTHON --json benchmarks/results/clients.json
 
-Every client runs in its own process, those of packages that are not here in the interpreter that is named:
-``--lerobot`` (also of ``datasets``), ``--webdataset``; or ``DHTORCH_CLIENTS``, interpreters with a colon between.
-A loader without an interpreter gets a row that says so. Sources are read from ``DHTORCH_DATA``.
+Every interpreter is one process (``serve.py``); packages that are not here are those of an interpreter that is named:
+``--lerobot`` (also of ``datasets``), ``--webdataset``, ``--openpi``, ``--nerfstudio``; or ``DHTORCH_CLIENTS``,
+interpreters with a colon between. A loader without an interpreter gets a row that says so. Sources are read from
+``DHTORCH_DATA``, beside two that are written first (``written.py``).
 """
 
 from __future__ import annotations
@@ -15,9 +16,14 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
+
+from written import WRITTEN
 
 HERE = Path(__file__).resolve().parent
 REPO = HERE.parents[1]
@@ -25,9 +31,11 @@ REPO = HERE.parents[1]
 #: The same quick method for all: what is asked is whether values arrive, not how good they are.
 QUICK = ("method=paper", "method.n=128", "gap=2", "dense=false", "report=false")
 
-#: Source → its folder below ``DHTORCH_DATA`` and the options it needs.
+DENSE = "dense={size: 80}"
+
+#: Source → its folder below ``DHTORCH_DATA``, or that it is written, and the options it needs.
 SOURCES: dict[str, tuple[str, ...]] = {
-    "TUM": ("tum_fr1_desk9", "dense={size: 80}"),
+    "TUM": ("tum_fr1_desk9", DENSE),
     "TUM, samples alone": ("tum_fr1_desk9",),
     "7-Scenes": ("7s_redkitchen_000",),
     "HoloLens": ("holo_a",),
@@ -38,6 +46,8 @@ SOURCES: dict[str, tuple[str, ...]] = {
         *("data=rlds", "data.fov=69", "data.rate_hz=5", "data.split=train"),
         *("data.camera=observation/image_0", "data.episode=[0,1]"),
     ),
+    "two-camera robot": ("written", "data=lerobot", DENSE),
+    "RLDS with depth": ("written", "data=rlds", "data.rate_hz=10", DENSE),
 }
 
 #: Target → what ``format=`` is told.
@@ -46,26 +56,33 @@ TARGETS = {"lerobot v3.0": "lerobot", "lerobot v2.1": "v2.1", "nerfstudio": "ner
 #: Loader that needs only torch, or a package → the script of one training step.
 STEPS = {
     "torch": "torch_loader.py",
-    "openpi-style": "openpi_transforms.py",
+    "openpi_client": "openpi_transforms.py",
     "datasets": "hf_datasets.py",
     "webdataset": "webdataset_stream.py",
 }
 
+#: Its name, interpreter, script that compares, script that trains.
+Loader = tuple[str, str | None, str | None, str | None]
+
 #: Packages whose versions name a loader.
-PACKAGES = ("lerobot", "datasets", "webdataset", "torch")
+PACKAGES = ("lerobot", "datasets", "webdataset", "torch", "openpi_client", "nerfstudio")
 
 
 def call(python: str, *words: str) -> tuple[dict[str, Any] | None, str]:
     """What a script said as JSON in its last line, or None and its last words."""
-    env = {**os.environ, "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "PYTHONWARNINGS": "ignore"}
-    env["PYTHONPATH"] = os.pathsep.join(filter(None, (str(REPO), env.get("PYTHONPATH"))))
-    done = subprocess.run([python, *words], env=env, cwd=HERE, capture_output=True, text=True, check=False)
+    done = subprocess.run([python, *words], env=environment(), cwd=HERE, capture_output=True, text=True, check=False)
     if done.returncode == 0:
         last = done.stdout.strip().splitlines()[-1:]
         return (json.loads(last[0]) if last and last[0].startswith("{") else {}), ""
     lines = [line.strip() for line in done.stderr.splitlines() if line.strip()]
     at = next((i for i in reversed(range(len(lines))) if "Error" in lines[i].split(":")[0]), max(len(lines) - 1, 0))
     return None, short(" ".join(lines[at : at + 2]) or "no word")
+
+
+def environment() -> dict[str, str]:
+    """Of a client's process."""
+    env = {**os.environ, "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "PYTHONWARNINGS": "ignore"}
+    return env | {"PYTHONPATH": os.pathsep.join(filter(None, (str(REPO), env.get("PYTHONPATH"))))}
 
 
 def short(text: str, most: int = 160) -> str:
@@ -86,20 +103,39 @@ def versions(python: str) -> dict[str, str]:
 
 def enriched(source: str, target: str, work: Path) -> tuple[Path, str]:
     """The folder of one source in one format, and why there is none; what is there already is not made again."""
-    folder, *options = SOURCES[source]
+    _, *options = SOURCES[source]
     out = work / f"{source.replace(',', '').replace(' ', '-')}-{TARGETS[target]}"
-    root = Path(os.environ["DHTORCH_DATA"]) / folder
-    words = ["-m", "dhtorch", "enrich", str(root), str(out), f"format={TARGETS[target]}", *QUICK, *options]
+    words = [
+        "-m",
+        "dhtorch",
+        "enrich",
+        str(place(source, work)),
+        str(out),
+        f"format={TARGETS[target]}",
+        *QUICK,
+        *options,
+    ]
     found, why = call(sys.executable, *words)
     return out, "" if found is not None else why
 
 
-def loaders(target: str, pythons: Sequence[str]) -> Iterator[tuple[str, str | None, str | None, str | None]]:
-    """(loader, interpreter, script that compares, script that trains) of a target."""
-    known = {python: versions(python) for python in pythons}
+def place(source: str, work: Path) -> Path:
+    """The folder of a source; one that is written here is written if it is not there yet."""
+    if SOURCES[source][0] != "written":
+        return Path(os.environ["DHTORCH_DATA"]) / SOURCES[source][0]
+    root = work / f"written-{source.replace(' ', '-')}"
+    if not root.is_dir():
+        WRITTEN[source](root)
+    return root
+
+
+def loaders(target: str, known: Mapping[str, Mapping[str, str]]) -> Iterator[Loader]:
+    """Those of a target; ``known``: interpreter → versions of its packages."""
     if target == "nerfstudio":
         yield "transforms.json by its keys", sys.executable, "compare_nerfstudio.py", None
-        yield "nerfstudio", None, None, None
+        having = next((p for p, has in known.items() if "nerfstudio" in has), None)
+        version = "" if having is None else f" {known[having]['nerfstudio']}"
+        yield f"nerfstudio{version}, its parser", having, "nerfstudio_parser.py", None
         return
     for number in dict.fromkeys(has["lerobot"] for has in known.values() if "lerobot" in has):
         python = next(p for p, has in known.items() if has.get("lerobot") == number)
@@ -107,26 +143,45 @@ def loaders(target: str, pythons: Sequence[str]) -> Iterator[tuple[str, str | No
     if target != "lerobot v3.0":
         return
     for package, script in STEPS.items():
-        name = "torch" if package == "openpi-style" else package
-        having = next((p for p, has in known.items() if name in has), None)
+        having = next((p for p, has in known.items() if package in has), None)
         version = "" if having is None else f" {known[having].get(package, '')}".rstrip()
         yield f"{package}{version}", having, None, script
 
 
-def rows(pythons: Sequence[str], work: Path, sources: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """One row for each source, target and loader."""
-    offered = {target: list(loaders(target, pythons)) for target in TARGETS}
-    for source in sources:
-        for target, clients in offered.items():
-            root, why = enriched(source, target, work)
-            for loader, python, compare, train in clients if not why else [("–", None, None, None)]:
-                row = {"source": source, "data": SOURCES[source][0], "options": list(SOURCES[source][1:])}
-                row |= {"target": target, "loader": loader, "opened": False, "compared": None, "step": None}
-                row["why"] = why or ("" if python else "not installed")
-                if python:
-                    row |= asked(python, compare, train, root, work / root.name.replace("nerfstudio", "lerobot"))
-                print(json.dumps(row), flush=True)
-                yield row
+def rows(source: str, offered: Mapping[str, Sequence[Loader]], work: Path) -> list[dict[str, Any]]:
+    """One row for each target and loader of a source."""
+    folder, *options = SOURCES[source]
+    start = {"source": source, "data": folder, "options": options}
+    nothing = {"opened": False, "compared": None, "step": None}
+    found = []
+    for target, clients in offered.items():
+        root, why = enriched(source, target, work)
+        for loader, python, compare, train in clients if not why else [("–", None, None, None)]:
+            row = {**start, "target": target, "loader": loader, **nothing}
+            row["why"] = why or ("" if python else "not installed")
+            if python:
+                row |= asked(python, compare, train, root, work / root.name.replace("nerfstudio", "lerobot"))
+            found.append(row)
+    if "data=rlds" in options:  # the set itself: its depth in the loader, without any step before
+        fov = [option.removeprefix("data.fov=") for option in options if option.startswith("data.fov=")]
+        step, why = Served.of(sys.executable).ask("rlds_steps.py", str(place(source, work)), *fov)
+        row = {**start, "target": "as it is", "loader": "RLDS steps", **nothing}
+        found.append(row | {"opened": step is not None, "step": step, "why": why})
+    print(*map(json.dumps, found), sep="\n", flush=True)
+    return found
+
+
+def own_depth(known: Mapping[str, Mapping[str, str]], work: Path) -> list[dict[str, Any]]:
+    """Depth that LeRobot wrote, as LeRobot and as dhtorch read it; versions before 0.6 know none."""
+    found = []
+    for python, has in known.items():
+        if "lerobot" in has and not any(row["loader"] == f"lerobot {has['lerobot']}" for row in found):
+            with tempfile.TemporaryDirectory(dir=work) as folder:
+                said, why = Served.of(python).ask("lerobot_depth.py", folder)
+            row = {"source": "LeRobot's own depth", "data": "written", "options": [], "target": "read by dhtorch"}
+            row |= {"loader": f"lerobot {has['lerobot']}", "opened": said is not None, "compared": said}
+            found.append({**row, "step": None, "why": why})
+    return found
 
 
 def asked(python: str, compare: str | None, train: str | None, root: Path, twin: Path) -> dict[str, Any]:
@@ -134,16 +189,51 @@ def asked(python: str, compare: str | None, train: str | None, root: Path, twin:
     found: dict[str, Any] = {}
     if compare:
         beside = [str(twin)] if compare == "compare_nerfstudio.py" else []
-        compared, why = call(python, compare, str(root), *beside)
+        compared, why = Served.of(python).ask(compare, str(root), *beside)
         found |= {"opened": compared is not None, "compared": compared, "why": why}
         if compared is None:
             return found
     if train:
         with tempfile.TemporaryDirectory() as folder:
             more = [f"{folder}/rows.tar"] if train == "webdataset_stream.py" else []
-            step, why = call(python, train, str(root), *more)
+            step, why = Served.of(python).ask(train, str(root), *more)
         found |= {"opened": found.get("opened", False) or step is not None, "step": step, "why": why}
     return found
+
+
+class Served:
+    """An interpreter in which scripts run one after the other (``serve.py``); it ends with this process."""
+
+    known: ClassVar[dict[str, Served]] = {}
+    alone: ClassVar[threading.Lock] = threading.Lock()
+
+    def __init__(self, python: str) -> None:
+        self.process = subprocess.Popen(
+            [python, "serve.py"],
+            **{"env": environment(), "cwd": HERE, "text": True},
+            **{"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL},
+        )
+        self.lock = threading.Lock()
+
+    @classmethod
+    def of(cls, python: str) -> Served:
+        """The one of an interpreter, started where there is none or the last one died."""
+        with cls.alone:
+            if python not in cls.known or cls.known[python].process.poll() is not None:
+                cls.known[python] = cls(python)
+            return cls.known[python]
+
+    def ask(self, script: str, *words: str) -> tuple[dict[str, Any] | None, str]:
+        """What a script said, or None and why."""
+        with self.lock:
+            assert self.process.stdin and self.process.stdout
+            self.process.stdin.write(json.dumps([script, *words]) + "\n")
+            self.process.stdin.flush()
+            line = self.process.stdout.readline()
+        if not line:
+            return None, f"{script} ended its interpreter"
+        said, why = json.loads(line)
+        return said, short(why)
 
 
 def main() -> int:
@@ -151,14 +241,21 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--lerobot", action="append", default=[], metavar="PYTHON")
     parser.add_argument("--webdataset", action="append", default=[], metavar="PYTHON")
+    parser.add_argument("--openpi", action="append", default=[], metavar="PYTHON")
+    parser.add_argument("--nerfstudio", action="append", default=[], metavar="PYTHON")
     parser.add_argument("--source", action="append", choices=SOURCES, help="only this one")
     parser.add_argument("--work", type=Path, help="folder of the sets, which are kept; a temporary one")
+    parser.add_argument("--at-once", type=int, default=1, metavar="N", help="sources")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     named = [python for python in os.environ.get("DHTORCH_CLIENTS", "").split(":") if python]
-    pythons = [*args.lerobot, *args.webdataset, *named, sys.executable]
-    with tempfile.TemporaryDirectory() as folder:
-        found = list(rows(list(dict.fromkeys(pythons)), args.work or Path(folder), args.source or list(SOURCES)))
+    pythons = dict.fromkeys([*args.lerobot, *args.webdataset, *args.openpi, *args.nerfstudio, *named, sys.executable])
+    known = {python: versions(python) for python in pythons}
+    offered = {target: list(loaders(target, known)) for target in TARGETS}
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(args.at_once) as pool:
+        of = partial(rows, offered=offered, work=args.work or Path(folder))
+        found = [row for some in pool.map(of, args.source or list(SOURCES)) for row in some]
+        found += own_depth(known, args.work or Path(folder))
     if args.json:
         args.json.write_text(json.dumps(found, indent=1) + "\n")
     return 0

@@ -18,7 +18,7 @@ GAP = 2
 
 
 def main(root: str) -> None:
-    found = columns(root)
+    found = columns(root, tables=True)
     files = [str(file) for file in sorted((Path(root) / "data").rglob("*.parquet"))]
     data = datasets.Dataset.from_parquet(files, cache_dir=str(Path(root).parent / "cache"), keep_in_memory=True)
     stored, image = data.with_format(None), found["keys"]["image"]

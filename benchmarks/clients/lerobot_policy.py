@@ -1,5 +1,7 @@
 """LeRobot: a window of frames of an enriched set, depth tokens, one training step of ACT that sees depth.
 
+The samples go through LeRobot's own processors: pictures, depth, state and action are normalised by ``meta/stats``.
+
 In an environment that has lerobot and dhtorch:  python benchmarks/clients/lerobot_policy.py DST
 """
 
@@ -13,13 +15,16 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
+from lerobot.policies.factory import make_pre_post_processors
 from torch.nn.functional import interpolate
 
 from dhtorch import ExtendDepth
 from dhtorch.transform import ExtendedDataset
 
 SIDE, HORIZON = 96, 4  # px; frames that are predicted
-ACT, NAMES = {"dim_model": 64, "dim_feedforward": 64, "n_heads": 2, "device": "cpu"}, ("colour", "depth")
+ACT = {"dim_model": 64, "dim_feedforward": 64, "n_heads": 2, "device": "cpu"}
+PREFIX = "observation.dh_"  # LeRobot's processors drop what does not begin with observation
+STATE, TOKENS = "observation.state", "observation.environment_state"
 
 
 def main(root: str) -> None:
@@ -29,31 +34,42 @@ def main(root: str) -> None:
     window[target] = [k * step for k in range(HORIZON)]
     metres = {"depth_output_unit": "m"} if "depth_output_unit" in inspect.signature(LeRobotDataset).parameters else {}
     data = LeRobotDataset("local/set", root=root, delta_timestamps=window, video_backend="pyav", **metres)
-    extended = ExtendedDataset(data, ExtendDepth(**keys, n=256, tokens_hw=(56, 56)))
+    extended = ExtendedDataset(data, ExtendDepth(**keys, prefix=PREFIX, n=256, tokens_hw=(56, 56)))
     batch = torch.utils.data.default_collate([extended[i] for i in (2, 3)])
 
-    z = batch[keys["depth"]][:, -1].float()  # (B, 1, h, w) m, 0 = no depth
-    pictures = batch[keys["image"]][:, -1], torch.where(z > 0, 1 / z.clamp_min(0.1), 0.0).expand(-1, 3, -1, -1)
-    sample = {f"observation.images.{n}": interpolate(x, (SIDE, SIDE)) for n, x in zip(NAMES, pictures, strict=True)}
-    sample["observation.environment_state"] = batch["dhtorch.tokens"].flatten(1)
-    sample["observation.state"] = batch.get("observation.state", batch[target][:, 0]).float()
-    sample |= {"action": batch[target].float(), "action_is_pad": batch[f"{target}_is_pad"]}
-    inputs = {f"observation.images.{n}": PolicyFeature(FeatureType.VISUAL, (3, SIDE, SIDE)) for n in NAMES}
-    for key, kind in (("observation.environment_state", FeatureType.ENV), ("observation.state", FeatureType.STATE)):
-        inputs[key] = PolicyFeature(kind, tuple(sample[key].shape[1:]))
-    outputs = {"action": PolicyFeature(FeatureType.ACTION, tuple(sample["action"].shape[2:]))}
+    image, depth, stats = keys["image"], keys["depth"], data.meta.stats
+    batch |= {key: batch[key][:, -1].float() for key in (image, depth)}  # this frame of the window
+    batch |= {"action": batch[target].float(), "action_is_pad": batch[f"{target}_is_pad"]}
+    batch[STATE] = batch.get(STATE, batch["action"][:, 0]).float()
+    batch[TOKENS] = batch[f"{PREFIX}tokens"].flatten(1)
+    stats = {STATE: stats[target], **stats, "action": stats[target]}
+    kinds = {image: FeatureType.VISUAL, depth: FeatureType.VISUAL, STATE: FeatureType.STATE, TOKENS: FeatureType.ENV}
+    inputs = {key: PolicyFeature(kind, tuple(batch[key].shape[1:])) for key, kind in kinds.items()}
+    outputs = {"action": PolicyFeature(FeatureType.ACTION, tuple(batch["action"].shape[2:]))}
     shape = {"chunk_size": HORIZON, "n_action_steps": HORIZON, "pretrained_backbone_weights": None}
-    policy = ACTPolicy(ACTConfig(input_features=inputs, output_features=outputs, **shape, **ACT))
+    config = ACTConfig(input_features=inputs, output_features=outputs, **shape, **ACT)
+    before, _ = make_pre_post_processors(config, dataset_stats=stats)
+    sample = before(batch)
+    mine = [key for key in batch if key.startswith(PREFIX)]
+    assert all(torch.equal(sample[key], batch[key]) for key in mine), "the processors changed what dhtorch made"
+
+    known = batch[depth] > 0  # 0 = no depth, which no statistics count
+    seen = torch.where(known, sample[depth], 0.0).requires_grad_()
+    given = {**sample, image: interpolate(sample[image], (SIDE, SIDE))}
+    given[depth] = interpolate(seen.expand(-1, 3, -1, -1), (SIDE, SIDE))
+    policy = ACTPolicy(config)
     optimiser = torch.optim.AdamW(policy.parameters(), 1e-4)
-    loss, _ = policy(sample)
+    loss, _ = policy(given)
     loss.backward()
     through = policy.model.encoder_env_state_input_proj.weight.grad
-    assert through is not None
+    assert loss.isfinite() and through is not None and seen.grad is not None
     optimiser.step()
-    said = {"frames": len(data), "target": target, "known": float((z > 0).float().mean()), "loss": float(loss.detach())}
-    print(
-        json.dumps(said | {"tokens_known": int(batch["dhtorch.tokens_valid"].sum()), "gradient": bool(through.any())})
-    )
+    said = {"frames": len(data), "target": target, "known": float(known.float().mean()), "loss": float(loss.detach())}
+    said |= {"tokens_known": int(batch[f"{PREFIX}tokens_valid"].sum()), "kept": len(mine)}
+    said |= {"gradient": bool(through.any()), "depth_gradient": bool(seen.grad.any())}
+    if known.any():  # of normalised depth, m, over what is known
+        said["normalised"] = [float(seen.detach()[known].mean()), float(seen.detach()[known].std())]
+    print(json.dumps(said))
 
 
 if __name__ == "__main__":

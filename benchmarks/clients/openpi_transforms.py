@@ -1,6 +1,8 @@
 """In openpi's manner: dict → dict transforms of NumPy leaves one after the other, then every leaf stacked.
 
-python benchmarks/clients/openpi_transforms.py DST
+openpi itself is no package of an index; pictures become its size by what its client installs, ``openpi_client``.
+
+In an environment that has openpi-client and dhtorch:  python benchmarks/clients/openpi_transforms.py DST
 """
 
 import json
@@ -10,18 +12,20 @@ from typing import Any
 import numpy as np
 import torch
 from columns import columns
+from openpi_client import image_tools
 from torch_loader import Rows
 
 from dhtorch import ExtendDepth
 from dhtorch.transform import NumpyTransform
 
-GAP = 2
+GAP, SIDE = 2, 224  # frames; px
 KEYS = {f"{key}": f"observation/{key}" for key in ("image", "other_image", "depth", "intrinsics")}
 
 
 def policy_inputs(data: dict[str, Any]) -> dict[str, Any]:
     """What the model takes: pictures by their name there, and the depth tokens beside them."""
-    images = {"image": {"base_0_rgb": data["observation/image"]}, "image_mask": {"base_0_rgb": np.True_}}
+    picture = image_tools.resize_with_pad(image_tools.convert_to_uint8(data["observation/image"]), SIDE, SIDE)
+    images = {"image": {"base_0_rgb": picture}, "image_mask": {"base_0_rgb": np.True_}}
     tokens = {"depth_tokens": data["dhtorch.tokens"], "depth_mask": data["dhtorch.tokens_valid"]}
     return {**images, **tokens, "actions": np.asarray(data["actions"], np.float32), "prompt": data["prompt"]}
 
@@ -33,7 +37,7 @@ def stack(samples: list[Any]) -> Any:
 
 
 def main(root: str) -> None:
-    found = columns(root)
+    found = columns(root, tables=True)
     rows, keys = Rows(root), found["keys"]
 
     def repacked(i: int) -> dict[str, Any]:
@@ -45,6 +49,7 @@ def main(root: str) -> None:
     batch = stack([policy_inputs(extend(repacked(i))) for i in (GAP, GAP + 1)])
     tokens, target = torch.from_numpy(batch["depth_tokens"]), torch.from_numpy(batch["actions"])
     head = torch.nn.Linear(tokens[0].numel(), target.shape[1])
+    assert batch["image"]["base_0_rgb"].shape == (2, SIDE, SIDE, 3)
     loss = (head(tokens.flatten(1)) - target).square().mean()
     loss.backward()
     torch.optim.SGD(head.parameters(), 1e-3).step()

@@ -37,7 +37,7 @@ class Rows(Dataset[dict[str, Any]]):
 
 
 def main(root: str, workers: str = "1") -> None:
-    found = columns(root)
+    found = columns(root, tables=True)
     transform = ExtendDepth(**found["keys"], other_image="before", n=256, tokens_hw=(56, 56))
     data = ExtendedDataset(Rows(root), transform, gap=2)
     loader = DataLoader(data, batch_size=3, num_workers=int(workers), worker_init_fn=one_thread)

@@ -19,7 +19,7 @@ GAP = 2
 
 
 def main(root: str, archive: str) -> None:
-    found = columns(root)
+    found = columns(root, tables=True)
     keys, rows = found["keys"], Rows(root)
     with webdataset.TarWriter(archive) as tar:
         for i in range(GAP, len(rows)):

@@ -1,0 +1,66 @@
+"""Sets written here for what no real one at hand has: actions and depth at once, from two cameras; RLDS with depth."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+from pyarrow import array, parquet
+
+from dhtorch.records import Frame
+from dhtorch.synthetic.robot import joints
+from dhtorch.synthetic.two_cameras import open_two_cameras
+from dhtorch.testing import write_lerobot, write_rlds
+
+CAMERAS = ("observation.images.left", "observation.images.right")
+BASE = np.array([[0, -1, 0, 0], [0, 0, -1, 0.35], [1, 0, 0, -0.5], [0, 0, 0, 1.0]])  # world from base: z up, m
+EPISODES, LENGTH = 2, 6
+
+
+def seen() -> list[list[list[Frame]]]:
+    """Camera → episode → frames of a robot that walks through the built-in room."""
+    sized = {"n_frames": LENGTH, "hw": (96, 128), "depth_hw": (48, 64), "supersample": 1, "range_limit": 3.0}
+    rigs = [open_two_cameras(seed=seed, **sized)[0].recording for seed in range(2, 2 + EPISODES)]
+    spans = range(0, LENGTH), range(LENGTH, 2 * LENGTH)
+    return [[[rig[i] for i in span] for rig in rigs] for span in spans]
+
+
+def hand(frame: Frame) -> np.ndarray:
+    """Seven joint angles and the gripper's width (8,) of an arm that carries the camera, rad and m."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = frame.T_world_from_cam.R[0].numpy(), frame.T_world_from_cam.t[0].numpy()
+    return np.append(joints(np.linalg.inv(BASE) @ T), 0.02 + 0.01 * np.sin(40 * T[2, 3]))
+
+
+def write_robot(root: Path) -> None:
+    """A LeRobot v2.1 set of two cameras with depth, a state of 8 numbers, and as action the state a frame later."""
+    cameras = seen()
+    for key, episodes in zip(CAMERAS, cameras, strict=True):
+        at = root if key == CAMERAS[0] else root.with_name(f"{root.name}-{key}")
+        write_lerobot(at, episodes, version=2, camera=key, image="image", depth="tiff", fps=30, poses=False)
+    number = {"dtype": "float32", "shape": [8], "names": [f"joint_{i}" for i in range(7)] + ["gripper"]}
+    info, other = (folder / "meta" / "info.json" for folder in (root, at))
+    said, more = json.loads(info.read_text()), json.loads(other.read_text())["features"]
+    said["features"] |= {k: v for k, v in more.items() if k.startswith(CAMERAS[1])}
+    said["features"] |= {"observation.state": number, "action": number}
+    info.write_text(json.dumps(said))
+    tables = [sorted((folder / "data").rglob("*.parquet")) for folder in (root, at)]
+    for file, beside, episode in zip(*tables, cameras[0], strict=True):
+        table, right = parquet.read_table(file), parquet.read_table(beside)
+        for name in (name for name in right.column_names if name.startswith(CAMERAS[1])):
+            table = table.append_column(name, right[name])
+        states = np.stack([hand(frame) for frame in episode]).astype(np.float32)
+        nexts = np.concatenate([states[1:], states[-1:]])
+        for name, values in (("observation.state", states), ("action", nexts)):
+            table = table.append_column(name, array(values.tolist()))
+        parquet.write_table(table, file)
+
+
+def write_steps(root: Path) -> None:
+    """An RLDS set of one camera with depth, seven actions a step and poses."""
+    write_rlds(root, seen()[0])
+
+
+#: Name of such a set → what writes it.
+WRITTEN = {"two-camera robot": write_robot, "RLDS with depth": write_steps}
