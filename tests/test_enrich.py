@@ -18,6 +18,7 @@ from pyarrow import parquet
 from dhtorch import data, storage
 from dhtorch import testing as writers
 from dhtorch.commands.run import main
+from dhtorch.export.lerobot import Moments
 from dhtorch.extract import shards
 from dhtorch.extract.robot_target import RobotTarget
 from dhtorch.synthetic.recording import SyntheticRoom
@@ -69,6 +70,14 @@ def rows(root):
 
 def map_of(row, key):
     return np.array(Image.open(io.BytesIO(row[key]["bytes"])))
+
+
+def test_statistics_of_large_numbers_keep_their_spread():
+    """A time stamp of today squared has no digits left for how far apart two frames are."""
+    x = 1.7e9 + np.arange(600).reshape(-1, 1) / 30
+    total = Moments.of(x[:7]) + Moments.of(x[7:7]) + Moments.parse(Moments.of(x[7:]).pack())
+    entry = total.stats(len(x), (1,))
+    assert np.allclose([entry["mean"][0] - 1.7e9, entry["std"][0]], [x.mean() - 1.7e9, (x - 1.7e9).std()], rtol=1e-5)
 
 
 def test_what_the_source_had_is_there_value_for_value(robot, enriched):

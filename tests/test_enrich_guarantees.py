@@ -164,7 +164,11 @@ def test_an_older_version_of_the_format(robot, whole, tmp_path):
     assert about["codebase_version"] == "v2.1" and about["total_videos"] == len(LENGTHS)
     lines = [json.loads(line) for line in (out / "meta" / "episodes_stats.jsonl").read_text().splitlines()]
     assert [line["episode_index"] for line in lines] == [0, 1]
-    assert f"{FRONT}_depth_enriched" in lines[1]["stats"]
+    depth = lines[1]["stats"][f"{FRONT}_depth_enriched"]
+    for name, entry in lines[1]["stats"].items():  # what LeRobot 0.3 asks of them
+        wanted = (3, 1, 1) if "image" in name else np.shape(entry["min"])
+        assert {np.shape(v) for k, v in entry.items() if k != "count"} == {wanted}, name
+    assert depth["mean"][0] == depth["mean"][1] == depth["mean"][2]
     again = data.open_all(out, depth=f"{FRONT}_depth_enriched")
     assert [len(each) for each in again] == list(LENGTHS)
     for a, b in zip(rows(out), rows(whole), strict=True):

@@ -139,7 +139,12 @@ def loaders(target: str, known: Mapping[str, Mapping[str, str]]) -> Iterator[Loa
         return
     for number in dict.fromkeys(has["lerobot"] for has in known.values() if "lerobot" in has):
         python = next(p for p, has in known.items() if has.get("lerobot") == number)
-        yield f"lerobot {number}", python, "compare_lerobot.py", "lerobot_policy.py"
+        yield (
+            f"lerobot {number}",
+            python,
+            "compare_lerobot.py",
+            "lerobot_policy.py" if target == "lerobot v3.0" else None,
+        )
     if target != "lerobot v3.0":
         return
     for package, script in STEPS.items():
@@ -187,6 +192,8 @@ def own_depth(known: Mapping[str, Mapping[str, str]], work: Path) -> list[dict[s
 def asked(python: str, compare: str | None, train: str | None, root: Path, twin: Path) -> dict[str, Any]:
     """What one loader made of one set."""
     found: dict[str, Any] = {}
+    folders = sorted(each.parent for each in root.rglob("transforms.json"))
+    root = folders[0] if folders else root  # of several episodes the first
     if compare:
         beside = [str(twin)] if compare == "compare_nerfstudio.py" else []
         compared, why = Served.of(python).ask(compare, str(root), *beside)

@@ -20,9 +20,10 @@ NEEDED = {"file_path", "transform_matrix", "depth_file_path", "fl_x", "fl_y", "c
 
 def main(root: str, twin: str) -> None:
     about, rows, keys = json.loads((Path(root) / "transforms.json").read_text()), Rows(twin), columns(twin)["keys"]
+    frames = sum(row["episode_index"] == 0 for row in rows.rows)  # a folder holds one episode
     unit = about["depth_unit_scale_factor"]
     shots = sorted(about["frames"], key=lambda shot: shot["file_path"])
-    assert about["camera_model"] == "OPENCV" and len(shots) == len(rows), f"{len(shots)} frames, expected {len(rows)}"
+    assert about["camera_model"] == "OPENCV" and len(shots) == frames, f"{len(shots)} frames, expected {frames}"
     worst = dict.fromkeys(("depth", "numbers"), 0.0)
     for i, shot in enumerate(shots):
         assert shot.keys() >= NEEDED, NEEDED - shot.keys()

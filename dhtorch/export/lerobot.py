@@ -59,8 +59,8 @@ class Moments(NamedTuple):
     """What statistics are made of: of some numbers for each of k channels, float64."""
 
     n: np.ndarray  # (k,)
-    total: np.ndarray
-    square: np.ndarray
+    mean: np.ndarray
+    spread: np.ndarray  # sum of squared deviations from the mean: a time stamp's squares would hide how it varies
     low: np.ndarray
     high: np.ndarray
 
@@ -69,10 +69,11 @@ class Moments(NamedTuple):
         """Of numbers (n, k), those that are finite and ``valid``; none of them give no statistics."""
         x = np.asarray(values, np.float64)
         keep = np.isfinite(x) if valid is None else np.isfinite(x) & valid
-        z = np.where(keep, x, 0.0)
+        n = keep.sum(0).astype(np.float64)
+        mean = np.where(keep, x, 0.0).sum(0) / np.maximum(n, 1.0)
+        spread = (np.where(keep, x - mean, 0.0) ** 2).sum(0)
         low, high = np.where(keep, x, np.inf), np.where(keep, x, -np.inf)
-        return cls(keep.sum(0).astype(np.float64), z.sum(0), (z * z).sum(0), low.min(0, initial=np.inf),
-                   high.max(0, initial=-np.inf))  # fmt: skip
+        return cls(n, mean, spread, low.min(0, initial=np.inf), high.max(0, initial=-np.inf))
 
     @classmethod
     def parse(cls, packed: Sequence[Sequence[float | None]]) -> Moments:
@@ -86,16 +87,17 @@ class Moments(NamedTuple):
         return [[float(x) if np.isfinite(x) else None for x in row] for row in self]
 
     def __add__(self, other: Moments) -> Moments:  # type: ignore[override]
-        return Moments(self.n + other.n, self.total + other.total, self.square + other.square,
-                       np.minimum(self.low, other.low), np.maximum(self.high, other.high))  # fmt: skip
+        """Of both sets of numbers (Chan, Golub and LeVeque 1979)."""
+        n, apart = self.n + other.n, other.mean - self.mean
+        part = other.n / np.maximum(n, 1.0)
+        mean, spread = self.mean + apart * part, self.spread + other.spread + apart**2 * self.n * part
+        return Moments(n, mean, spread, np.minimum(self.low, other.low), np.maximum(self.high, other.high))
 
     def stats(self, frames: int, shape: Sequence[int]) -> dict[str, Any] | None:
         """The entry of ``meta/stats``, each in that shape; None where there is no number."""
         if not (self.n > 0).all():
             return None
-        mean = self.total / self.n
-        std = np.sqrt(np.maximum(self.square / self.n - mean**2, 0.0))
-        found = {"min": self.low, "max": self.high, "mean": mean, "std": std}
+        found = {"min": self.low, "max": self.high, "mean": self.mean, "std": np.sqrt(self.spread / self.n)}
         return {**{k: x.reshape(shape).tolist() for k, x in found.items()}, "count": [frames]}
 
 

@@ -339,7 +339,11 @@ class RobotTarget:
         lerobot.write_meta(self.root, self.version, about, episodes, tasks, self._stats(owns, features))
 
     def _stats(self, owns: Sequence[Row], features: Mapping[str, Feature]) -> dict[str, Any]:
-        """Of every column of numbers, and of the pictures and maps that were looked at."""
+        """Of every column of numbers, and of the pictures and maps that were looked at.
+
+        A LeRobot that reads v2.1 refuses a set unless whatever has "image" in its name has statistics of three
+        channels: a map's stand there three times, and numbers of such a name have none.
+        """
         frames = sum(own["length"] for own in owns)
         found = {}
         for name, feature in features.items():
@@ -351,6 +355,10 @@ class RobotTarget:
                 total = total + more
             visual = feature["dtype"] in ("image", "video")
             entry = total.stats(frames, (len(total.n), 1, 1) if visual else (len(total.n),))
+            if self.version == 2 and "image" in name and entry is not None:
+                if not visual:
+                    continue
+                entry = {k: v * (3 // len(v)) if k != "count" else v for k, v in entry.items()}
             if entry is not None:
                 found[name] = entry
         return found
