@@ -10,6 +10,8 @@ from typing import Any
 
 from cells import percent, table
 
+from dhtorch.console import many
+
 RESULTS = Path(__file__).resolve().parent / "results"
 
 #: Uses of a given pose, in words.
@@ -57,7 +59,7 @@ def answered_numbers(rows: list[dict[str, Any]]) -> str:
     keys = ("median_rel", "within_sigma", "within_2sigma")
     error, one, two = (percent(statistics.median(row[key] for row in of)) for key in keys)
     near = [row["near"]["median_rel"] for row in of if row["near"]["median_rel"] is not None]
-    return f"{error} ({percent(statistics.median(near)) if near else '–'}), {one}, {two}; {len(of)} captures"
+    return f"{error} ({percent(statistics.median(near)) if near else '–'}), {one}, {two}; {many(len(of), 'capture')}"
 
 
 def by_capture(method: str) -> dict[str, list[dict[str, Any]]]:
