@@ -318,7 +318,7 @@ def captures() -> str:
         f"\n\n![{file.stem}: picture, sensor, completed](../assets/captures/{file.name})\n\n`{file.stem}`"
         for file in sorted((HERE.parent / "docs/assets/captures").glob("*.jpg"))
     )
-    return f"{grid}\n\n{found['processor']}, {found['cores']} cores.{shown}"
+    return f"{grid}\n\n{found['processor']}, {found['cores']} cores, beside other work.{shown}"
 
 
 def enriched() -> str:
