@@ -89,7 +89,9 @@ def test_one_episode_and_its_camera_by_name(tmp_path: Path) -> None:
     assert [r.name[-12:] for r in data.open_all(tmp_path, episode=[1, 0])] == ["000001/front", "000000/front"]
     with pytest.raises(FormatError, match=r"meta: episodes: found 0 of those asked for, expected \[7\]"):
         data.open(tmp_path, episode=7)
-    with pytest.raises(FormatError, match=r"info.json: cameras: found wrist, expected of observation.images.front"):
+    with pytest.raises(
+        FormatError, match=r"info.json: cameras: found wrist, expected some of observation.images.front"
+    ):
         data.open(tmp_path, camera="wrist")
 
 

@@ -58,6 +58,35 @@ def both_ways(call, monkeypatch):
 
 
 @needs_compiler
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("kind", [torch.uint8, torch.float32])
+@pytest.mark.parametrize(("hw", "gradients"), [((61, 83), True), ((72, 96), False)])
+def test_pyramids_agree_up_to_one_rounding(loaded, monkeypatch, channels, kind, hw, gradients):
+    image = volume(2, channels, *hw, most=256)
+    image = image if kind == torch.uint8 else image.float() / 255
+    ours, torchs = both_ways(lambda: pyramid.build_pyramid(image, 3, 11, gradients=gradients), monkeypatch)
+    assert len(ours.levels) == len(torchs.levels) == 3 and ours.pad == torchs.pad
+    for a, b in zip(ours.levels, torchs.levels, strict=True):
+        assert a.shape == b.shape and (a - b).abs().max() <= 2.0**-23
+    assert not torch.equal(ours.levels[0][0], ours.levels[0][1])
+
+
+@needs_compiler
+def test_pyramids_that_compiled_code_cannot_build_are_torchs(loaded, monkeypatch):
+    calls = []
+    monkeypatch.setattr(torch.ops.dhtorch, "pyramid_level", lambda *_: calls.append(1))
+    image = torch.rand(1, 3, 48, 64)
+    pyramid.build_pyramid(image.double(), 2, 11)
+    pyramid.build_pyramid(image.transpose(-1, -2), 1, 11)
+    (slope,) = torch.autograd.grad(
+        pyramid.build_pyramid(image.requires_grad_(), 2, 11).levels[1].square().sum(), [image]
+    )
+    assert not calls and slope.abs().sum() > 0
+    pyramid.build_pyramid(image.detach(), 2, 11)
+    assert len(calls) == 2
+
+
+@needs_compiler
 @pytest.mark.parametrize(
     ("shape", "views", "most"),
     [((2, 7, 5, 48), (1, 3), 31), ((1, 1, 9, 3), (8,), 249), ((1, 6, 1, 4), (2,), 2), ((3, 5, 4, 130), (1, 2, 8), 255)],

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from dhtorch import native
 from dhtorch.geometry import filters
 from dhtorch.geometry.lookup import windows
 from dhtorch.geometry.shapes import check
@@ -157,16 +158,25 @@ def build_pyramid(
     h, w = image.shape[-2:]
     while len(chain) < levels and min(h, w) > smallest:
         level = image.new_empty(len(image), 3 if gradients else 1, h + 2 * pad, w + 2 * pad, dtype=dtype)
-        grey = level[:, GREY : GREY + 1]
-        inside = grey[..., pad:-pad, pad:-pad]
-        for part in _bands(image, (h, w)):
-            inside[..., part, :] = _half(chain[-1], pad, part) if chain else filters.grey(image[..., part, :])
-        _mirror(grey, pad)
-        if gradients:
-            _add_gradients(level, pad, image)
+        below = chain[-1] if chain else image
+        if native.serves(below, level) and below.dtype in (torch.uint8, torch.float32):
+            torch.ops.dhtorch.pyramid_level(below, level, pad, bool(chain), below.dtype == torch.uint8)
+        else:
+            _fill(level, pad, image, chain[-1] if chain else None)
         chain.append(level)
         h, w = (h + 1) // 2, (w + 1) // 2
     return Pyramid(tuple(chain), pad)
+
+
+def _fill(level: Tensor, pad: int, image: Tensor, below: Tensor | None) -> None:
+    """Fill a padded level of ``image``, of whose own pixels it is made, or of those of the level ``below`` it."""
+    grey = level[:, GREY : GREY + 1]
+    inside = grey[..., pad:-pad, pad:-pad]
+    for part in _bands(image, inside.shape[-2:]):
+        inside[..., part, :] = filters.grey(image[..., part, :]) if below is None else _half(below, pad, part)
+    _mirror(grey, pad)
+    if level.shape[1] > 1:
+        _add_gradients(level, pad, image)
 
 
 def _bands(image: Tensor, hw: tuple[int, ...]) -> list[slice]:
