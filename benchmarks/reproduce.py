@@ -99,8 +99,13 @@ SCRIPTS |= {
     "clients": "",  # interpreters of the loaders in DHTORCH_CLIENTS
 }
 
+#: Speeds again with the vectors of processors that lack AVX-512.
+AVX2 = ("lk", "pair", "dense_speed")
+SCRIPTS |= {f"{name}_avx2": f"--avx2 {SCRIPTS[name]}".strip() for name in AVX2}
+
 #: Scripts of another name than their result: ``kornia.py`` would be imported instead of the library.
 NAMED = {"kornia": "beside_kornia", "dense_speed": "dense", "clients": "clients/all", "judge_speed": "judge"}
+NAMED |= {f"{name}_avx2": NAMED.get(name, name) for name in AVX2}
 
 #: Options that change no number, and which a file may hold otherwise.
 ASIDE = {"figures", "traceback", "root"}

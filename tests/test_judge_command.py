@@ -12,7 +12,7 @@ from torch.utils.data import DataLoader
 from dhtorch import testing as writers
 from dhtorch.codes import State
 from dhtorch.commands import run
-from dhtorch.commands.judge import _cut, _off_at_least, _share_at_least, _wrong_at_least, exceeded, parse_limits
+from dhtorch.commands.judge import _cut, _off_at_least, _said, _share_at_least, _wrong_at_least, exceeded, parse_limits
 from dhtorch.data.depth_maps import open_maps
 from dhtorch.data.files import FormatError
 from dhtorch.export import png
@@ -127,6 +127,10 @@ def test_maps_that_are_cut_are_told(tmp_path, maps, room):
     assert code == run.DONE
     assert [row["ceiling"] for row in found["frames"]] == pytest.approx([2.55] * 3)
     assert [(row["cause"], row["kind"]) for row in found["windows"]] == [("cut at 2.55 m", "cut")]
+    assert found["whole"]["ceiling"] == pytest.approx(2.55) and "2.55" in (tmp_path / "out/judge.html").read_text()
+    unnamed = _said("room", found["whole"] | {"causes": {}})
+    assert unnamed[-1] == "  cut at 2.55 m: what is farther is said to lie there"
+    assert not any("farther" in line for line in _said("room", found["whole"])), "said once"
     assert _cut([{"ceiling": 2.55}, {"ceiling": None}]) is None, "not most of them"
     assert _cut([{"ceiling": 2.55}, {"ceiling": 3.0}]) is None, "not at one depth"
 
@@ -193,6 +197,9 @@ def test_a_loader_gets_verdicts_of_one_shape():
         metres = sample["depth"].astype(np.float32) / 1000
         samples.append(transform({**sample, "map": factor * metres}))
     batch = next(iter(DataLoader(samples, batch_size=2)))
+    assert batch["dhtorch.ceiling_known"].tolist() == [False, False] and not batch["dhtorch.ceiling"].any()
+    cut = transform({**sample, "map": np.minimum(metres, np.float32(1.6))})
+    assert bool(cut["dhtorch.ceiling_known"]) and float(cut["dhtorch.ceiling"]) == pytest.approx(1.6)
     assert batch["dhtorch.state"].shape == (2, 64, 64)
     assert batch["dhtorch.scale_known"].all()
     assert batch["dhtorch.scale"][:, 0].tolist() == pytest.approx([1.0, 1.4], abs=0.02)

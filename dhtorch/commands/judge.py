@@ -53,7 +53,7 @@ LIMITS = {
 }
 
 #: Columns of the page's table.
-COLUMNS = ("wrong, of what is known", "known, of the depth", "scale", "shift, m", "tilt")
+COLUMNS = ("wrong, of what is known", "known, of the depth", "scale", "shift, m", "tilt", "cut at, m")
 
 _LIMIT = re.compile(r"\s*([a-z]+)\s*>\s*([0-9.eE+-]+)\s*")
 
@@ -282,6 +282,7 @@ def _whole(found: Found) -> Row:
         "wrong": count["wrong"] / known if known else None,
         "causes": dict(kinds),
         "windows": len(able),
+        "ceiling": _cut(rows),
         "held": held,
     }
 
@@ -321,6 +322,8 @@ def _said(name: str, whole: Row) -> list[str]:
     lines = [f"{name}: {many(whole['frames'], 'frame')}: {wrong}, {unknown}; {scale}"]
     for cause, n in sorted(whole["causes"].items(), key=lambda item: -item[1]):
         lines.append(f"  likely cause in {n} of {many(whole['windows'], 'window')}: {cause}")
+    if whole["ceiling"] is not None and not any(cause.startswith("cut at") for cause in whole["causes"]):
+        lines.append(f"  cut at {whole['ceiling']:.3g} m: what is farther is said to lie there")
     return lines
 
 
@@ -331,6 +334,7 @@ def _page(place: Path, found: Found, whole: Row, over: Sequence[str]) -> Path:
         known = None if row["share_cannot_know"] is None else 1 - row["share_cannot_know"]
         cells = [pages.cell(row["wrong"]), "–" if known is None else f"{known:.2f}"]
         cells += [pages.cell(row[name]) for name in ("scale", "shift", "tilt")]
+        cells.append("–" if row["ceiling"] is None else f"{row['ceiling']:.3g}")
         frames.append(pages.JudgedFrame(f"frame {row['frame']}", cells, found.pictures.get(row["frame"])))
     failed = [f"Exceeded: {line}" for line in over]
     guess = told.guessed(found.scene.recording.report)

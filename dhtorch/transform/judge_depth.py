@@ -44,7 +44,8 @@ class JudgeDepth(torch.nn.Module):
         The sample and, behind the prefix (with B in front of a batch): ``state`` (h, w) of
         :class:`dhtorch.codes.State`; ``evidence`` (h, w) sigmas, 0 where nothing is said; ``state_share`` (3,) of the
         pixels with a depth, by state; ``scale``, ``shift``, ``tilt``, ``wrong`` (3,) value, low, high, with
-        ``<name>_known``; what cannot be known is 0. Without a second view near returns alone speak.
+        ``<name>_known``; ``ceiling`` () m, where the map is cut, with ``ceiling_known``; what cannot be known, or is
+        not so, is 0. Without a second view near returns alone speak.
 
     Raises:
         ValueError: options that cannot be.
@@ -121,4 +122,4 @@ def _as_keys(verdict: Verdict) -> dict[str, Tensor]:
     for name in NUMBERS:
         value = getattr(verdict, name)
         added |= {name: value.nan_to_num(0.0, 0.0, 0.0), f"{name}_known": value.isfinite().all(-1)}
-    return added
+    return added | {"ceiling": verdict.ceiling.nan_to_num(0.0), "ceiling_known": verdict.ceiling.isfinite()}
