@@ -70,6 +70,7 @@ EXPERIMENTS = {
     "focus_stack": "experiment=focus_stack data=synthetic_views",
     "learned_score": "experiment=learned_score data=shared_scenes",
     "rh20t_probe": "experiment=rh20t_probe data=rh20t_synthetic",
+    "rh20t_probe_xfeat": "experiment=rh20t_probe data=rh20t_synthetic experiment.dinov2=null experiment.xfeat=true",
     "vo_probe": "experiment=vo_probe data=shared_scenes",
     "vo_probe_xfeat": "experiment=vo_probe data=shared_scenes experiment.dinov2=null experiment.xfeat=true",
 }

@@ -135,7 +135,8 @@ def verdict(outcome: Outcome, real: bool) -> tuple[bool | None, str]:
     )
     scenes = [s for s in ours if ours[s].get("mse") is not None and theirs.get(s, {}).get("mse") is not None]
     if not scenes:
-        return None, f"{'no scene with enough pairs' if theirs else 'DINOv2 was left out'}{beside}"
+        known = any(row.get("mse") is not None for row in ours.values())
+        return None, f"{'DINOv2 was left out' if known else 'no scene with enough pairs'}{beside}"
     parts = [f"{s} {ours[s]['mse']:.2f} against {theirs[s]['mse']:.2f}{_between(ours[s])}" for s in scenes]
     text = f"{'; '.join(parts)} (paper: 1.32 against 1.63, ratio 0.81){beside}"
     if not real:
