@@ -273,7 +273,8 @@ def loader_times() -> str:
         said.append(f"{alone['ours_ms']:.0f} ms with {words} ({batch['ours_ms']:.0f} by batch)")
     plain, _ = taken("single", "eager")
     compiled = [f"{r['ours_ms']:.0f}" for r in taken("pair", "native")]
-    native = f"; after `python -m dhtorch.native`, which compiles its inner loops, {' and '.join(compiled)}" * bool(compiled)
+    after = "; after `python -m dhtorch.native`, which compiles inner loops, "
+    native = f"{after}{' and '.join(compiled)}" * bool(compiled)
     return (
         f"A sample of 640×480 takes {' and '.join(said)}{native}; {plain['peer_ms']:.0f} ms of it is decoding\n"
         f"(`python benchmarks/loader.py`; one thread, {plain['processor']})."
