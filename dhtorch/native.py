@@ -27,6 +27,7 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from dhtorch.archive import processor
 
@@ -104,12 +105,13 @@ def load() -> None:
 
 def serves(*tensors: Tensor) -> bool:
     """Whether tensors may be handed to the compiled code: it is loaded, or DHTORCH_NATIVE=1 asks for that, and they are
-    contiguous ones of the CPU, in whole numbers or single precision, and nobody transforms or differentiates them.
+    contiguous ones of the CPU, in whole numbers or single precision, and nobody transforms or differentiates them
+    (backward, or forward: ``torch.autograd.forward_ad`` hides its tangents within plain tensors).
 
     Raises:
         FileNotFoundError: DHTORCH_NATIVE=1 asks for what was not compiled.
     """
-    if torch.compiler.is_compiling():
+    if torch.compiler.is_compiling() or forward_ad._current_level >= 0:
         return False
     if not _loaded:
         if os.environ.get("DHTORCH_NATIVE", "") in ("", "0"):

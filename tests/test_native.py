@@ -8,6 +8,7 @@ import sys
 
 import pytest
 import torch
+from torch.autograd import forward_ad
 
 from dhtorch import native
 from dhtorch.geometry import affine, least_squares, pyramid, se3, sweep
@@ -365,6 +366,17 @@ def test_what_compiled_code_cannot_do_is_left_to_torch(loaded, monkeypatch):
     assert torch.equal(sweep.aggregate(C.int()), sweep.aggregate(C)), "other whole numbers"
     monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
     assert not native.serves(x)
+
+
+@needs_compiler
+def test_tangents_are_carried_though_compiled_code_is_loaded(loaded):
+    image, tangent = torch.rand(2, 1, 3, 48, 64)
+    with forward_ad.dual_level():
+        top = pyramid.build_pyramid(forward_ad.make_dual(image, tangent), 2, 11).levels[1]
+        found = forward_ad.unpack_dual(top).tangent
+    expected = pyramid.build_pyramid(tangent, 2, 11).levels[1]  # linear in the image
+    assert found is not None and torch.allclose(found, expected, atol=1e-6)
+    assert native.serves(image)
 
 
 @needs_compiler

@@ -73,6 +73,11 @@ def test_no_level_is_smaller_than_the_window_or_its_padding(window, least):
             build_pyramid(noise(1, 1, *small), 4, window)
 
 
+def test_a_batch_without_images_has_levels_without_images():
+    found = build_pyramid(torch.zeros(0, 3, 48, 64, dtype=torch.uint8), 2, 11)
+    assert [x.shape for x in found.levels] == [(0, 3, 48 + 26, 64 + 26), (0, 3, 24 + 26, 32 + 26)]
+
+
 def test_as_many_levels_are_made_as_asked_for():
     assert [len(build_pyramid(noise(1, 1, 90, 90), n, 5).levels) for n in (1, 2, 3, 4, 9)] == [1, 2, 3, 4, 4]
     usual = build_pyramid(noise(1, 1, 180, 180), window=5), build_pyramid(noise(1, 1, 60, 60))

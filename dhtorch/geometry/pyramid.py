@@ -183,7 +183,7 @@ def _bands(image: Tensor, hw: tuple[int, ...]) -> list[slice]:
     """Rows of a level to be worked on at once; all of them where a graph or a compiler would have to carry each."""
     h, w = hw
     whole = torch.compiler.is_compiling() or (image.requires_grad and torch.is_grad_enabled())
-    rows = h if whole else max(BAND // (len(image) * w), 1)
+    rows = h if whole else max(BAND // max(len(image) * w, 1), 1)
     return [slice(top, min(top + rows, h)) for top in range(0, h, rows)]
 
 
