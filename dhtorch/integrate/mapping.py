@@ -309,7 +309,7 @@ def _said(row: Row, cell: float) -> str:
     wider = f", {row['voxels_vs_sensor']:.3g} times the sensor's" if row["voxels_vs_sensor"] else ""
     wider += f" and {row['voxels_vs_sparse']:.3g} times those without a sweep" if row.get("voxels_vs_sparse") else ""
     islands = f"{row['n_islands']} islands, the largest {row['largest_island']:.0%}"
-    size = f"{row['n_points']} points" + (f", {row['n_triangles']} triangles" if row["n_triangles"] else "")
+    size = f"{row['n_points']:,} points" + (f", {row['n_triangles']:,} triangles" if row["n_triangles"] else "")
     return (
         f"{row['scene']}: {placed}, {fragments}; {row['n_voxels']} voxels of {100 * cell:g} cm{wider}, {islands};"
         f" {size}, {row['volume_mib']:.1f} MiB, {row['seconds']:.1f} s"

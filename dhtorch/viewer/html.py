@@ -94,7 +94,7 @@ def _data(scene: Exhibit) -> dict[str, Any]:
     outcomes += [(name, words(name), GATES[code]) for code, name in names(Gate).items() if code != Gate.ANSWER]
     n = sum(len(shot.samples["depth"]) for shot in scene.shots)
     swept = sum(len(shot.swept.xyz) for shot in scene.shots)
-    said = f"{many(len(scene.shots), 'pair')}, {n} samples" if scene.views else f"{n + swept} points"
+    said = f"{many(len(scene.shots), 'pair')}, {n:,} samples" if scene.views else f"{n + swept:,} points"
     said += f", {swept} swept pixels" if scene.views and swept else ""
     return {
         "title": scene.name,

@@ -61,7 +61,7 @@ function tellCoverage() {
   }
   const left = risk.errors.filter((_, k) => risk.scores[k] >= state.threshold);
   const share = hasViews ? `: ${percent(total.kept / total.holes)} of the ${total.holes} samples without a usable return` : "";
-  const first = [total.answers ? `${total.kept} of ${total.answers} answers stay${share}.` : "", total.swept ? `${total.stay} of ${total.swept} swept points stay.` : ""].filter(Boolean).join(" ") || "Nothing beyond the sensor was recovered here.";
+  const first = [total.answers ? `${total.kept.toLocaleString("en")} of ${total.answers.toLocaleString("en")} answers stay${share}.` : "", total.swept ? `${total.stay.toLocaleString("en")} of ${total.swept.toLocaleString("en")} swept points stay.` : ""].filter(Boolean).join(" ") || "Nothing beyond the sensor was recovered here.";
   const second = left.length ? ` Of ${risk.candidates} held-back returns ${percent(left.length / risk.candidates)} are answered, median error ${percent(quantile(left, 0.5))}.` : "";
   $("coverage").textContent = first + second;
   $("threshold-value").textContent = state.threshold.toFixed(2);
