@@ -174,6 +174,23 @@ def test_an_older_set_becomes_one_of_today_and_its_numbers_stay_beside(shots, tm
     assert copied.read_bytes() == (source / "videos" / "chunk-000" / CAMERA / "episode_000001.mp4").read_bytes()
 
 
+def test_one_episode_of_an_older_set_is_counted_from_0_in_its_own_version(shots, tmp_path):
+    source = robot_set(tmp_path / "old", shots, 2)
+    out = tmp_path / "new"
+    assert main(["enrich", str(source), str(out), *ASKED, "data=lerobot", "data.episode=1", "format=same"]) == 0
+    table = parquet.read_table(out / "data" / "chunk-000" / "episode_000000.parquet")
+    assert table.column("episode_index").to_pylist() == [0] * LENGTHS[1]
+    assert table.column("index").to_pylist() == list(range(LENGTHS[1]))
+    assert table.column("source.episode_index").to_pylist() == [1] * LENGTHS[1]
+    info = json.loads((out / "meta" / "info.json").read_text())
+    assert info["codebase_version"] == "v2.1" and info["total_chunks"] == 1 and "source.index" in info["features"]
+    (said,) = map(json.loads, (out / "meta" / "episodes.jsonl").read_text().splitlines())
+    assert said["episode_index"] == 0
+    film = Path("videos") / "chunk-000" / CAMERA
+    copied, origin = out / film / "episode_000000.mp4", source / film / "episode_000001.mp4"
+    assert copied.read_bytes() == origin.read_bytes()
+
+
 def test_a_recording_becomes_a_set_and_a_nerfstudio_folder(tmp_path, capsys):
     folder = tmp_path / "room"
     assert main(["enrich", "out=" + str(folder), "data=synthetic", "data.hw=[48,64]", "data.n_frames=3", *ASKED]) == 0

@@ -65,7 +65,7 @@ class RobotTarget:
         self.key, self.cut = key, cut
         self.given: dict[str, Feature] = {} if origin is None else origin.features
         self.keys = {view.key: self._keys(view) for view in views.values()}
-        self.renumbered = version == 3 and (cut or list(numbers) != list(range(len(numbers))))
+        self.renumbered = cut or list(numbers) != list(range(len(numbers)))
         for name in (*self.given, *views):
             if not name or any(mark in name for mark in ("/", "\\", "..", "\0")):
                 raise ValueError(f"data: found a feature called {name!r}, expected a name without / and ..")
@@ -119,13 +119,9 @@ class RobotTarget:
 
     # ------------------------------------------------------------------------------------------------- one episode
 
-    def number(self, k: int) -> int:
-        """Of the ``k``-th episode, in the new set: loaders of v3 count them from 0."""
-        return k if self.version == 3 else self.numbers[k]
-
     def file(self, k: int) -> Path:
         """The table of the ``k``-th episode."""
-        return self.root / lerobot.data_file(self.version, self.number(k))
+        return self.root / lerobot.data_file(self.version, k)
 
     def own(self, k: int) -> Row | None:
         """As :meth:`Target.own`."""
@@ -214,7 +210,7 @@ class RobotTarget:
                 {
                     "timestamp": (at / self.fps).astype(np.float32),
                     "frame_index": at,
-                    "episode_index": np.full(len(kept), self.number(k)),
+                    "episode_index": np.full(len(kept), k),
                     "index": start + at,
                     "task_index": np.zeros(len(kept), np.int64),
                     "observation.frame_number": [row["frame_index"] for row in first],
@@ -249,15 +245,15 @@ class RobotTarget:
         return cells
 
     def _renumbered(self, table: Any, k: int, start: int) -> Any:
-        """Episodes from 0 and rows one after another, where the loader of this version counts so or nobody did."""
+        """Episodes from 0 and rows one after another, as loaders count."""
         pyarrow = need("pyarrow", extra="scale")
         n = table.num_rows
-        news = {"episode_index": np.full(n, self.number(k)), "index": start + np.arange(n)}
+        news = {"episode_index": np.full(n, k), "index": start + np.arange(n)}
         for name, values in news.items():
             mine = pyarrow.array(values.astype(np.int64))
             if name not in table.column_names:
                 table = table.append_column(name, mine)
-            elif self.version == 3:
+            elif self.renumbered or self.version == 3:
                 place = table.column_names.index(name)
                 if self.renumbered:
                     table = table.append_column(f"source.{name}", table.column(name))
@@ -294,7 +290,7 @@ class RobotTarget:
     def _copy_videos(self, k: int, length: int) -> None:
         """Byte for byte."""
         for key, (file, clip) in self._clips(k, length).items():
-            storage.copy_file(file, self.root / lerobot.video_file(self.version, key, clip, self.number(k)))
+            storage.copy_file(file, self.root / lerobot.video_file(self.version, key, clip, k))
 
     def _clips(self, k: int, length: int) -> dict[str, tuple[Path, lerobot.Clip]]:
         if self.origin is None:
@@ -302,7 +298,7 @@ class RobotTarget:
         found = self.origin.clips(k, length)
         if self.origin.version == 3:
             return found
-        chunk, file = divmod(self.number(k), lerobot.CHUNK)
+        chunk, file = divmod(k, lerobot.CHUNK)
         return {key: (path, clip._replace(chunk=chunk, file=file)) for key, (path, clip) in found.items()}
 
     # ---------------------------------------------------------------------------------------------------- the whole
@@ -318,7 +314,7 @@ class RobotTarget:
             storage.copy_file(file, self.root / name)
         episodes = [
             lerobot.Episode(
-                number=self.number(k),
+                number=k,
                 length=own["length"],
                 start=own["start"],
                 tasks=own["tasks"],
@@ -371,7 +367,7 @@ class RobotTarget:
             if "split" in own["about"]:
                 splits.setdefault(own["about"]["split"], []).append(own["number"])
         for name, numbers in splits.items():
-            places = [self.number(k) for k, number in enumerate(self.numbers) if number in set(numbers)]
+            places = [k for k, number in enumerate(self.numbers) if number in set(numbers)]
             if places and places == list(range(places[0], places[-1] + 1)):
                 found[name] = f"{places[0]}:{places[-1] + 1}"
         return found
@@ -379,7 +375,7 @@ class RobotTarget:
     def _write_about(self, owns: Sequence[Row]) -> None:
         """What an origin says of its episodes and the format has no place for."""
         if any(own["about"] for own in owns):
-            rows = [{"episode_index": self.number(k), **own["about"]} for k, own in enumerate(owns)]
+            rows = [{"episode_index": k, **own["about"]} for k, own in enumerate(owns)]
             text = "".join(storage.dumps(row) + "\n" for row in rows)
             storage.replace_file(self.root / "meta" / "source_episodes.jsonl", text.encode())
 
