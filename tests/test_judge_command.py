@@ -182,8 +182,48 @@ def test_damaged_or_hostile_maps_are_refused(tmp_path, room):
     with pytest.raises(FormatError, match="shape"):
         open_maps(tmp_path, room)[0]
     (tmp_path / "0.png").write_bytes(b"")
-    with pytest.raises(FormatError, match="both kinds"):
+    with pytest.raises(FormatError, match=r"1 \.npy and 1 \.png"):
         open_maps(tmp_path, room)
+
+
+def folder_of(root, names, hw=(6, 8)):
+    """A folder of maps, each of the depth of its place in the list, 1 m first."""
+    root.mkdir()
+    for k, name in enumerate(names):
+        np.save(root / f"{name}.npy", np.full(hw, 1.0 + k, np.float32))
+    return root
+
+
+def depths(maps):
+    return [None if maps[i] is None else float(maps[i][0, 0, 0]) for i in range(len(maps.files))]
+
+
+def test_files_are_matched_by_number_else_in_order_and_never_by_halves(tmp_path, room):
+    n = len(room)
+    some = open_maps(folder_of(tmp_path / "some", ["depth_3", "depth_1"]), room)
+    assert depths(some)[:4] == [None, 2.0, None, 1.0] and some.frames == [1, 3]
+    assert some.notes == [f"{n - 2} of {n} frames have no map."]
+    assert some.report == {"missing": n - 2, "matched_by": "number"}
+    more = open_maps(folder_of(tmp_path / "more", range(n + 5)), room)
+    assert depths(more) == [1.0 + k for k in range(n)] and not more.notes
+    later = open_maps(folder_of(tmp_path / "later", [f"{95 + k}" for k in range(n)]), room)
+    assert depths(later) == [1.0 + k for k in range(n)], "99 comes before 100"
+    assert later.report == {"missing": 0, "matched_by": "order"} and "in their order" in later.notes[0]
+    named = open_maps(folder_of(tmp_path / "named", "abcdefghijklmnopqrstuvwxyz"[:n]), room)
+    assert depths(named) == [1.0 + k for k in range(n)] and named.by == "order"
+    for k, names in enumerate((range(n - 1, 2 * n - 1), [*range(n - 1), "x"], ["a", "b"])):
+        with pytest.raises(FormatError, match=f"one for each of {n} frames, numbered 0 to {n - 1}"):
+            open_maps(folder_of(tmp_path / f"wrong{k}", names), room)
+    with pytest.raises(FormatError, match=r"b_1\.npy: name: .*number 1 as a_1\.npy has"):
+        open_maps(folder_of(tmp_path / "twice", ["a_1", "b_1"]), room)
+
+
+def test_a_map_is_laid_over_the_whole_picture(tmp_path, room):
+    h, w = room[0].hw
+    with pytest.raises(FormatError, match=rf"a map of {h}x{w}, expected one over the field of its picture, {w}x{h}"):
+        open_maps(folder_of(tmp_path / "upright", ["0"], (w, h)), room)[0]
+    with pytest.warns(UserWarning, match="maps of 64x64 are taken to be stretched"):
+        assert open_maps(folder_of(tmp_path / "square", ["0"], (64, 64)), room)[0].shape == (1, 64, 64)
 
 
 OPTIONS = {"image": "image", "depth": "depth", "intrinsics": "intrinsics", "depth_unit": "mm", "n": 256}

@@ -88,9 +88,9 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     over = exceeded(whole, limits, LIMITS)
     content = {"scene": scene.name, "kind": settings["kind"], "fail_on": settings["fail_on"], "exceeded": over}
     keep = ("frame", "anchored", "views")
-    content |= {"whole": whole, "frames": [{k: row[k] for k in keep} for row in rows]}
+    content |= {"maps": maps.report, "whole": whole, "frames": [{k: row[k] for k in keep} for row in rows]}
     storage.write_json(out / "anchor.json", storage.strict(content))
-    said = _said(scene.name, settings["kind"], whole, before)
+    said = [*_said(scene.name, settings["kind"], whole, before), *(f"  {note}" for note in maps.notes)]
     _page(task, maps, said, over)
     print("\n".join([*said, *(f"  exceeded: {line}" for line in over), "wrote", f"  {out}"]))
     return int(bool(over))
@@ -102,9 +102,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
 def _task(scene: Scene, maps: DepthMaps, method: Method, settings: Mapping[str, Any], out: Path) -> Task:
     """What is wanted of a recording: every frame that has a map."""
     recording = scene.recording
-    frames = [i for i in range(0, len(recording), settings["every"]) if maps.files[i] is not None][: settings["most"]]
-    if not frames:
-        raise ValueError(f"depth: found a map of none of the {len(recording)} frames, expected some")
+    frames = maps.frames[:: settings["every"]][: settings["most"]]
     hw = recording[frames[0]].hw
     if 0 in hw:
         raise ValueError(f"{scene.name}: found frames without pictures, expected pictures (data.images=true)")

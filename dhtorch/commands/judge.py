@@ -69,6 +69,15 @@ class Found:
     pictures: dict[int, bytes] = field(default_factory=dict)  # frame → PNG, of the worst
 
     @property
+    def notes(self) -> list[str]:
+        """How files were matched to frames, where that has to be known."""
+        return [] if self.maps is None else self.maps.notes
+
+    def asked(self, every: int) -> list[int]:
+        """Every so many of the frames that have a map."""
+        return list(range(len(self.scene.recording)) if self.maps is None else self.maps.frames)[::every]
+
+    @property
     def by_number(self) -> dict[int, Row]:
         """Rows of the frames that were looked at, by their number in the capture."""
         return {row["frame"]: row for row in self.rows}
@@ -98,10 +107,11 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         over = exceeded(whole, limits)
         place = folder if len(scenes) == 1 else folder / scene.name
         content = {"scene": scene.name, "source": "sensor" if maps is None else "maps", "fail_on": settings["fail_on"]}
+        content |= {} if maps is None else {"maps": maps.report}
         content |= {"intrinsics_guessed": told.guessed(scene.recording.report)}
         content |= {"exceeded": over, "whole": whole, "windows": found.windows, "frames": found.rows}
         written += [storage.write_json(place / "judge.json", storage.strict(content)), _page(place, found, whole, over)]
-        lines += [*_said(scene.name, whole), *(f"  exceeded: {line}" for line in over)]
+        lines += [*_said(found.scene.name, whole, found.notes), *(f"  exceeded: {line}" for line in over)]
         failed += over
     print("\n".join([*lines, "wrote", *(f"  {path}" for path in written)]))
     return int(bool(failed))
@@ -142,7 +152,7 @@ def parse_limits(text: str | None, known: Mapping[str, str] = LIMITS) -> dict[st
 def _judged(found: Found, method: Method, settings: Mapping[str, Any], progress: Progress) -> Found:
     """Every frame by itself, then windows of frames."""
     n = len(found.scene.recording)
-    frames = range(0, n, settings["every"])[: settings["most"]]
+    frames = found.asked(settings["every"])[: settings["most"]]
     for i in progress(frames, f"{found.scene.name}: frames", len(frames)):
         frame = _shown(found.scene, settings, i)
         verdict = _verdict(found, frame, i, method, settings)
@@ -313,7 +323,7 @@ def _share_at_least(part: int, whole: int) -> float | None:
     return None if math.isnan(low) else low
 
 
-def _said(name: str, whole: Row) -> list[str]:
+def _said(name: str, whole: Row, notes: Sequence[str] = ()) -> list[str]:
     """A recording in words."""
     held, middle = whole["held"], whole["median"]
     wrong = "nothing can be known" if whole["wrong"] is None else f"{whole['wrong']:.1%} of what is known is wrong"
@@ -324,7 +334,7 @@ def _said(name: str, whole: Row) -> list[str]:
         lines.append(f"  likely cause in {n} of {many(whole['windows'], 'window')}: {cause}")
     if whole["ceiling"] is not None and not any(cause.startswith("cut at") for cause in whole["causes"]):
         lines.append(f"  cut at {whole['ceiling']:.3g} m: what is farther is said to lie there")
-    return lines
+    return lines + [f"  {note}" for note in notes]
 
 
 def _page(place: Path, found: Found, whole: Row, over: Sequence[str]) -> Path:
@@ -338,7 +348,7 @@ def _page(place: Path, found: Found, whole: Row, over: Sequence[str]) -> Path:
         frames.append(pages.JudgedFrame(f"frame {row['frame']}", cells, found.pictures.get(row["frame"])))
     failed = [f"Exceeded: {line}" for line in over]
     guess = told.guessed(found.scene.recording.report)
-    said = _said(found.scene.name, whole) + ([f"Its {guess}."] if guess else [])
+    said = _said(found.scene.name, whole, found.notes) + ([f"Its {guess}."] if guess else [])
     return pages.write(place / "judge.html", found.scene.name, said=said, columns=COLUMNS, frames=frames, failed=failed)
 
 

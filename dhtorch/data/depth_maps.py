@@ -2,18 +2,21 @@
 
 ``*.png`` of 16 bits in steps of a stated unit; ``*.npy``, ``*.npz`` (its one array, or the one named depth),
 ``*.tiff``, ``*.pfm`` or ``*.exr`` of numbers in the same unit; (h, w) over the field of the frame's picture, of any
-size. 0, and what is not finite, is no depth. What ``dhtorch complete`` wrote is read as it is: its ``complete.json``
-says the unit.
+size, stretched where its sides have another ratio. 0, and what is not finite, is no depth. What ``dhtorch complete``
+wrote is read as it is: its ``complete.json`` says the unit.
 """
 
 from __future__ import annotations
 
 import io
 import re
+import warnings
 import zipfile
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,6 +35,9 @@ UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 
 _ENDINGS = (".png", ".npy", ".npz", ".tif", ".tiff", ".pfm", ".exr")
 
+#: By which share the ratio of a map's sides may differ from the picture's before it counts as another.
+ALIKE = 0.05
+
 #: Array of an archive that is taken where it has several.
 _KEY = "depth"
 
@@ -42,17 +48,38 @@ class DepthMaps:
 
     files: Sequence[Path | None]  # of every frame
     unit: float  # m
+    hw: tuple[int, int]  # of the pictures
+    by: str = "number"  # how files were matched to frames: number | order
+
+    @property
+    def frames(self) -> list[int]:
+        """The frames that have a map."""
+        return [i for i, file in enumerate(self.files) if file is not None]
+
+    @property
+    def notes(self) -> list[str]:
+        """What a reader of the answer has to know of how files were matched."""
+        missing, n = len(self.files) - len(self.frames), len(self.files)
+        found = [f"{missing} of {n} frames have no map."] if missing else []
+        ordered = ["No file has a frame's number: files were matched in their order."]
+        return found + (ordered if self.by == "order" else [])
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """The same as numbers."""
+        return {"missing": len(self.files) - len(self.frames), "matched_by": self.by}
 
     def __getitem__(self, i: int) -> Tensor | None:
         """(1, h, w) m float32 of frame ``i``, 0 = no depth; None where there is no file.
 
         Raises:
-            FormatError: a damaged file, or one of another kind.
+            FormatError: a damaged file, one of another kind, or one that stands upright where the picture lies.
         """
         file = self.files[i]
         if file is None:
             return None
         array = _READERS[file.suffix.lower()](file)
+        _check_shape(file, array.shape, self.hw)
         depth = torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))[None] * self.unit
         return torch.where(depth.isfinite() & (depth > 0), depth, 0.0)
 
@@ -60,8 +87,9 @@ class DepthMaps:
 def open_maps(folder: str | Path, recording: Recording, unit: str | float | None = None) -> DepthMaps:
     """The maps of a recording's frames.
 
-    A file belongs to the frame whose number its name ends in; where a name has none, files and frames are matched in
-    their order, and there must be as many.
+    A file belongs to the frame whose number is the last one in its name: all frames must have a file, or all files a
+    frame. Where no file has a frame's number, and there are as many files as frames, they are matched in their order,
+    by the numbers in their names.
 
     Args:
         folder: of the files, or one that ``dhtorch complete`` wrote.
@@ -70,7 +98,7 @@ def open_maps(folder: str | Path, recording: Recording, unit: str | float | None
             others.
 
     Raises:
-        FormatError: no folder, no map, both kinds, or files that cannot be matched.
+        FormatError: no folder, no map, maps of several kinds, two of one number, or files that cannot be matched.
         ValueError: an unknown unit.
     """
     root = Path(folder).expanduser()
@@ -79,27 +107,65 @@ def open_maps(folder: str | Path, recording: Recording, unit: str | float | None
     about = root / "complete.json" if (root / "complete.json").is_file() else root.parent / "complete.json"
     place = root / "depth" if (root / "depth").is_dir() else root
     found = sorted(file for file in place.iterdir() if file.suffix.lower() in _ENDINGS)
-    kinds = {file.suffix.lower() for file in found}
+    kinds = Counter(file.suffix.lower() for file in found)
     if len(kinds) != 1:
-        what = "both kinds" if kinds else "no such file"
-        raise FormatError(place, "depth", what, f"one kind of file a frame of {', '.join(_ENDINGS)}")
+        what = " and ".join(f"{n} {kind}" for kind, n in sorted(kinds.items())) or "no such file"
+        raise FormatError(place, "depth", what, f"one file a frame, all of one kind of {', '.join(_ENDINGS)}")
     step = _unit(unit)
     if step is None and about.is_file():
         step = files.to_positive(files.read_json(about).get("unit_m"), about, "unit_m")
     if step is None:
-        step = UNITS["mm"] if kinds == {".png"} else UNITS["m"]
-    return DepthMaps(_matched(place, found, recording), step)
+        step = UNITS["mm"] if set(kinds) == {".png"} else UNITS["m"]
+    mine, by = _matched(place, found, recording.number.tolist())
+    return DepthMaps(mine, step, recording[0].hw, by)
 
 
-def _matched(place: Path, found: Sequence[Path], recording: Recording) -> list[Path | None]:
-    number = recording.number.tolist()
-    named = [re.search(r"(\d+)\D*$", file.stem) for file in found]
-    by_number = {int(match.group(1)): file for match, file in zip(named, found, strict=True) if match}
-    if len(by_number) == len(found) and set(by_number) & set(number):
-        return [by_number.get(k) for k in number]
-    if len(found) == len(number):
-        return list(found)
-    raise FormatError(place, "depth", f"{len(found)} files of other names", f"one for each of {len(number)} frames")
+def _matched(place: Path, found: Sequence[Path], number: Sequence[int]) -> tuple[list[Path | None], str]:
+    """Every frame's file, and whether numbers or order told it."""
+    named = [_numbers(file)[-1:] for file in found]
+    frames, told = set(number), {n for numbers in named for n in numbers}
+    if told & frames and all(named):
+        if frames <= told or told <= frames:
+            by_number = _by_number(found, [numbers[0] for numbers in named])
+            return [by_number.get(k) for k in number], "number"
+    elif not told & frames and len(found) == len(number):
+        in_order = sorted(found, key=_numbers)
+        return [*in_order], "order"
+    said = f"{len(found)} files"
+    if told:
+        said += f" numbered {_range(told)}, {len(told & frames)} of them with a frame's number"
+    raise FormatError(place, "depth", said, f"one for each of {len(number)} frames, numbered {_range(frames)}")
+
+
+def _numbers(file: Path) -> list[int]:
+    """All whole numbers in a file's name, so that 10 comes after 9."""
+    return [int(digits) for digits in re.findall(r"\d+", file.stem)]
+
+
+def _by_number(found: Sequence[Path], named: Sequence[int]) -> dict[int, Path]:
+    by_number: dict[int, Path] = {}
+    for file, n in zip(found, named, strict=True):
+        first = by_number.setdefault(n, file)
+        if first is not file:
+            raise FormatError(file, "name", f"number {n} as {first.name} has", "a number of its own in every name")
+    return by_number
+
+
+def _range(numbers: set[int]) -> str:
+    return f"{min(numbers)} to {max(numbers)}"
+
+
+def _check_shape(file: Path, shape: tuple[int, ...], hw: tuple[int, int]) -> None:
+    """A map is laid over the whole picture; one that is upright where the picture lies cannot be meant."""
+    if 0 in hw:
+        return
+    ratio, expected = shape[1] / shape[0], hw[1] / hw[0]
+    size, picture = f"{shape[1]}x{shape[0]}", f"{hw[1]}x{hw[0]}"
+    if (ratio - 1) * (expected - 1) < 0 and abs(ratio / expected - 1) > ALIKE:
+        raise FormatError(file, "depth", f"a map of {size}", f"one over the field of its picture, {picture}")
+    if abs(ratio / expected - 1) > ALIKE:
+        text = f"{file.parent}: maps of {size} are taken to be stretched over the whole picture, {picture}"
+        warnings.warn(text, UserWarning, stacklevel=3)
 
 
 def _unit(given: str | float | None) -> float | None:
