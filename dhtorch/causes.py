@@ -52,7 +52,7 @@ FOCALS = (0.8, 0.87, 0.93, 0.95, 1.05, 1.07, 1.15, 1.25)
 
 #: Fields of view of a depth over that of the picture it should be laid over, and by which share of the width it may lie
 #: beside its place.
-FIELDS, BESIDE = (0.7, 0.78, 0.87, 1.15, 1.28, 1.43), (-0.08, -0.04, 0.04, 0.08)
+FIELDS, BESIDE = (0.55, 0.62, 0.7, 0.78, 0.87, 1.15, 1.28, 1.43, 1.6, 1.8), (-0.08, -0.04, 0.04, 0.08)
 
 #: Factors that take a depth in another unit to metres.
 UNITS = {"mm read as m": 1e-3, "m read as mm": 1e3, "inch read as m": 0.0254, "m read as inch": 1 / 0.0254}
@@ -82,6 +82,12 @@ def turned(depth: Tensor, quarters: int) -> Tensor:
     return F.interpolate(flat, depth.shape[-2:], mode="nearest-exact").reshape(depth.shape)
 
 
+def _seen_over(field: float) -> str:
+    """The field in words; beyond the last one that is tried, nobody has looked."""
+    bound = {FIELDS[0]: "at most ", FIELDS[-1]: "at least "}.get(field, "")
+    return f"not registered: seen over {bound}{field:.2f} of the picture's field"
+
+
 def _mirrored(depth: Tensor) -> Tensor:
     return depth.flip(-1)
 
@@ -96,14 +102,7 @@ CAUSES: tuple[Cause, ...] = (
     *(Cause("unit", name, partial(_times, factor=factor)) for name, factor in UNITS.items()),
     Cause("mirrored", "mirrored left to right", _mirrored),
     *(Cause("rolled", f"rolled by {90 * k} degrees", partial(turned, quarters=4 - k)) for k in (1, 2, 3)),
-    *(
-        Cause(
-            "registration",
-            f"not registered: seen over {field:.2f} of the picture's field",
-            partial(magnified, factor=field),
-        )
-        for field in FIELDS
-    ),
+    *(Cause("registration", _seen_over(field), partial(magnified, factor=field)) for field in FIELDS),
     *(
         Cause(
             "registration",
@@ -149,7 +148,7 @@ def name_cause(
         seed: of the pose search.
         watched: what :func:`watch` found in the same pictures; None = it is asked.
 
-    Where all frames carry a pose of their own (``T_world_from_cam``) misses under that motion count as well, so that a
+    Where all frames carry a pose of their own (``T_world_from_cam``) misses under that motion count half, so that a
     unit or a focal length, which motions fitted to the same depth swallow, shows. Without, a unit of the sensor's own
     depth cannot be known and is not named.
 
@@ -187,20 +186,24 @@ def decided(losses: Mapping[str, Tensor]) -> Named:
     base = losses[NONE.name]
     able = base.isfinite()
     mean = {name: float(loss[able & loss.isfinite()].mean()) for name, loss in losses.items()}
-    n = int(able.sum())
-    known = {name: value for name, value in mean.items() if math.isfinite(value)}
-    nothing = Named(None, None, known, n)
-    others = {name: value for name, value in known.items() if name != NONE.name}
-    if n < FEWEST or not others:
+    nothing = Named(None, None, {name: value for name, value in mean.items() if math.isfinite(value)}, int(able.sum()))
+    saved = {
+        name: (base - loss)[base.isfinite() & loss.isfinite()] for name, loss in losses.items() if name != NONE.name
+    }
+    saved = {name: each for name, each in saved.items() if len(each) >= FEWEST}
+    if not saved:
         return nothing
-    best = min(others, key=lambda name: others[name])
-    both = able & losses[best].isfinite()
-    saved = (base - losses[best])[both]
-    rivals = [value for name, value in others.items() if kinds[name] != kinds[best]]
-    error = float(saved.std() / len(saved) ** 0.5) if len(saved) >= FEWEST else float("inf")
-    clear = float(saved.mean()) > max(SAVES, ERRORS * error)
-    alone = not rivals or min(rivals) - others[best] > BEYOND
-    return Named(best, kinds[best], known, n) if clear and alone else nothing
+    best = max(saved, key=lambda name: float(saved[name].mean()))
+    error = float(saved[best].std() / len(saved[best]) ** 0.5)
+    beyond = [_mean_of_both(losses[name] - losses[best]) for name in saved if kinds[name] != kinds[best]]
+    clear = float(saved[best].mean()) > max(SAVES, ERRORS * error)
+    return nothing._replace(cause=best, kind=kinds[best]) if clear and all(x > BEYOND for x in beyond) else nothing
+
+
+def _mean_of_both(more: Tensor) -> float:
+    """Of the pairs that both can tell, since some are easier than others; infinite without any."""
+    known = more[more.isfinite()]
+    return float(known.mean()) if len(known) else math.inf
 
 
 class Watched(NamedTuple):
@@ -252,7 +255,7 @@ class Window:
         found = self._under_fit(samples, depth, scaled)
         given = self._under_trajectory(depth, scaled)
         if given is not None:
-            found = torch.where(found.isfinite(), found, 1.0) + given
+            found = 0.5 * (torch.where(found.isfinite(), found, 1.0) + given)
         return torch.where(there, found, torch.nan)
 
     @staticmethod

@@ -1,5 +1,7 @@
 """Faults that all maps of a window share are named by undoing them, and nothing else is."""
 
+import re
+
 import pytest
 import torch
 
@@ -43,6 +45,28 @@ def test_a_planted_fault_is_named(kind, own, frames, watched):
     found = name_cause(shown, maps, method=METHOD, watched=watched)
     assert found.kind == kind
     assert found.n_pairs >= 4
+
+
+@pytest.mark.parametrize(("field", "bound"), [(1.6, ""), (0.65, ""), (2.2, "at least "), (0.5, "at most ")])
+def test_a_field_is_told_within_a_step_and_beyond_them_as_a_bound(field, bound, frames, watched):
+    shown = [range_split(f, 2.0).replace(T_world_from_cam=None) for f in frames]
+    found = name_cause(shown, [magnified(f.depth, 1 / field) for f in frames], method=METHOD, watched=watched)
+    told = re.fullmatch(r"not registered: seen over (at \w+ )?(\d\.\d\d) of the picture's field", found.cause)
+    if bound:
+        assert told[1] == bound
+    else:
+        assert float(told[2]) == pytest.approx(field, rel=0.13)
+
+
+def test_pairs_that_some_explanations_cannot_tell_favour_none_of_them():
+    """Two hard pairs fall out of the window's end for a late map: what is left is easier, and no explanation."""
+    base = torch.tensor([0.6, 0.6, 0.2, 0.2, 0.2, 0.2])
+    none_left = torch.full((6,), torch.nan)
+    losses = {cause.name: none_left for cause in CAUSES} | {NONE.name: base}
+    late = torch.cat((none_left[:2], base[2:]))
+    sideways = base - torch.tensor([0.05, 0.06, 0.05, 0.06, 0.05, 0.06])
+    assert decided(losses | {"1 frames late": late}).cause is None
+    assert decided(losses | {"1 frames late": late, "mirrored left to right": sideways}).kind == "mirrored"
 
 
 def test_a_sound_recording_has_no_cause(frames, watched):
