@@ -201,18 +201,19 @@ void census(Tensor grey, Tensor offsets, Tensor code) {
   }
 }
 
-// Where a view without a lens sees points on rays (B, N, 3) at q (B, N): uv (B, N, 2) and whether before it (B, N) bool.
+// Where a view without a lens sees points on rays (B, 3, N) at q (B, N): uv (B, 2, N) and whether before it (B, N) bool.
 // R (B, 9), t, turn (B, 3), f, c (B, 2).
 void seen_at(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor turn, Tensor f, Tensor c, Tensor uv, Tensor front) {
   const int64_t B = q.size(0), N = q.size(1);
   for (int64_t k = 0; k < B; ++k) {
     const float *m = data<float>(R) + 9 * k, *tk = data<float>(t) + 3 * k, *w = data<float>(turn) + 3 * k;
-    const float *fk = data<float>(f) + 2 * k, *ck = data<float>(c) + 2 * k, *qk = data<float>(q) + N * k;
-    const float* r = data<float>(ray) + 3 * N * k;
-    float* __restrict to = data<float>(uv) + 2 * N * k;
+    const float *fk = data<float>(f) + 2 * k, *ck = data<float>(c) + 2 * k, *__restrict qk = data<float>(q) + N * k;
+    const float *__restrict ax = data<float>(ray) + 3 * N * k, *__restrict ay = ax + N, *__restrict az = ay + N;
+    float *__restrict u = data<float>(uv) + 2 * N * k, *__restrict v = u + N;
     bool* __restrict before = data<bool>(front) + N * k;
+#pragma GCC ivdep
     for (int64_t n = 0; n < N; ++n) {
-      const float a = r[3 * n], b = r[3 * n + 1], d = r[3 * n + 2];
+      const float a = ax[n], b = ay[n], d = az[n];
       float x = (a * m[0] + b * m[1] + d * m[2]) + qk[n] * tk[0];
       float y = (a * m[3] + b * m[4] + d * m[5]) + qk[n] * tk[1];
       float z = (a * m[6] + b * m[7] + d * m[8]) + qk[n] * tk[2];
@@ -221,9 +222,13 @@ void seen_at(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor turn, Tensor f, Te
       x = x + dx;
       y = y + dy;
       z = z + dz;
-      before[n] = z > 1e-3f;
-      to[2 * n] = z > 1e-3f ? x / z * fk[0] + ck[0] : 1.0f * fk[0] + ck[0];
-      to[2 * n + 1] = z > 1e-3f ? y / z * fk[1] + ck[1] : 1.0f * fk[1] + ck[1];
+      const bool ahead = z > 1e-3f;
+      before[n] = ahead;
+      x = ahead ? x : 1.0f;
+      y = ahead ? y : 1.0f;
+      z = ahead ? z : 1.0f;
+      u[n] = x / z * fk[0] + ck[0];
+      v[n] = y / z * fk[1] + ck[1];
     }
   }
 }

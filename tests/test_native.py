@@ -147,6 +147,54 @@ def test_places_codes_and_smooth_maps_are_equal(loaded, monkeypatch, turning):
         assert torch.equal(*smooth)
 
 
+@needs_compiler
+@pytest.mark.parametrize("lens", [False, True])
+@pytest.mark.parametrize("hw", [(41, 53), (6, 70), (9, 3)])
+def test_fitted_windows_agree_up_to_rounding(loaded, monkeypatch, lens, hw):
+    """Pairs turned and moved, pixels that leave the other picture or lie behind it, and one without texture."""
+    g = torch.Generator().manual_seed(3)
+    pictures = gaussian(torch.rand(3, 2, *hw, generator=g), 1.2)
+    pictures[2, 0] = 0.4
+    f = torch.full((3, 2), float(max(hw)))
+    lens = torch.tensor([[0.05, -0.01, 0.001, -0.002]]).expand(3, -1) if lens else None
+    camera = Camera(f, torch.tensor([[hw[1] / 2, hw[0] / 2]]).expand(3, -1), lens)
+    motion = se3.exp(0.05 * torch.randn(3, 6, generator=g) + torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, -0.4]))
+    base = sweep.base(pictures[:, :1], camera)
+    view = sweep.View(pictures[:, 1:], camera, motion)
+    q = 0.2 + 0.1 * gaussian(torch.rand(3, 1, *hw, generator=g), 2.0)[:, 0]
+    q[:, 0] = 4.0  # behind
+    picture = sweep.with_gradients(view.image)
+    found, expected = both_ways(lambda: sweep.fit_windows(base, view, picture, q), monkeypatch)
+    assert torch.equal(found.seen, expected.seen) and not bool(found.seen.all()) and bool(found.seen.any())
+    for name in ("step", "contrast", "noise", "correlation", "motion"):
+        a, b = getattr(found, name), getattr(expected, name)
+        scale = b.abs().flatten(1).mean(1).clamp_min(1e-6)[:, None]
+        assert a.shape == b.shape and ((a - b).flatten(1).abs() <= 1e-4 * (scale + b.flatten(1).abs())).all(), name
+    assert found.correlation[:2].abs().mean() > 0.05
+
+
+@needs_compiler
+def test_windows_of_another_size_or_type_or_with_a_graph_are_fitted_by_torch(loaded, monkeypatch):
+    monkeypatch.setattr(sweep, "_compiled_fit", None)
+    grey = torch.rand(1, 2, 12, 14, generator=torch.Generator().manual_seed(4))
+    camera = Camera(torch.full((1, 2), 20.0), torch.tensor([[6.5, 5.5]]))
+    motion = se3.exp(torch.tensor([[0.0, 0.0, 0.0, 0.1, 0.0, 0.0]]))
+
+    def fitted(grey, **options):
+        base = sweep.base(grey[:, :1], camera.to(grey.dtype))
+        view = sweep.View(grey[:, 1:], camera.to(grey.dtype), motion.to(grey.dtype))
+        q = torch.full_like(grey[:, 0], 0.5)
+        return sweep.fit_windows(base, view, sweep.with_gradients(view.image), q, **options)
+
+    fitted(grey.double())
+    fitted(grey, radius=2)
+    graph = grey.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(fitted(graph).step.sum(), [graph])
+    assert bool(slope.isfinite().all()) and slope.abs().sum() > 0
+    with pytest.raises(TypeError):
+        fitted(grey)
+
+
 @pytest.fixture(scope="module")
 def seen_twice():
     """Two pictures, each seen again moved by a few pixels and lit otherwise; points in, at the border of and beside it."""
@@ -210,6 +258,12 @@ def test_compiled_code_has_the_constants_of_torchs():
         "NOISE = 2.0 / 255 / 2, DAMPING = NOISE * NOISE, MIN_PIVOT = 1e-6;",
     ):
         assert line in source
+    for line in (
+        f"RADIUS = {sweep.FIT_RADIUS};",
+        f"LEAST_GAIN = {sweep.GAIN[0]}f, MOST_GAIN = {sweep.GAIN[1]}f, FLAT = 1e-8f;",
+    ):
+        assert line in native.SOURCES[4].read_text()
+    assert sweep.FLAT == 1e-8
     assert affine.DAMPING == (2 / 255 / 2) ** 2 and least_squares.MIN_PIVOT == 1e-6
     assert lk.RATIO[0] == -lk.RATIO[1] and {*lk.TOP, *lk.BETWEEN, *lk.FINEST} <= {1, 2}
     assert pyramid.REACH >= pyramid.MARGIN + 2 + 2, "the largest radius, and the row"

@@ -108,10 +108,19 @@ class Level(NamedTuple):
 
 
 def pixel_rays(camera: Camera, hw: tuple[int, int], margin: int = 0) -> Tensor:
-    """Rays (B, N, 3) with z = 1 of all pixels of a picture and of ``margin`` more around it; NaN outside the lens."""
-    rows, columns = (torch.arange(-margin, n + margin, device=camera.f.device).to(camera.f) for n in hw)
-    v, u = torch.meshgrid(rows, columns, indexing="ij")
-    return cam.rays(camera, torch.stack([u, v], -1).reshape(1, -1, 2).expand(len(camera.f), -1, -1))
+    """Rays (B, N, 3) with z = 1 of all pixels of a picture and of ``margin`` more around it; NaN outside the lens.
+
+    In memory each axis lies by itself, as all numbers here that belong to a pixel do: operations then run along pixels.
+    """
+    columns, rows = (torch.arange(-margin, n + margin, device=camera.f.device).to(camera.f) for n in hw[::-1])
+    if camera.distortion is not None:
+        v, u = torch.meshgrid(rows, columns, indexing="ij")
+        uv = torch.stack([u, v], -1).reshape(1, -1, 2).expand(len(camera.f), -1, -1)
+        return cam.rays(camera, uv).mT.contiguous().mT
+    x, y = ((place - camera.c[:, k, None]) / camera.f[:, k, None] for k, place in enumerate((columns, rows)))
+    x = x[:, None].expand(-1, len(rows), -1)
+    y = y[:, :, None].expand(-1, -1, len(columns))
+    return torch.stack([x, y, torch.ones_like(x)], 1).flatten(2).mT
 
 
 def base(image: Tensor, camera: Camera) -> Base:
@@ -127,25 +136,32 @@ def seen_at(view: View, ray: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
     """Where view 1 sees the points on rays (B, N, 3) at inverse depths q (B, N): pixels (B, N, 2) of its picture, and
     whether they lie before it (B, N). Gradient: to everything."""
     check("seen_at", ray=(ray, "B N 3"), q=(q, "B N"), t=(view.T_1_from_0.t, "B 3"))
-    given = view.T_1_from_0.R, view.T_1_from_0.t, view.camera.f, view.camera.c
-    turn = torch.zeros_like(view.T_1_from_0.t) if view.turn is None else view.turn
-    if view.camera.distortion is None and native.serves(ray, q, turn, *given):
-        R, t, f, c = given
-        uv = q.new_empty(*q.shape, 2)
-        front = torch.empty_like(q, dtype=torch.bool)
-        torch.ops.dhtorch.seen_at(ray, q, R=R, t=t, turn=turn, f=f, c=c, uv=uv, front=front)
-        return uv, front
-    x = se3.rotate(view.T_1_from_0.R, ray) + q[..., None] * view.T_1_from_0.t[:, None]
+    R, t, f, c = view.T_1_from_0.R, view.T_1_from_0.t, view.camera.f, view.camera.c
+    if view.camera.distortion is None:
+        given = ray.mT.contiguous(), q, R, t, torch.zeros_like(t) if view.turn is None else view.turn, f, c
+        if native.serves(*given):
+            uv = torch.empty_like(given[0][:, :2])
+            front = torch.empty_like(q, dtype=torch.bool)
+            torch.ops.dhtorch.seen_at(*given, uv, front)
+            return uv.mT, front
+    x, y, z = (part + q * t[:, None] for part, t in zip(turned(R, ray), t.unbind(-1), strict=True))
     if view.turn is not None:
-        x = x + _cross(view.turn[:, None] * ray[..., 1:2], x)
-    front = x[..., 2] > 1e-3
-    return cam.project(view.camera, torch.where(front[..., None], x, torch.ones_like(x))), front
+        p, o, s = (view.turn[:, k, None] * ray[..., 1] for k in range(3))
+        x, y, z = x + (o * z - s * y), y + (s * x - p * z), z + (p * y - o * x)
+    front = z > 1e-3
+    x, y, z = (torch.where(front, part, 1.0) for part in (x, y, z))
+    if view.camera.distortion is not None:
+        return cam.project(view.camera, torch.stack([x, y, z], -1)), front
+    places = [part / z * f[:, k, None] + c[:, k, None] for k, part in enumerate((x, y))]
+    return torch.stack(places, 1).mT, front
 
 
-def _cross(a: Tensor, b: Tensor) -> Tensor:
-    """Cross products (…, 3); torch's own take several times as long on so many."""
-    (a0, a1, a2), (b0, b1, b2) = a.unbind(-1), b.unbind(-1)
-    return torch.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], -1)
+def turned(R: Tensor, ray: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """(B, 3, 3) times each of (B, N, 3), one tensor (B, N) an axis: the numbers of :func:`dhtorch.geometry.se3.rotate`,
+    which takes several times as long on so many. Gradient: to both."""
+    x, y, z = ray.unbind(-1)
+    right, down, ahead = (x * row[:, 0, None] + y * row[:, 1, None] + z * row[:, 2, None] for row in R.unbind(1))
+    return right, down, ahead
 
 
 def bilinear(image: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
@@ -338,6 +354,10 @@ def _for_all(x: Tensor, like: Tensor) -> Tensor:
     return x.repeat_interleave(2, 1).repeat_interleave(2, 2)[:, : like.shape[1], : like.shape[2]]
 
 
+#: Radius of a window that is fitted.
+FIT_RADIUS = 4
+
+
 class Fit(NamedTuple):
     """How the grey values around every pixel fit one view at the depths given; (B, h, w) each."""
 
@@ -362,7 +382,7 @@ def fit_windows(
     picture_1: Tensor,  # (B, 3, H, W), view 1's by with_gradients
     q: Tensor,  # (B, h, w) 1/m
     *,
-    radius: int = 4,
+    radius: int = FIT_RADIUS,
 ) -> Fit:
     """One step of every pixel's inverse depth towards equal grey values in its window, whatever bias and gain.
 
@@ -374,7 +394,11 @@ def fit_windows(
     flat = q.flatten(1)
     little = 1e-3 * flat.detach().amax(1, keepdim=True).clamp_min(1e-3)
     uv, front = seen_at(view, base.ray, flat)
-    motion = (seen_at(view, base.ray, flat + little)[0] - uv) / little[..., None]
+    further = seen_at(view, base.ray, flat + little)[0]
+    given = base.image, picture_1, uv.mT.contiguous(), further.mT.contiguous(), little[:, 0]
+    if radius == FIT_RADIUS and native.serves(*given) and all(x.dtype == torch.float32 for x in given):
+        return _compiled_fit(*given, front=front)
+    motion = (further - uv) / little[..., None]
     values, inside = bilinear(picture_1, uv)
     J, du, dv = (x.unflatten(-1, base.hw) for x in values.unbind(1))
     du_dq, dv_dq = (x.unflatten(-1, base.hw) for x in motion.unbind(-1))
@@ -394,6 +418,16 @@ def fit_windows(
         seen=(inside & front).unflatten(-1, base.hw),
         motion=motion.unflatten(1, base.hw),
     )
+
+
+def _compiled_fit(grey: Tensor, picture_1: Tensor, *places: Tensor, front: Tensor) -> Fit:
+    """What :func:`fit_windows` finds at places of every pixel, and of those a little nearer, by how much."""
+    step, contrast, noise, correlation = (torch.empty_like(grey[:, 0]) for _ in range(4))
+    inside = torch.empty_like(step, dtype=torch.bool)
+    motion = torch.empty_like(places[0])
+    torch.ops.dhtorch.fit_windows(grey, picture_1, *places, step, contrast, noise, correlation, inside, motion)
+    seen = inside & front.view_as(inside)
+    return Fit(step, contrast, noise, correlation, seen, motion.mT.unflatten(1, inside.shape[1:]))
 
 
 def smooth(q: Tensor, tolerance: Tensor, *, radius: int = 4) -> Tensor:
@@ -450,11 +484,12 @@ def window_sum(x: Tensor, radius: int) -> Tensor:
 def spread(q: Tensor, radius: int) -> Tensor:
     """Largest minus smallest value (B, h, w) of a map in the window around each pixel. Gradient: none."""
     q = q.detach()
-    return _extreme(q, radius, torch.maximum) - _extreme(q, radius, torch.minimum)
+    return extreme(q, radius, torch.maximum) - extreme(q, radius, torch.minimum)
 
 
-def _extreme(x: Tensor, radius: int, pick: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-    """What ``pick`` chooses (B, h, w) in the window around each pixel, of two windows half as wide, and so on."""
+def extreme(x: Tensor, radius: int, pick: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    """What ``pick`` chooses of two, torch.maximum or torch.minimum, in the window around each pixel (B, h, w): of two
+    windows half as wide, and so on. Gradient: to x."""
     for dim in (1, 2):
         first, last = (x.narrow(dim, k, 1) for k in (0, x.shape[dim] - 1))
         x, width = torch.cat([first] * radius + [x] + [last] * radius, dim), 1
