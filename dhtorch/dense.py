@@ -347,11 +347,11 @@ class Found(NamedTuple):
 def _best_planes(base: sweep.Base, partners: list[Partner], q: Tensor) -> Found:
     """The best surface through the planes q (B, D)."""
     views = torch.stack([partner.use for partner in partners]).sum(0).clamp_min(1)
-    S = sweep.aggregate(_costs(base, partners, q), views)
-    best, step = sweep.winner(S), q[:, 1] - q[:, 0]
+    best, some = sweep.surface(_costs(base, partners, q), views)
+    step = q[:, 1] - q[:, 0]
     place = (best.plane + best.shift) * step[:, None, None]
     each = views[:, None, None]
-    alone = sweep.rivals(S, best, _elsewhere(base, partners, place, step)) >= RIVAL * each
+    alone = sweep.rivals(some, best, _elsewhere(base, partners, place, step)) >= RIVAL * each
     return Found(place, best.cost / each.to(q), alone)
 
 

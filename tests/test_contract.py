@@ -415,6 +415,7 @@ ROWS = [
     Row(sweep.count_bits, lambda b, n, d: (torch.randint(0, 2**31 - 1, (b, n), generator=generator(), dtype=torch.int32),), "batch vmap capture empty shuffle padding", (0,)),
     Row(sweep.aggregate, lambda b, n, d: (volumes(b, n, d), torch.arange(1, b + 1)), "batch capture raises", bad=lambda a: (a[0][0], a[1])),
     Row(sweep.winner, lambda b, n, d: (sweep.aggregate(volumes(b, n, d)),), "batch capture raises", bad=lambda a: (a[0][0],)),
+    Row(sweep.surface, lambda b, n, d: (volumes(b, n, d), torch.arange(1, b + 1)), "batch capture"),
     Row(sweep.with_gradients, lambda b, n, d: (uniform(b, 1, *HW, dtype=d),), POINTLESS, grad=(0,)),
     Row(sweep.fit_windows, lambda b, n, d: (*swept(b, n, d)[:2], sweep.with_gradients(swept(b, n, d)[1].image), swept(b, n, d)[2]), "dtype batch capture"),
     Row(sweep.smooth, lambda b, n, d: (uniform(b, 12, 15, dtype=d), uniform(b, dtype=d)), "dtype batch vmap capture gradcheck", grad=(0,)),

@@ -268,10 +268,6 @@ def aggregate(
     """
     check("aggregate", C=(C, "B h w D"))
     price = torch.as_tensor(views, dtype=torch.int16, device=C.device).reshape(-1, 1, 1)
-    if native.serves(C) and C.dtype == torch.uint8:
-        S = torch.empty_like(C, dtype=torch.int16)
-        torch.ops.dhtorch.aggregate(C, S, *(x.expand(len(C), 1, 1).contiguous() for x in (price * step, price * jump)))
-        return S
     S = torch.zeros_like(C, dtype=torch.int16)
     for dim in (1, 2):
         _both_ways(C, S, dim, price * step, price * jump)
@@ -307,11 +303,6 @@ class Winner(NamedTuple):
 def winner(S: Tensor) -> Winner:
     """The plane of least cost S (B, h, w, D), the first of equals, and the parabola through its neighbours' costs."""
     check("winner", S=(S, "B h w D"))
-    if native.serves(S) and S.dtype == torch.int16:
-        types = torch.int64, torch.float32, torch.int16
-        found = Winner(*(torch.empty(S.shape[:-1], dtype=dtype) for dtype in types))
-        torch.ops.dhtorch.winner(S.flatten(0, 2), *found)
-        return found
     return Winner(*(torch.cat(part, 1) for part in zip(*map(_winner, S.split(ROWS, 1)), strict=True)))
 
 
@@ -328,24 +319,42 @@ def _winner(S: Tensor) -> tuple[Tensor, ...]:
     return index, shift, cost.to(S.dtype)
 
 
-def rivals(S: Tensor, best: Winner, reach: Tensor) -> Tensor:
+def surface(
+    C: Tensor,  # (B, h, w, D) uint8
+    views: Tensor,  # (B,) how many views' costs are in C
+) -> tuple[Winner, Tensor]:
+    """The best planes of the best surface, and its cost (B, ⌈h/2⌉, ⌈w/2⌉, D) at every other pixel, both ways.
+
+    What :func:`winner` says of :func:`aggregate`, whose answer compiled code (:mod:`dhtorch.native`) never writes down.
+    """
+    if not native.serves(C) or C.dtype != torch.uint8:
+        S = aggregate(C, views)
+        return winner(S), S[:, ::2, ::2]
+    B, h, w, D = C.shape
+    prices = ((price * views).to(torch.int16).expand(B).contiguous() for price in (STEP, JUMP))
+    best = Winner(*(torch.empty(B, h, w, dtype=dtype) for dtype in (torch.int64, torch.float32, torch.int16)))
+    some = torch.empty(B, (h + 1) // 2, (w + 1) // 2, D, dtype=torch.int16)
+    torch.ops.dhtorch.surface(C, *prices, *best, some)
+    return best, some
+
+
+def rivals(some: Tensor, best: Winner, reach: Tensor) -> Tensor:
     """How much more the best plane costs (B, h, w) that lies further than ``reach`` (B,) planes from the winner.
 
-    Asked at every other pixel, both ways; its neighbours have its answer. Gradient: none.
+    Asked at every other pixel, both ways, of the costs ``some`` (B, ⌈h/2⌉, ⌈w/2⌉, D) there, see :func:`surface`; its
+    neighbours have its answer. Gradient: none.
     """
-    if native.serves(S, best.plane) and S.dtype == torch.int16:
-        more = torch.empty(len(S), *((n + 1) // 2 for n in S.shape[1:3]), dtype=S.dtype)
+    plane, cost = (x[:, ::2, ::2].contiguous() for x in (best.plane, best.cost))
+    if native.serves(some, plane) and some.dtype == torch.int16:
+        more = torch.empty_like(cost)
         for b, far in enumerate(reach.tolist()):
-            torch.ops.dhtorch.elsewhere(S[b], best.plane[b], more[b], int(far))
-        return _for_all(more - best.cost[:, ::2, ::2], best.cost)
-    places = torch.arange(S.shape[-1], dtype=torch.int16, device=S.device)
+            torch.ops.dhtorch.elsewhere(some[b].flatten(0, 1), plane[b], more[b], int(far))
+        return _for_all(more - cost, best.cost)
+    places = torch.arange(some.shape[-1], dtype=torch.int16, device=some.device)
     reach, found = reach.to(torch.int16)[:, None, None, None], []
-    for first in range(0, S.shape[1], ROWS):  # some rows at once, as the winner is read
-        rows = slice(first, first + ROWS, 2)
-        cost, plane = (x[:, rows, ::2, None] for x in (best.cost, best.plane.to(torch.int16)))
-        near = (places - plane).abs() <= reach
-        others = S[:, rows, ::2].masked_fill(near, torch.iinfo(S.dtype).max)
-        found.append((others.amin(-1, keepdim=True) - cost)[..., 0])
+    for part, at, least in zip(*(x.split(ROWS // 2, 1) for x in (some, plane, cost)), strict=True):  # as it is read
+        near = (places - at[..., None].to(torch.int16)).abs() <= reach
+        found.append(part.masked_fill(near, torch.iinfo(some.dtype).max).amin(-1) - least)
     return _for_all(torch.cat(found, 1), best.cost)
 
 
@@ -422,10 +431,10 @@ def fit_windows(
 
 def _compiled_fit(grey: Tensor, picture_1: Tensor, *places: Tensor, front: Tensor) -> Fit:
     """What :func:`fit_windows` finds at places of every pixel, and of those a little nearer, by how much."""
-    step, contrast, noise, correlation = (torch.empty_like(grey[:, 0]) for _ in range(4))
+    told = step, contrast, noise, correlation = [torch.empty_like(grey[:, 0]) for _ in range(4)]
     inside = torch.empty_like(step, dtype=torch.bool)
     motion = torch.empty_like(places[0])
-    torch.ops.dhtorch.fit_windows(grey, picture_1, *places, step, contrast, noise, correlation, inside, motion)
+    torch.ops.dhtorch.fit_windows(grey, picture_1, *places, *told, inside, motion)
     seen = inside & front.view_as(inside)
     return Fit(step, contrast, noise, correlation, seen, motion.mT.unflatten(1, inside.shape[1:]))
 
