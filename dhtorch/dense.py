@@ -25,7 +25,7 @@ from dhtorch.calibration import available, load
 from dhtorch.codes import Gate, PoseCode, Source, first_reason
 from dhtorch.evaluate.score_calibration import Calibration
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry import se3, sweep
+from dhtorch.geometry import sweep
 from dhtorch.geometry.covariance import median
 from dhtorch.geometry.filters import grey
 from dhtorch.geometry.se3 import Pose
@@ -347,11 +347,11 @@ class Found(NamedTuple):
 def _best_planes(base: sweep.Base, partners: list[Partner], q: Tensor) -> Found:
     """The best surface through the planes q (B, D)."""
     views = torch.stack([partner.use for partner in partners]).sum(0).clamp_min(1)
-    S = sweep.aggregate(_costs(base, partners, q), views)
-    best, step = sweep.winner(S), q[:, 1] - q[:, 0]
+    best, some = sweep.surface(_costs(base, partners, q), views)
+    step = q[:, 1] - q[:, 0]
     place = (best.plane + best.shift) * step[:, None, None]
     each = views[:, None, None]
-    alone = sweep.rivals(S, best, _elsewhere(base, partners, place, step)) >= RIVAL * each
+    alone = sweep.rivals(some, best, _elsewhere(base, partners, place, step)) >= RIVAL * each
     return Found(place, best.cost / each.to(q), alone)
 
 
@@ -436,7 +436,8 @@ def _joined(
 def pose_variance(base: sweep.Base, view: sweep.View, fit: PoseFit, q: Tensor, motion: Tensor) -> Tensor:
     """Variance (B, h, w) of q, 1/m², by the motion's covariance."""
     flat = q.flatten(1).clamp_min(1e-6)
-    x, y, z = (se3.rotate(view.T_1_from_0.R, base.ray) / flat[..., None] + view.T_1_from_0.t[:, None]).unbind(-1)
+    there = zip(sweep.turned(view.T_1_from_0.R, base.ray), view.T_1_from_0.t.unbind(-1), strict=True)
+    x, y, z = (part / flat + t[:, None] for part, t in there)
     cov = fit.cov if fit.shutter is None else fit.shutter.cov
     cov = torch.where(fit.ok[:, None, None], cov, 0.0).nan_to_num().to(z)
     du, dv = motion.flatten(1, 2).unbind(-1)

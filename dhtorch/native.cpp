@@ -9,18 +9,21 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <memory>
 #include <vector>
 
 namespace {
 
-constexpr int16_t NOWHERE = std::numeric_limits<int16_t>::max() / 2;
-
 inline int32_t bits(int32_t code) {  // of the lower 31, as count_bits: vectors have no such instruction everywhere
+#ifdef __AVX512VPOPCNTDQ__
+  return __builtin_popcount(code);
+#else
   uint32_t x = static_cast<uint32_t>(code);
   x = x - ((x >> 1) & 0x55555555u);
   x = (x & 0x33333333u) + ((x >> 2) & 0x33333333u);
   x = (x + (x >> 4)) & 0x0F0F0F0Fu;
   return static_cast<int32_t>((x * 0x01010101u) >> 24);
+#endif
 }
 
 // Add to C (B, h, w, D) uint8 how badly each pixel fits at every plane. code_0 (B, N) and code_1 (B, rows * columns)
@@ -68,107 +71,154 @@ void add_costs(Tensor C, Tensor code_0, Tensor code_1, Tensor a, Tensor b, Tenso
   }
 }
 
-// One step of a path: the costs of the best paths that end at the pixel before, in place, become those at this one.
-// `path` has a place before and one behind its D planes. Returns the least of them.
-inline int16_t step_on(int16_t* __restrict path, int16_t* __restrict next, const uint8_t* __restrict cost, int64_t D,
-                       int16_t low, int16_t step, int16_t jump) {
-  const int16_t far = static_cast<int16_t>(low + jump);
-  int16_t least = std::numeric_limits<int16_t>::max();
-#pragma GCC ivdep
-  for (int64_t d = 0; d < D; ++d) {
-    int16_t best = std::min(path[d], path[d + 2]);
-    best = static_cast<int16_t>(best + step);
-    best = std::min(best, path[d + 1]);
-    best = std::min(best, far);
-    best = static_cast<int16_t>(best - low + cost[d]);
-    next[d + 1] = best;
-    least = std::min(least, best);
-  }
-  return least;
-}
+// The best surface through costs C (h, w, D) uint8, by paths from four sides, and its best planes. Path, Two and Four are
+// the numbers that hold the cost of one path, of two and of all. Twice through the picture: from its first pixel on with
+// the paths from the left and from above, and back, where all four are known.
+template <typename Path, typename Two, typename Four>
+struct Surface {
+  const int64_t h, w, D, wide;  // paths have a place before and one behind their D planes
+  const Path step, jump;
+  std::vector<Path> above, under, left, right, low;  // of the row and pixel before, and of this one
+  std::unique_ptr<Two[]> half;
+  std::vector<Four> all;
 
-inline int16_t begin(int16_t* next, const uint8_t* cost, int64_t D) {
-  int16_t least = std::numeric_limits<int16_t>::max();
-  for (int64_t d = 0; d < D; ++d) {
-    next[d + 1] = cost[d];
-    least = std::min(least, next[d + 1]);
-  }
-  return least;
-}
+  Surface(int64_t h, int64_t w, int64_t D, int64_t step, int64_t jump)
+      : h(h), w(w), D(D), wide(D + 2), step(static_cast<Path>(step)), jump(static_cast<Path>(jump)), above(w * wide),
+        under(w * wide), left(wide), right(wide), low(w), half(new Two[h * w * D]), all(D) {}
 
-// S (B, h, w, D) int16 of C (B, h, w, D) uint8: the sum of the best paths from four sides; step and jump (B) int16.
-// Twice through the picture: from its first pixel on with the paths from the left and from above, and back.
-void aggregate(Tensor C, Tensor S, Tensor step, Tensor jump) {
-  const int64_t B = C.size(0), h = C.size(1), w = C.size(2), D = C.size(3), wide = D + 2;
-  std::vector<int16_t> columns(w * wide), other(wide), row(wide), row_next(wide), low(w);
-  for (int64_t k = 0; k < B; ++k) {
-    const int16_t one = data<int16_t>(step)[k], more = data<int16_t>(jump)[k];
-    for (int back = 0; back < 2; ++back) {
-      std::fill(columns.begin(), columns.end(), NOWHERE);
-      std::fill(other.begin(), other.end(), NOWHERE);
-      std::fill(row.begin(), row.end(), NOWHERE);
-      std::fill(row_next.begin(), row_next.end(), NOWHERE);
-      for (int64_t i = 0; i < h; ++i) {
-        const int64_t y = back ? h - 1 - i : i;
-        int16_t row_low = 0;
-        for (int64_t j = 0; j < w; ++j) {
-          const int64_t x = back ? w - 1 - j : j, place = ((k * h + y) * w + x) * D;
-          const uint8_t* cost = data<uint8_t>(C) + place;
-          int16_t* column = columns.data() + x * wide;
-          row_low = j ? step_on(row.data(), row_next.data(), cost, D, row_low, one, more)
-                      : begin(row_next.data(), cost, D);
-          std::swap(row, row_next);
-          low[x] = i ? step_on(column, other.data(), cost, D, low[x], one, more) : begin(other.data(), cost, D);
-          std::memcpy(column + 1, other.data() + 1, D * sizeof(int16_t));
-          int16_t* __restrict sum = data<int16_t>(S) + place;
-          const int16_t *__restrict p = row.data() + 1, *__restrict r = column + 1;
-          if (back) {
-            for (int64_t d = 0; d < D; ++d) sum[d] = static_cast<int16_t>(sum[d] + p[d] + r[d]);
-          } else {
-            for (int64_t d = 0; d < D; ++d) sum[d] = static_cast<int16_t>(p[d] + r[d]);
-          }
-        }
-      }
+  // A path that begins has cost nothing; a step from beyond the ends costs more than any other.
+  void begin(std::vector<Path>& paths) const {
+    std::fill(paths.begin(), paths.end(), static_cast<Path>(0));
+    for (size_t i = 0; i < paths.size(); i += wide) {
+      paths[i] = paths[i + wide - 1] = static_cast<Path>(std::numeric_limits<Path>::max() - step);
     }
   }
-}
+  void begin() {
+    for (auto* paths : {&above, &under, &left, &right}) begin(*paths);
+    std::fill(low.begin(), low.end(), static_cast<Path>(0));
+  }
 
-// Of S (N, D) int16: the first plane of least cost (N) int64, where between its neighbours a parabola is least (N)
-// float32, and that cost (N) int16.
-void winner(Tensor S, Tensor plane, Tensor shift, Tensor cost) {
-  const int64_t N = S.size(0), D = S.size(1);
-  const int16_t* s = data<int16_t>(S);
-  for (int64_t n = 0; n < N; ++n, s += D) {
-    int16_t low = s[0];
-    for (int64_t d = 1; d < D; ++d) low = std::min(low, s[d]);
+  // The cost of the best path to this pixel at a plane, of those to the pixel before: there, one before and one behind.
+  Path go(const Path* from, Path least, Path far, uint8_t cost) const {
+    Path best = std::min(from[0], from[2]);
+    best = static_cast<Path>(best + step);
+    best = std::min(best, from[1]);
+    best = std::min(best, far);
+    return static_cast<Path>(static_cast<Path>(best - least) + cost);
+  }
+
+  // Both paths to pixel x, which become those to the pixel before; their sums, with those from the other sides if there
+  // are some, and the least of those.
+  template <typename Sum>
+  Sum pass(int64_t x, const uint8_t* __restrict cost, Path& least, const Two* __restrict others, Sum* __restrict sum) {
+    const Path *__restrict p = left.data(), *__restrict r = above.data() + x * wide;
+    Path *__restrict p_to = right.data() + 1, *__restrict r_to = under.data() + x * wide + 1;
+    const Path p_least = least, r_least = low[x];
+    const Path p_far = static_cast<Path>(p_least + jump), r_far = static_cast<Path>(r_least + jump);
+    Path p_found = std::numeric_limits<Path>::max(), r_found = p_found;
+    Sum found = std::numeric_limits<Sum>::max();
+#pragma GCC ivdep
+    for (int64_t d = 0; d < D; ++d) {
+      const Path here = go(p + d, p_least, p_far, cost[d]), there = go(r + d, r_least, r_far, cost[d]);
+      p_to[d] = here;
+      r_to[d] = there;
+      p_found = std::min(p_found, here);
+      r_found = std::min(r_found, there);
+      Sum both = static_cast<Sum>(static_cast<Sum>(here) + static_cast<Sum>(there));
+      if (others) both = static_cast<Sum>(both + static_cast<Sum>(others[d]));
+      sum[d] = both;
+      found = std::min(found, both);
+    }
+    std::swap(left, right);
+    least = p_found;
+    low[x] = r_found;
+    return found;
+  }
+
+  // The first plane of the least of all, and between its neighbours where a parabola is least.
+  void choose(Four least, int64_t* plane, float* shift, int16_t* cost) const {
+    const Four* s = all.data();
     int64_t d = 0;
-    while (s[d] != low) ++d;
+    if constexpr (sizeof(Four) == 1) {
+      d = static_cast<const Four*>(std::memchr(s, least, D)) - s;
+    } else {
+      while (s[d] != least) ++d;
+    }
     float between = 0.0f;
     if (d > 0 && d < D - 1) {
       const float before = s[d - 1], here = s[d], after = s[d + 1], bend = before + after - 2.0f * here;
       if (bend > 0.0f) between = std::clamp(0.5f * (before - after) / std::max(bend, 1e-6f), -0.5f, 0.5f);
     }
-    data<int16_t>(cost)[n] = low;
-    data<int64_t>(plane)[n] = d;
-    data<float>(shift)[n] = between;
+    *plane = d;
+    *shift = between;
+    *cost = static_cast<int16_t>(least);
+  }
+
+  void find(const uint8_t* C, int64_t* plane, float* shift, int16_t* cost, int16_t* some) {
+    begin();
+    for (int64_t y = 0, n = 0; y < h; ++y) {
+      begin(left);
+      Path least = 0;
+      for (int64_t x = 0; x < w; ++x, ++n) pass<Two>(x, C + n * D, least, nullptr, half.get() + n * D);
+      std::swap(above, under);
+    }
+    begin();
+    for (int64_t y = h - 1, n = h * w - 1; y >= 0; --y) {
+      begin(left);
+      Path least = 0;
+      for (int64_t x = w - 1; x >= 0; --x, --n) {
+        const Four found = pass<Four>(x, C + n * D, least, half.get() + n * D, all.data());
+        choose(found, plane + n, shift + n, cost + n);
+        if (x % 2 == 0 && y % 2 == 0) {
+          int16_t* __restrict kept = some + (y / 2 * ((w + 1) / 2) + x / 2) * D;
+          for (int64_t d = 0; d < D; ++d) kept[d] = all[d];
+        }
+      }
+      std::swap(above, under);
+    }
+  }
+};
+
+// Of C (B, h, w, D) uint8, step and jump (B) int16: the best planes of the best surface, plane (B, h, w) int64, between
+// planes by shift float32, its cost there int16; and the cost of all planes at every other pixel both ways, `some`
+// (B, (h + 1) / 2, (w + 1) / 2, D) int16. In bytes wherever no sum is larger.
+void surface(Tensor C, Tensor step, Tensor jump, Tensor plane, Tensor shift, Tensor cost, Tensor some) {
+  const int64_t B = C.size(0), h = C.size(1), w = C.size(2), D = C.size(3), N = h * w, quarter = some.size(1) * some.size(2);
+  for (int64_t k = 0; k < B; ++k) {
+    const uint8_t* costs = data<uint8_t>(C) + k * N * D;
+    const int64_t one = data<int16_t>(step)[k], more = data<int16_t>(jump)[k];
+    uint8_t worst = 0;
+    for (int64_t i = 0; i < N * D; ++i) worst = std::max(worst, costs[i]);
+    const int64_t most = worst + more;  // of a path: beyond its least it is kept within a jump
+    const auto found = [&]<typename Path, typename Two, typename Four>() {
+      Surface<Path, Two, Four>(h, w, D, one, more)
+          .find(costs, data<int64_t>(plane) + k * N, data<float>(shift) + k * N, data<int16_t>(cost) + k * N,
+                data<int16_t>(some) + k * quarter * D);
+    };
+    if (most + std::max(one, more) > 255) {
+      found.template operator()<int16_t, int16_t, int16_t>();
+    } else if (2 * most > 255) {
+      found.template operator()<uint8_t, int16_t, int16_t>();
+    } else if (4 * most > 255) {
+      found.template operator()<uint8_t, uint8_t, int16_t>();
+    } else {
+      found.template operator()<uint8_t, uint8_t, uint8_t>();
+    }
   }
 }
 
-// Of S (h, w, D) int16, at every other pixel both ways: the least cost further than `reach` planes from `plane` (h, w)
-// int64; the type's most where there is none.
+// Of S (N, D) int16: the least cost (N) further than `reach` planes from `plane` (N) int64; the type's most where there is
+// none.
 void elsewhere(Tensor S, Tensor plane, Tensor cost, int64_t reach) {
-  const int64_t h = S.size(0), w = S.size(1), D = S.size(2);
-  int16_t* found = data<int16_t>(cost);
-  for (int64_t y = 0; y < h; y += 2) {
-    for (int64_t x = 0; x < w; x += 2) {
-      const int16_t* s = data<int16_t>(S) + (y * w + x) * D;
-      const int64_t at = data<int64_t>(plane)[y * w + x];
-      const int64_t before = std::max<int64_t>(at - reach, 0), after = std::min<int64_t>(at + reach + 1, D);
-      int16_t low = std::numeric_limits<int16_t>::max();
-      for (int64_t d = 0; d < before; ++d) low = std::min(low, s[d]);
-      for (int64_t d = after; d < D; ++d) low = std::min(low, s[d]);
-      *found++ = low;
-    }
+  const int64_t N = S.size(0), D = S.size(1);
+  const int16_t* s = data<int16_t>(S);
+  for (int64_t n = 0; n < N; ++n, s += D) {
+    const int64_t at = data<int64_t>(plane)[n];
+    const int64_t before = std::max<int64_t>(at - reach, 0), after = std::min<int64_t>(at + reach + 1, D);
+    int16_t low = std::numeric_limits<int16_t>::max();
+    for (int64_t d = 0; d < before; ++d) low = std::min(low, s[d]);
+    for (int64_t d = after; d < D; ++d) low = std::min(low, s[d]);
+    data<int16_t>(cost)[n] = low;
   }
 }
 
@@ -201,18 +251,19 @@ void census(Tensor grey, Tensor offsets, Tensor code) {
   }
 }
 
-// Where a view without a lens sees points on rays (B, N, 3) at q (B, N): uv (B, N, 2) and whether before it (B, N) bool.
+// Where a view without a lens sees points on rays (B, 3, N) at q (B, N): uv (B, 2, N) and whether before it (B, N) bool.
 // R (B, 9), t, turn (B, 3), f, c (B, 2).
 void seen_at(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor turn, Tensor f, Tensor c, Tensor uv, Tensor front) {
   const int64_t B = q.size(0), N = q.size(1);
   for (int64_t k = 0; k < B; ++k) {
     const float *m = data<float>(R) + 9 * k, *tk = data<float>(t) + 3 * k, *w = data<float>(turn) + 3 * k;
-    const float *fk = data<float>(f) + 2 * k, *ck = data<float>(c) + 2 * k, *qk = data<float>(q) + N * k;
-    const float* r = data<float>(ray) + 3 * N * k;
-    float* __restrict to = data<float>(uv) + 2 * N * k;
+    const float *fk = data<float>(f) + 2 * k, *ck = data<float>(c) + 2 * k, *__restrict qk = data<float>(q) + N * k;
+    const float *__restrict ax = data<float>(ray) + 3 * N * k, *__restrict ay = ax + N, *__restrict az = ay + N;
+    float *__restrict u = data<float>(uv) + 2 * N * k, *__restrict v = u + N;
     bool* __restrict before = data<bool>(front) + N * k;
+#pragma GCC ivdep
     for (int64_t n = 0; n < N; ++n) {
-      const float a = r[3 * n], b = r[3 * n + 1], d = r[3 * n + 2];
+      const float a = ax[n], b = ay[n], d = az[n];
       float x = (a * m[0] + b * m[1] + d * m[2]) + qk[n] * tk[0];
       float y = (a * m[3] + b * m[4] + d * m[5]) + qk[n] * tk[1];
       float z = (a * m[6] + b * m[7] + d * m[8]) + qk[n] * tk[2];
@@ -221,9 +272,13 @@ void seen_at(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor turn, Tensor f, Te
       x = x + dx;
       y = y + dy;
       z = z + dz;
-      before[n] = z > 1e-3f;
-      to[2 * n] = z > 1e-3f ? x / z * fk[0] + ck[0] : 1.0f * fk[0] + ck[0];
-      to[2 * n + 1] = z > 1e-3f ? y / z * fk[1] + ck[1] : 1.0f * fk[1] + ck[1];
+      const bool ahead = z > 1e-3f;
+      before[n] = ahead;
+      x = ahead ? x : 1.0f;
+      y = ahead ? y : 1.0f;
+      z = ahead ? z : 1.0f;
+      u[n] = x / z * fk[0] + ck[0];
+      v[n] = y / z * fk[1] + ck[1];
     }
   }
 }
@@ -284,8 +339,9 @@ STABLE_TORCH_LIBRARY(dhtorch, m) {
   m.def(
       "add_costs(Tensor(a!) C, Tensor code_0, Tensor code_1, Tensor a, Tensor b, Tensor c, Tensor q, int rows, "
       "int columns, int margin, int unseen) -> ()");
-  m.def("aggregate(Tensor C, Tensor(a!) S, Tensor step, Tensor jump) -> ()");
-  m.def("winner(Tensor S, Tensor(a!) plane, Tensor(b!) shift, Tensor(c!) cost) -> ()");
+  m.def(
+      "surface(Tensor C, Tensor step, Tensor jump, Tensor(a!) plane, Tensor(b!) shift, Tensor(c!) cost, "
+      "Tensor(d!) some) -> ()");
   m.def("census(Tensor grey, Tensor offsets, Tensor(a!) code) -> ()");
   m.def(
       "seen_at(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor turn, Tensor f, Tensor c, Tensor(a!) uv, "
@@ -296,8 +352,7 @@ STABLE_TORCH_LIBRARY(dhtorch, m) {
 
 STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) {
   m.impl("add_costs", TORCH_BOX(&add_costs));
-  m.impl("aggregate", TORCH_BOX(&aggregate));
-  m.impl("winner", TORCH_BOX(&winner));
+  m.impl("surface", TORCH_BOX(&surface));
   m.impl("census", TORCH_BOX(&census));
   m.impl("seen_at", TORCH_BOX(&seen_at));
   m.impl("smooth", TORCH_BOX(&smooth));

@@ -31,7 +31,9 @@ from torch.autograd import forward_ad
 
 from dhtorch.archive import processor
 
-SOURCES = tuple(Path(__file__).with_name(f"native{part}.cpp") for part in ("", "_search", "_affine", "_pyramid"))
+SOURCES = tuple(
+    Path(__file__).with_name(f"native{part}.cpp") for part in ("", "_search", "_affine", "_pyramid", "_fit")
+)
 
 #: What the sources share.
 HEADER = Path(__file__).with_name("native_vectors.h")

@@ -12,14 +12,6 @@
 
 namespace {
 
-inline float fused(float a, float b, float c) {
-#ifdef __FMA__
-  return __builtin_fmaf(a, b, c);
-#else
-  return a * b + c;
-#endif
-}
-
 inline float binomial(float a, float b, float c, float d, float e) {
   return fused(6.0f, c, fused(4.0f, b + d, a + e)) * (1.0f / 16.0f);
 }

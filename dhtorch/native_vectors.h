@@ -33,6 +33,15 @@ inline Vector load(const float* from) {
 
 inline void store(Vector x, float* to) { std::memcpy(to, &x, sizeof(x)); }
 
+// As torch fuses products with sums, where the processor can.
+inline float fused(float a, float b, float c) {
+#ifdef __FMA__
+  return __builtin_fmaf(a, b, c);
+#else
+  return a * b + c;
+#endif
+}
+
 inline float total(Vector x) {
   float part[LANES];
   store(x, part);

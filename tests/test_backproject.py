@@ -154,6 +154,22 @@ def test_every_sample_is_what_a_loop_says(options):
     assert len(seen) >= 6 and len(found.confidence.unique()) >= 4
 
 
+@pytest.mark.parametrize("interleaved", [False, True])
+def test_all_pixels_at_once_are_told_bit_for_bit_what_a_few_are(interleaved):
+    """So many are read from windows of the whole picture and map, a few from patches around them."""
+    frame = frames(dtype=torch.float32)
+    image = (255 * frame.image).round().to(torch.uint8)
+    frame = frame.replace(image=image.to(memory_format=torch.channels_last) if interleaved else image)
+    v, u = torch.meshgrid(torch.arange(-2.0, HW[0] + 2), torch.arange(-2.0, HW[1] + 2), indexing="ij")
+    uv = torch.cat([torch.stack([u, v], -1).reshape(-1, 2), everywhere()[0].float()])
+    found = backproject(frame, uv)
+    few = [backproject(frame, some) for some in uv.split(100)]  # of 560 and 2240 pixels
+    for name in ("depth", "sigma", "xyz", "confidence", "flag"):
+        parts = torch.cat([getattr(part, name) for part in few], 1)
+        assert torch.equal(getattr(found, name).nan_to_num(-1), parts.nan_to_num(-1)), name
+    assert all((found.flag & bit).any() for bit in (1, 2, 4, 8, 16, 32, 128))
+
+
 def test_a_depth_map_smaller_than_the_neighbourhood_is_looked_at_whole():
     frame, uv = frames(depth_hw=(12, 28)), everywhere()
     small = frame.replace(depth=frame.depth[:, 5:9], conf=frame.conf[:, 5:9])

@@ -90,18 +90,24 @@ def test_pyramids_that_compiled_code_cannot_build_are_torchs(loaded, monkeypatch
 @needs_compiler
 @pytest.mark.parametrize(
     ("shape", "views", "most"),
-    [((2, 7, 5, 48), (1, 3), 31), ((1, 1, 9, 3), (8,), 249), ((1, 6, 1, 4), (2,), 2), ((3, 5, 4, 130), (1, 2, 8), 255)],
+    [
+        ((2, 7, 5, 48), (1, 3), 31),
+        ((1, 1, 9, 3), (8,), 249),
+        ((1, 6, 1, 4), (2,), 2),
+        ((3, 5, 4, 130), (1, 2, 8), 255),
+        ((4, 6, 7, 96), (1, 2, 3, 5), 31),
+        ((1, 3, 3, 600), (1,), 20),
+    ],
 )
-def test_surfaces_winners_and_rivals_are_equal(loaded, monkeypatch, shape, views, most):
+def test_surfaces_and_rivals_are_equal(loaded, monkeypatch, shape, views, most):
+    """In numbers as small as costs allow: bytes where four paths fit into one, or two, or one, and larger ones."""
     C, views = volume(*shape, most=most), torch.tensor(views)
-    S, expected = both_ways(lambda: sweep.aggregate(C, views), monkeypatch)
-    assert torch.equal(S, expected) and S.dtype == expected.dtype
-    (found, expected) = both_ways(lambda: sweep.winner(S), monkeypatch)
-    for a, b in zip(found, expected, strict=True):
+    (found, some), (expected, few) = both_ways(lambda: sweep.surface(C, views), monkeypatch)
+    for a, b in zip((*found, some), (*expected, few), strict=True):
         assert torch.equal(a, b) and a.dtype == b.dtype
     for reach in (0.0, 2.0, 1e4):
         far = torch.full((len(C),), reach)
-        a, b = both_ways(lambda far=far: sweep.rivals(S, found, far), monkeypatch)
+        a, b = both_ways(lambda far=far: sweep.rivals(some, found, far), monkeypatch)
         assert torch.equal(a, b)
 
 
@@ -146,6 +152,54 @@ def test_places_codes_and_smooth_maps_are_equal(loaded, monkeypatch, turning):
         q = torch.rand(*shape, generator=g)
         smooth = both_ways(lambda q=q: sweep.smooth(q, torch.tensor([0.2, 0.5])), monkeypatch)
         assert torch.equal(*smooth)
+
+
+@needs_compiler
+@pytest.mark.parametrize("lens", [False, True])
+@pytest.mark.parametrize("hw", [(41, 53), (6, 70), (9, 3)])
+def test_fitted_windows_agree_up_to_rounding(loaded, monkeypatch, lens, hw):
+    """Pairs turned and moved, pixels that leave the other picture or lie behind it, and one without texture."""
+    g = torch.Generator().manual_seed(3)
+    pictures = gaussian(torch.rand(3, 2, *hw, generator=g), 1.2)
+    pictures[2, 0] = 0.4
+    f = torch.full((3, 2), float(max(hw)))
+    lens = torch.tensor([[0.05, -0.01, 0.001, -0.002]]).expand(3, -1) if lens else None
+    camera = Camera(f, torch.tensor([[hw[1] / 2, hw[0] / 2]]).expand(3, -1), lens)
+    motion = se3.exp(0.05 * torch.randn(3, 6, generator=g) + torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, -0.4]))
+    base = sweep.base(pictures[:, :1], camera)
+    view = sweep.View(pictures[:, 1:], camera, motion)
+    q = 0.2 + 0.1 * gaussian(torch.rand(3, 1, *hw, generator=g), 2.0)[:, 0]
+    q[:, 0] = 4.0  # behind
+    picture = sweep.with_gradients(view.image)
+    found, expected = both_ways(lambda: sweep.fit_windows(base, view, picture, q), monkeypatch)
+    assert torch.equal(found.seen, expected.seen) and not bool(found.seen.all()) and bool(found.seen.any())
+    for name in ("step", "contrast", "noise", "correlation", "motion"):
+        a, b = getattr(found, name), getattr(expected, name)
+        scale = b.abs().flatten(1).mean(1).clamp_min(1e-6)[:, None]
+        assert a.shape == b.shape and ((a - b).flatten(1).abs() <= 1e-4 * (scale + b.flatten(1).abs())).all(), name
+    assert found.correlation[:2].abs().mean() > 0.05
+
+
+@needs_compiler
+def test_windows_of_another_size_or_type_or_with_a_graph_are_fitted_by_torch(loaded, monkeypatch):
+    monkeypatch.setattr(sweep, "_compiled_fit", None)
+    grey = torch.rand(1, 2, 12, 14, generator=torch.Generator().manual_seed(4))
+    camera = Camera(torch.full((1, 2), 20.0), torch.tensor([[6.5, 5.5]]))
+    motion = se3.exp(torch.tensor([[0.0, 0.0, 0.0, 0.1, 0.0, 0.0]]))
+
+    def fitted(grey, **options):
+        base = sweep.base(grey[:, :1], camera.to(grey.dtype))
+        view = sweep.View(grey[:, 1:], camera.to(grey.dtype), motion.to(grey.dtype))
+        q = torch.full_like(grey[:, 0], 0.5)
+        return sweep.fit_windows(base, view, sweep.with_gradients(view.image), q, **options)
+
+    fitted(grey.double())
+    fitted(grey, radius=2)
+    graph = grey.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(fitted(graph).step.sum(), [graph])
+    assert bool(slope.isfinite().all()) and slope.abs().sum() > 0
+    with pytest.raises(TypeError):
+        fitted(grey)
 
 
 @pytest.fixture(scope="module")
@@ -211,6 +265,12 @@ def test_compiled_code_has_the_constants_of_torchs():
         "NOISE = 2.0 / 255 / 2, DAMPING = NOISE * NOISE, MIN_PIVOT = 1e-6;",
     ):
         assert line in source
+    for line in (
+        f"RADIUS = {sweep.FIT_RADIUS};",
+        f"LEAST_GAIN = {sweep.GAIN[0]}f, MOST_GAIN = {sweep.GAIN[1]}f, FLAT = 1e-8f;",
+    ):
+        assert line in native.SOURCES[4].read_text()
+    assert sweep.FLAT == 1e-8
     assert affine.DAMPING == (2 / 255 / 2) ** 2 and least_squares.MIN_PIVOT == 1e-6
     assert lk.RATIO[0] == -lk.RATIO[1] and {*lk.TOP, *lk.BETWEEN, *lk.FINEST} <= {1, 2}
     assert pyramid.REACH >= pyramid.MARGIN + 2 + 2, "the largest radius, and the row"
@@ -363,7 +423,9 @@ def test_what_compiled_code_cannot_do_is_left_to_torch(loaded, monkeypatch):
     torch.vmap(lambda y: (told.append(native.serves(y)), y)[1])(x)
     assert told == [False]
     C = volume(2, 4, 5, 6, most=31)
-    assert torch.equal(sweep.aggregate(C.int()), sweep.aggregate(C)), "other whole numbers"
+    assert torch.equal(sweep.surface(C.int(), torch.tensor(1))[1], sweep.surface(C, torch.tensor(1))[1]), (
+        "other numbers"
+    )
     monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
     assert not native.serves(x)
 
@@ -396,7 +458,7 @@ def test_nothing_is_compiled_silently(tmp_path, monkeypatch):
     monkeypatch.setenv("DHTORCH_CACHE", str(tmp_path / "none"))
     monkeypatch.setenv("DHTORCH_NATIVE", "1")
     with pytest.raises(FileNotFoundError, match=f"not compiled .*; {native.COMMAND} does it"):
-        sweep.aggregate(volume(1, 2, 2, 3, most=31))
+        sweep.surface(volume(1, 2, 2, 3, most=31), torch.tensor(1))
     assert not (tmp_path / "none").exists()
 
 

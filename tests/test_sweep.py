@@ -194,13 +194,14 @@ def test_a_lens_is_in_the_reading():
 def test_rivals_are_the_best_places_further_away():
     S = torch.randint(0, 400, (2, 7, 5, 12), generator=generator(6), dtype=torch.int16)
     best, reach = sweep.winner(S), torch.tensor([2.0, 4.0])
-    found = sweep.rivals(S, best, reach)
+    some = S[:, ::2, ::2]
+    found = sweep.rivals(some, best, reach)
     for b, i, j in itertools.product(range(2), range(7), range(5)):
         asked = S[b, i - i % 2, j - j % 2].tolist()
         at = asked.index(min(asked))
         others = [cost for k, cost in enumerate(asked) if abs(k - at) > reach[b]]
         assert int(found[b, i, j]) == min(others) - asked[at]
-    assert bool((sweep.rivals(S, best, torch.tensor([20.0, 20.0])) > 30_000).all()), "all in reach: there is none"
+    assert bool((sweep.rivals(some, best, torch.tensor([20.0, 20.0])) > 30_000).all()), "all in reach: there is none"
 
 
 def test_windows_are_summed_and_their_spread_is_known():

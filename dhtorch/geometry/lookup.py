@@ -23,6 +23,9 @@ _THOUSANDTHS = (299.0, 587.0, 114.0)
 #: Numbers of patches that are summarised together: few enough to stay in cache, and to need no fresh memory pages.
 NUMBERS = 1 << 18
 
+#: Share of an image's pixels from which on windows of the whole image are faster than as many patches.
+WHOLE = 0.25
+
 #: Variance of rounding grey values to 8 bits; no residual is believed to be smaller.
 QUANTISATION = 1 / (12 * 255**2)
 
@@ -73,6 +76,17 @@ def summarise(
     found = [reduce(luma(pixels, 0)[0] if grey else pixels) for pixels in seen]
     joined = found[0] if len(parts) == 1 else [torch.cat(x) for x in zip(*found, strict=True)]
     return tuple((x[: B * N] if fill else x).view(B, N) for x in joined)
+
+
+def whole_is_faster(hw: tuple[int, int], n: int, size: int) -> bool:
+    """Whether windows of all pixels of an image are faster than the patches around n of them."""
+    return size % 2 == 1 and n >= WHOLE * hw[0] * hw[1]
+
+
+def read_whole(found: Tensor, pixel: Tensor, size: int) -> Tensor:
+    """What was found (B, H, W) for every pixel's patch, at the pixels (B, N, 2) that :func:`summarise` would ask."""
+    x, y = _moved_inside(pixel, (found.shape[1], found.shape[2]), size)
+    return found.flatten(1).gather(1, torch.add(x, y, alpha=found.shape[2]).long())
 
 
 def _read(flat: Tensor, channels: tuple[int, int], down: Tensor, right: Tensor, middle: Tensor) -> Tensor:

@@ -108,10 +108,19 @@ class Level(NamedTuple):
 
 
 def pixel_rays(camera: Camera, hw: tuple[int, int], margin: int = 0) -> Tensor:
-    """Rays (B, N, 3) with z = 1 of all pixels of a picture and of ``margin`` more around it; NaN outside the lens."""
-    rows, columns = (torch.arange(-margin, n + margin, device=camera.f.device).to(camera.f) for n in hw)
-    v, u = torch.meshgrid(rows, columns, indexing="ij")
-    return cam.rays(camera, torch.stack([u, v], -1).reshape(1, -1, 2).expand(len(camera.f), -1, -1))
+    """Rays (B, N, 3) with z = 1 of all pixels of a picture and of ``margin`` more around it; NaN outside the lens.
+
+    In memory each axis lies by itself, as all numbers here that belong to a pixel do: operations then run along pixels.
+    """
+    columns, rows = (torch.arange(-margin, n + margin, device=camera.f.device).to(camera.f) for n in hw[::-1])
+    if camera.distortion is not None:
+        v, u = torch.meshgrid(rows, columns, indexing="ij")
+        uv = torch.stack([u, v], -1).reshape(1, -1, 2).expand(len(camera.f), -1, -1)
+        return cam.rays(camera, uv).mT.contiguous().mT
+    x, y = ((place - camera.c[:, k, None]) / camera.f[:, k, None] for k, place in enumerate((columns, rows)))
+    x = x[:, None].expand(-1, len(rows), -1)
+    y = y[:, :, None].expand(-1, -1, len(columns))
+    return torch.stack([x, y, torch.ones_like(x)], 1).flatten(2).mT
 
 
 def base(image: Tensor, camera: Camera) -> Base:
@@ -127,25 +136,32 @@ def seen_at(view: View, ray: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
     """Where view 1 sees the points on rays (B, N, 3) at inverse depths q (B, N): pixels (B, N, 2) of its picture, and
     whether they lie before it (B, N). Gradient: to everything."""
     check("seen_at", ray=(ray, "B N 3"), q=(q, "B N"), t=(view.T_1_from_0.t, "B 3"))
-    given = view.T_1_from_0.R, view.T_1_from_0.t, view.camera.f, view.camera.c
-    turn = torch.zeros_like(view.T_1_from_0.t) if view.turn is None else view.turn
-    if view.camera.distortion is None and native.serves(ray, q, turn, *given):
-        R, t, f, c = given
-        uv = q.new_empty(*q.shape, 2)
-        front = torch.empty_like(q, dtype=torch.bool)
-        torch.ops.dhtorch.seen_at(ray, q, R=R, t=t, turn=turn, f=f, c=c, uv=uv, front=front)
-        return uv, front
-    x = se3.rotate(view.T_1_from_0.R, ray) + q[..., None] * view.T_1_from_0.t[:, None]
+    R, t, f, c = view.T_1_from_0.R, view.T_1_from_0.t, view.camera.f, view.camera.c
+    if view.camera.distortion is None:
+        given = ray.mT.contiguous(), q, R, t, torch.zeros_like(t) if view.turn is None else view.turn, f, c
+        if native.serves(*given):
+            uv = torch.empty_like(given[0][:, :2])
+            front = torch.empty_like(q, dtype=torch.bool)
+            torch.ops.dhtorch.seen_at(*given, uv, front)
+            return uv.mT, front
+    x, y, z = (part + q * t[:, None] for part, t in zip(turned(R, ray), t.unbind(-1), strict=True))
     if view.turn is not None:
-        x = x + _cross(view.turn[:, None] * ray[..., 1:2], x)
-    front = x[..., 2] > 1e-3
-    return cam.project(view.camera, torch.where(front[..., None], x, torch.ones_like(x))), front
+        p, o, s = (view.turn[:, k, None] * ray[..., 1] for k in range(3))
+        x, y, z = x + (o * z - s * y), y + (s * x - p * z), z + (p * y - o * x)
+    front = z > 1e-3
+    x, y, z = (torch.where(front, part, 1.0) for part in (x, y, z))
+    if view.camera.distortion is not None:
+        return cam.project(view.camera, torch.stack([x, y, z], -1)), front
+    places = [part / z * f[:, k, None] + c[:, k, None] for k, part in enumerate((x, y))]
+    return torch.stack(places, 1).mT, front
 
 
-def _cross(a: Tensor, b: Tensor) -> Tensor:
-    """Cross products (…, 3); torch's own take several times as long on so many."""
-    (a0, a1, a2), (b0, b1, b2) = a.unbind(-1), b.unbind(-1)
-    return torch.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], -1)
+def turned(R: Tensor, ray: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """(B, 3, 3) times each of (B, N, 3), one tensor (B, N) an axis: the numbers of :func:`dhtorch.geometry.se3.rotate`,
+    which takes several times as long on so many. Gradient: to both."""
+    x, y, z = ray.unbind(-1)
+    right, down, ahead = (x * row[:, 0, None] + y * row[:, 1, None] + z * row[:, 2, None] for row in R.unbind(1))
+    return right, down, ahead
 
 
 def bilinear(image: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
@@ -252,10 +268,6 @@ def aggregate(
     """
     check("aggregate", C=(C, "B h w D"))
     price = torch.as_tensor(views, dtype=torch.int16, device=C.device).reshape(-1, 1, 1)
-    if native.serves(C) and C.dtype == torch.uint8:
-        S = torch.empty_like(C, dtype=torch.int16)
-        torch.ops.dhtorch.aggregate(C, S, *(x.expand(len(C), 1, 1).contiguous() for x in (price * step, price * jump)))
-        return S
     S = torch.zeros_like(C, dtype=torch.int16)
     for dim in (1, 2):
         _both_ways(C, S, dim, price * step, price * jump)
@@ -291,11 +303,6 @@ class Winner(NamedTuple):
 def winner(S: Tensor) -> Winner:
     """The plane of least cost S (B, h, w, D), the first of equals, and the parabola through its neighbours' costs."""
     check("winner", S=(S, "B h w D"))
-    if native.serves(S) and S.dtype == torch.int16:
-        types = torch.int64, torch.float32, torch.int16
-        found = Winner(*(torch.empty(S.shape[:-1], dtype=dtype) for dtype in types))
-        torch.ops.dhtorch.winner(S.flatten(0, 2), *found)
-        return found
     return Winner(*(torch.cat(part, 1) for part in zip(*map(_winner, S.split(ROWS, 1)), strict=True)))
 
 
@@ -312,30 +319,52 @@ def _winner(S: Tensor) -> tuple[Tensor, ...]:
     return index, shift, cost.to(S.dtype)
 
 
-def rivals(S: Tensor, best: Winner, reach: Tensor) -> Tensor:
+def surface(
+    C: Tensor,  # (B, h, w, D) uint8
+    views: Tensor,  # (B,) how many views' costs are in C
+) -> tuple[Winner, Tensor]:
+    """The best planes of the best surface, and its cost (B, ⌈h/2⌉, ⌈w/2⌉, D) at every other pixel, both ways.
+
+    What :func:`winner` says of :func:`aggregate`, whose answer compiled code (:mod:`dhtorch.native`) never writes down.
+    """
+    if not native.serves(C) or C.dtype != torch.uint8:
+        S = aggregate(C, views)
+        return winner(S), S[:, ::2, ::2]
+    B, h, w, D = C.shape
+    prices = ((price * views).to(torch.int16).expand(B).contiguous() for price in (STEP, JUMP))
+    best = Winner(*(torch.empty(B, h, w, dtype=dtype) for dtype in (torch.int64, torch.float32, torch.int16)))
+    some = torch.empty(B, (h + 1) // 2, (w + 1) // 2, D, dtype=torch.int16)
+    torch.ops.dhtorch.surface(C, *prices, *best, some)
+    return best, some
+
+
+def rivals(some: Tensor, best: Winner, reach: Tensor) -> Tensor:
     """How much more the best plane costs (B, h, w) that lies further than ``reach`` (B,) planes from the winner.
 
-    Asked at every other pixel, both ways; its neighbours have its answer. Gradient: none.
+    Asked at every other pixel, both ways, of the costs ``some`` (B, ⌈h/2⌉, ⌈w/2⌉, D) there, see :func:`surface`; its
+    neighbours have its answer. Gradient: none.
     """
-    if native.serves(S, best.plane) and S.dtype == torch.int16:
-        more = torch.empty(len(S), *((n + 1) // 2 for n in S.shape[1:3]), dtype=S.dtype)
+    plane, cost = (x[:, ::2, ::2].contiguous() for x in (best.plane, best.cost))
+    if native.serves(some, plane) and some.dtype == torch.int16:
+        more = torch.empty_like(cost)
         for b, far in enumerate(reach.tolist()):
-            torch.ops.dhtorch.elsewhere(S[b], best.plane[b], more[b], int(far))
-        return _for_all(more - best.cost[:, ::2, ::2], best.cost)
-    places = torch.arange(S.shape[-1], dtype=torch.int16, device=S.device)
+            torch.ops.dhtorch.elsewhere(some[b].flatten(0, 1), plane[b], more[b], int(far))
+        return _for_all(more - cost, best.cost)
+    places = torch.arange(some.shape[-1], dtype=torch.int16, device=some.device)
     reach, found = reach.to(torch.int16)[:, None, None, None], []
-    for first in range(0, S.shape[1], ROWS):  # some rows at once, as the winner is read
-        rows = slice(first, first + ROWS, 2)
-        cost, plane = (x[:, rows, ::2, None] for x in (best.cost, best.plane.to(torch.int16)))
-        near = (places - plane).abs() <= reach
-        others = S[:, rows, ::2].masked_fill(near, torch.iinfo(S.dtype).max)
-        found.append((others.amin(-1, keepdim=True) - cost)[..., 0])
+    for part, at, least in zip(*(x.split(ROWS // 2, 1) for x in (some, plane, cost)), strict=True):  # as it is read
+        near = (places - at[..., None].to(torch.int16)).abs() <= reach
+        found.append(part.masked_fill(near, torch.iinfo(some.dtype).max).amin(-1) - least)
     return _for_all(torch.cat(found, 1), best.cost)
 
 
 def _for_all(x: Tensor, like: Tensor) -> Tensor:
     """What was asked at every other pixel, both ways, also for its neighbours."""
     return x.repeat_interleave(2, 1).repeat_interleave(2, 2)[:, : like.shape[1], : like.shape[2]]
+
+
+#: Radius of a window that is fitted.
+FIT_RADIUS = 4
 
 
 class Fit(NamedTuple):
@@ -362,7 +391,7 @@ def fit_windows(
     picture_1: Tensor,  # (B, 3, H, W), view 1's by with_gradients
     q: Tensor,  # (B, h, w) 1/m
     *,
-    radius: int = 4,
+    radius: int = FIT_RADIUS,
 ) -> Fit:
     """One step of every pixel's inverse depth towards equal grey values in its window, whatever bias and gain.
 
@@ -374,7 +403,11 @@ def fit_windows(
     flat = q.flatten(1)
     little = 1e-3 * flat.detach().amax(1, keepdim=True).clamp_min(1e-3)
     uv, front = seen_at(view, base.ray, flat)
-    motion = (seen_at(view, base.ray, flat + little)[0] - uv) / little[..., None]
+    further = seen_at(view, base.ray, flat + little)[0]
+    given = base.image, picture_1, uv.mT.contiguous(), further.mT.contiguous(), little[:, 0]
+    if radius == FIT_RADIUS and native.serves(*given) and all(x.dtype == torch.float32 for x in given):
+        return _compiled_fit(*given, front=front)
+    motion = (further - uv) / little[..., None]
     values, inside = bilinear(picture_1, uv)
     J, du, dv = (x.unflatten(-1, base.hw) for x in values.unbind(1))
     du_dq, dv_dq = (x.unflatten(-1, base.hw) for x in motion.unbind(-1))
@@ -394,6 +427,16 @@ def fit_windows(
         seen=(inside & front).unflatten(-1, base.hw),
         motion=motion.unflatten(1, base.hw),
     )
+
+
+def _compiled_fit(grey: Tensor, picture_1: Tensor, *places: Tensor, front: Tensor) -> Fit:
+    """What :func:`fit_windows` finds at places of every pixel, and of those a little nearer, by how much."""
+    told = step, contrast, noise, correlation = [torch.empty_like(grey[:, 0]) for _ in range(4)]
+    inside = torch.empty_like(step, dtype=torch.bool)
+    motion = torch.empty_like(places[0])
+    torch.ops.dhtorch.fit_windows(grey, picture_1, *places, *told, inside, motion)
+    seen = inside & front.view_as(inside)
+    return Fit(step, contrast, noise, correlation, seen, motion.mT.unflatten(1, inside.shape[1:]))
 
 
 def smooth(q: Tensor, tolerance: Tensor, *, radius: int = 4) -> Tensor:
@@ -450,11 +493,12 @@ def window_sum(x: Tensor, radius: int) -> Tensor:
 def spread(q: Tensor, radius: int) -> Tensor:
     """Largest minus smallest value (B, h, w) of a map in the window around each pixel. Gradient: none."""
     q = q.detach()
-    return _extreme(q, radius, torch.maximum) - _extreme(q, radius, torch.minimum)
+    return extreme(q, radius, torch.maximum) - extreme(q, radius, torch.minimum)
 
 
-def _extreme(x: Tensor, radius: int, pick: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-    """What ``pick`` chooses (B, h, w) in the window around each pixel, of two windows half as wide, and so on."""
+def extreme(x: Tensor, radius: int, pick: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    """What ``pick`` chooses of two, torch.maximum or torch.minimum, in the window around each pixel (B, h, w): of two
+    windows half as wide, and so on. Gradient: to x."""
     for dim in (1, 2):
         first, last = (x.narrow(dim, k, 1) for k in (0, x.shape[dim] - 1))
         x, width = torch.cat([first] * radius + [x] + [last] * radius, dim), 1

@@ -10,8 +10,18 @@ from torch import Tensor
 
 from dhtorch.codes import Flag, Hole
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry.lookup import fits, luma, nearest_index, patches, pixels, summarise
+from dhtorch.geometry.lookup import (
+    fits,
+    luma,
+    nearest_index,
+    patches,
+    pixels,
+    read_whole,
+    summarise,
+    whole_is_faster,
+)
 from dhtorch.geometry.shapes import check
+from dhtorch.geometry.sweep import extreme, window_sum
 from dhtorch.records import Frame, Samples
 
 #: Search radius in a sparse depth map, px: the truth test reads sparse returns in 7×7 windows, so do the samples.
@@ -113,7 +123,10 @@ def _read_depth(frame: Frame, uv: Tensor, search_px: int, edge_rel: float) -> tu
     place = cam.depth_pixels(frame.camera, frame.hw, frame.depth_camera, (h, w), uv)
     size = min(max(NEIGHBOURHOOD, 2 * search_px + 1), h, w)
     pixel = pixels(place)
-    low, high = summarise(frame.depth[:, None], pixel, size, _extremes)
+    if whole_is_faster((h, w), uv.shape[1], size):
+        low, high = (read_whole(x, pixel, size) for x in _whole_extremes(frame.depth, size))
+    else:
+        low, high = summarise(frame.depth[:, None], pixel, size, _extremes)
     if search_px > 0:
         pixel = pixels(_nearest_return(frame.depth, place, size, search_px))
     index, inside = nearest_index((h, w), pixel)
@@ -130,6 +143,13 @@ def _extremes(window: Tensor) -> tuple[Tensor, Tensor]:
     window = window.detach().flatten(0, 2).nan_to_num(0, 0, 0)
     none = torch.nn.functional.threshold(window, 0.0, torch.inf)
     return none.amin(0), window.amax(0)
+
+
+def _whole_extremes(depth: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """What :func:`_extremes` finds around every pixel (B, h, w) of a map."""
+    depth = depth.detach().nan_to_num(0, 0, 0)
+    none = torch.nn.functional.threshold(depth, 0.0, torch.inf)
+    return extreme(none, size // 2, torch.minimum), extreme(depth, size // 2, torch.maximum)
 
 
 def _nearest_return(depth: Tensor, place: Tensor, size: int, search_px: int) -> Tensor:
@@ -155,10 +175,13 @@ def _appearance(image: Tensor, uv: Tensor, dark: float, saturated: float, highli
     hw = (image.shape[-2], image.shape[-1])
     pixel = pixels(uv)
     size = min(NEIGHBOURHOOD, *hw)
-    mean, centre, top, bottom = summarise(image.detach(), pixel, size, _brightness)
+    whole = whole_is_faster(hw, uv.shape[1], size) and image.dtype == torch.uint8
+    seen = _whole_brightness(image, size) if whole else summarise(image.detach(), pixel, size, _brightness)
+    mean, centre, top, bottom = seen
     white = 1 if image.is_floating_point() else 255
     shine = (top - bottom <= 0.15 * top) & (centre >= highlight * white) & (centre - mean >= 0.1 * white)
-    return ~fits(pixel, hw, size), mean <= dark * white, mean >= saturated * white, shine
+    told = mean <= dark * white, mean >= saturated * white, shine
+    return ~fits(pixel, hw, size), *((read_whole(x, pixel, size) for x in told) if whole else told)
 
 
 def _brightness(patch: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -167,6 +190,15 @@ def _brightness(patch: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     middle = patch[:, patch.shape[1] // 2, patch.shape[2] // 2]
     mean, centre = luma(torch.stack((patch.flatten(1, 2).mean(1), middle), 1), 0)[0]
     return mean, centre, middle.amax(0), middle.amin(0)
+
+
+def _whole_brightness(image: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """What :func:`_brightness` finds around every pixel (B, H, W) of pictures of bytes, whose sums are exact in
+    whatever order they are taken."""
+    planes = image.contiguous()
+    total = window_sum(planes.flatten(0, 1).to(torch.int16), size // 2).view_as(planes)
+    mean, centre = (luma(x, 1)[:, 0] for x in (total.float() / size**2, planes.float()))
+    return mean, centre, planes.amax(1).float(), planes.amin(1).float()
 
 
 def _bits(*masks: tuple[Tensor, int]) -> Tensor:
