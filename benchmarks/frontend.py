@@ -5,7 +5,8 @@
 One view of the built-in room with its LiDAR model (depth 192x256 with confidence), the picture resampled to 224x224 and
 1440x1920, three channels uint8, interleaved in memory as decoders leave them. The peer answers the same questions about
 the same pixels in numpy + OpenCV: depth, points, noise, confidence, flags, texture, class. Both sides keep the spiral,
-which depends on the picture's size alone. Mode ``compiled`` is ``torch.compile`` of the three stages.
+which depends on the picture's size alone. Mode ``compiled`` is ``torch.compile`` of the three stages, ``native`` reads
+windows with the compiled code of ``python -m dhtorch.native``.
 
 Errors: median relative difference of the trackability from float64 arithmetic on grey values that were not rounded.
 """
@@ -52,6 +53,12 @@ def front_end(frame: Frame, n: int) -> Samples:
     """Stages 1 to 3."""
     uv = spiral(frame.hw, n, device=frame.image.device)
     return classify(frame, backproject(frame, uv))
+
+
+def natively(frame: Frame, n: int) -> Samples:
+    """Stages 1 to 3, whose windows compiled code reads."""
+    with harness.natively():
+        return front_end(frame, n)
 
 
 class OpenCVFrontEnd:
@@ -139,7 +146,7 @@ def measure(size: str, n: int, batch: int, options: Any, compile_too: bool) -> l
     """Rows of one size: eager and compiled against OpenCV."""
     frame = view(SIZES[size], batch)
     peer = OpenCVFrontEnd(frame, n)
-    calls: list[Callable[[], Any]] = [peer, partial(front_end, frame, n)]
+    calls: list[Callable[[], Any]] = [peer, partial(front_end, frame, n), partial(natively, frame, n)]
     seconds = 0.0
     if compile_too:
         fast, seconds = compiled(front_end, frame, n)
@@ -155,9 +162,11 @@ def measure(size: str, n: int, batch: int, options: Any, compile_too: bool) -> l
     ]
     print(f"{name}: {agreement(calls[1](), theirs)}" + (f"; compiled in {seconds:.0f} s" if compile_too else ""))
     more = {"n": n, "batch": batch, "bar": True, "ours_error": errors[0], "peer_error": errors[1]}
-    rows = [harness.row(name, times[1], "numpy_opencv", times[0], **more)]
+    rows = [
+        harness.row(name, times[k], "numpy_opencv", times[0], **more, mode=("eager", "native")[k - 1]) for k in (1, 2)
+    ]
     if compile_too:
-        rows.append(harness.row(name, times[2], "numpy_opencv", times[0], **more, mode="compiled", warm_up_s=seconds))
+        rows.append(harness.row(name, times[3], "numpy_opencv", times[0], **more, mode="compiled", warm_up_s=seconds))
     return rows
 
 
@@ -183,7 +192,7 @@ def against_dinov2(options: Any) -> list[dict[str, Any]]:
 def growth(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Rows of the time at 1440x1920 beside the own time at 224x224."""
     found = []
-    for mode in ("eager", "compiled"):
+    for mode in ("eager", "native", "compiled"):
         small, large = ([r for r in rows if r["name"] == f"frontend_{s}" and r["mode"] == mode] for s in SIZES)
         if small and large:
             a, b = large[0]["ours_ms"], small[0]["ours_ms"]

@@ -37,6 +37,8 @@ BARS = (
     ("loader", "loader_pair_640x480_workers0", "eager", 1.2, "loader with two views, 640×480"),
     ("loader", "loader_pair_640x480_workers0_by_batch", "eager", 0.9, "the same, a batch at once"),
     ("loader", "loader_scaling_pair_640x480", "eager", 1.05, "loader with two views, what two workers gain"),
+    ("frontend", "frontend_224", "native", 1.3, "front end, 224×224, n = 1024"),
+    ("frontend", "frontend_1440", "native", 0.08, "front end, 1440×1920"),
     ("lk", "lk_w21_n2048", "native", 1.3, "search there, n = 2048"),
     ("lk", "lk_w21_n512_b8", "native", 1.3, "search there, n = 512, B = 8"),
     ("lk", "lk_fb_w21_n2048", "native", 1.2, "search there and back, n = 2048"),

@@ -15,7 +15,9 @@ from dhtorch.geometry import affine, least_squares, pyramid, se3, sweep
 from dhtorch.geometry import lucas_kanade as lk
 from dhtorch.geometry.camera import Camera
 from dhtorch.geometry.filters import gaussian
-from dhtorch.records import NO_HINT, TrackHint
+from dhtorch.records import NO_HINT, Frame, TrackHint
+from dhtorch.stages.backproject import backproject
+from dhtorch.stages.holes import classify, min_eigenvalue
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 
 COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
@@ -70,6 +72,46 @@ def test_pyramids_agree_up_to_one_rounding(loaded, monkeypatch, channels, kind, 
     for a, b in zip(ours.levels, torchs.levels, strict=True):
         assert a.shape == b.shape and (a - b).abs().max() <= 2.0**-23
     assert not torch.equal(ours.levels[0][0], ours.levels[0][1])
+
+
+@needs_compiler
+@pytest.mark.parametrize("layout", ["interleaved", "planar", "grey", "bgr of rgba"])
+@pytest.mark.parametrize("block", [3, 7, 9])
+def test_numbers_about_windows_agree_bit_for_bit(loaded, monkeypatch, layout, block):
+    image = volume(2, 1 if layout == "grey" else 3, 41, 53, most=256)
+    if layout == "interleaved":
+        image = image.contiguous(memory_format=torch.channels_last)
+    if layout == "bgr of rgba":
+        image = volume(2, 41, 53, 4, most=256).permute(0, 3, 1, 2)[:, [2, 1, 0]]
+    depth = 4 * torch.rand(2, 41, 53, generator=torch.Generator().manual_seed(1)) - 1
+    depth[:, ::7, ::5], depth[0, 3], depth[1, :, 9] = torch.nan, torch.inf, -torch.inf
+    uv = torch.rand(2, 301, 2, generator=torch.Generator().manual_seed(2)) * 70 - 8  # the border and beyond
+    uv[0, 0] = torch.nan
+    camera = Camera(f=torch.full((2, 2), 50.0), c=torch.full((2, 2), 20.0))
+    frame = Frame(image=image, depth=depth, camera=camera, conf=None)
+    calls = []
+    for name in ("extremes", "brightness", "gradients"):
+        was = getattr(torch.ops.dhtorch, f"window_{name}")
+        monkeypatch.setattr(
+            torch.ops.dhtorch, f"window_{name}", lambda *a, was=was, **k: (calls.append(1), was(*a, **k))
+        )
+    ours, torchs = both_ways(lambda: classify(frame, backproject(frame, uv), block=block), monkeypatch)
+    assert len(calls) == 3
+    for name in ("depth", "confidence", "flag", "trackability", "hole"):
+        a, b = getattr(ours, name), getattr(torchs, name)
+        assert torch.equal(a.nan_to_num(7), b.nan_to_num(7)) or (name == "trackability" and (a - b).abs().max() < 1e-7)
+    assert ours.flag.unique().numel() > 3 and ours.trackability.unique().numel() > 100
+
+
+@needs_compiler
+def test_windows_that_compiled_code_cannot_read_are_torchs(loaded, monkeypatch):
+    for name in ("extremes", "brightness", "gradients"):
+        monkeypatch.setattr(torch.ops.dhtorch, f"window_{name}", None)
+    image, uv = torch.rand(1, 3, 31, 32), torch.rand(1, 9, 2) * 30
+    assert min_eigenvalue(image, uv).shape == (1, 9), "numbers that are no bytes"
+    assert min_eigenvalue((255 * image).byte(), uv, block=15).shape == (1, 9), "a window of 17 pixels"
+    (slope,) = torch.autograd.grad(min_eigenvalue(image.requires_grad_(), uv).sum(), [image])
+    assert slope.abs().sum() > 0
 
 
 @needs_compiler

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dhtorch import native
 from dhtorch.geometry.exact import LANES
 from dhtorch.geometry.shapes import check
 
@@ -22,6 +23,12 @@ _THOUSANDTHS = (299.0, 587.0, 114.0)
 
 #: Numbers of patches that are summarised together: few enough to stay in cache, and to need no fresh memory pages.
 NUMBERS = 1 << 18
+
+#: Operations of compiled code → the type of pixels that they read, and how many numbers they find.
+COMPILED = {"extremes": (torch.float32, 2), "brightness": (torch.uint8, 4), "gradients": (torch.uint8, 3)}
+
+#: Widest windows that compiled code reads, px.
+WIDEST = 16
 
 #: Share of an image's pixels from which on windows of the whole image are faster than as many patches.
 WHOLE = 0.25
@@ -37,13 +44,15 @@ def summarise(
     reduce: Callable[[Tensor], tuple[Tensor, ...]],
     *,
     grey: bool = False,
+    compiled: str | None = None,
 ) -> tuple[Tensor, ...]:
     """A few numbers (B, N) about the patch around each pixel, without keeping the patches.
 
     ``reduce`` sees some points at a time and turns their pixels (C, size, size, P), points last, into tensors (P,);
     with ``grey`` their grey values (size, size, P). Whatever it does pixel by pixel then runs along contiguous points.
     It must treat every point alike and may not count on P, which is a multiple of LANES: the last ones are there to
-    fill up. A patch that would leave the image is moved back inside.
+    fill up. A patch that would leave the image is moved back inside. ``compiled`` names the operation of
+    :data:`COMPILED` that does the same.
 
     Raises:
         ValueError: wrong shapes, or an image smaller than a patch.
@@ -55,6 +64,15 @@ def summarise(
     B, N, C, H, W = (sizes[k] for k in "BNCHW")
     _must_fit("summarise", size, H, W)
     flat, (b, c, v, u) = _flat(image)
+    if compiled is not None and size <= WIDEST and native.serves(flat, pixel):
+        kind, count = COMPILED[compiled]
+        if image.dtype == kind:
+            found = image.new_empty(count, B, N, dtype=torch.float32)
+            steps = {"image": b, "channel": c, "row": v, "column": u}
+            shape = {"channels": C, "height": H, "width": W, "size": size}
+            exact = {"whole": u == 3 and _product_is_exact(image)} if grey else {}
+            getattr(torch.ops.dhtorch, f"window_{compiled}")(flat, pixel, found, **steps, **shape, **exact)
+            return found.unbind(0)
     x, y = _moved_inside(pixel if image.numel() < 1 << 31 else pixel.long(), (H, W), size)
     middle = torch.add(x if u == 1 else x * u, y, alpha=v)
     whole: Any = {"device": image.device, "dtype": middle.dtype}
@@ -73,8 +91,8 @@ def summarise(
         read, grey = partial(_read_rows, flat, grey), False
     parts = (middle,) if len(middle) <= at_once else middle.split(at_once)
     seen = (read(down, right, part) for part in parts)
-    found = [reduce(luma(pixels, 0)[0] if grey else pixels) for pixels in seen]
-    joined = found[0] if len(parts) == 1 else [torch.cat(x) for x in zip(*found, strict=True)]
+    numbers = [reduce(luma(pixels, 0)[0] if grey else pixels) for pixels in seen]
+    joined = numbers[0] if len(parts) == 1 else [torch.cat(x) for x in zip(*numbers, strict=True)]
     return tuple((x[: B * N] if fill else x).view(B, N) for x in joined)
 
 

@@ -126,7 +126,7 @@ def _read_depth(frame: Frame, uv: Tensor, search_px: int, edge_rel: float) -> tu
     if whole_is_faster((h, w), uv.shape[1], size):
         low, high = (read_whole(x, pixel, size) for x in _whole_extremes(frame.depth, size))
     else:
-        low, high = summarise(frame.depth[:, None], pixel, size, _extremes)
+        low, high = summarise(frame.depth[:, None], pixel, size, _extremes, compiled="extremes")
     if search_px > 0:
         pixel = pixels(_nearest_return(frame.depth, place, size, search_px))
     index, inside = nearest_index((h, w), pixel)
@@ -176,7 +176,11 @@ def _appearance(image: Tensor, uv: Tensor, dark: float, saturated: float, highli
     pixel = pixels(uv)
     size = min(NEIGHBOURHOOD, *hw)
     whole = whole_is_faster(hw, uv.shape[1], size) and image.dtype == torch.uint8
-    seen = _whole_brightness(image, size) if whole else summarise(image.detach(), pixel, size, _brightness)
+    seen = (
+        _whole_brightness(image, size)
+        if whole
+        else summarise(image.detach(), pixel, size, _brightness, compiled="brightness")
+    )
     mean, centre, top, bottom = seen
     white = 1 if image.is_floating_point() else 255
     shine = (top - bottom <= 0.15 * top) & (centre >= highlight * white) & (centre - mean >= 0.1 * white)
@@ -202,8 +206,7 @@ def _whole_brightness(image: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor,
 
 
 def _bits(*masks: tuple[Tensor, int]) -> Tensor:
-    """One int32 bit set of (mask, bit) pairs."""
-    flag = torch.zeros_like(masks[0][0], dtype=torch.int32)
-    for mask, bit in masks:
-        flag = torch.where(mask, flag | bit, flag)
-    return flag
+    """One int32 bit set of (mask, bit) pairs; of eight bits at most, which a byte holds."""
+    held = torch.stack([mask for mask, _ in masks])
+    bits = torch.tensor([bit for _, bit in masks], dtype=torch.uint8, device=held.device)
+    return torch.where(held, bits.view(-1, *[1] * (held.dim() - 1)), 0).sum(0, dtype=torch.int32)

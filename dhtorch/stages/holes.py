@@ -74,7 +74,7 @@ def min_eigenvalue(
     Gradient: to the image; at equal eigenvalues the subgradient without the split is taken.
     """
     check("min_eigenvalue", image=(image, "B C H W"), uv=(uv, "B N 2"))
-    a, b, c = summarise(image, pixels(uv), block + 2, _gradient_sums, grey=True)
+    a, b, c = summarise(image, pixels(uv), block + 2, _gradient_sums, grey=True, compiled="gradients")
     smaller, _ = eigenvalues(a, b, c)
     return smaller / (16 * block * block)
 
