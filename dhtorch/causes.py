@@ -46,6 +46,9 @@ HALF_PX = 2.0
 #: of another kind.
 SAVES, ERRORS, BEYOND = 0.04, 3.0, 0.015
 
+#: Share of what a map misses beyond what the sensor's near returns miss that its cause must explain.
+EXPLAINED = 0.5
+
 #: Frames that a depth may be early or late at most, and the factors on the focal length that are tried.
 LAG = 5
 FOCALS = (0.8, 0.87, 0.93, 0.95, 1.05, 1.07, 1.15, 1.25)
@@ -66,11 +69,13 @@ PAIRS, FEWEST, GAPS, FOUND = 8, 4, (8, 4, 2, 1), 0.4
 class Cause:
     """A fault that maps of a recording may share, and how it is undone."""
 
-    kind: str  # unit | mirrored | rolled | registration | time offset | focal length
+    kind: str  # unit | mirrored | rolled | registration | along the ray | inverse | time offset | focal length
     name: str  # of this one
     undo: Callable[[Tensor], Tensor] = lambda depth: depth  # map (B, h, w) → as it should be
     lag: int = 0  # frames by which the maps come late
     focal: float = 1.0  # what the focal length is to be multiplied by
+    ray: bool = False  # depth is to be divided by the length of its ray
+    scaled: bool = False  # what was undone is known up to a scale, which near returns tell
 
 
 def turned(depth: Tensor, quarters: int) -> Tensor:
@@ -88,8 +93,20 @@ def _seen_over(field: float) -> str:
     return f"not registered: seen over {bound}{field:.2f} of the picture's field"
 
 
-def _mirrored(depth: Tensor) -> Tensor:
-    return depth.flip(-1)
+def ray_lengths(camera: cam.Camera, hw: tuple[int, int]) -> Tensor:
+    """Lengths (B, h, w) of the viewing rays with z = 1 through a map's pixels: distance over depth. Gradient: none."""
+    v, u = torch.meshgrid(*(torch.arange(n, device=camera.f.device) for n in hw), indexing="ij")
+    uv = torch.stack((u, v), -1).view(1, -1, 2).expand(len(camera.f), -1, -1).to(camera.f)
+    with torch.no_grad():
+        return cam.rays(camera, uv).norm(dim=-1).unflatten(1, hw)
+
+
+def _mirrored(depth: Tensor, axis: int) -> Tensor:
+    return depth.flip(axis)
+
+
+def _inverse(depth: Tensor) -> Tensor:
+    return torch.where(depth > 0, 1 / torch.where(depth > 0, depth, 1.0), 0.0)
 
 
 def _times(depth: Tensor, factor: float) -> Tensor:
@@ -100,7 +117,10 @@ def _times(depth: Tensor, factor: float) -> Tensor:
 NONE = Cause("none", "none")
 CAUSES: tuple[Cause, ...] = (
     *(Cause("unit", name, partial(_times, factor=factor)) for name, factor in UNITS.items()),
-    Cause("mirrored", "mirrored left to right", _mirrored),
+    Cause("mirrored", "mirrored left to right", partial(_mirrored, axis=-1)),
+    Cause("mirrored", "mirrored upside down", partial(_mirrored, axis=-2)),
+    Cause("along the ray", "distance along the ray, not depth", ray=True),
+    Cause("inverse", "inverse depth or disparity, not depth", _inverse, scaled=True),
     *(Cause("rolled", f"rolled by {90 * k} degrees", partial(turned, quarters=4 - k)) for k in (1, 2, 3)),
     *(Cause("registration", _seen_over(field), partial(magnified, factor=field)) for field in FIELDS),
     *(
@@ -176,8 +196,11 @@ def name_cause(
             method=method,
             seed=seed,
         )
-        losses = {cause.name: window.loss(cause) for cause in window.hypotheses()}
-    return decided(losses)._replace(pairs=watched.pairs)
+        asked = {cause.name: cause for cause in window.hypotheses()}
+        named = decided({name: window.loss(cause) for name, cause in asked.items()})._replace(pairs=watched.pairs)
+        if named.cause is None or window.explains(asked[named.cause]):
+            return named
+        return named._replace(cause=None, kind=None)
 
 
 def decided(losses: Mapping[str, Tensor]) -> Named:
@@ -230,33 +253,66 @@ class Window:
 
     def hypotheses(self) -> Sequence[Cause]:
         """What could be known: a motion fitted to near returns swallows a focal length, and the unit of its own."""
-        if self.anchors.T_world_from_cam is not None and self.others.T_world_from_cam is not None:
-            return (NONE, *CAUSES)
-        swallowed = {"focal length", "unit"} if self.maps is None else {"focal length"}
+        swallowed: set[str] = {"inverse"} if self.maps is None else set()
+        if self.anchors.T_world_from_cam is None or self.others.T_world_from_cam is None:
+            swallowed |= {"focal length", "unit"} if self.maps is None else {"focal length"}
         return (NONE, *(cause for cause in CAUSES if cause.kind not in swallowed))
 
-    def loss(self, cause: Cause) -> Tensor:
-        """(P,) loss with that fault undone; NaN where a pair cannot tell."""
+    def explains(self, cause: Cause) -> bool:
+        """Whether maps with that fault undone come near to the sensor's returns, where there are any: an explanation
+        that is only better than none is none. The sensor's own depth is held against nothing."""
+        if self.maps is None:
+            return True
+        before, after = (self.loss(each, near=True) for each in (NONE, cause))
+        least = self.loss(NONE, near=True, sensor=True, focal=cause.focal)
+        known = before.isfinite() & after.isfinite() & least.isfinite()
+        if int(known.sum()) < FEWEST:
+            return True
+        return float((before - after)[known].mean()) >= EXPLAINED * float((before - least)[known].mean())
+
+    def loss(self, cause: Cause, *, near: bool = False, sensor: bool = False, focal: float | None = None) -> Tensor:
+        """(P,) loss with that fault undone; NaN where a pair cannot tell.
+
+        Args:
+            cause: what is undone.
+            near: of samples with a near return alone.
+            sensor: of the sensor's returns, whatever the maps.
+            focal: another factor on the focal lengths than the cause's.
+        """
         place = [i + cause.lag for i, _ in self.pairs]
         there = torch.tensor([0 <= i < len(self.depths) for i in place], device=self.samples.uv.device)
         place = [min(max(i, 0), len(self.depths) - 1) for i in place]
-        scaled = (self._scaled(self.anchors, cause.focal), self._scaled(self.others, cause.focal))
+        factor = cause.focal if focal is None else focal
+        scaled = (self._scaled(self.anchors, factor), self._scaled(self.others, factor))
         own = self.maps is None
-        sensor = self.anchors.depth
+        returns = self.anchors.depth
         if own:
-            sensor = cause.undo(torch.cat([self.depths[i] for i in place]))
-        view = scaled[0].replace(depth=sensor)
+            returns = self._undone(torch.cat([self.depths[i] for i in place]), cause, scaled[0])
+        view = scaled[0].replace(depth=returns)
         samples = self.method.backproject(view, self.samples.uv).replace(trackability=self.samples.trackability)
-        depth = torch.where(samples.usable, samples.depth, 0.0)
-        if self.maps is not None:
-            depth = cause.undo(torch.cat([self.maps[i] for i in place])).to(depth)
+        told = torch.where(samples.usable, samples.depth, 0.0)
+        depth = told
+        if self.maps is not None and not sensor:
+            picture = scaled[0].replace(depth_camera=None)
+            depth = self._undone(torch.cat([self.maps[i] for i in place]).to(told), cause, picture)
             at = cam.resize_pixels(self.samples.uv, view.hw, (depth.shape[-2], depth.shape[-1]))
             depth = nearest(depth, at)[0].nan_to_num(0.0, 0.0, 0.0)
+            depth = depth * _ratio(told, depth) if cause.scaled else depth
+            depth = torch.where(samples.usable, depth, 0.0) if near else depth
         found = self._under_fit(samples, depth, scaled)
         given = self._under_trajectory(depth, scaled)
         if given is not None:
             found = 0.5 * (torch.where(found.isfinite(), found, 1.0) + given)
         return torch.where(there, found, torch.nan)
+
+    @staticmethod
+    def _undone(depth: Tensor, cause: Cause, view: Frame) -> Tensor:
+        """Maps (P, h, w) as they should be, over the field of the pictures or of a camera of their own."""
+        depth = cause.undo(depth)
+        if not cause.ray:
+            return depth
+        hw = (depth.shape[-2], depth.shape[-1])
+        return depth / ray_lengths(view.depth_camera or cam.resize(view.camera, view.hw, hw), hw)
 
     @staticmethod
     def _scaled(frame: Frame, factor: float) -> Frame:
@@ -297,6 +353,13 @@ class Window:
         n = used.sum(-1)
         mean = torch.where(used, loss, 0.0).sum(-1) / n.clamp_min(1)
         return torch.where(n >= 12, mean, torch.nan)
+
+
+def _ratio(told: Tensor, depth: Tensor) -> Tensor:
+    """Median ratio (P, 1) of near returns ``told`` (P, N) to what a map says there; 0 where no return meets it."""
+    both = (told > 0) & (depth > 0)
+    ratio = torch.where(both, told / torch.where(both, depth, 1.0), torch.nan)
+    return ratio.nanmedian(-1, keepdim=True).values.nan_to_num(0.0)
 
 
 def watch(frames: Sequence[Frame], method: Method = TRACKING) -> Watched:

@@ -5,8 +5,9 @@ import re
 import pytest
 import torch
 
-from dhtorch.causes import CAUSES, NONE, TRACKING, decided, name_cause, turned, watch
+from dhtorch.causes import CAUSES, NONE, TRACKING, decided, name_cause, ray_lengths, turned, watch
 from dhtorch.evaluate.holdout import range_split
+from dhtorch.geometry import camera as cam
 from dhtorch.geometry.lookup import magnified
 from dhtorch.synthetic import SyntheticRoom
 from dhtorch.synthetic.depth_faults import mirrored
@@ -26,18 +27,29 @@ def watched(frames):
     return watch(frames, METHOD)
 
 
+def along_the_ray(depth):
+    camera = SyntheticRoom(hw=(180, 240), n_frames=1, supersample=1)[0].camera
+    return depth * ray_lengths(cam.resize(camera, (180, 240), (90, 120)), (90, 120))
+
+
+#: Fault → its kind, and how it is planted; an inverse of the sensor's own has no returns to be held against.
 FAULTS = {
-    "unit": lambda d: 1000 * d,
-    "mirrored": mirrored,
-    "rolled": lambda d: turned(d, 1),
-    "registration": lambda d: magnified(d, 1 / 1.35),
+    "unit": ("unit", lambda d: 1000 * d),
+    "mirrored": ("mirrored", mirrored),
+    "upside down": ("mirrored", lambda d: d.flip(-2)),
+    "rolled": ("rolled", lambda d: turned(d, 1)),
+    "registration": ("registration", lambda d: magnified(d, 1 / 1.35)),
+    "along the ray": ("along the ray", along_the_ray),
+    "inverse": ("inverse", lambda d: torch.where(d > 0, 7 / d.clamp_min(0.1), 0.0)),
 }
 
 
-@pytest.mark.parametrize("own", [True, False])
-@pytest.mark.parametrize("kind", FAULTS)
-def test_a_planted_fault_is_named(kind, own, frames, watched):
-    spoilt = [FAULTS[kind](frame.depth) for frame in frames]
+@pytest.mark.parametrize(
+    ("name", "own"), [(name, own) for name in FAULTS for own in (True, False) if (name, own) != ("inverse", True)]
+)
+def test_a_planted_fault_is_named(name, own, frames, watched):
+    kind, plant = FAULTS[name]
+    spoilt = [plant(frame.depth) for frame in frames]
     if own:
         shown, maps = [f.replace(depth=d) for f, d in zip(frames, spoilt, strict=True)], None
     else:
@@ -45,6 +57,13 @@ def test_a_planted_fault_is_named(kind, own, frames, watched):
     found = name_cause(shown, maps, method=METHOD, watched=watched)
     assert found.kind == kind
     assert found.n_pairs >= 4
+
+
+def test_a_fault_that_is_no_known_one_is_not_named_after_the_nearest(frames, watched):
+    """Depths that are bent are explained a little as lengths of rays or as inverse depth, and not by half."""
+    shown = [range_split(f, 2.0).replace(T_world_from_cam=None) for f in frames]
+    for power in (1.15, 0.7):
+        assert name_cause(shown, [f.depth**power for f in frames], method=METHOD, watched=watched).cause is None
 
 
 @pytest.mark.parametrize(("field", "bound"), [(1.6, ""), (0.65, ""), (2.2, "at least "), (0.5, "at most ")])

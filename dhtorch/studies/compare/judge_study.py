@@ -87,6 +87,8 @@ class Planted:
     spoil: Callable[[Tensor], Tensor] = lambda depth: depth
     lag: int = 0  # frames by which the maps come late
     focal: float = 1.0  # factor on the focal lengths that are told
+    ray: bool = False  # depth becomes the distance along the ray
+    told: bool = True  # of the sensor's own depth as well: nothing holds its order against another
 
 
 PLANTED: dict[str, Planted] = {
@@ -95,6 +97,9 @@ PLANTED: dict[str, Planted] = {
     "unit_m": Planted("unit", partial(scaled, factor=1e-3)),
     "unit_inch": Planted("unit", partial(scaled, factor=1 / 0.0254)),
     "mirrored": Planted("mirrored", mirrored),
+    "upside_down": Planted("mirrored", partial(torch.flip, dims=(-2,))),
+    "along_ray": Planted("along the ray", ray=True),
+    "inverse": Planted("inverse", lambda depth: torch.where(depth > 0, 3 / depth.clamp_min(1e-3), 0.0), told=False),
     "rolled_90": Planted("rolled", partial(causes.turned, quarters=1)),
     "rolled_180": Planted("rolled", partial(causes.turned, quarters=2)),
     "wide": Planted("registration", partial(magnified, factor=1 / 1.35)),
@@ -316,6 +321,8 @@ def _window_rows(scene: Scene, first: int, look: Callable[[int], Frame]) -> list
     rows = []
     for own in (True, False):
         for name, planted in PLANTED.items():
+            if own and not planted.told:
+                continue
             frames, maps = _planted(scene, around_it, first, planted, own)
             found = causes.name_cause(frames, maps, watched=watched)
             moved = _moved_px(frames, maps, around_it, first, found.pairs) if planted.kind else 0.0
@@ -331,15 +338,26 @@ def _planted(
 ) -> tuple[list[Frame], list[Tensor] | None]:
     shown, maps = [], []
     for k in range(first, first + WINDOW):
-        spoilt = fault.spoil(frames[k - fault.lag].depth)
+        seen = frames[k - fault.lag]
+        spoilt = fault.spoil(seen.depth)
         camera = frames[k].camera.replace(f=frames[k].camera.f * fault.focal)
         depth_camera = frames[k].depth_camera
         if depth_camera is not None:
             depth_camera = depth_camera.replace(f=depth_camera.f * fault.focal)
         frame = frames[k].replace(camera=camera, depth_camera=depth_camera)
+        over = _over_picture(seen)
+        if fault.ray:
+            spoilt = spoilt * _rays(seen.depth_camera, seen, spoilt)
+            over = over * _rays(None, seen, over)
         shown.append(frame.replace(depth=spoilt) if own else range_split(frame, scene.near))
-        maps.append(fault.spoil(_over_picture(frames[k - fault.lag])))
+        maps.append(fault.spoil(over))
     return shown, None if own else maps
+
+
+def _rays(camera: cam.Camera | None, frame: Frame, depth: Tensor) -> Tensor:
+    """Lengths of the rays through a map's pixels, of a camera of its own or of the picture's."""
+    hw = (depth.shape[-2], depth.shape[-1])
+    return causes.ray_lengths(camera or cam.resize(frame.camera, frame.hw, hw), hw)
 
 
 def _over_picture(frame: Frame, size: int = 320) -> Tensor:
