@@ -14,7 +14,6 @@ All costs are whole numbers: they depend on no order of summation, so not on bat
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -25,6 +24,7 @@ from dhtorch import native
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.camera import Camera
+from dhtorch.geometry.neighbours import window_sum
 from dhtorch.geometry.se3 import Pose
 from dhtorch.geometry.shapes import check
 from dhtorch.tree import Record, record
@@ -166,6 +166,12 @@ def turned(R: Tensor, ray: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def bilinear(image: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
     """Values (B, C, N) of pictures (B, C, H, W) at pixels (B, N, 2), and which lie inside (B, N). Gradient: to both."""
+    axes = uv.mT.contiguous()
+    if native.serves(image, axes) and image.dtype == axes.dtype == torch.float32:
+        found = image.new_empty(*image.shape[:2], uv.shape[1])
+        shown = torch.empty_like(axes[:, 0], dtype=torch.bool)
+        torch.ops.dhtorch.bilinear(image, axes, found, shown)
+        return found, shown
     H, W = image.shape[-2:]
     size = uv.new_tensor([W, H])
     inside = ((uv >= 0) & (uv <= size - 1)).all(-1)
@@ -439,81 +445,16 @@ def _compiled_fit(grey: Tensor, picture_1: Tensor, *places: Tensor, front: Tenso
     return Fit(step, contrast, noise, correlation, seen, motion.mT.unflatten(1, inside.shape[1:]))
 
 
-def smooth(q: Tensor, tolerance: Tensor, *, radius: int = 4) -> Tensor:
-    """Inverse depths (B, h, w), each the mean of those along its column, then along its row, up to ``radius`` away that
-    differ from it by no more than ``tolerance`` (B,) 1/m: planes stay what they are, and so do edges.
-
-    A window cannot see how its pixels scatter about their mean, so what is fitted by windows must be smooth within
-    them. Gradient: to q.
-    """
-    if native.serves(q, tolerance) and q.dtype == tolerance.dtype == torch.float32:
-        out = torch.empty_like(q)
-        torch.ops.dhtorch.smooth(q, tolerance, out, radius)
-        return out
-    near = tolerance[:, None, None]
-    for dim in (1, 2):
-        n = q.shape[dim]
-        total, count = q, torch.ones_like(q)
-        for k in range(1, min(radius, n - 1) + 1):
-            # a plane is kept where both sides are read: k before with k after
-            before, after = (_beside(q, dim, step) for step in (-k, k))
-            fine = ((before - q).abs() <= near) & ((after - q).abs() <= near)
-            total = total + torch.where(fine, before + after, 0.0)
-            count = count + torch.where(fine, 2.0, 0.0)
-        q = total / count
-    return q
-
-
-def _beside(q: Tensor, dim: int, step: int) -> Tensor:
-    """The value ``step`` further along ``dim``; infinite beyond the border."""
-    n = q.shape[dim]
-    none = torch.full_like(q.narrow(dim, 0, abs(step)), torch.inf)
-    if step > 0:
-        return torch.cat([q.narrow(dim, step, n - step), none], dim)
-    return torch.cat([none, q.narrow(dim, 0, n + step)], dim)
-
-
-def window_sum(x: Tensor, radius: int) -> Tensor:
-    """Sum (B, h, w) of the (2 radius + 1)² pixels around each, the border's repeated outside. Gradient: to x."""
-    for dim in (1, 2):
-        n, side = x.shape[dim], 2 * radius + 1
-        first, last = (x.narrow(dim, k, 1) for k in (0, n - 1))
-        part = torch.cat([first] * radius + [x] + [last] * radius, dim)  # sums of 1, 2, 4, … neighbours
-        x, width, begin = part.narrow(dim, 0, n), 1, 1
-        while 2 * width <= side:
-            length = part.shape[dim] - width
-            part = part.narrow(dim, 0, length) + part.narrow(dim, width, length)
-            width *= 2
-            if side & width:
-                x = x + part.narrow(dim, begin, n)
-                begin += width
-    return x
-
-
-def spread(q: Tensor, radius: int) -> Tensor:
-    """Largest minus smallest value (B, h, w) of a map in the window around each pixel. Gradient: none."""
-    q = q.detach()
-    return extreme(q, radius, torch.maximum) - extreme(q, radius, torch.minimum)
-
-
-def extreme(x: Tensor, radius: int, pick: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-    """What ``pick`` chooses of two, torch.maximum or torch.minimum, in the window around each pixel (B, h, w): of two
-    windows half as wide, and so on. Gradient: to x."""
-    for dim in (1, 2):
-        first, last = (x.narrow(dim, k, 1) for k in (0, x.shape[dim] - 1))
-        x, width = torch.cat([first] * radius + [x] + [last] * radius, dim), 1
-        while width < 2 * radius + 1:
-            more = min(width, 2 * radius + 1 - width)
-            length = x.shape[dim] - more
-            x, width = pick(x.narrow(dim, 0, length), x.narrow(dim, more, length)), width + more
-    return x
-
-
 def hidden(go: Travel, q: Tensor, tolerance: Tensor) -> Tensor:
     """Which pixels (B, h, w) of a map of inverse depths another one covers in view 1, nearer by more than
     ``tolerance`` (B,) 1/m. Gradient: none."""
     B, h, w = q.shape
     edge = max(h, w) // MARGIN
+    given = go.a, go.b[..., 0].contiguous(), go.c[:, 0].contiguous(), q.flatten(1), tolerance
+    if native.serves(*given) and all(x.dtype == torch.float32 for x in given):
+        covered = torch.empty_like(q, dtype=torch.bool)
+        torch.ops.dhtorch.hidden(*given, covered, rows=h + 2 * edge, columns=w + 2 * edge, margin=edge)
+        return covered
     index = go.cell(q.flatten(1), (h + 2 * edge, w + 2 * edge), edge)
     front = q.new_full((B, (h + 2 * edge) * (w + 2 * edge)), -1.0)
     front = front.scatter_reduce(1, index, q.flatten(1), "amax")
