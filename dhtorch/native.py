@@ -37,8 +37,9 @@ SOURCES = tuple(
 #: What the sources share.
 HEADER = Path(__file__).with_name("native_vectors.h")
 
-#: A product that is fused with a sum would round once where torch rounds twice.
-FLAGS = ("-O3", "-std=c++20", "-fPIC", "-shared", "-ffp-contract=off")
+#: A product that is fused with a sum would round once where torch rounds twice. Nobody asks whether an operation was
+#: invalid, so that roots and choices between numbers may be made in vectors; they stay what they are.
+FLAGS = ("-O3", "-std=c++20", "-fPIC", "-shared", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math")
 
 #: What ATEN_CPU_CAPABILITY may hold torch to → the level of x86-64 that has no wider vectors.
 _LEVELS = {"avx2": "x86-64-v3", "default": "x86-64-v2"}
