@@ -365,7 +365,12 @@ def _costs(base: sweep.Base, partners: list[Partner], q: Tensor) -> Tensor:
     for view, _, _, use in partners:
         if is_static(use) or bool(use.any()):
             sweep.add_costs(C, base, view, q, use)
-    return C.movedim(1, -1).contiguous()
+    if native.serves(q):
+        return C.movedim(1, -1)
+    last = C.new_empty(len(q), *shape, planes)
+    for pixels_last, planes_last in zip(C.flatten(2), last.flatten(1, 2), strict=True):
+        planes_last.copy_(pixels_last.t())  # of a matrix at once takes a quarter of what a permutation does
+    return last
 
 
 def _elsewhere(base: sweep.Base, partners: list[Partner], q: Tensor, step: Tensor) -> Tensor:

@@ -63,21 +63,15 @@ def smooth(q: Tensor, tolerance: Tensor, *, radius: int = 4) -> Tensor:
     near = tolerance[:, None, None]
     for dim in (1, 2):
         n = q.shape[dim]
-        total, count = q, torch.ones_like(q)
-        for k in range(1, min(radius, n - 1) + 1):
+        reach = min(radius, n - 1)
+        none = torch.full_like(q.narrow(dim, 0, reach), torch.inf)
+        wide = torch.cat([none, q, none], dim)
+        total, count = q, torch.zeros_like(q, dtype=torch.int16)
+        for k in range(1, reach + 1):
             # a plane is kept where both sides are read: k before with k after
-            before, after = (_beside(q, dim, step) for step in (-k, k))
-            fine = ((before - q).abs() <= near) & ((after - q).abs() <= near)
+            before, after = (wide.narrow(dim, reach + step, n) for step in (-k, k))
+            fine = torch.maximum((before - q).abs(), (after - q).abs()) <= near
             total = total + torch.where(fine, before + after, 0.0)
-            count = count + torch.where(fine, 2.0, 0.0)
-        q = total / count
+            count = count + fine.to(count.dtype)
+        q = total / (1 + 2 * count).to(q)
     return q
-
-
-def _beside(q: Tensor, dim: int, step: int) -> Tensor:
-    """The value ``step`` further along ``dim``; infinite beyond the border."""
-    n = q.shape[dim]
-    none = torch.full_like(q.narrow(dim, 0, abs(step)), torch.inf)
-    if step > 0:
-        return torch.cat([q.narrow(dim, step, n - step), none], dim)
-    return torch.cat([none, q.narrow(dim, 0, n + step)], dim)
