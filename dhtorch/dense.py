@@ -238,7 +238,7 @@ def pixels(anchor: Frame, hw: tuple[int, int]) -> Tensor:
     rows, columns = (torch.arange(n, device=anchor.camera.f.device).to(anchor.camera.f) for n in hw)
     scale = anchor.hw[0] / hw[0], anchor.hw[1] / hw[1]
     v, u = torch.meshgrid((rows + 0.5) * scale[0] - 0.5, (columns + 0.5) * scale[1] - 0.5, indexing="ij")
-    return torch.stack([u, v], -1).reshape(-1, 2)
+    return torch.stack([u, v]).flatten(1).mT  # each axis by itself in memory
 
 
 def resized(frame: Frame, size: int) -> tuple[Tensor, Camera]:
@@ -359,12 +359,16 @@ def _costs(base: sweep.Base, partners: list[Partner], q: Tensor) -> Tensor:
     """How badly every pixel fits all views at every plane, (B, h, w, D) uint8."""
     shape, planes = base.hw, q.shape[1]
     if native.serves(q):  # compiled code goes from pixel to pixel, torch from plane to plane
-        C = torch.zeros(len(q), *shape, planes, dtype=torch.uint8).movedim(-1, 1)
+        C = torch.empty(len(q), *shape, planes, dtype=torch.uint8).movedim(-1, 1)
     else:
-        C = torch.zeros(len(q), planes, *shape, dtype=torch.uint8, device=q.device)
+        C = torch.empty(len(q), planes, *shape, dtype=torch.uint8, device=q.device)
+    fresh = True
     for view, _, _, use in partners:
         if is_static(use) or bool(use.any()):
-            sweep.add_costs(C, base, view, q, use)
+            sweep.add_costs(C, base, view, q, use, fresh=fresh)
+            fresh = False
+    if fresh:
+        C.zero_()
     if native.serves(q):
         return C.movedim(1, -1)
     last = C.new_empty(len(q), *shape, planes)

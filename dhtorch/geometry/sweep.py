@@ -244,8 +244,10 @@ def add_costs(
     view: View,
     q: Tensor,  # (B, D)
     wanted: Tensor,  # (B,) bool, others cost UNSEEN everywhere
+    *,
+    fresh: bool = False,
 ) -> None:
-    """Add to C how badly every pixel fits a view at every plane.
+    """Add to C how badly every pixel fits a view at every plane; ``fresh``: C holds nothing yet.
 
     At most :data:`VIEWS` views fit into a byte. C may lie in memory with its planes last, as compiled code wants it
     (:mod:`dhtorch.native`). Memory: pictures of view 0's size, whatever D. Gradient: none.
@@ -255,8 +257,10 @@ def add_costs(
     given = base.code.flatten(1), seen.code, go.a, go.b[..., 0].contiguous(), go.c[:, 0].contiguous(), q.contiguous()
     last = C.movedim(1, -1)
     if native.serves(last, *given):
-        torch.ops.dhtorch.add_costs(last, *given, *seen.hw, seen.margin, UNSEEN)
+        torch.ops.dhtorch.add_costs(last, *given, *seen.hw, seen.margin, UNSEEN, fresh)
         return
+    if fresh:
+        C.zero_()
     for k in range(q.shape[1]):
         C[:, k] += misfit(base, seen, go, q[:, k, None]).to(torch.uint8).unflatten(-1, base.hw)
 
