@@ -4,14 +4,15 @@ as compiled code, for those who ask for it; nothing needs it.
     python -m dhtorch.native            compile ``native*.cpp``, with the system's C++ compiler, into the user's cache
     DHTORCH_NATIVE=1 python …           use it, in loader workers as well; or dhtorch.native.load() in a program
 
-``dhtorch.dense``, ``dhtorch.geometry.sweep``, ``pyramid``, ``lucas_kanade`` and ``affine`` ask here whether tensors may
-be handed over; where not (nothing was loaded, another device or type, under vmap, a compiler or a graph) they do the
-same in torch, which is the reference. The sweep then answers alike bit for bit and its fits up to rounding: no more than
-one gate in 200 differs, and 99 of 100 depths by less than a tenth of their sigma. A pyramid does up to one rounding of a
-grey value. The search and the registration do up to the rounding of sums over a window: half of the places that were
-searched for are equal and half of those that were registered lie within 1e-4 px, 99 of 100 lie within a tenth of their
-sigma, and no more than one verdict in 200 changes. Nothing is ever compiled or downloaded without the command above. The
-file in the cache is named after its sources, torch's version and the processor, whose widest vectors it uses.
+``dhtorch.dense``, ``dhtorch.geometry.sweep``, ``pyramid``, ``lucas_kanade`` and ``affine`` ask here whether tensors
+may be handed over; where not (nothing was loaded, another device or type, under vmap, a compiler or a graph) they do
+the same in torch, which is the reference. The sweep then answers alike bit for bit and its fits up to rounding: no
+more than one gate in 200 differs, and 99 of 100 depths by less than a tenth of their sigma. A pyramid does up to one
+rounding of a grey value. The search and the registration do up to the rounding of sums over a window: half of the
+places that were searched for are equal and half of those that were registered lie within 1e-4 px, 99 of 100 lie within
+a tenth of their sigma, and no more than one verdict in 200 changes. Nothing is ever compiled or downloaded without the
+command above. The file in the cache is named after its sources, torch's version and the processor, whose widest
+vectors it uses.
 """
 
 from __future__ import annotations
