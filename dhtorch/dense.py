@@ -25,7 +25,7 @@ from dhtorch.calibration import available, load
 from dhtorch.codes import Gate, PoseCode, Source, first_reason
 from dhtorch.evaluate.score_calibration import Calibration
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry import sweep
+from dhtorch.geometry import neighbours, sweep
 from dhtorch.geometry.covariance import median
 from dhtorch.geometry.filters import grey
 from dhtorch.geometry.se3 import Pose
@@ -238,7 +238,7 @@ def pixels(anchor: Frame, hw: tuple[int, int]) -> Tensor:
     rows, columns = (torch.arange(n, device=anchor.camera.f.device).to(anchor.camera.f) for n in hw)
     scale = anchor.hw[0] / hw[0], anchor.hw[1] / hw[1]
     v, u = torch.meshgrid((rows + 0.5) * scale[0] - 0.5, (columns + 0.5) * scale[1] - 0.5, indexing="ij")
-    return torch.stack([u, v], -1).reshape(-1, 2)
+    return torch.stack([u, v]).flatten(1).mT  # each axis by itself in memory
 
 
 def resized(frame: Frame, size: int) -> tuple[Tensor, Camera]:
@@ -359,13 +359,22 @@ def _costs(base: sweep.Base, partners: list[Partner], q: Tensor) -> Tensor:
     """How badly every pixel fits all views at every plane, (B, h, w, D) uint8."""
     shape, planes = base.hw, q.shape[1]
     if native.serves(q):  # compiled code goes from pixel to pixel, torch from plane to plane
-        C = torch.zeros(len(q), *shape, planes, dtype=torch.uint8).movedim(-1, 1)
+        C = torch.empty(len(q), *shape, planes, dtype=torch.uint8).movedim(-1, 1)
     else:
-        C = torch.zeros(len(q), planes, *shape, dtype=torch.uint8, device=q.device)
+        C = torch.empty(len(q), planes, *shape, dtype=torch.uint8, device=q.device)
+    fresh = True
     for view, _, _, use in partners:
         if is_static(use) or bool(use.any()):
-            sweep.add_costs(C, base, view, q, use)
-    return C.movedim(1, -1).contiguous()
+            sweep.add_costs(C, base, view, q, use, fresh=fresh)
+            fresh = False
+    if fresh:
+        C.zero_()
+    if native.serves(q):
+        return C.movedim(1, -1)
+    last = C.new_empty(len(q), *shape, planes)
+    for pixels_last, planes_last in zip(C.flatten(2), last.flatten(1, 2), strict=True):
+        planes_last.copy_(pixels_last.t())  # of a matrix at once takes a quarter of what a permutation does
+    return last
 
 
 def _elsewhere(base: sweep.Base, partners: list[Partner], q: Tensor, step: Tensor) -> Tensor:
@@ -384,15 +393,15 @@ def _fitted(base: sweep.Base, partners: list[Partner], start: Found, q: Tensor, 
     plane = q[:, 1] - q[:, 0]
     near = ALL_STEPS * plane[:, None, None]
     with torch.no_grad():
-        at = sweep.smooth(start.q, SURFACE * plane)
+        at = neighbours.smooth(start.q, SURFACE * plane)
         for _ in range(steps):
             moved = at + _joined(base, partners, at, plane)[0]
             at = torch.minimum(torch.maximum(moved, start.q - near), start.q + near).clamp_min(0)
-            at = sweep.smooth(at, SURFACE * plane)
+            at = neighbours.smooth(at, SURFACE * plane)
     step, found = _joined(base, partners, at, plane, last=True)
     if step.requires_grad:
         step = step / _slope(base, partners, at, plane)
-    edge = EDGE * sweep.spread(at, WINDOW)
+    edge = EDGE * neighbours.spread(at, WINDOW)
     own = found.own * (start.misfit / MISFIT).square() + edge.square()
     return found._replace(q=at + (step - step.detach()), own=own)
 
@@ -411,35 +420,62 @@ def _joined(
 ) -> tuple[Tensor, Fitted]:
     """The step (B, h, w) that the views together ask for at inverse depths ``at``, each by its own variance, and how
     well they fit there; what the motions add to that (``shared``) where it is the last. The gradient is the step's."""
-    total, weight, shared = (torch.zeros_like(at) for _ in range(3))
-    best = torch.full_like(at, -1)
-    seen = torch.zeros_like(at, dtype=torch.bool)
-    most = STEP * plane[:, None, None]
+    none = torch.zeros_like(at)
+    said = _Said(none, none.clone(), none.clone(), best=torch.full_like(at, -1), seen=torch.zeros_like(at).bool())
     for view, picture, fit, use in partners:
         one = sweep.fit_windows(base, view, picture, at)
         with torch.no_grad():
             here = one.seen & use[:, None, None] & ~sweep.hidden(sweep.travel(base, view), at, NEARER * plane)
-            own = (one.noise + GREY_NOISE**2) / (INDEPENDENT * one.contrast)
-            say = torch.where(here & (one.correlation > SAY), 1 / own, 0.0)
-            if last:
-                shared = shared + say * pose_variance(base, view, fit, at, one.motion)
-            weight, seen = weight + say, seen | here
-            best = torch.where(here, torch.maximum(best, one.correlation), best)
-        total = total + say * torch.minimum(torch.maximum(one.step, -most), most)
-    given = weight > 0
-    weight = torch.where(given, weight, 1.0)
+            moved = pose_variance(base, view, fit, at, one.motion) if last else None
+        said = _also(said, one, here, STEP * plane, moved)
+    given = said.weight > 0
+    weight = torch.where(given, said.weight, 1.0)
     infinite = torch.full_like(at, torch.inf)
-    own, shared = (torch.where(given, x / weight, infinite) for x in (torch.ones_like(at), shared))
-    return total / weight, Fitted(at, own, shared, best, seen)
+    own, shared = (torch.where(given, x / weight, infinite) for x in (torch.ones_like(at), said.shared))
+    return said.step / weight, Fitted(at, own, shared, said.best, said.seen)
+
+
+class _Said(NamedTuple):
+    """What some views said of every pixel, (B, h, w) each: sums of steps and of the motions' variances, by weight."""
+
+    step: Tensor
+    weight: Tensor
+    shared: Tensor
+    best: Tensor  # correlation
+    seen: Tensor  # bool
+
+
+def _also(said: _Said, one: sweep.Fit, here: Tensor, most: Tensor, moved: Tensor | None) -> _Said:
+    """What they said with one view more, where it sees pixels ``here`` (B, h, w): a step of at ``most`` (B,) 1/m, and
+    the variance by its motion if that is asked for."""
+    given = one.step, one.contrast, one.noise, one.correlation, here, most
+    if native.serves(*given, *said) and all(x.dtype == torch.float32 for x in (one.step, said.step, most)):
+        variance = most.new_empty(0) if moved is None else moved
+        torch.ops.dhtorch.weigh(*given, variance, *said, grey=GREY_NOISE**2, independent=INDEPENDENT, say=SAY)
+        return said
+    with torch.no_grad():
+        own = (one.noise + GREY_NOISE**2) / (INDEPENDENT * one.contrast)
+        say = torch.where(here & (one.correlation > SAY), 1 / own, 0.0)
+        shared = said.shared if moved is None else said.shared + say * moved
+        best = torch.where(here, torch.maximum(said.best, one.correlation), said.best)
+    limit = most[:, None, None]
+    step = said.step + say * torch.minimum(torch.maximum(one.step, -limit), limit)
+    return _Said(step, said.weight + say, shared, best, said.seen | here)
 
 
 def pose_variance(base: sweep.Base, view: sweep.View, fit: PoseFit, q: Tensor, motion: Tensor) -> Tensor:
     """Variance (B, h, w) of q, 1/m², by the motion's covariance."""
-    flat = q.flatten(1).clamp_min(1e-6)
-    there = zip(sweep.turned(view.T_1_from_0.R, base.ray), view.T_1_from_0.t.unbind(-1), strict=True)
-    x, y, z = (part / flat + t[:, None] for part, t in there)
     cov = fit.cov if fit.shutter is None else fit.shutter.cov
-    cov = torch.where(fit.ok[:, None, None], cov, 0.0).nan_to_num().to(z)
+    cov = torch.where(fit.ok[:, None, None], cov, 0.0).nan_to_num().to(q)
+    at, T = q.flatten(1), view.T_1_from_0
+    moved = motion.flatten(1, 2).mT.contiguous()
+    given = base.ray.mT.contiguous(), at, T.R, T.t, view.camera.f, cov.contiguous(), moved
+    if native.serves(*given) and all(x.dtype == torch.float32 for x in given):
+        variance = torch.empty_like(q)
+        torch.ops.dhtorch.pose_variance(*given, variance)
+        return variance
+    flat = at.clamp_min(1e-6)
+    x, y, z = (part / flat + t[:, None] for part, t in zip(sweep.turned(T.R, base.ray), T.t.unbind(-1), strict=True))
     du, dv = motion.flatten(1, 2).unbind(-1)
     share = 1 / (du * du + dv * dv).clamp_min(1e-12)
     # what a shift of the point does along the motion, as epipolar.point_jacobians, one number a tensor
@@ -501,13 +537,23 @@ def _gated(
     )
 
 
-def _returns(anchor: Frame, method: Method, hw: tuple[int, int]) -> Samples:
-    """What the sensor says at every pixel of a map of that size, (B, h, w) each."""
+class Returns(NamedTuple):
+    """What the sensor says at every pixel of a map, (B, h, w) each."""
+
+    depth: Tensor  # m
+    sigma: Tensor  # m
+    confidence: Tensor  # in [0, 1]
+    usable: Tensor  # bool
+
+
+def _returns(anchor: Frame, method: Method, hw: tuple[int, int]) -> Returns:
+    """What the sensor says at every pixel of a map of that size."""
     samples = method.backproject(anchor, pixels(anchor, hw))
-    return samples.map(lambda x: x.unflatten(1, hw))
+    told = samples.depth, samples.sigma, samples.confidence, samples.usable
+    return Returns(*(x.unflatten(1, hw) for x in told))
 
 
-def _judged(told: DepthMap, returns: Samples, near: Samples) -> DepthMap:
+def _judged(told: DepthMap, returns: Returns, near: Samples) -> DepthMap:
     """The sweep, silent where the sensor refutes it, and as unsure as the sensor is that the motions' metre is from."""
     usable, depth, sigma = returns.usable, returns.depth.detach(), returns.sigma.detach()
     sigma_told = told.sigma.detach()
@@ -525,9 +571,10 @@ def _judged(told: DepthMap, returns: Samples, near: Samples) -> DepthMap:
     return told.replace(sigma=sigma_told, gate=gate)
 
 
-def _joined_with(told: DepthMap, returns: Samples) -> DepthMap:
+def _joined_with(told: DepthMap, returns: Returns) -> DepthMap:
     """Returns of the sensor where they are usable, else the sweep where it answers."""
-    usable, keep = returns.usable, told.keep & ~returns.usable
+    usable = returns.usable
+    keep = told.keep & ~usable
     nan = torch.full_like(told.depth, torch.nan)
     return DepthMap(
         depth=torch.where(usable, returns.depth.to(nan), torch.where(keep, told.depth, nan)),

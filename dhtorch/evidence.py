@@ -21,7 +21,7 @@ from torch import Tensor
 
 from dhtorch import dense
 from dhtorch.codes import Flag
-from dhtorch.geometry import se3, sweep
+from dhtorch.geometry import neighbours, se3, sweep
 from dhtorch.geometry.camera import resize_pixels
 from dhtorch.geometry.lookup import nearest, nearest_index, pixels
 from dhtorch.geometry.shapes import check
@@ -232,8 +232,8 @@ def _filled(depth: Tensor) -> tuple[Tensor, Tensor]:
     """Inverse depth (B, h, w), holes filled by the mean around, and which pixels have windows with enough of it."""
     there = (depth > 0) & depth.isfinite()
     q = torch.where(there, 1 / depth.clamp_min(1e-6), 0.0)
-    count = sweep.window_sum(there.to(q), RADIUS)
-    mean = sweep.window_sum(q, RADIUS) / count.clamp_min(1)
+    count = neighbours.window_sum(there.to(q), RADIUS)
+    mean = neighbours.window_sum(q, RADIUS) / count.clamp_min(1)
     return torch.where(there, q, mean), there & (count >= FILLED * (2 * RADIUS + 1) ** 2)
 
 

@@ -12,7 +12,20 @@
 #include <memory>
 #include <vector>
 
+#ifdef __linux__
+#include <sys/mman.h>
+#endif
+
 namespace {
+
+// Ask for large pages where memory is about to be filled for the first time: small ones come one by one.
+inline void large_pages(void* from, size_t bytes) {
+#if defined(__linux__) && defined(MADV_HUGEPAGE)
+  constexpr uintptr_t PAGE = uintptr_t{1} << 21;
+  const uintptr_t at = reinterpret_cast<uintptr_t>(from), first = (at + PAGE - 1) & ~(PAGE - 1), end = (at + bytes) & ~(PAGE - 1);
+  if (first < end) madvise(reinterpret_cast<void*>(first), end - first, MADV_HUGEPAGE);
+#endif
+}
 
 inline int32_t bits(int32_t code) {  // of the lower 31, as count_bits: vectors have no such instruction everywhere
 #ifdef __AVX512VPOPCNTDQ__
@@ -26,16 +39,17 @@ inline int32_t bits(int32_t code) {  // of the lower 31, as count_bits: vectors 
 #endif
 }
 
-// Add to C (B, h, w, D) uint8 how badly each pixel fits at every plane. code_0 (B, N) and code_1 (B, rows * columns)
+// Add to C (B, h, w, D) uint8, or write into it where it is `fresh`, how badly each pixel fits at every plane. code_0 (B, N) and code_1 (B, rows * columns)
 // int32; a (B, 2, N), b (B, 2), c (B) and q (B, D) float32: pixels are seen at (a + q b) / (1 + q c), margin further in.
 void add_costs(Tensor C, Tensor code_0, Tensor code_1, Tensor a, Tensor b, Tensor c, Tensor q, int64_t rows,
-               int64_t columns, int64_t margin, int64_t unseen) {
+               int64_t columns, int64_t margin, int64_t unseen, bool fresh) {
   const int64_t B = q.size(0), D = q.size(1), N = code_0.size(1), M = code_1.size(1);
   const float inside = static_cast<float>(margin + 0.5), right = static_cast<float>(columns - 1),
               down = static_cast<float>(rows - 1);
   const int32_t width = static_cast<int32_t>(columns), none = static_cast<int32_t>(unseen);
   std::vector<float> scale(D), along(D), across(D);
   std::vector<int32_t> cell(D);
+  if (fresh) large_pages(data<uint8_t>(C), B * N * D);
   for (int64_t k = 0; k < B; ++k) {
     const float *bk = data<float>(b) + 2 * k, *qk = data<float>(q) + D * k, *ak = data<float>(a) + 2 * N * k;
     for (int64_t d = 0; d < D; ++d) {
@@ -66,7 +80,7 @@ void add_costs(Tensor C, Tensor code_0, Tensor code_1, Tensor a, Tensor b, Tenso
         at[d] = code < 0 ? none : bits(code ^ own);
       }
 #pragma GCC ivdep
-      for (int64_t d = 0; d < D; ++d) cost[d] = static_cast<uint8_t>(cost[d] + at[d]);
+      for (int64_t d = 0; d < D; ++d) cost[d] = static_cast<uint8_t>((fresh ? 0 : cost[d]) + at[d]);
     }
   }
 }
@@ -84,7 +98,9 @@ struct Surface {
 
   Surface(int64_t h, int64_t w, int64_t D, int64_t step, int64_t jump)
       : h(h), w(w), D(D), wide(D + 2), step(static_cast<Path>(step)), jump(static_cast<Path>(jump)), above(w * wide),
-        under(w * wide), left(wide), right(wide), low(w), half(new Two[h * w * D]), all(D) {}
+        under(w * wide), left(wide), right(wide), low(w), half(new Two[h * w * D]), all(D) {
+    large_pages(half.get(), h * w * D * sizeof(Two));
+  }
 
   // A path that begins has cost nothing; a step from beyond the ends costs more than any other.
   void begin(std::vector<Path>& paths) const {
@@ -338,7 +354,7 @@ void smooth(Tensor q, Tensor tolerance, Tensor out, int64_t radius) {
 STABLE_TORCH_LIBRARY(dhtorch, m) {
   m.def(
       "add_costs(Tensor(a!) C, Tensor code_0, Tensor code_1, Tensor a, Tensor b, Tensor c, Tensor q, int rows, "
-      "int columns, int margin, int unseen) -> ()");
+      "int columns, int margin, int unseen, bool fresh) -> ()");
   m.def(
       "surface(Tensor C, Tensor step, Tensor jump, Tensor(a!) plane, Tensor(b!) shift, Tensor(c!) cost, "
       "Tensor(d!) some) -> ()");

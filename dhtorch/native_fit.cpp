@@ -1,6 +1,6 @@
-// What dhtorch/geometry/sweep.py's fit_windows does in torch as an operator on torch's stable ABI: the same products and
-// sums in the same order, so that it answers alike bit for bit where torch reads pictures without fused products, and up
-// to rounding elsewhere. One thread, no gradient. Callers check shapes, types and that everything is contiguous; see
+// How dhtorch/dense.py fits a surface to another view, as operators on torch's stable ABI: the same products and sums in
+// the same order, fused where torch fuses them, so that they answer alike up to rounding, and here bit for bit but for the
+// correlation. One thread, no gradient. Callers check shapes, types and that everything is contiguous; see
 // dhtorch/native.py.
 
 #include <torch/csrc/stable/library.h>
@@ -18,23 +18,25 @@ constexpr int64_t RADIUS = 4;
 constexpr float LEAST_GAIN = 0.5f, MOST_GAIN = 2.0f, FLAT = 1e-8f;
 
 constexpr int64_t SIDE = 2 * RADIUS + 1, PRODUCTS = 9;
+constexpr int64_t SOME = 512;  // pixels that stay in cache meanwhile
 
 // Nine numbers, summed as sweep.window_sum does: one, and eight by halves.
 inline Vector nine(const Vector* x) {
   return x[0] + (((x[1] + x[2]) + (x[3] + x[4])) + ((x[5] + x[6]) + (x[7] + x[8])));
 }
 
-// A row of the picture that is fitted: where the other view shows each pixel, and the products of what it shows.
-struct Row {
-  int64_t w, H, W;
+// Pictures (channels, H, W) read at up to w places at once.
+struct Reader {
+  int64_t channels, H, W;
   std::vector<int32_t> first, right, down;
   std::vector<float> weight;  // (4, w)
-  std::vector<float> read;    // (3, w)
 
-  Row(int64_t w, int64_t H, int64_t W) : w(w), H(H), W(W), first(w), right(w), down(w), weight(4 * w), read(3 * w) {}
+  Reader(const Tensor& picture, int64_t w)
+      : channels(picture.size(1)), H(picture.size(2)), W(picture.size(3)), first(w), right(w), down(w), weight(4 * w) {}
 
-  // As F.grid_sample in its border mode, of places that went through its normalised coordinates.
-  void look(const float* picture, const float* u_of, const float* v_of) {
+  // As F.grid_sample in its border mode, of places that went through its normalised coordinates; channel after channel,
+  // `apart` numbers from each other.
+  void read(const float* picture, const float* u_of, const float* v_of, int64_t w, float* found, int64_t apart) {
     const float across = static_cast<float>(W), along = static_cast<float>(H);
     const int32_t wide = static_cast<int32_t>(W), last_u = wide - 1, last_v = static_cast<int32_t>(H) - 1;
     int32_t *__restrict at = first.data(), *__restrict aside = right.data(), *__restrict below = down.data();
@@ -61,9 +63,9 @@ struct Row {
       sw[x] = e_ * n_;
       se[x] = w_ * n_;
     }
-    for (int64_t k = 0; k < 3; ++k) {
+    for (int64_t k = 0; k < channels; ++k) {
       const float* plane = picture + k * H * W;
-      float* __restrict to = read.data() + k * w;
+      float* __restrict to = found + k * apart;
 #pragma GCC ivdep
       for (int64_t x = 0; x < w; ++x) {
         const float *here = plane + at[x], *under = here + below[x];
@@ -72,7 +74,28 @@ struct Row {
       }
     }
   }
+
+  // Whether places lie in the picture.
+  void within(const float* __restrict u, const float* __restrict v, int64_t w, bool* __restrict inside) const {
+    const float right = static_cast<float>(W - 1), down = static_cast<float>(H - 1);
+#pragma GCC ivdep
+    for (int64_t x = 0; x < w; ++x) inside[x] = (u[x] >= 0.0f) & (u[x] <= right) & (v[x] >= 0.0f) & (v[x] <= down);
+  }
 };
+
+// values (B, C, N) of picture (B, C, H, W) at uv (B, 2, N), float32, and which lie inside (B, N) bool.
+void bilinear(Tensor picture, Tensor uv, Tensor values, Tensor inside) {
+  const int64_t B = uv.size(0), N = uv.size(2), C = picture.size(1);
+  Reader reader(picture, SOME);
+  for (int64_t k = 0; k < B; ++k) {
+    const float *image = data<float>(picture) + k * C * reader.H * reader.W, *u = data<float>(uv) + 2 * k * N;
+    for (int64_t n = 0; n < N; n += SOME) {
+      const int64_t w = std::min(SOME, N - n);
+      reader.read(image, u + n, u + N + n, w, data<float>(values) + k * C * N + n, N);
+      reader.within(u + n, u + N + n, w, data<bool>(inside) + k * N + n);
+    }
+  }
+}
 
 // A pixel's window, in the nine means of it, tells how the pixel must move.
 struct Answers {
@@ -111,9 +134,9 @@ void fit_windows(Tensor grey, Tensor picture, Tensor uv, Tensor further, Tensor 
                  Tensor noise, Tensor correlation, Tensor inside, Tensor motion) {
   const int64_t B = grey.size(0), h = grey.size(2), w = grey.size(3), H = picture.size(2), W = picture.size(3), N = h * w;
   const int64_t wide = (w + LANES - 1) / LANES * LANES, padded = wide + 2 * RADIUS + LANES;
-  const float share = static_cast<float>(1.0 / (SIDE * SIDE)), right = static_cast<float>(W - 1), down = static_cast<float>(H - 1);
-  std::vector<float> ring(SIDE * PRODUCTS * wide), column(padded), mean(PRODUCTS * wide);
-  Row row(w, H, W);
+  const float share = static_cast<float>(1.0 / (SIDE * SIDE));
+  std::vector<float> ring(SIDE * PRODUCTS * wide), column(padded), mean(PRODUCTS * wide), seen(3 * w);
+  Reader reader(picture, w);
   for (int64_t k = 0; k < B; ++k) {
     const float* image = data<float>(grey) + k * N;
     const float *here = data<float>(uv) + 2 * k * N, *there = data<float>(further) + 2 * k * N;
@@ -124,16 +147,15 @@ void fit_windows(Tensor grey, Tensor picture, Tensor uv, Tensor further, Tensor 
       for (; next <= std::min(y + RADIUS, h - 1); ++next) {
         const float *u = here + next * w, *v = u + N, *u_then = there + next * w, *v_then = u_then + N;
         const float* __restrict I = image + next * w;
-        row.look(data<float>(picture) + 3 * k * H * W, u, v);
+        reader.read(data<float>(picture) + 3 * k * H * W, u, v, w, seen.data(), w);
+        reader.within(u, v, w, data<bool>(inside) + k * N + next * w);
         float *__restrict right_by = data<float>(motion) + 2 * k * N + next * w, *__restrict down_by = right_by + N;
-        bool* __restrict shown = data<bool>(inside) + k * N + next * w;
 #pragma GCC ivdep
         for (int64_t x = 0; x < w; ++x) {
           right_by[x] = (u_then[x] - u[x]) / by;
           down_by[x] = (v_then[x] - v[x]) / by;
-          shown[x] = (u[x] >= 0.0f) & (u[x] <= right) & (v[x] >= 0.0f) & (v[x] <= down);
         }
-        const float *__restrict J = row.read.data(), *__restrict du = J + w, *__restrict dv = du + w;
+        const float *__restrict J = seen.data(), *__restrict du = J + w, *__restrict dv = du + w;
         float* __restrict to = ring.data() + next % SIDE * PRODUCTS * wide;
 #pragma GCC ivdep
         for (int64_t x = 0; x < w; ++x) {
@@ -174,12 +196,141 @@ void fit_windows(Tensor grey, Tensor picture, Tensor uv, Tensor further, Tensor 
   }
 }
 
+// covered (B, N) bool: which of the inverse depths q (B, N) another covers, nearer by more than `tolerance` (B), where pixels
+// are seen at (a + q b) / (1 + q c), margin further in, of rows * columns; a (B, 2, N), b (B, 2), c (B) float32.
+void hidden(Tensor a, Tensor b, Tensor c, Tensor q, Tensor tolerance, Tensor covered, int64_t rows, int64_t columns,
+            int64_t margin) {
+  const int64_t B = q.size(0), N = q.size(1);
+  const float inside = static_cast<float>(margin + 0.5), right = static_cast<float>(columns - 1),
+              down = static_cast<float>(rows - 1);
+  const int32_t width = static_cast<int32_t>(columns);
+  std::vector<float> nearest(rows * columns);
+  std::vector<int32_t> cell(N);
+  for (int64_t k = 0; k < B; ++k) {
+    const float *__restrict u_0 = data<float>(a) + 2 * k * N, *__restrict v_0 = u_0 + N, *__restrict own = data<float>(q) + k * N;
+    const float u_by = data<float>(b)[2 * k], v_by = data<float>(b)[2 * k + 1], z_by = data<float>(c)[k];
+    int32_t* __restrict at = cell.data();
+#pragma GCC ivdep
+    for (int64_t n = 0; n < N; ++n) {
+      const float z = 1.0f + own[n] * z_by, scale = z > 1e-3f ? 1.0f / z : 1e9f;
+      float u = (u_0[n] + own[n] * u_by) * scale + inside, v = (v_0[n] + own[n] * v_by) * scale + inside;
+      u = u > 0.0f ? u : 0.0f;
+      v = v > 0.0f ? v : 0.0f;
+      u = u < right ? u : right;
+      v = v < down ? v : down;
+      at[n] = static_cast<int32_t>(v) * width + static_cast<int32_t>(u);
+    }
+    std::fill(nearest.begin(), nearest.end(), -1.0f);
+    for (int64_t n = 0; n < N; ++n) nearest[at[n]] = std::max(nearest[at[n]], own[n]);
+    const float more = data<float>(tolerance)[k], *front = nearest.data();
+    bool* __restrict to = data<bool>(covered) + k * N;
+#pragma GCC ivdep
+    for (int64_t n = 0; n < N; ++n) to[n] = front[at[n]] > own[n] + more;
+  }
+}
+
+// variance (B, N) of q (B, N) on rays (B, 3, N) that a motion R (B, 9), t (B, 3) moves by (B, 2, N) px a step of q, from the
+// motion's covariance (B, K, K), K 6, or 9 with a shutter's turn; f (B, 2). Callers hand over what a pixel's row is at most.
+void pose_variance(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor f, Tensor cov, Tensor moved, Tensor variance) {
+  const int64_t B = q.size(0), N = q.size(1), K = cov.size(1);
+  float row[9][SOME], carried[SOME];
+  for (int64_t k = 0; k < B; ++k) {
+    const float *m = data<float>(R) + 9 * k, *tk = data<float>(t) + 3 * k, *C = data<float>(cov) + K * K * k;
+    const float f_u = data<float>(f)[2 * k], f_v = data<float>(f)[2 * k + 1];
+    const float *__restrict ax = data<float>(ray) + 3 * N * k, *__restrict ay = ax + N, *__restrict az = ay + N;
+    const float *__restrict own = data<float>(q) + N * k, *__restrict u_by = data<float>(moved) + 2 * N * k;
+    const float* __restrict v_by = u_by + N;
+    for (int64_t first = 0; first < N; first += SOME) {
+      const int64_t some = std::min(SOME, N - first);
+#pragma GCC ivdep
+      for (int64_t i = 0; i < some; ++i) {
+        const int64_t n = first + i;
+        const float a = ax[n], b = ay[n], d = az[n], flat = own[n] < 1e-6f ? 1e-6f : own[n];
+        const float x = (a * m[0] + b * m[1] + d * m[2]) / flat + tk[0];
+        const float y = (a * m[3] + b * m[4] + d * m[5]) / flat + tk[1];
+        const float z = (a * m[6] + b * m[7] + d * m[8]) / flat + tk[2];
+        const float length = u_by[n] * u_by[n] + v_by[n] * v_by[n], share = 1.0f / (length < 1e-12f ? 1e-12f : length);
+        const float inv_z = 1.0f / (std::abs(z) < 1e-9f ? 1e-9f : z);
+        const float gx = f_u * inv_z * u_by[n] * share, gy = f_v * inv_z * v_by[n] * share;
+        const float gz = -(gx * x + gy * y) * inv_z;
+        row[0][i] = y * gz - z * gy;
+        row[1][i] = z * gx - x * gz;
+        row[2][i] = x * gy - y * gx;
+        row[3][i] = gx;
+        row[4][i] = gy;
+        row[5][i] = gz;
+        for (int64_t p = 0; p < 3; ++p) row[6 + p][i] = row[p][i] * b;
+      }
+      float* __restrict to = data<float>(variance) + N * k + first;
+      std::fill_n(to, some, 0.0f);
+      for (int64_t p = 0; p < K; ++p) {
+        for (int64_t i = 0; i < some; ++i) carried[i] = row[0][i] * C[p];
+        for (int64_t r = 1; r < K; ++r) {
+          for (int64_t i = 0; i < some; ++i) carried[i] = fused(row[r][i], C[r * K + p], carried[i]);
+        }
+        for (int64_t i = 0; i < some; ++i) to[i] = fused(carried[i], row[p][i], to[i]);
+      }
+      for (int64_t i = 0; i < some; ++i) to[i] = to[i] < 0.0f ? 0.0f : to[i];
+    }
+  }
+}
+
+// Add to total, weight and, if there is a variance, to shared what a view says, and to best and seen how well it
+// fits, all (B, h, w): step, contrast, noise, correlation of Fit, and whether it sees the pixel, `here`; most (B) of a step.
+// grey: a pixel's own variance; independent pixels of a window; `say`: correlation from which on it has one.
+void weigh(Tensor step, Tensor contrast, Tensor noise, Tensor correlation, Tensor here, Tensor most, Tensor variance,
+           Tensor total, Tensor weight, Tensor shared, Tensor best, Tensor seen, double grey, double independent, double say) {
+  const int64_t B = step.size(0), N = step.size(1) * step.size(2);
+  const bool motion = variance.size(0) == B;
+  const float least = static_cast<float>(grey), count = static_cast<float>(independent), from = static_cast<float>(say);
+  for (int64_t k = 0; k < B; ++k) {
+    const int64_t at = k * N;
+    const float *__restrict move = data<float>(step) + at, *__restrict clear = data<float>(contrast) + at;
+    const float *__restrict left = data<float>(noise) + at, *__restrict alike = data<float>(correlation) + at;
+    const bool* __restrict shown = data<bool>(here) + at;
+    const float limit = data<float>(most)[k];
+    float *__restrict sum = data<float>(total) + at, *__restrict all = data<float>(weight) + at;
+    float* __restrict top = data<float>(best) + at;
+    bool* __restrict any = data<bool>(seen) + at;
+    const float* __restrict wide = data<float>(variance) + (motion ? at : 0);
+    float* __restrict common = data<float>(shared) + at;
+    for (int64_t n = 0; n < N; ++n) {
+      const float own = (left[n] + least) / (count * clear[n]);
+      const float now = (shown[n] & (alike[n] > from)) ? 1.0f / own : 0.0f;
+      float by = move[n] < -limit ? -limit : move[n];
+      by = by > limit ? limit : by;
+      sum[n] = sum[n] + now * by;
+      all[n] = all[n] + now;
+      top[n] = (shown[n] & (alike[n] > top[n])) ? alike[n] : top[n];
+      any[n] = any[n] | shown[n];
+      if (motion) common[n] = common[n] + now * wide[n];
+    }
+  }
+}
+
 }  // namespace
 
 STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
+  m.def("bilinear(Tensor picture, Tensor uv, Tensor(a!) values, Tensor(b!) inside) -> ()");
+  m.def(
+      "hidden(Tensor a, Tensor b, Tensor c, Tensor q, Tensor tolerance, Tensor(a!) covered, int rows, int columns, "
+      "int margin) -> ()");
+  m.def(
+      "pose_variance(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor f, Tensor cov, Tensor moved, Tensor(a!) variance) "
+      "-> ()");
+  m.def(
+      "weigh(Tensor step, Tensor contrast, Tensor noise, Tensor correlation, Tensor here, Tensor most, Tensor variance, "
+      "Tensor(a!) total, Tensor(b!) weight, Tensor(c!) shared, Tensor(d!) best, Tensor(e!) seen, float grey, "
+      "float independent, float say) -> ()");
   m.def(
       "fit_windows(Tensor grey, Tensor picture, Tensor uv, Tensor further, Tensor little, Tensor(a!) step, "
       "Tensor(b!) contrast, Tensor(c!) noise, Tensor(d!) correlation, Tensor(e!) inside, Tensor(f!) motion) -> ()");
 }
 
-STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) { m.impl("fit_windows", TORCH_BOX(&fit_windows)); }
+STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) {
+  m.impl("bilinear", TORCH_BOX(&bilinear));
+  m.impl("fit_windows", TORCH_BOX(&fit_windows));
+  m.impl("hidden", TORCH_BOX(&hidden));
+  m.impl("pose_variance", TORCH_BOX(&pose_variance));
+  m.impl("weigh", TORCH_BOX(&weigh));
+}

@@ -10,15 +10,18 @@ import pytest
 import torch
 from torch.autograd import forward_ad
 
-from dhtorch import native
-from dhtorch.geometry import affine, least_squares, pyramid, se3, sweep
+from dhtorch import WINDOW, dense, native
+from dhtorch.codes import PoseCode, Source
+from dhtorch.evaluate.holdout import range_split
+from dhtorch.geometry import affine, least_squares, neighbours, pyramid, se3, sweep
 from dhtorch.geometry import lucas_kanade as lk
 from dhtorch.geometry.camera import Camera
 from dhtorch.geometry.filters import gaussian
-from dhtorch.records import NO_HINT, Frame, TrackHint
+from dhtorch.records import NO_HINT, Frame, PoseFit, Shutter, TrackHint
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.holes import classify, min_eigenvalue
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
+from dhtorch.synthetic import SyntheticRoom
 
 COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
 needs_compiler = pytest.mark.skipif(COMPILER is None or sys.platform == "win32", reason="no C++ compiler here")
@@ -192,7 +195,7 @@ def test_places_codes_and_smooth_maps_are_equal(loaded, monkeypatch, turning):
     assert torch.equal(found[0], expected[0]) and torch.equal(found[1], expected[1]) and not bool(found[1].all())
     for shape in ((2, 30, 17), (2, 3, 5), (2, 1, 1)):
         q = torch.rand(*shape, generator=g)
-        smooth = both_ways(lambda q=q: sweep.smooth(q, torch.tensor([0.2, 0.5])), monkeypatch)
+        smooth = both_ways(lambda q=q: neighbours.smooth(q, torch.tensor([0.2, 0.5])), monkeypatch)
         assert torch.equal(*smooth)
 
 
@@ -220,6 +223,53 @@ def test_fitted_windows_agree_up_to_rounding(loaded, monkeypatch, lens, hw):
         scale = b.abs().flatten(1).mean(1).clamp_min(1e-6)[:, None]
         assert a.shape == b.shape and ((a - b).flatten(1).abs() <= 1e-4 * (scale + b.flatten(1).abs())).all(), name
     assert found.correlation[:2].abs().mean() > 0.05
+
+
+@needs_compiler
+@pytest.mark.parametrize("turning", [False, True])
+def test_what_hides_and_how_sure_motions_are_agrees(loaded, monkeypatch, turning):
+    g = torch.Generator().manual_seed(8)
+    grey = torch.rand(2, 1, 13, 50, generator=g)
+    camera = Camera(torch.tensor([[40.0, 41.0], [35.0, 35.0]]), torch.tensor([[24.5, 6.0], [21.0, 5.5]]))
+    T = se3.exp(torch.tensor([[0.02, -0.1, 0.2, -0.6, 0.1, 0.05], [0.0, 0.0, 0.0, 0.1, 0.0, -1.4]]))
+    base, view = sweep.base(grey, camera), sweep.View(grey, camera, T)
+    q = torch.rand(2, 13, 50, generator=g)
+    near = torch.tensor([0.01, 0.3])
+    found, expected = both_ways(lambda: sweep.hidden(sweep.travel(base, view), q, near), monkeypatch)
+    assert torch.equal(found, expected) and 0.05 < found.float().mean() < 0.9
+    half = torch.randn(2, 9 if turning else 6, 9 if turning else 6, generator=g)
+    cov = 1e-4 * half @ half.mT
+    none = torch.zeros(2)
+    shutter = Shutter(torch.zeros(2, 3), cov) if turning else None
+    code = torch.tensor([PoseCode.OK, PoseCode.KEPT_PNP], dtype=torch.int32)
+    fit = PoseFit(T, cov[:, :6, :6], none[:, None] > 1, none.long(), none, none, none, code, shutter)
+    motion = torch.randn(2, 13, 50, 2, generator=g)
+    motion[0, :2] = 0.0
+    found, expected = both_ways(lambda: dense.pose_variance(base, view, fit, q, motion), monkeypatch)
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=0.0)
+    for code in (PoseCode.OK, PoseCode.TOO_FEW):
+        lost = fit.replace(code=torch.full_like(fit.code, code), cov=fit.cov * torch.nan, shutter=None)
+        a, b = both_ways(lambda lost=lost: dense.pose_variance(base, view, lost, q, motion), monkeypatch)
+        assert torch.equal(a, b) and not a.any(), "what is not known is no number"
+
+
+@needs_compiler
+@pytest.mark.parametrize("partners", [1, 2])
+def test_maps_agree_to_far_less_than_their_sigma(loaded, monkeypatch, partners):
+    room = SyntheticRoom(n_frames=9, hw=(96, 128), depth_hw=(48, 64))
+    anchor, *others = (range_split(room[k], 2.0) for k in (1, 6, 8))
+    with monkeypatch.context() as patch:
+        patch.setattr(native, "_loaded", [])
+        trace = {}
+        asked = dense.views_asked(WINDOW(anchor, others, trace=trace), others, trace)
+    found, expected = both_ways(
+        lambda: dense.swept(anchor, asked, partners=partners, planes=48, max_sigma_rel=0.5), monkeypatch
+    )
+    assert (found.gate != expected.gate).float().mean() <= 0.005 and torch.equal(found.gate == 0, found.depth > 0)
+    both = (found.source == Source.SWEPT) & (expected.source == Source.SWEPT)
+    assert both.float().mean() > 0.1
+    assert ((found.depth - expected.depth)[both].abs() / expected.sigma[both]).quantile(0.99) <= 0.1
+    torch.testing.assert_close(found.sigma[both].median(), expected.sigma[both].median(), rtol=1e-3, atol=0.0)
 
 
 @needs_compiler

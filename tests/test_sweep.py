@@ -5,7 +5,7 @@ import itertools
 import pytest
 import torch
 
-from dhtorch.geometry import se3, sweep
+from dhtorch.geometry import neighbours, se3, sweep
 from dhtorch.geometry.camera import Camera
 from dhtorch.geometry.filters import gaussian
 
@@ -136,7 +136,7 @@ def test_windows_are_fitted_to_walls_that_recede_and_to_other_light(slope, light
     view = view.replace(image=light[0] * view.image + light[1])
     q = truth + 0.01 + 0.01 * torch.randn(truth.shape, generator=generator())  # a quarter of a pixel, and noise
     for _ in range(4):
-        q = sweep.smooth(q, torch.tensor([0.05]))
+        q = neighbours.smooth(q, torch.tensor([0.05]))
         fit = sweep.fit_windows(base, view, sweep.with_gradients(view.image), q)
         q = q + fit.step.clamp(-0.05, 0.05)
     inner = slice(None), slice(16, -16), slice(24, -24)
@@ -160,11 +160,11 @@ def test_what_the_step_says_of_the_pictures_is_the_derivative_of_the_depth_that_
 def test_planes_and_edges_stay_when_a_map_is_smoothed():
     v, u = torch.meshgrid(torch.arange(20.0), torch.arange(30.0), indexing="ij")
     slope = (0.3 + 0.01 * u - 0.005 * v)[None].double()
-    torch.testing.assert_close(sweep.smooth(slope, torch.tensor([0.1])), slope)
+    torch.testing.assert_close(neighbours.smooth(slope, torch.tensor([0.1])), slope)
     step = torch.where(u < 15, 0.3, 0.8)[None]
-    torch.testing.assert_close(sweep.smooth(step, torch.tensor([0.1])), step)
+    torch.testing.assert_close(neighbours.smooth(step, torch.tensor([0.1])), step)
     noisy = 0.5 + 0.02 * torch.randn(1, 40, 50, generator=generator())
-    assert float(sweep.smooth(noisy, torch.tensor([0.2])).std()) < 0.3 * float(noisy.std())
+    assert float(neighbours.smooth(noisy, torch.tensor([0.2])).std()) < 0.3 * float(noisy.std())
 
 
 def test_what_a_nearer_surface_covers_is_hidden():
@@ -208,7 +208,7 @@ def test_windows_are_summed_and_their_spread_is_known():
     q = torch.rand(2, 9, 11, generator=generator(), dtype=torch.float64)
     padded = torch.nn.functional.pad(q[:, None], (4, 4, 4, 4), mode="replicate")[:, 0]
     for radius in (1, 2, 4):
-        total, spread = sweep.window_sum(q, radius), sweep.spread(q, radius)
+        total, spread = neighbours.window_sum(q, radius), neighbours.spread(q, radius)
         for i, j in itertools.product((0, 4, 8), (0, 5, 10)):
             window = padded[:, 4 + i - radius : 5 + i + radius, 4 + j - radius : 5 + j + radius].flatten(1)
             torch.testing.assert_close(total[:, i, j], window.sum(-1))

@@ -14,7 +14,6 @@ All costs are whole numbers: they depend on no order of summation, so not on bat
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -25,6 +24,7 @@ from dhtorch import native
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.camera import Camera
+from dhtorch.geometry.neighbours import window_sum
 from dhtorch.geometry.se3 import Pose
 from dhtorch.geometry.shapes import check
 from dhtorch.tree import Record, record
@@ -166,6 +166,12 @@ def turned(R: Tensor, ray: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def bilinear(image: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
     """Values (B, C, N) of pictures (B, C, H, W) at pixels (B, N, 2), and which lie inside (B, N). Gradient: to both."""
+    axes = uv.mT.contiguous()
+    if native.serves(image, axes) and image.dtype == axes.dtype == torch.float32:
+        found = image.new_empty(*image.shape[:2], uv.shape[1])
+        shown = torch.empty_like(axes[:, 0], dtype=torch.bool)
+        torch.ops.dhtorch.bilinear(image, axes, found, shown)
+        return found, shown
     H, W = image.shape[-2:]
     size = uv.new_tensor([W, H])
     inside = ((uv >= 0) & (uv <= size - 1)).all(-1)
@@ -227,7 +233,8 @@ def misfit(base: Base, seen: Level, go: Travel, q: Tensor) -> Tensor:
     does not show them. Gradient: none."""
     code = seen.code.gather(1, go.cell(q, seen.hw, seen.margin))
     count = count_bits(code ^ base.code.flatten(1))
-    return count.masked_fill_(code < 0, UNSEEN)
+    unseen = code.bitwise_right_shift(31)  # all bits or none; masks take three times as long
+    return count.add_(unseen.bitwise_and_(UNSEEN - count))
 
 
 @torch.no_grad()
@@ -237,8 +244,10 @@ def add_costs(
     view: View,
     q: Tensor,  # (B, D)
     wanted: Tensor,  # (B,) bool, others cost UNSEEN everywhere
+    *,
+    fresh: bool = False,
 ) -> None:
-    """Add to C how badly every pixel fits a view at every plane.
+    """Add to C how badly every pixel fits a view at every plane; ``fresh``: C holds nothing yet.
 
     At most :data:`VIEWS` views fit into a byte. C may lie in memory with its planes last, as compiled code wants it
     (:mod:`dhtorch.native`). Memory: pictures of view 0's size, whatever D. Gradient: none.
@@ -248,8 +257,10 @@ def add_costs(
     given = base.code.flatten(1), seen.code, go.a, go.b[..., 0].contiguous(), go.c[:, 0].contiguous(), q.contiguous()
     last = C.movedim(1, -1)
     if native.serves(last, *given):
-        torch.ops.dhtorch.add_costs(last, *given, *seen.hw, seen.margin, UNSEEN)
+        torch.ops.dhtorch.add_costs(last, *given, *seen.hw, seen.margin, UNSEEN, fresh)
         return
+    if fresh:
+        C.zero_()
     for k in range(q.shape[1]):
         C[:, k] += misfit(base, seen, go, q[:, k, None]).to(torch.uint8).unflatten(-1, base.hw)
 
@@ -282,7 +293,7 @@ def _both_ways(C: Tensor, S: Tensor, dim: int, step: Tensor, jump: Tensor) -> No
     for k in range(n):
         now = path[..., 1:-1]
         if k:
-            low = now.amin(-1, keepdim=True)
+            low = _least(now)
             best = torch.minimum(path[..., :D], path[..., 2:]).add_(step)
             best = torch.minimum(torch.minimum(best, now), low + jump)
             now.copy_(best.sub_(low))
@@ -290,6 +301,15 @@ def _both_ways(C: Tensor, S: Tensor, dim: int, step: Tensor, jump: Tensor) -> No
             now[1].add_(C.select(dim, n - 1 - k))
         S.select(dim, k).add_(now[0])
         S.select(dim, n - 1 - k).add_(now[1])
+
+
+def _least(x: Tensor) -> Tensor:
+    """The smallest along the last axis, which stays: by halves, as long as that is faster."""
+    n = x.shape[-1]
+    while n > 16:
+        half = (n + 1) // 2
+        x, n = torch.minimum(x[..., :half], x[..., n - half :]), half
+    return x.amin(-1, keepdim=True)
 
 
 class Winner(NamedTuple):
@@ -309,7 +329,7 @@ def winner(S: Tensor) -> Winner:
 def _winner(S: Tensor) -> tuple[Tensor, ...]:
     D = S.shape[-1]
     plane = torch.arange(D, dtype=torch.int32, device=S.device)
-    both = (S.to(torch.int32) * D + plane).amin(-1)  # the least cost, and of equals the first
+    both = _least(S.to(torch.int32).mul_(D).add_(plane))[..., 0]  # the least cost, and of equals the first
     index, cost = (both % D).long(), both // D
     centre = index.clamp(1, D - 2)
     low, middle, high = (S.gather(-1, (centre + o)[..., None])[..., 0].float() for o in (-1, 0, 1))
@@ -439,81 +459,16 @@ def _compiled_fit(grey: Tensor, picture_1: Tensor, *places: Tensor, front: Tenso
     return Fit(step, contrast, noise, correlation, seen, motion.mT.unflatten(1, inside.shape[1:]))
 
 
-def smooth(q: Tensor, tolerance: Tensor, *, radius: int = 4) -> Tensor:
-    """Inverse depths (B, h, w), each the mean of those along its column, then along its row, up to ``radius`` away that
-    differ from it by no more than ``tolerance`` (B,) 1/m: planes stay what they are, and so do edges.
-
-    A window cannot see how its pixels scatter about their mean, so what is fitted by windows must be smooth within
-    them. Gradient: to q.
-    """
-    if native.serves(q, tolerance) and q.dtype == tolerance.dtype == torch.float32:
-        out = torch.empty_like(q)
-        torch.ops.dhtorch.smooth(q, tolerance, out, radius)
-        return out
-    near = tolerance[:, None, None]
-    for dim in (1, 2):
-        n = q.shape[dim]
-        total, count = q, torch.ones_like(q)
-        for k in range(1, min(radius, n - 1) + 1):
-            # a plane is kept where both sides are read: k before with k after
-            before, after = (_beside(q, dim, step) for step in (-k, k))
-            fine = ((before - q).abs() <= near) & ((after - q).abs() <= near)
-            total = total + torch.where(fine, before + after, 0.0)
-            count = count + torch.where(fine, 2.0, 0.0)
-        q = total / count
-    return q
-
-
-def _beside(q: Tensor, dim: int, step: int) -> Tensor:
-    """The value ``step`` further along ``dim``; infinite beyond the border."""
-    n = q.shape[dim]
-    none = torch.full_like(q.narrow(dim, 0, abs(step)), torch.inf)
-    if step > 0:
-        return torch.cat([q.narrow(dim, step, n - step), none], dim)
-    return torch.cat([none, q.narrow(dim, 0, n + step)], dim)
-
-
-def window_sum(x: Tensor, radius: int) -> Tensor:
-    """Sum (B, h, w) of the (2 radius + 1)² pixels around each, the border's repeated outside. Gradient: to x."""
-    for dim in (1, 2):
-        n, side = x.shape[dim], 2 * radius + 1
-        first, last = (x.narrow(dim, k, 1) for k in (0, n - 1))
-        part = torch.cat([first] * radius + [x] + [last] * radius, dim)  # sums of 1, 2, 4, … neighbours
-        x, width, begin = part.narrow(dim, 0, n), 1, 1
-        while 2 * width <= side:
-            length = part.shape[dim] - width
-            part = part.narrow(dim, 0, length) + part.narrow(dim, width, length)
-            width *= 2
-            if side & width:
-                x = x + part.narrow(dim, begin, n)
-                begin += width
-    return x
-
-
-def spread(q: Tensor, radius: int) -> Tensor:
-    """Largest minus smallest value (B, h, w) of a map in the window around each pixel. Gradient: none."""
-    q = q.detach()
-    return extreme(q, radius, torch.maximum) - extreme(q, radius, torch.minimum)
-
-
-def extreme(x: Tensor, radius: int, pick: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-    """What ``pick`` chooses of two, torch.maximum or torch.minimum, in the window around each pixel (B, h, w): of two
-    windows half as wide, and so on. Gradient: to x."""
-    for dim in (1, 2):
-        first, last = (x.narrow(dim, k, 1) for k in (0, x.shape[dim] - 1))
-        x, width = torch.cat([first] * radius + [x] + [last] * radius, dim), 1
-        while width < 2 * radius + 1:
-            more = min(width, 2 * radius + 1 - width)
-            length = x.shape[dim] - more
-            x, width = pick(x.narrow(dim, 0, length), x.narrow(dim, more, length)), width + more
-    return x
-
-
 def hidden(go: Travel, q: Tensor, tolerance: Tensor) -> Tensor:
     """Which pixels (B, h, w) of a map of inverse depths another one covers in view 1, nearer by more than
     ``tolerance`` (B,) 1/m. Gradient: none."""
     B, h, w = q.shape
     edge = max(h, w) // MARGIN
+    given = go.a, go.b[..., 0].contiguous(), go.c[:, 0].contiguous(), q.flatten(1), tolerance
+    if native.serves(*given) and all(x.dtype == torch.float32 for x in given):
+        covered = torch.empty_like(q, dtype=torch.bool)
+        torch.ops.dhtorch.hidden(*given, covered, rows=h + 2 * edge, columns=w + 2 * edge, margin=edge)
+        return covered
     index = go.cell(q.flatten(1), (h + 2 * edge, w + 2 * edge), edge)
     front = q.new_full((B, (h + 2 * edge) * (w + 2 * edge)), -1.0)
     front = front.scatter_reduce(1, index, q.flatten(1), "amax")

@@ -20,8 +20,8 @@ from dhtorch.geometry.lookup import (
     summarise,
     whole_is_faster,
 )
+from dhtorch.geometry.neighbours import extreme, window_sum
 from dhtorch.geometry.shapes import check
-from dhtorch.geometry.sweep import extreme, window_sum
 from dhtorch.records import Frame, Samples
 
 #: Search radius in a sparse depth map, px: the truth test reads sparse returns in 7×7 windows, so do the samples.
