@@ -47,7 +47,7 @@ HALF_PX = 2.0
 SAVES, ERRORS, BEYOND = 0.04, 3.0, 0.015
 
 #: Share of what a map misses beyond what the sensor's near returns miss that its cause must explain.
-EXPLAINED = 0.5
+EXPLAINED = 0.75
 
 #: Frames that a depth may be early or late at most, and the factors on the focal length that are tried.
 LAG = 5
