@@ -5,7 +5,7 @@ Alphabet: B samples, T frames of a sample along time, C × H × W image, h × w 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -42,6 +42,18 @@ def find(sample: Mapping[str, Any], key: str) -> Any:
 def has(sample: Mapping[str, Any], key: str) -> bool:
     """Whether there is a value under a key, as :func:`find` looks for it."""
     return _found(sample, key) is not _MISSING
+
+
+def without(sample: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
+    """A copy of a sample without what :func:`find` finds under some keys; nested dicts that lose it are copied."""
+    out = dict(sample)
+    for key in keys:
+        head, _, rest = key.replace("/", ".").partition(".")
+        if key in out:
+            del out[key]
+        elif rest and isinstance(out.get(head), Mapping):
+            out[head] = without(out[head], [rest])
+    return out
 
 
 #: What is found under a key that is not there.

@@ -38,6 +38,13 @@ _ROUNDING = 1e-5
 MAX_ASPECT = 0.1
 
 
+#: Options that may name a key.
+_KEYED = (
+    *("image", "depth", "confidence", "intrinsics", "distortion", "depth_intrinsics"),
+    *("other_image", "other_intrinsics", "pose", "pose_cov", "other_pose"),
+)
+
+
 class Read(NamedTuple):
     """The views of B samples."""
 
@@ -138,6 +145,11 @@ class Views:
             anchor = anchor.replace(image=anchor.image.contiguous())
         bad = torch.stack([c[0] for c in checks]).any(0) if checks else paired.new_zeros(len(depth))
         return Read(anchor, other, paired, bad, tuple(checks), motion)
+
+    def keys(self) -> tuple[str, ...]:
+        """The keys of a sample that are read, but for those that say what only pads."""
+        said = (getattr(self, name) for name in _KEYED)
+        return tuple(dict.fromkeys(key for key in said if isinstance(key, str)))
 
     def image_hw(self, sample: Mapping[str, Any]) -> tuple[int, int] | None:
         """Size of the anchor's image, None where it cannot be read."""
