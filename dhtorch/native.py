@@ -30,7 +30,9 @@ from torch import Tensor
 
 from dhtorch.archive import processor
 
-SOURCES = tuple(Path(__file__).with_name(f"native{part}.cpp") for part in ("", "_search", "_affine", "_pyramid"))
+SOURCES = tuple(
+    Path(__file__).with_name(f"native{part}.cpp") for part in ("", "_search", "_affine", "_pyramid", "_tokens")
+)
 
 #: What the sources share.
 HEADER = Path(__file__).with_name("native_vectors.h")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dhtorch import native
 from dhtorch.codes import Hole, Source, names
 from dhtorch.geometry.shapes import check
 from dhtorch.records import Map
@@ -17,6 +18,9 @@ CHANNELS = ("inverse_depth", "sigma", "answered", *(f"hole_{name.lower()}" for n
 
 #: How many classes of holes there are; their codes count from 0.
 _CLASSES = len(names(Hole))
+
+#: Types of uv, depth, sigma, source and hole that compiled code takes.
+_COMPILED = (*[torch.float32] * 3, *[torch.int32] * 2)
 
 #: How a picture is brought to the network's size: stretched, shrunk whole with bars, or cut to fill.
 FITS = ("stretch", "pad", "crop")
@@ -66,8 +70,16 @@ def patch_tokens(
     Gradient: to depth and sigma; where a sample lies and whether it has an answer carry none.
     """
     check("patch_tokens", uv=(found.uv, "B N 2"), depth=(found.depth, "B N"), hole=(hole, "B N"))
+    check("patch_tokens", depth=(found.depth, "B N"), sigma=(found.sigma, "B N"), source=(found.source, "B N"))
     rows, columns = grid(hw, patch=patch, tokens_hw=tokens_hw)
-    cell = _cells(found.uv, hw, patch=patch, tokens_hw=tokens_hw or hw, fit=fit, rows=rows, columns=columns)
+    scale, margin = _placement(hw, tokens_hw or hw, fit)
+    given = found.uv.contiguous(), found.depth, found.sigma, found.source, hole
+    if native.serves(*given) and tuple(x.dtype for x in given) == _COMPILED:
+        tokens = hole.new_empty(*hole.shape[:1], rows * columns, len(CHANNELS), dtype=torch.float32)
+        known = torch.empty_like(tokens[..., 0], dtype=torch.bool)
+        torch.ops.dhtorch.patch_tokens(*given, tokens, known, patch, rows, columns, *scale, *margin)
+        return tokens, known
+    cell = _cells(found.uv, scale, margin, patch=patch, rows=rows, columns=columns)
 
     def total(x: Tensor) -> Tensor:  # (B, N, k) → (B, P + 1, k), the last of what lies in no patch
         zero = torch.zeros(x.shape[0], rows * columns + 1, x.shape[2], dtype=torch.float64, device=x.device)
@@ -90,16 +102,19 @@ def patch_tokens(
     return tokens.to(found.depth.dtype), sums[:, :-1, 2] > 0
 
 
-def _cells(
-    uv: Tensor, hw: tuple[int, int], *, patch: int, tokens_hw: tuple[int, int], fit: str, rows: int, columns: int
-) -> Tensor:
-    """(B, N) index of the patch each sample lies in; rows · columns where it lies in none."""
+def _placement(hw: tuple[int, int], tokens_hw: tuple[int, int], fit: str) -> tuple[list[float], list[float]]:
+    """Scale and margin along x and y by which (uv + ½) lies in the network's picture."""
     if fit not in FITS:
         raise ValueError(f"tokens: fit is {fit!r}, expected one of {', '.join(FITS)}")
     scale = [tokens_hw[1] / hw[1], tokens_hw[0] / hw[0]]
     if fit != "stretch":
         scale = [min(scale) if fit == "pad" else max(scale)] * 2
     margin = [(tokens_hw[k] - hw[k] * s) / 2 for k, s in zip((1, 0), scale, strict=True)]
+    return scale, margin
+
+
+def _cells(uv: Tensor, scale: list[float], margin: list[float], *, patch: int, rows: int, columns: int) -> Tensor:
+    """(B, N) index of the patch each sample lies in; rows · columns where it lies in none."""
     place = uv.detach().double() + 0.5
     place = place * (scale[0] if scale[0] == scale[1] else place.new_tensor(scale))
     if any(margin):
