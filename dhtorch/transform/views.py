@@ -317,7 +317,7 @@ def _unit_range_checks(image: Tensor, key: str) -> list[tuple[Tensor, Tensor, st
     if image.dtype == torch.uint8:
         return []
     text = f"{key}: found the value {{:.4g}}, expected floats in [0, 1] (pixels before any normalisation)"
-    low, high = (f(image.detach().flatten(1), 1) for f in (torch.amin, torch.amax))
+    low, high = (f(image.detach(), (1, 2, 3)) for f in (torch.amin, torch.amax))  # no copy in whatever layout
     bad_low, bad_high = ~(low >= -1e-3), ~(high <= 1 + 1e-3)
     return [(bad_low | bad_high, torch.where(bad_high, high, low), text)]
 
