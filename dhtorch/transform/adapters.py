@@ -100,14 +100,13 @@ class ExtendedDataset(Dataset[Any]):
         """One batch, collated as torch does and then extended as a whole; with ``by_batch``."""
         # In a worker torch collates into memory that it shares: page by page a new one, several times as slow.
         own = {key: _stacked(samples, key) for key in self.consumed if has(samples[0], key)}
-        batch = default_collate([without(sample, own) for sample in samples])
+        batch = default_collate([without(sample, own) for sample in samples] if own else list(samples))
         return self._returned(self.transform({**batch, **own})) or {}
 
     def _returned(self, out: dict[str, Any] | None) -> dict[str, Any] | None:
         """Without what a gap lent, and what was consumed."""
-        if out is None:
-            return out
-        return without(out, self.consumed if self.gap is None else (*self.consumed, *self._lent))
+        gone = self.consumed if self.gap is None else (*self.consumed, *self._lent)
+        return without(out, gone) if out is not None and gone else out
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") or name == "dataset":

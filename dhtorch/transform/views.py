@@ -37,7 +37,6 @@ _ROUNDING = 1e-5
 #: The shapes of the image and the depth map may differ by this share; a transposed map differs by far more.
 MAX_ASPECT = 0.1
 
-
 #: Options that may name a key.
 _KEYED = (
     *("image", "depth", "confidence", "intrinsics", "distortion", "depth_intrinsics"),
