@@ -101,7 +101,7 @@ class ExtendedDataset(Dataset[Any]):
         # In a worker torch collates into memory that it shares: page by page a new one, several times as slow.
         own = {key: _stacked(samples, key) for key in self.consumed if has(samples[0], key)}
         batch = default_collate([without(sample, own) for sample in samples] if own else list(samples))
-        return self._returned(self.transform({**batch, **own})) or {}
+        return self._returned(self.transform({**batch, **own} if own else batch)) or {}
 
     def _returned(self, out: dict[str, Any] | None) -> dict[str, Any] | None:
         """Without what a gap lent, and what was consumed."""
