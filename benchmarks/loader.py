@@ -7,6 +7,7 @@ to 224×224 for a network; only that leaves the worker. ``single`` is one view p
 front end alone is asked; ``pair`` is two views, and beside the transform stands the same with OpenCV in its seats. Rows
 of mode ``native`` use the compiled code of ``python -m dhtorch.native``. Rows
 with ``by_batch`` collate in the worker first and extend the whole batch at once (``batched=True``): the same answers.
+Bars are about rows without workers (``workers0``).
 ``ours_ms`` and ``peer_ms`` are milliseconds per sample in the steady state, workers included. In ``scaling`` rows
 ``peer_ms`` is what two workers would take per sample if the transform scaled from one worker to two as the plain
 loader does. In ``step`` rows the transform alone stands beside a forward pass of DINOv2 (random weights).
@@ -28,14 +29,14 @@ import cv2
 import harness
 import numpy as np
 import torch
-from torch.utils.data import DataLoader, Dataset, default_collate
+from torch.utils.data import DataLoader, Dataset
 
 from dhtorch import PAPER, data
 from dhtorch.geometry import camera as cam
 from dhtorch.stages import triangulate
 from dhtorch.studies.baselines import dinov2, opencv
 from dhtorch.synthetic.recording import SyntheticRoom
-from dhtorch.transform import ExtendDepth, one_thread
+from dhtorch.transform import ExtendDepth, ExtendedDataset, one_thread
 
 SIDE = 224
 BATCH = 8
@@ -54,13 +55,15 @@ OPENCV = PAPER.replace(
 
 
 class Encoded(Dataset[Any]):
-    """Views as JPEG and depth as 16-bit PNG, in memory, repeated; decoded, resized and transformed when asked for."""
+    """Views as JPEG and depth as 16-bit PNG, in memory, repeated; decoded, resized and handed out when asked for.
+
+    ``light`` = without the pictures in full size and the depth, of which the network has no use.
+    """
 
     def __init__(
-        self, pairs: list[dict[str, Any]], hw: tuple[int, int], keys: Sequence[str], length: int, transform: Any = None
+        self, pairs: list[dict[str, Any]], hw: tuple[int, int], keys: Sequence[str], length: int, light: bool = False
     ) -> None:
-        self.pairs, self.hw, self.keys, self.length, self.transform = pairs, hw, keys, length, transform
-        self.by_batch = transform is not None and transform.batched
+        self.pairs, self.hw, self.keys, self.length, self.light = pairs, hw, keys, length, light
 
     def __len__(self) -> int:
         return self.length
@@ -69,19 +72,9 @@ class Encoded(Dataset[Any]):
         out = self.decoded(i)
         views = {key: out[key] for key in self.keys}
         small = {f"{k}_{SIDE}": cv2.resize(v, (SIDE, SIDE), interpolation=cv2.INTER_AREA) for k, v in views.items()}
-        if self.by_batch:
-            return {**small, **out}
-        out = out if self.transform is None else self.transform(out)
-        return {**small, **self.light(out)}
-
-    def collated(self, samples: list[dict[str, Any]]) -> dict[str, Any]:
-        """A batch, extended at once where the transform wants batches."""
-        batch = default_collate(samples)
-        return self.light(self.transform(batch)) if self.by_batch else batch
-
-    def light(self, sample: dict[str, Any]) -> dict[str, Any]:
-        """Without the pictures in full size and the depth, which stay in the worker."""
-        return {k: v for k, v in sample.items() if k not in (*self.keys, "depth")}
+        if self.light:
+            out = {k: v for k, v in out.items() if k not in (*self.keys, "depth")}
+        return {**small, **out}
 
     def decoded(self, i: int) -> dict[str, Any]:
         """One sample as the transform reads it."""
@@ -115,11 +108,12 @@ def encoded() -> tuple[str, tuple[int, int], list[dict[str, Any]]]:
     return recording.name, recording[0].hw, pairs
 
 
-def per_sample(dataset: Encoded, workers: int, repeats: int, clock: str) -> Iterator[float]:
+def per_sample(dataset: Encoded | ExtendedDataset, workers: int, repeats: int, clock: str) -> Iterator[float]:
     """Milliseconds per sample, one number for each stretch, after one to warm up; of workers always by the wall."""
     now = harness.CLOCKS["wall" if workers else clock]
     options: dict[str, Any] = {"worker_init_fn": one_thread, "multiprocessing_context": "fork"} if workers else {}
-    loader = iter(DataLoader(dataset, BATCH, num_workers=workers, collate_fn=dataset.collated, **options))
+    collate = dataset.collate if isinstance(dataset, ExtendedDataset) and dataset.by_batch else None
+    loader = iter(DataLoader(dataset, BATCH, num_workers=workers, collate_fn=collate, **options))
     for k in range(repeats + 1):
         start = now()
         for _ in range(STRETCH):
@@ -137,8 +131,8 @@ class Bench:
         self.keys = ("image",) if mode == "single" else ("image", "other")
         self.transforms = {"transform": self.transform(), "by_batch": self.transform(batched=True)}
         self.transforms["plain_loader"] = None
+        self.transforms |= {side: self.transforms[NATIVE[side]] for side in NATIVE}
         if mode == "pair":
-            self.transforms |= {side: self.transforms[NATIVE[side]] for side in NATIVE}
             self.transforms["opencv_seats"] = self.transform(method=OPENCV)
         self.times: dict[tuple[str, int], list[float]] = {}
 
@@ -149,10 +143,17 @@ class Bench:
             depth_unit="mm", intrinsics_hw=self.found[1], tokens_hw=(SIDE, SIDE), n=self.n, **other, **options
         )
 
-    def dataset(self, transform: ExtendDepth | None, workers: int) -> Encoded:
+    def encoded(self, workers: int, *, light: bool = False) -> Encoded:
         """Long enough for one turn."""
         length = BATCH * (STRETCH * (self.repeats + 1) + 2 * workers)
-        return Encoded(self.found[2], SIZES[self.size], self.keys, length, transform)
+        return Encoded(self.found[2], SIZES[self.size], self.keys, length, light)
+
+    def dataset(self, transform: ExtendDepth | None, workers: int) -> Encoded | ExtendedDataset:
+        """What leaves the worker are small pictures and, with a transform, what it tells."""
+        if transform is None:
+            return self.encoded(workers, light=True)
+        consumed = (*self.keys, "depth")
+        return ExtendedDataset(self.encoded(workers), transform, by_batch=transform.batched, consumed=consumed)
 
     def measure(self, workers: int) -> None:
         """Loaders take turns, so that a busy minute hits all alike."""
@@ -177,7 +178,7 @@ class Bench:
                 peer,
                 self.times[peer, workers],
                 mode="native" if side in NATIVE else "eager",
-                **self.common(peer == barred),
+                **self.common(peer == barred and not workers),
             )
             for side in ours
             for peer in self.transforms
@@ -208,7 +209,7 @@ def steps(benches: Sequence[Bench], repeats: int, clock: str) -> Iterator[dict[s
             print(f"step rows skipped: {error}")
             return
         for bench in benches:
-            transform, sample = bench.transforms["transform"], bench.dataset(None, 0).decoded(0)
+            transform, sample = bench.transforms["transform"], bench.encoded(0).decoded(0)
             calls = [partial(transform, sample), partial(network, pixel_values=picture)]
             with torch.no_grad():
                 ours, theirs = harness.in_turn(calls, repeats=repeats, warm_up=1, clock=clock)

@@ -141,12 +141,17 @@ def _held(
     return without(refined, ended)
 
 
-def merge(samples: Samples, estimate: Estimate) -> Map:
+def merge(samples: Samples, estimate: Estimate | None) -> Map:
     """The user's map: the sensor where it has a usable return, a recovered depth where it has none, else a hole.
+
+    Without an estimate the sensor's returns alone.
 
     Gradient: to both sources.
     """
     sensed = samples.usable
+    if estimate is None:
+        depth, sigma, score = (torch.where(sensed, x, 0.0) for x in (samples.depth, samples.sigma, samples.confidence))
+        return Map(samples.uv, depth, sigma, score, sensed.int() * Source.SENSOR)
     recovered = estimate.keep & ~sensed
     zero = torch.zeros_like(samples.depth)
 

@@ -17,11 +17,12 @@ from dhtorch.geometry import affine, least_squares, neighbours, pyramid, se3, sw
 from dhtorch.geometry import lucas_kanade as lk
 from dhtorch.geometry.camera import Camera
 from dhtorch.geometry.filters import gaussian
-from dhtorch.records import NO_HINT, Frame, PoseFit, Shutter, TrackHint
+from dhtorch.records import NO_HINT, Frame, Map, PoseFit, Shutter, TrackHint
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.holes import classify, min_eigenvalue
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 from dhtorch.synthetic import SyntheticRoom
+from dhtorch.transform import patch_tokens
 
 COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
 needs_compiler = pytest.mark.skipif(COMPILER is None or sys.platform == "win32", reason="no C++ compiler here")
@@ -130,6 +131,41 @@ def test_pyramids_that_compiled_code_cannot_build_are_torchs(loaded, monkeypatch
     assert not calls and slope.abs().sum() > 0
     pyramid.build_pyramid(image.detach(), 2, 11)
     assert len(calls) == 2
+
+
+def sparse(batch, n, seed=0):
+    """Samples, some outside of a picture of 60x80 and some that are no numbers, and their holes."""
+    random = torch.Generator().manual_seed(seed)
+    uv, depth, sigma = (torch.rand(batch, n, *k, generator=random) for k in ((2,), (), ()))
+    uv = uv * torch.tensor([90.0, 70.0]) - 5
+    uv[:, ::7, 1], depth[:, ::5], sigma[:, ::11], depth[:, ::13] = torch.nan, 0, torch.nan, torch.inf
+    source, hole = (torch.randint(0, k, (batch, n), generator=random, dtype=torch.int32) for k in (3, 8))
+    return Map(uv, depth, sigma, torch.ones_like(depth), source), hole - 1  # -1: of no class
+
+
+@needs_compiler
+@pytest.mark.parametrize("fit", ["stretch", "pad", "crop"])
+@pytest.mark.parametrize(("batch", "n", "size"), [(1, 5000, None), (3, 400, (42, 70)), (2, 0, (28, 28))])
+def test_tokens_are_the_same_bits(loaded, monkeypatch, fit, batch, n, size):
+    found, hole = sparse(batch, n)
+    asked = {"patch": 7, "tokens_hw": size, "fit": fit}
+    ours, torchs = both_ways(lambda: patch_tokens(found, hole, (60, 80), **asked), monkeypatch)
+    assert all(torch.equal(a, b) and a.dtype == b.dtype for a, b in zip(ours, torchs, strict=True))
+    assert n == 0 or (ours[0] > 0).any(1).all()
+
+
+@needs_compiler
+def test_tokens_that_compiled_code_cannot_pool_are_torchs(loaded, monkeypatch):
+    found, hole = sparse(1, 50)
+    calls = []
+    monkeypatch.setattr(torch.ops.dhtorch, "patch_tokens", lambda *_: calls.append(1))
+    patch_tokens(found.to(torch.float64), hole, (60, 80))
+    patch_tokens(found, hole.long(), (60, 80))
+    patch_tokens(found.replace(uv=found.uv.nan_to_num().int()), hole, (60, 80))
+    patch_tokens(found.map(lambda x: x.requires_grad_() if x.is_floating_point() else x), hole, (60, 80))
+    assert not calls
+    patch_tokens(found.detach(), hole, (60, 80))
+    assert calls
 
 
 @needs_compiler

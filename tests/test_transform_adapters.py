@@ -327,6 +327,42 @@ def test_a_loader_extends_whole_batches_and_the_bits_are_the_same(items):
         ExtendedDataset(source, single.transform, by_batch=True)
 
 
+@pytest.mark.parametrize("by_batch", [False, True])
+def test_what_was_consumed_stays_in_the_worker_and_changes_no_answer(items, by_batch):
+    class Nested(torch.utils.data.Dataset):
+        def __len__(self):
+            return 4
+
+        def __getitem__(self, i):
+            if i == 2 and not by_batch:
+                raise OSError("a torn file")
+            item = items[i]
+            told = {"depth": item["depth"], "state": np.float32(i), "image": item["image"]}
+            return {"observation": told, "intrinsics": item["intrinsics"]}
+
+    options = {"image": "observation.image", "depth": "observation/depth", "depth_unit": "mm", "n": 64}
+    options |= {"batched": by_batch, "on_error": "raise" if by_batch else "flag"}
+    whole, light = (
+        ExtendedDataset(Nested(), ExtendDepth(**options), by_batch=by_batch, consumed=keys)
+        for keys in ((), ("observation/depth", "intrinsics"))
+    )
+    for workers in (0, 1):
+        a, b = (
+            next(iter(DataLoader(d, 4, num_workers=workers, collate_fn=d.collate if by_batch else None)))
+            for d in (whole, light)
+        )
+        assert b["observation"].keys() == {"state", "image"} and a.keys() - b.keys() == {"intrinsics"}
+        assert torch.equal(a["observation"]["image"], b["observation"]["image"])
+        assert all(torch.equal(a[k], b[k]) for k in a if k.startswith("dhtorch.")), workers
+        assert b["dhtorch.problem"].tolist() == [1, 1, 1 if by_batch else 3, 1]
+    for wrong in ("intrinsics", ["action"], ["mm"]):
+        with pytest.raises(
+            ValueError,
+            match="expected a list of some of observation.image, observation/depth, intri".replace(".", r"\."),
+        ):
+            ExtendedDataset(Nested(), whole.transform, by_batch=by_batch, consumed=wrong)
+
+
 def test_the_prefix_that_lerobots_processors_keep():
     """They keep what begins with "observation." and the action; everything else is gone behind them."""
     out = tiny(prefix="observation.dh_")(tiny_sample())

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch.utils.data import default_collate
 
-from dhtorch.transform import SampleError, Views
+from dhtorch.transform import SampleError, Views, views
 from dhtorch.transform.leaves import to_tensor
 
 H, W = 6, 8
@@ -401,6 +401,24 @@ def test_the_principal_point_lies_near_the_centre_of_the_picture():
     assert read(sample(intrinsics=off)).bad and not read(sample(intrinsics=off), max_offset=0.4).bad
     assert not read(sample(intrinsics=[20, 20, *centre]), max_offset=0.01).bad, "exactly the centre"
     assert read(sample(intrinsics=[20, 20, np.nan, 2.5])).bad
+
+
+def test_numbers_that_are_looked_at_are_judged_as_by_operations(monkeypatch):
+    def judged(given):
+        with monkeypatch.context() as patched:
+            patched.setattr(views, "_told_at_once", lambda _: False)
+            return read(given).bad
+
+    near = [limit * (1 + step * 2**-23) for limit in (0.01, 100.0) for step in (-100, -2, -1, 0, 1, 2, 100)]
+    for value in (*near, 0.0, np.nan, 1.0, 1e3):
+        given = sample(depth=np.full((H, W), value, np.float32))
+        assert torch.equal(read(given).bad, judged(given)), value
+    for share in (0.2, -0.2):
+        for step in (-100, -2, -1, 0, 1, 2, 100):
+            given = sample(intrinsics=[20, 1e-30, W / 2 - 0.5 + W * share * (1 + step * 2**-23), H / 2 - 0.5])
+            assert torch.equal(read(given).bad, judged(given)), (share, step)
+    batch = default_collate([sample(), sample(depth=metres() * 1e3), sample(intrinsics=matrix(20, -1, 3.5, 2.5))])
+    assert read(batch, batched=True).bad.tolist() == [False, True, True]
 
 
 def test_focal_lengths_are_positive():

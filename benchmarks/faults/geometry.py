@@ -41,7 +41,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("cofactors", "A.roll(-1, 0), A.roll(-2, 0)", "A.roll(1, 0), A.roll(-2, 0)"),
     ],
     "geometry.camera": [
-        ("from_matrix", "(K[:, 0, 0], K[:, 1, 1])", "(K[:, 0, 0], K[:, 0, 0])"),
+        ("from_matrix", "[:, :2].contiguous()", "[:, 1:].contiguous()"),
         ("from_matrix", "K[:, :2, 2], distortion, readout", "K[:, 2, :2], distortion, readout"),
         ("from_matrix", "distortion, readout)\n", "distortion)\n"),
         ("to_matrix", "camera.f[:, 1], camera.c[:, 1]", "camera.f[:, 0], camera.c[:, 1]"),

@@ -65,7 +65,7 @@ class Camera(Record):
 def from_matrix(K: Tensor, distortion: Tensor | None = None, readout: Tensor | None = None) -> Camera:
     """Camera of a (B, 3, 3) intrinsic matrix without skew."""
     check("camera.from_matrix", K=(K, "B 3 3"), distortion=(distortion, "B k"))
-    return Camera(torch.stack((K[:, 0, 0], K[:, 1, 1]), -1), K[:, :2, 2], distortion, readout)
+    return Camera(K.diagonal(dim1=1, dim2=2)[:, :2].contiguous(), K[:, :2, 2], distortion, readout)
 
 
 def to_matrix(camera: Camera) -> Tensor:

@@ -18,7 +18,7 @@ import torch
 from torch.utils.data import Dataset, IterableDataset, default_collate
 
 from dhtorch.transform.extend_depth import ExtendDepth
-from dhtorch.transform.leaves import SampleError, find
+from dhtorch.transform.leaves import SampleError, find, has, to_tensor, without
 
 #: Neighbours asked for the shapes of a sample that could not be loaded.
 _NEIGHBOURS = 16
@@ -40,10 +40,12 @@ class ExtendedDataset(Dataset[Any]):
         episode_key: key of a number that items of one episode share; None = there is one episode.
         by_batch: items stay as they are, and :meth:`collate`, the loader's ``collate_fn``, extends the whole batch in
             the worker: the same bits in less time.
+        consumed: keys among those that the transform reads, of which nobody has a use afterwards (the depth, the other
+            view): items and batches come without them, so that no worker copies them into shared memory.
 
     Raises:
         ValueError: a gap without ``other_image``; a transform for batches without ``by_batch``, or with it one for
-            single samples or one that does not raise.
+            single samples or one that does not raise; a consumed key that the transform does not read.
     """
 
     def __init__(
@@ -54,6 +56,7 @@ class ExtendedDataset(Dataset[Any]):
         gap: int | None = None,
         episode_key: str | None = "episode_index",
         by_batch: bool = False,
+        consumed: Sequence[str] = (),
     ) -> None:
         if gap is not None and (gap < 1 or transform.views.other_image is None):
             raise ValueError(f"gap is {gap}: expected a positive one, and a transform with other_image")
@@ -63,7 +66,10 @@ class ExtendedDataset(Dataset[Any]):
             raise ValueError(f"found a transform for {single if by_batch else batches}")
         if by_batch and transform.on_error != "raise":
             raise ValueError(f"on_error is {transform.on_error!r}, expected raise where by_batch is set")
-        self.by_batch = by_batch
+        keys = transform.views.keys()
+        if isinstance(consumed, str) or not set(consumed) <= set(keys):
+            raise ValueError(f"consumed is {consumed!r}, expected a list of some of {', '.join(keys)}")
+        self.by_batch, self.consumed = by_batch, tuple(consumed)
         self.dataset, self.transform, self.gap, self.episode_key = dataset, transform, gap, episode_key
         views = transform.views
         self._lent: tuple[str, ...] = (
@@ -86,18 +92,21 @@ class ExtendedDataset(Dataset[Any]):
             if self.transform.on_error == "raise" or isinstance(error, MemoryError | torch.OutOfMemoryError):
                 raise
             zeros = {} if self.transform.on_error == "skip" else self._zeros_like_neighbour(i, error)
-            return self.transform.left_out(zeros, SampleError(f"item {i} cannot be loaded: {error}"))
+            out = self.transform.left_out(zeros, SampleError(f"item {i} cannot be loaded: {error}"))
+            return self._returned(out)
         return self._returned(self.transform(sample))
 
     def collate(self, samples: Sequence[Any]) -> dict[str, Any]:
         """One batch, collated as torch does and then extended as a whole; with ``by_batch``."""
-        return self._returned(self.transform(default_collate(list(samples)))) or {}
+        # In a worker torch collates into memory that it shares: page by page a new one, several times as slow.
+        own = {key: _stacked(samples, key) for key in self.consumed if has(samples[0], key)}
+        batch = default_collate([without(sample, own) for sample in samples] if own else list(samples))
+        return self._returned(self.transform({**batch, **own} if own else batch)) or {}
 
     def _returned(self, out: dict[str, Any] | None) -> dict[str, Any] | None:
-        """Without what a gap lent."""
-        if out is None or self.gap is None:
-            return out
-        return {key: value for key, value in out.items() if key not in self._lent}
+        """Without what a gap lent, and what was consumed."""
+        gone = self.consumed if self.gap is None else (*self.consumed, *self._lent)
+        return without(out, gone) if out is not None and gone else out
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") or name == "dataset":
@@ -207,6 +216,11 @@ def one_thread(worker: int = 0) -> None:
     opencv = sys.modules.get("cv2")
     if opencv is not None:
         opencv.setNumThreads(0)  # 1 would wait for the threads of the pool, which a forked worker does not have
+
+
+def _stacked(samples: Sequence[Any], key: str) -> torch.Tensor:
+    """What lies under a key of each sample, in memory of this process alone."""
+    return torch.stack([to_tensor(find(sample, key), key, signed=False) for sample in samples])
 
 
 def _zero(value: Any) -> Any:

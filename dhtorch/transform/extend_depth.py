@@ -124,17 +124,19 @@ class ExtendDepth(torch.nn.Module):
             try:
                 read = self.views.read(sample, batched=self.batched)
                 seed = self._seeds(sample, len(read.bad))
-                if bool(read.bad.any()) and not (self.batched and self.on_error == "flag"):
+                flagged = bool(read.complaints) and bool(read.bad.any())
+                if flagged and not (self.batched and self.on_error == "flag"):
                     raise SampleError(read.complaint())
             except SampleError as error:
                 if self.on_error == "raise" or self.batched:
                     raise
                 return self.left_out(sample, error)
-            if bool(read.bad.any()):
+            if flagged:
                 warnings.warn(f"flagged: {read.complaint()}", stacklevel=2)
-            added = self._answer(read, seed)
+            added = self._answer(read, seed, flagged)
         self.tally.add(added["problem"])
-        self._seen_hw = read.anchor.hw
+        if self._seen_hw != read.anchor.hw:  # torch looks twice at what a module is given
+            self._seen_hw = read.anchor.hw
         return self._joined(sample, added)
 
     def report(self) -> dict[str, int]:
@@ -155,7 +157,7 @@ class ExtendDepth(torch.nn.Module):
         self.tally.add(torch.tensor([SampleProblem.UNREADABLE]))
         return None if self.on_error == "skip" or hw is None else self._joined(sample, self._blank(hw))
 
-    def _answer(self, read: Read, seed: int | Tensor) -> dict[str, Tensor]:
+    def _answer(self, read: Read, seed: int | Tensor, flagged: bool) -> dict[str, Tensor]:
         frame, paired, bad = read.anchor, read.paired, read.bad
         samples, estimate, fits, dense = self._asked(read, seed)
         fit = fits[-1] if fits else None
@@ -163,38 +165,38 @@ class ExtendDepth(torch.nn.Module):
         pooled = (found, samples.hole) if dense is None else maps.as_samples(dense, frame, self.method)
         tokens, known = patch_tokens(*pooled, frame.hw, patch=self.patch, tokens_hw=self.tokens_hw, fit=self.fit)
         valid = found.source != Source.NONE
-        xyz = cam.unproject(frame.camera, found.uv, found.depth)
+        xyz = samples.xyz if estimate is None else cam.unproject(frame.camera, found.uv, found.depth)
         problem = (~paired).int() * SampleProblem.NO_SECOND_VIEW
-        problem = torch.where(frame.depth.flatten(1).amax(1) > 0, problem, SampleProblem.NO_DEPTH)
+        problem = torch.where(frame.depth.amax((1, 2)) > 0, problem, SampleProblem.NO_DEPTH)
         added = {
             "uv": found.uv,
             "xyz": torch.where(valid[..., None], xyz, 0.0),
             "depth": found.depth,
-            "sigma": torch.where(valid, found.sigma, 0.0),
-            "score": torch.where(valid, found.score, 0.0),
+            "sigma": found.sigma,
+            "score": found.score,
             "valid": valid,
             "source": found.source,
             "flag": samples.flag,
             "hole": samples.hole,
-            "gate": estimate.gate,
+            "gate": torch.full_like(samples.hole, Gate.NO_TRACK) if estimate is None else estimate.gate,
             **_pose(fit, paired, found.depth),
             **({} if self.views.pose is None else given.keys(fits, paired, given.name_of(self.views.pose))),
             "tokens": tokens,
             "tokens_valid": known,
             **({} if dense is None else maps.as_keys(dense)),
         }
-        if bool(bad.any()):
+        if flagged:
             added = {key: x.masked_fill(bad.view(-1, *[1] * (x.ndim - 1)), 0) for key, x in added.items()}
             problem = torch.where(bad, SampleProblem.UNREADABLE, problem)
         return {**added, "problem": problem}
 
-    def _asked(self, read: Read, seed: int | Tensor) -> tuple[Samples, Estimate, list[PoseFit], DepthMap | None]:
+    def _asked(self, read: Read, seed: int | Tensor) -> tuple[Samples, Estimate | None, list[PoseFit], DepthMap | None]:
         """What the method says, and of which views' poses, the last of which stands for all, and the maps where they
-        are wanted; the front end alone where nothing is paired."""
+        are wanted; the front end alone, and no estimate, where nothing is paired."""
         if read.other is None or not bool(read.paired.any()):
             samples = self.method.look(read.anchor)
             dense = None if self.maps is None else self.maps.sensed(read.anchor, self.method)
-            return samples, Estimate.silent(samples, Gate.NO_TRACK, n_views=0), [], dense
+            return samples, None, [], dense
         trace: dict[str, Any] = {}
         told: dict[str, Any] = {"seed": seed, "hint": self.hint, "trace": trace}
         told |= {} if read.given is None else {"fit": read.given}

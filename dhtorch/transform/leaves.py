@@ -5,7 +5,7 @@ Alphabet: B samples, T frames of a sample along time, C × H × W image, h × w 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -33,23 +33,42 @@ def find(sample: Mapping[str, Any], key: str) -> Any:
     Raises:
         SampleError: there is none.
     """
-    if key in sample:
-        return sample[key]
-    value: Any = sample
-    for piece in key.replace("/", ".").split("."):
-        if not (isinstance(value, Mapping) and piece in value):
-            raise SampleError(f"{key}: found no such key, expected one of {', '.join(_keys(sample))}")
-        value = value[piece]
+    value = _found(sample, key)
+    if value is _MISSING:
+        raise SampleError(f"{key}: found no such key, expected one of {', '.join(_keys(sample))}")
     return value
 
 
 def has(sample: Mapping[str, Any], key: str) -> bool:
     """Whether there is a value under a key, as :func:`find` looks for it."""
-    try:
-        find(sample, key)
-    except SampleError:
-        return False
-    return True
+    return _found(sample, key) is not _MISSING
+
+
+def without(sample: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
+    """A copy of a sample without what :func:`find` finds under some keys; nested dicts that lose it are copied."""
+    out = dict(sample)
+    for key in keys:
+        head, _, rest = key.replace("/", ".").partition(".")
+        if key in out:
+            del out[key]
+        elif rest and isinstance(out.get(head), Mapping):
+            out[head] = without(out[head], [rest])
+    return out
+
+
+#: What is found under a key that is not there.
+_MISSING = object()
+
+
+def _found(sample: Mapping[str, Any], key: str) -> Any:
+    if key in sample:
+        return sample[key]
+    value: Any = sample
+    for piece in key.replace("/", ".").split("."):
+        if not (isinstance(value, Mapping) and piece in value):
+            return _MISSING
+        value = value[piece]
+    return value
 
 
 def to_tensor(value: Any, key: str, *, signed: bool = True) -> Tensor:

@@ -9,6 +9,7 @@ Alphabet: B samples, T frames of a sample along time, C × H × W image, h × w 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -18,6 +19,7 @@ from torch import Tensor
 
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import conventions
+from dhtorch.geometry.shapes import is_transformed
 from dhtorch.records import Camera, Frame, GivenPose
 from dhtorch.transform import given
 from dhtorch.transform.leaves import Leaves, Numbers, SampleError
@@ -29,8 +31,17 @@ UNITS = {"m": 1.0, "mm": 1000.0}
 #: Pixels at most by which the median depth of a frame is judged.
 PROBES = 1024
 
+#: Relative distance from a limit beyond which single precision cannot change a verdict.
+_ROUNDING = 1e-5
+
 #: The shapes of the image and the depth map may differ by this share; a transposed map differs by far more.
 MAX_ASPECT = 0.1
+
+#: Options that may name a key.
+_KEYED = (
+    *("image", "depth", "confidence", "intrinsics", "distortion", "depth_intrinsics"),
+    *("other_image", "other_intrinsics", "pose", "pose_cov", "other_pose"),
+)
 
 
 class Read(NamedTuple):
@@ -111,7 +122,8 @@ class Views:
         images = leaves.images(self.image, self.layout)
         T, hw = images.shape[1], (images.shape[-2], images.shape[-1])
         at = _place(self.at, T, self.image)
-        checks = [_in_unit_range(images[:, at], self.image)]
+        image = images[:, at]
+        checks = _unit_range_checks(image, self.image)
         depths = self._metres(leaves.planes(self.depth, T, signed=False))
         depth = depths[:, at if depths.shape[1] > 1 else 0].contiguous()
         checks += self._depth_checks(depth)
@@ -123,15 +135,20 @@ class Views:
             if conf.shape != depth.shape:
                 raise SampleError(f"{self.confidence}: found {_size(conf)}, expected {_size(depth)} as {self.depth}")
         camera = self._camera(leaves, self.intrinsics, hw, T, at, checks)
-        anchor = Frame(images[:, at], depth, camera, self._depth_camera(leaves, depth, hw, T, at), conf)
+        anchor = Frame(image, depth, camera, self._depth_camera(leaves, depth, hw, T, at), conf)
         if self.sparse:
             anchor = anchor.replace(sparse=torch.ones(len(depth), dtype=torch.bool, device=depth.device))
         other, paired = self._other(leaves, images, depths, anchor, checks)
         motion = None if other is None else self._motion(leaves, T, checks)
         if other is not None:  # tracking reads all pixels, the front end alone a few where they lie
             anchor = anchor.replace(image=anchor.image.contiguous())
-        bad = torch.stack([c[0] for c in checks]).any(0)
+        bad = torch.stack([c[0] for c in checks]).any(0) if checks else paired.new_zeros(len(depth))
         return Read(anchor, other, paired, bad, tuple(checks), motion)
+
+    def keys(self) -> tuple[str, ...]:
+        """The keys of a sample that are read, but for those that say what only pads."""
+        said = (getattr(self, name) for name in _KEYED)
+        return tuple(dict.fromkeys(key for key in said if isinstance(key, str)))
 
     def image_hw(self, sample: Mapping[str, Any]) -> tuple[int, int] | None:
         """Size of the anchor's image, None where it cannot be read."""
@@ -153,12 +170,12 @@ class Views:
         places = [_place(p, images.shape[1], key) for p in wanted]
         pad = leaves.pad(key, images.shape[1])
         if self.other_image is None and set(places) == {at}:
-            return None, torch.zeros_like(pad[:, at])
+            return None, pad.new_zeros(len(pad))
         frames, own = [], []
         for p in places:
             own.append(~pad[:, p] if self.other_image is not None or p != at else torch.zeros_like(pad[:, p]))
             image = images[:, p].contiguous()
-            checks.append(_in_unit_range(image, key))
+            checks += _unit_range_checks(image, key)
             depth = torch.zeros_like(anchor.depth)
             if self.other_image is None and depths.shape[1] > 1:
                 depth = depths[:, p].contiguous()
@@ -234,6 +251,9 @@ class Views:
         flat = depth.detach().flatten(1)
         flat = flat[:, :: max(1, flat.shape[1] // PROBES)]
         median = torch.where(flat > 0, flat, torch.nan).nanmedian(1).values
+        low, high = self.min_depth * (1 + _ROUNDING), self.max_depth * (1 - _ROUNDING)
+        if _told_at_once(median) and all(low < m < high or math.isnan(m) for m in median.tolist()):
+            return []
         said = f"{self.depth}: the median return is {{:.4g}} m with the unit {self.depth_unit!r}, expected"
         return [
             (median > self.max_depth, median, f"{said} at most {self.max_depth:g} m; are the numbers millimetres?"),
@@ -246,6 +266,8 @@ class Views:
         camera = leaves.camera(numbers, T, at, leaves.numbers(self.distortion, T, at))
         if self.intrinsics_hw is not None and self.intrinsics_hw != hw:
             camera = cam.resize(camera, self.intrinsics_hw, hw)
+        if self._fits_surely(camera, hw):
+            return camera
         name = numbers if isinstance(numbers, str) else "intrinsics"
         size = torch.tensor([hw[1], hw[0]], dtype=camera.c.dtype, device=camera.c.device)
         off = ((camera.c.detach() + 0.5) / size - 0.5).abs().amax(-1)
@@ -256,6 +278,13 @@ class Views:
         )
         checks.append((~(small > 0), small, f"{name}: found focal length {{:.4g}}, expected a positive number of px"))
         return camera
+
+    def _fits_surely(self, camera: Camera, hw: tuple[int, int]) -> bool:
+        """Whether no rounding can make the intrinsics suspect; for few numbers operations of torch are dear."""
+        if not (_told_at_once(camera.c) and camera.f.dtype == camera.c.dtype):
+            return False
+        off = (abs((c + 0.5) / n - 0.5) for row in camera.c.tolist() for c, n in zip(row, (hw[1], hw[0]), strict=True))
+        return all(x < self.max_offset - _ROUNDING for x in off) and all(x > 0 for x in camera.f.flatten().tolist())
 
     def _depth_camera(self, leaves: Leaves, depth: Tensor, hw: tuple[int, int], T: int, at: int) -> Camera | None:
         if self.depth_intrinsics is not None:
@@ -278,13 +307,18 @@ def _place(at: int, T: int, key: str) -> int:
     return at % T
 
 
-def _in_unit_range(image: Tensor, key: str) -> tuple[Tensor, Tensor, str]:
-    text = f"{key}: found the value {{:.4g}}, expected floats in [0, 1] (pixels before any normalisation)"
+def _told_at_once(x: Tensor) -> bool:
+    """Whether numbers may be looked at without waiting for a device, and have the digits for it."""
+    return x.device.type == "cpu" and x.dtype.itemsize >= 4 and not is_transformed()
+
+
+def _unit_range_checks(image: Tensor, key: str) -> list[tuple[Tensor, Tensor, str]]:
     if image.dtype == torch.uint8:
-        return torch.zeros_like(image[:, 0, 0, 0], dtype=torch.bool), image[:, 0, 0, 0], text
-    low, high = (f(image.detach().flatten(1), 1) for f in (torch.amin, torch.amax))
+        return []
+    text = f"{key}: found the value {{:.4g}}, expected floats in [0, 1] (pixels before any normalisation)"
+    low, high = (f(image.detach(), (1, 2, 3)) for f in (torch.amin, torch.amax))  # no copy in whatever layout
     bad_low, bad_high = ~(low >= -1e-3), ~(high <= 1 + 1e-3)
-    return bad_low | bad_high, torch.where(bad_high, high, low), text
+    return [(bad_low | bad_high, torch.where(bad_high, high, low), text)]
 
 
 def _is_level(conf: Tensor, key: str | None) -> tuple[Tensor, Tensor, str]:
