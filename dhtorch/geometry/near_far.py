@@ -56,21 +56,26 @@ class Unknowns(NamedTuple):
     """What is solved for."""
 
     T: Pose
-    turn: Tensor  # (B, 3) rad per unit of y
+    turn: Tensor | None  # (B, 3) rad per unit of y; None: none, and none is looked for
 
 
 def moved(at: Unknowns, xi: Tensor) -> Unknowns:
-    """The unknowns displaced by xi (B, 9): a tangent vector of the pose, then the turn. Gradient: to both."""
-    check("moved", turn=(at.turn, "B 3"), xi=(xi, "B 9"))
-    return Unknowns(move(at.T, xi[:, :6]), at.turn + xi[:, 6:])
+    """The unknowns displaced by xi (B, 9): a tangent vector of the pose, then the turn; (B, 6) where there is none.
+
+    Gradient: to both. Raises ValueError for wrong shapes.
+    """
+    check("moved", turn=(at.turn, "B 3"), xi=(xi, "B 6" if at.turn is None else "B 9"))
+    return Unknowns(move(at.T, xi[:, :6]), None if at.turn is None else at.turn + xi[:, 6:])
 
 
 def step(at: Unknowns, H: Tensor, g: Tensor) -> tuple[Unknowns, Tensor]:
     """The unknowns after one Gauss–Newton step, H (B, 9, 9) and g (B, 9), and ``ok`` (B,); unmoved where H is singular.
 
+    Without a turn H is (B, 6, 6) and g (B, 6).
+
     Gradient: to all three. Raises ValueError for wrong shapes.
     """
-    check("step", turn=(at.turn, "B 3"), H=(H, "B 9 9"), g=(g, "B 9"))
+    check("step", turn=(at.turn, "B 3"), H=(H, "B n n"), g=(g, "B n"))
     xi, ok = solve_spd(H, -g[..., None])
     return moved(at, xi[..., 0]), ok
 
@@ -80,7 +85,7 @@ def trial_step(at: Unknowns, H: Tensor, g: Tensor) -> tuple[Unknowns, Tensor]:
 
     Gradient: none. Raises ValueError for wrong shapes.
     """
-    check("trial_step", turn=(at.turn, "B 3"), H=(H, "B 9 9"), g=(g, "B 9"))
+    check("trial_step", turn=(at.turn, "B 3"), H=(H, "B n n"), g=(g, "B n"))
     with torch.no_grad():
         xi, info = torch.linalg.solve_ex(H.double(), -g.double())
         return moved(at, xi.to(g.dtype)), info == 0
@@ -113,21 +118,24 @@ def _straight(seen: Tensor, y: Tensor, turn: Tensor) -> Tensor:
 class Linear(NamedTuple):
     """The tracks of a problem, linearised at z = 1: two equations each, before their inverse depth is eliminated."""
 
-    u: Tensor  # (B, 7, N), along u: six columns of the pose, then the residual
-    v: Tensor  # (B, 7, N), along v
+    u: Tensor  # (B, 7, N), along u: six columns of the pose, then the residual; or (B, 1, N), the residual alone
+    v: Tensor  # (B, 7, N) or (B, 1, N), along v
     slope: Tensor  # (B, 2, N) m, d r / d q
     variance: Tensor  # (B, N) 1/m², of q before this track is read: infinite for far tracks, 0 for one at infinity
     front: Tensor  # (B, N) bool, in front of camera 1 and not at the epipole; others are finite and have no meaning
 
 
-def linearise_tracks(problem: Problem, at: Unknowns) -> Linear:
+def linearise_tracks(problem: Problem, at: Unknowns, *, columns: bool = True) -> Linear:
     """Residuals and their Jacobian at the sensor's inverse depths, and at the most probable ones of far tracks.
+
+    Without ``columns`` the residuals alone, the same bits: enough for :func:`squares`.
 
     Gradient: to measurements, cameras, rays and the sensor's q; the far tracks' q is held at its optimum, where it has
     no first-order effect. Raises ValueError for wrong shapes.
     """
     check("linearise_tracks", ray=(problem.ray, "B 3 N"), uv=(problem.uv, "B 2 N"), turn=(at.turn, "B 3"))
-    seen = _straight((problem.uv - problem.c[..., None]) / problem.f[..., None], _height(problem), at.turn)
+    seen = (problem.uv - problem.c[..., None]) / problem.f[..., None]
+    seen = seen if at.turn is None else _straight(seen, _height(problem), at.turn)
     a, t = turned(at.T.R, problem.ray), at.T.t[..., None]
     with torch.no_grad():
         free = _inverse_depth(a, t, seen, _noise_shape(problem))
@@ -140,34 +148,43 @@ def linearise_tracks(problem: Problem, at: Unknowns) -> Linear:
     nearest = torch.where(problem.near, problem.inverse, 0.0).amax(-1, keepdim=True).detach()
     front = (Y[:, 2] > MIN_DEPTH) & (problem.near | (q < MAX_NEARER * nearest))
     w = 1 / torch.where(front, Y[:, 2], 1.0)
-    plane, k = Y[:, :2] * w[:, None], q * w
+    plane = Y[:, :2] * w[:, None]
+    slope = (t[:, :2] - plane * t[:, 2:]) * w[:, None]
+    if not columns:
+        r = plane - seen
+        return Linear(r[:, :1], r[:, 1:], slope, variance, front)
+    k = q * w
     (x, y) = plane.unbind(1)
     (x_r, y_r) = (plane - seen).unbind(1)
     (xx, yy) = (1 + plane * plane).unbind(1)
     (xk, yk) = (plane * -k[:, None]).unbind(1)
     xy, zero = x * y, torch.zeros_like(x)
     u, v = torch.stack((-xy, xx, -y, k, zero, xk, x_r), 1), torch.stack((-yy, xy, x, zero, k, yk, y_r), 1)
-    return Linear(u, v, (t[:, :2] - plane * t[:, 2:]) * w[:, None], variance, front)
+    return Linear(u, v, slope, variance, front)
 
 
 def residuals(
     problem: Problem,
     linear: Linear,
     noise: Tensor,  # (B, N) px²
+    *,
+    turn: bool = True,
 ) -> Tensor:
     """Whitened rows (B, 10, 2, N), inverse depths eliminated: six columns of the pose, three of the turn, the residual.
 
     Args:
         problem, linear: tracks and :func:`linearise_tracks` of them.
         noise: scale of the tracks' ``shape``.
+        turn: whether it has columns; (B, 7, 2, N) without.
 
     Gradient: to ``linear``, variance excepted, and noise. Raises ValueError for wrong shapes.
     """
     check("residuals", u=(linear.u, "B 7 N"), noise=(noise, "B N"))
     m0, m1 = (m[:, None] for m in _whitener(problem, linear, noise))
     rows = m0 * linear.u[:, :, None] + m1 * linear.v[:, :, None]
-    turn = rows[:, :3] * _height(problem)[:, None, None]
-    return torch.cat((rows[:, :6], turn, rows[:, 6:]), 1)
+    if not turn:
+        return rows
+    return torch.cat((rows[:, :6], rows[:, :3] * _height(problem)[:, None, None], rows[:, 6:]), 1)
 
 
 def squares(
@@ -179,9 +196,9 @@ def squares(
 
     Gradient: as :func:`residuals`. Raises ValueError for wrong shapes.
     """
-    check("squares", u=(linear.u, "B 7 N"), noise=(noise, "B N"))
+    check("squares", u=(linear.u, "B n N"), noise=(noise, "B N"))
     m0, m1 = _whitener(problem, linear, noise)
-    return _square(linear, m0 * linear.u[:, 6:] + m1 * linear.v[:, 6:])
+    return _square(linear, m0 * linear.u[:, -1:] + m1 * linear.v[:, -1:])
 
 
 def normal(
@@ -197,7 +214,7 @@ def normal(
     """Cost and normal equations (n = 9) of near tracks with weight 1, far tracks with ``far_weight``, turns near zero.
 
     Args:
-        problem, at, noise: as in :func:`linearise_tracks` and :func:`residuals`.
+        problem, at, noise: as in :func:`linearise_tracks` and :func:`residuals`. Without a turn n = 6.
         far_weight: of a far track's robust cost; 0 leaves them out.
         turn_precision: of the turn around zero; a huge one holds it there.
         kernel, bend: robust kernel of a whitened residual and where it bends, see ``least_squares.robust``.
@@ -205,14 +222,44 @@ def normal(
     Gradient: as :func:`residuals`. Raises ValueError for wrong shapes or an unknown kernel.
     """
     linear = linearise_tracks(problem, at)
-    rows = residuals(problem, linear, noise)
+    rows = residuals(problem, linear, noise, turn=at.turn is not None)
     rho, weight = robust(_square(linear, rows[:, -1]), kernel, bend)
-    share = torch.where(problem.near, 1.0, torch.where(problem.far, far_weight[:, None], 0.0))
+    share = _share(problem, far_weight)
     H, g = normal_equations(rows, torch.where(linear.front, weight * share, 0.0), block=SUM_LANES)
+    total = _total(rho, share, at, turn_precision)
+    if at.turn is None:
+        return Normal(total, H, g)
     known = prior(turn_precision.to(g.dtype))
     turn = torch.cat((torch.zeros_like(g[:, :6]), at.turn), -1)
-    cost = (rho * share).sum(-1) + turn_precision * (at.turn * at.turn).sum(-1)
-    return Normal(cost, H + torch.diag_embed(known), g + known * turn)
+    return Normal(total, H + torch.diag_embed(known), g + known * turn)
+
+
+def cost(
+    problem: Problem,
+    at: Unknowns,
+    noise: Tensor,  # (B, N) px²
+    far_weight: Tensor,  # (B,)
+    turn_precision: Tensor,  # (B,) 1/rad²
+    *,
+    kernel: str | None,
+    bend: float,
+) -> Tensor:
+    """The cost (B,) of :func:`normal`, the same bits, without its equations.
+
+    Gradient: as :func:`residuals`. Raises ValueError for wrong shapes or an unknown kernel.
+    """
+    rho, _ = robust(squares(problem, linearise_tracks(problem, at, columns=False), noise), kernel, bend)
+    return _total(rho, _share(problem, far_weight), at, turn_precision)
+
+
+def _share(problem: Problem, far_weight: Tensor) -> Tensor:
+    """Weight (B, N) of each track's robust cost."""
+    return torch.where(problem.near, 1.0, torch.where(problem.far, far_weight[:, None], 0.0))
+
+
+def _total(rho: Tensor, share: Tensor, at: Unknowns, turn_precision: Tensor) -> Tensor:
+    total = (rho * share).sum(-1)
+    return total if at.turn is None else total + turn_precision * (at.turn * at.turn).sum(-1)
 
 
 def _square(linear: Linear, r: Tensor) -> Tensor:
