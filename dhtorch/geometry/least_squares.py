@@ -94,7 +94,7 @@ def reprojection(
 
 
 def _seen(T: Pose, xyz: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Where points are seen at z = 1 (B, 2, N), one over their depth (B, 1, N), at a safe place behind, and z (B, N)."""
+    """Where points are seen at z = 1 (B, 2, N), one over their depth (B, 1, N), safe for points behind, and z."""
     Y = torch.baddbmm(T.t[..., None], T.R, xyz)
     z = Y[:, 2:]
     w = z.clamp_min(MIN_DEPTH).reciprocal()

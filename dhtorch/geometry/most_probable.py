@@ -25,9 +25,8 @@ from dhtorch.geometry.least_squares import (
 from dhtorch.geometry.near_far import (
     Problem,
     Unknowns,
-    cost,
+    equations,
     linearise_tracks,
-    normal,
     prior,
     residuals,
     squares,
@@ -76,7 +75,7 @@ class FitOptions(NamedTuple):
 class Solution(NamedTuple):
     """The unknowns at the optimum, and the weights under which it is one."""
 
-    at: Unknowns
+    at: Unknowns  # with a turn, zero where none was believed
     noise: Tensor  # (B, N) px²
     far_weight: Tensor  # (B,) 0 where far tracks were not believed
     turn_precision: Tensor  # (B,) 1/rad²
@@ -107,12 +106,7 @@ def most_probable(problem: Problem, start: Pose, o: FitOptions) -> Solution:
     def solve(
         at: Unknowns, noise: Tensor, far: Tensor, precision: Tensor, steps: int, problem: Problem = problem
     ) -> tuple[Unknowns, Tensor]:
-        def evaluate(at: Unknowns) -> Normal:
-            return normal(problem, at, noise, far, precision, kernel=o.kernel, bend=o.bend)
-
-        def judge(at: Unknowns) -> Tensor:
-            return cost(problem, at, noise, far, precision, kernel=o.kernel, bend=o.bend)
-
+        evaluate, judge = equations(problem, noise, far, precision, kernel=o.kernel, bend=o.bend)
         return minimise(evaluate, at, steps, cost=judge, step=trial_step)
 
     half = o.near_steps // 2
@@ -163,14 +157,13 @@ def _used_first(problem: Problem) -> tuple[Problem, Problem]:
 def _translates(problem: Problem, at: Unknowns, noise: Tensor, far: Tensor, precision: Tensor, o: FitOptions) -> Tensor:
     """Whether (B,) the cost is far below that of the best rotation without translation, under the same noise."""
 
-    free = at.turn.new_tensor([1.0] * 3 + [0.0] * 3 + [1.0] * 3)  # a trace of t would be a baseline to a far track
+    free = noise.new_tensor([1.0] * 3 + [0.0] * 3 + [1.0] * 3)  # a trace of t would be a baseline to a far track
+
+    normal, judge = equations(problem, noise, far, precision, kernel=o.kernel, bend=o.bend)
 
     def evaluate(at: Unknowns) -> Normal:
-        there, H, g = normal(problem, at, noise, far, precision, kernel=o.kernel, bend=o.bend)
+        there, H, g = normal(at)
         return Normal(there, H * free * free[:, None] + torch.diag(1 - free), g * free)
-
-    def judge(at: Unknowns) -> Tensor:
-        return cost(problem, at, noise, far, precision, kernel=o.kernel, bend=o.bend)
 
     still = Unknowns(Pose(at.T.R, torch.zeros_like(at.T.t)), at.turn)
     turned, rotation = minimise(evaluate, still, o.steps, cost=judge, step=trial_step)

@@ -18,6 +18,7 @@ shutter bundle adjustment", 2012.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -115,6 +116,26 @@ def _straight(seen: Tensor, y: Tensor, turn: Tensor) -> Tensor:
     return ray[:, :2] / torch.where(z.abs() < 0.1, 0.1, z)  # beyond any shutter: stays finite
 
 
+class Fixed(NamedTuple):
+    """What a problem's tracks are at z = 1, wherever the pose is."""
+
+    seen: Tensor  # (B, 2, N) measured in camera 1
+    shape: Tensor  # (B, 3, N) the noise's covariance there, up to scale: xx, xy, yy
+    height: Tensor  # (B, N) of the ray in camera 0
+    nearest: Tensor  # (B, 1) 1/m, largest q of the near tracks
+
+
+def fixed(problem: Problem) -> Fixed:
+    """To be worked out once for several linearisations. Gradient: as :func:`linearise_tracks`."""
+    f0, f1 = problem.f[:, :1], problem.f[:, 1:]
+    return Fixed(
+        seen=(problem.uv - problem.c[..., None]) / problem.f[..., None],
+        shape=problem.shape / torch.cat((f0 * f0, f0 * f1, f1 * f1), 1)[..., None],
+        height=problem.ray[:, 1] / problem.ray[:, 2],
+        nearest=torch.where(problem.near, problem.inverse, 0.0).amax(-1, keepdim=True).detach(),
+    )
+
+
 class Linear(NamedTuple):
     """The tracks of a problem, linearised at z = 1: two equations each, before their inverse depth is eliminated."""
 
@@ -123,36 +144,37 @@ class Linear(NamedTuple):
     slope: Tensor  # (B, 2, N) m, d r / d q
     variance: Tensor  # (B, N) 1/m², of q before this track is read: infinite for far tracks, 0 for one at infinity
     front: Tensor  # (B, N) bool, in front of camera 1 and not at the epipole; others are finite and have no meaning
+    fixed: Fixed
 
 
-def linearise_tracks(problem: Problem, at: Unknowns, *, columns: bool = True) -> Linear:
+def linearise_tracks(problem: Problem, at: Unknowns, *, columns: bool = True, known: Fixed | None = None) -> Linear:
     """Residuals and their Jacobian at the sensor's inverse depths, and at the most probable ones of far tracks.
 
-    Without ``columns`` the residuals alone, the same bits: enough for :func:`squares`.
+    Without ``columns`` the residuals alone, the same bits: enough for :func:`squares`. ``known`` is :func:`fixed` of
+    the problem, where it was worked out before.
 
     Gradient: to measurements, cameras, rays and the sensor's q; the far tracks' q is held at its optimum, where it has
     no first-order effect. Raises ValueError for wrong shapes.
     """
     check("linearise_tracks", ray=(problem.ray, "B 3 N"), uv=(problem.uv, "B 2 N"), turn=(at.turn, "B 3"))
-    seen = (problem.uv - problem.c[..., None]) / problem.f[..., None]
-    seen = seen if at.turn is None else _straight(seen, _height(problem), at.turn)
+    known = fixed(problem) if known is None else known
+    seen = known.seen if at.turn is None else _straight(known.seen, known.height, at.turn)
     a, t = turned(at.T.R, problem.ray), at.T.t[..., None]
     with torch.no_grad():
-        free = _inverse_depth(a, t, seen, _noise_shape(problem))
+        free = _inverse_depth(a, t, seen, known.shape)
         # A point cannot lie beyond infinity: there q is known, and nothing is eliminated.
         variance = torch.where(free < 0, 0.0, torch.inf).to(free.dtype)
     q = torch.where(problem.near, problem.inverse, free.clamp_min(0))
     variance = torch.where(problem.near, problem.variance, variance)
     Y = a + q[:, None] * t
     # At the epipole a track fits any pose if only its point is near enough, and then holds it as if it were a vice.
-    nearest = torch.where(problem.near, problem.inverse, 0.0).amax(-1, keepdim=True).detach()
-    front = (Y[:, 2] > MIN_DEPTH) & (problem.near | (q < MAX_NEARER * nearest))
+    front = (Y[:, 2] > MIN_DEPTH) & (problem.near | (q < MAX_NEARER * known.nearest))
     w = 1 / torch.where(front, Y[:, 2], 1.0)
     plane = Y[:, :2] * w[:, None]
     slope = (t[:, :2] - plane * t[:, 2:]) * w[:, None]
     if not columns:
         r = plane - seen
-        return Linear(r[:, :1], r[:, 1:], slope, variance, front)
+        return Linear(r[:, :1], r[:, 1:], slope, variance, front, known)
     k = q * w
     (x, y) = plane.unbind(1)
     (x_r, y_r) = (plane - seen).unbind(1)
@@ -160,7 +182,7 @@ def linearise_tracks(problem: Problem, at: Unknowns, *, columns: bool = True) ->
     (xk, yk) = (plane * -k[:, None]).unbind(1)
     xy, zero = x * y, torch.zeros_like(x)
     u, v = torch.stack((-xy, xx, -y, k, zero, xk, x_r), 1), torch.stack((-yy, xy, x, zero, k, yk, y_r), 1)
-    return Linear(u, v, slope, variance, front)
+    return Linear(u, v, slope, variance, front, known)
 
 
 def residuals(
@@ -180,11 +202,15 @@ def residuals(
     Gradient: to ``linear``, variance excepted, and noise. Raises ValueError for wrong shapes.
     """
     check("residuals", u=(linear.u, "B 7 N"), noise=(noise, "B N"))
-    m0, m1 = (m[:, None] for m in _whitener(problem, linear, noise))
+    return _rows(linear, _sphere(linear.fixed, noise), turn)
+
+
+def _rows(linear: Linear, sphere: tuple[Tensor, Tensor, Tensor], turn: bool) -> Tensor:
+    m0, m1 = (m[:, None] for m in _whitener(linear, sphere))
     rows = m0 * linear.u[:, :, None] + m1 * linear.v[:, :, None]
     if not turn:
         return rows
-    return torch.cat((rows[:, :6], rows[:, :3] * _height(problem)[:, None, None], rows[:, 6:]), 1)
+    return torch.cat((rows[:, :6], rows[:, :3] * linear.fixed.height[:, None, None], rows[:, 6:]), 1)
 
 
 def squares(
@@ -197,7 +223,11 @@ def squares(
     Gradient: as :func:`residuals`. Raises ValueError for wrong shapes.
     """
     check("squares", u=(linear.u, "B n N"), noise=(noise, "B N"))
-    m0, m1 = _whitener(problem, linear, noise)
+    return _lengths(linear, _sphere(linear.fixed, noise))
+
+
+def _lengths(linear: Linear, sphere: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+    m0, m1 = _whitener(linear, sphere)
     return _square(linear, m0 * linear.u[:, -1:] + m1 * linear.v[:, -1:])
 
 
@@ -221,45 +251,46 @@ def normal(
 
     Gradient: as :func:`residuals`. Raises ValueError for wrong shapes or an unknown kernel.
     """
-    linear = linearise_tracks(problem, at)
-    rows = residuals(problem, linear, noise, turn=at.turn is not None)
-    rho, weight = robust(_square(linear, rows[:, -1]), kernel, bend)
-    share = _share(problem, far_weight)
-    H, g = normal_equations(rows, torch.where(linear.front, weight * share, 0.0), block=SUM_LANES)
-    total = _total(rho, share, at, turn_precision)
-    if at.turn is None:
-        return Normal(total, H, g)
-    known = prior(turn_precision.to(g.dtype))
-    turn = torch.cat((torch.zeros_like(g[:, :6]), at.turn), -1)
-    return Normal(total, H + torch.diag_embed(known), g + known * turn)
+    return equations(problem, noise, far_weight, turn_precision, kernel=kernel, bend=bend)[0](at)
 
 
-def cost(
+def equations(
     problem: Problem,
-    at: Unknowns,
     noise: Tensor,  # (B, N) px²
     far_weight: Tensor,  # (B,)
     turn_precision: Tensor,  # (B,) 1/rad²
     *,
     kernel: str | None,
     bend: float,
-) -> Tensor:
-    """The cost (B,) of :func:`normal`, the same bits, without its equations.
+) -> tuple[Callable[[Unknowns], Normal], Callable[[Unknowns], Tensor]]:
+    """:func:`normal` as a function of the unknowns, and its cost (B,) alone, the same bits; for several places.
 
-    Gradient: as :func:`residuals`. Raises ValueError for wrong shapes or an unknown kernel.
+    Gradient: as :func:`residuals`.
     """
-    rho, _ = robust(squares(problem, linearise_tracks(problem, at, columns=False), noise), kernel, bend)
-    return _total(rho, _share(problem, far_weight), at, turn_precision)
+    known = fixed(problem)
+    sphere = _sphere(known, noise)
+    share = torch.where(problem.near, 1.0, torch.where(problem.far, far_weight[:, None], 0.0))
 
+    def total(rho: Tensor, turn: Tensor | None) -> Tensor:
+        cost = (rho * share).sum(-1)
+        return cost if turn is None else cost + turn_precision * (turn * turn).sum(-1)
 
-def _share(problem: Problem, far_weight: Tensor) -> Tensor:
-    """Weight (B, N) of each track's robust cost."""
-    return torch.where(problem.near, 1.0, torch.where(problem.far, far_weight[:, None], 0.0))
+    def normal(at: Unknowns) -> Normal:
+        linear = linearise_tracks(problem, at, known=known)
+        rows = _rows(linear, sphere, at.turn is not None)
+        rho, weight = robust(_square(linear, rows[:, -1]), kernel, bend)
+        H, g = normal_equations(rows, torch.where(linear.front, weight * share, 0.0), block=SUM_LANES)
+        if at.turn is None:
+            return Normal(total(rho, None), H, g)
+        precision = prior(turn_precision.to(g.dtype))
+        turn = torch.cat((torch.zeros_like(g[:, :6]), at.turn), -1)
+        return Normal(total(rho, at.turn), H + torch.diag_embed(precision), g + precision * turn)
 
+    def cost(at: Unknowns) -> Tensor:
+        square = _lengths(linearise_tracks(problem, at, columns=False, known=known), sphere)
+        return total(robust(square, kernel, bend)[0], at.turn)
 
-def _total(rho: Tensor, share: Tensor, at: Unknowns, turn_precision: Tensor) -> Tensor:
-    total = (rho * share).sum(-1)
-    return total if at.turn is None else total + turn_precision * (at.turn * at.turn).sum(-1)
+    return normal, cost
 
 
 def _square(linear: Linear, r: Tensor) -> Tensor:
@@ -271,12 +302,6 @@ def prior(turn_precision: Tensor) -> Tensor:
     """Information (B, 9) that is there before any track: none on the pose."""
     zero = torch.zeros_like(turn_precision)
     return torch.stack((*[zero] * 6, *[turn_precision] * 3), -1)
-
-
-def _noise_shape(problem: Problem) -> Tensor:
-    """The noise's covariance (B, 3, N) at z = 1, up to scale."""
-    f0, f1 = problem.f[:, :1], problem.f[:, 1:]
-    return problem.shape / torch.cat((f0 * f0, f0 * f1, f1 * f1), 1)[..., None]
 
 
 def _inverse_depth(a: Tensor, t: Tensor, seen: Tensor, shape: Tensor) -> Tensor:
@@ -293,17 +318,21 @@ def _inverse_depth(a: Tensor, t: Tensor, seen: Tensor, shape: Tensor) -> Tensor:
     return -(p * d).sum(1) / (d * d).sum(1).clamp_min(1e-24)
 
 
-def _whitener(problem: Problem, linear: Linear, noise: Tensor) -> tuple[Tensor, Tensor]:
+def _sphere(known: Fixed, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """a, b, d (B, N) of L⁻¹ = [[a, 0], [−b d, d]], which makes the noise S = L Lᵀ of a track round."""
+    xx, xy, yy = (known.shape * noise[:, None]).unbind(1)
+    b = xy / xx
+    return xx.rsqrt(), b, (yy - b * xy).rsqrt()
+
+
+def _whitener(linear: Linear, sphere: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     """The columns (B, 2, N) of a matrix M with MᵀM = (S + variance s sᵀ)⁻¹, singular where the variance is infinite.
 
     With S = L Lᵀ the whitened slope e = L⁻¹ s is a vector of the plane. Only the residual along it depends on q: of its
     weight, 1 / (1 + |e|² variance) is left. M turns e to the first axis and scales that.
     """
-    xx, xy, yy = (_noise_shape(problem) * noise[:, None]).unbind(1)
+    a, b, d = sphere
     s0, s1 = linear.slope.unbind(1)
-    b = xy / xx
-    a = xx.rsqrt()
-    d = (yy - b * xy).rsqrt()  # L⁻¹ = [[a, 0], [−b d, d]]
     e0, e1 = a * s0, d * (s1 - b * s0)
     square = e0 * e0 + e1 * e1
     flat = square < 1e-12  # the pixel does not depend on q
@@ -316,7 +345,3 @@ def _whitener(problem: Problem, linear: Linear, noise: Tensor) -> tuple[Tensor, 
         torch.stack((left0 * a - left1 * bd, -e1 * a - e0 * bd), 1),
         torch.stack((left1 * d, e0 * d), 1),
     )
-
-
-def _height(problem: Problem) -> Tensor:
-    return problem.ray[:, 1] / problem.ray[:, 2]

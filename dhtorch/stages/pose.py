@@ -418,6 +418,7 @@ def _fit_all(o: FitOptions, threshold_px: float, first: PoseFit, problem: Proble
         far_noise = torch.where(problem.far, found.noise, 0.0).amax(-1)
         variance = torch.where(problem.far.any(-1), far_noise, found.noise.amax(-1))
         t_snr = covariance.mahalanobis(at.T.t, cov[:, 3:6, 3:6])
+    assert at.turn is not None  # most_probable answers one, of zeros where it believes none
 
     def answer(x: Tensor) -> Tensor:
         return torch.where(ok.view(-1, *[1] * (x.ndim - 1)), x, torch.nan).to(tracks.uv_1.dtype)
@@ -472,9 +473,10 @@ def _near_far(samples: Samples, tracks: Tracks, camera_0: Camera, camera_1: Came
 
 def _reprojection(problem: Problem, at: near_far.Unknowns, threshold_px: float) -> tuple[Tensor, Tensor]:
     """Near tracks (B, N) whose point, at the sensor's depth, falls close to where they were seen; rms px of these."""
-    y = problem.ray[:, 1]
-    uv = near_far.straighten(problem.uv, problem.f, problem.c, y, at.turn)
-    rows, depth = linearise(at.T, problem.f, problem.c, problem.ray / problem.inverse[:, None], uv)
-    square = (rows[:, 6] * rows[:, 6]).sum(1)
+    uv = problem.uv
+    if at.turn is not None:
+        uv = near_far.straighten(uv, problem.f, problem.c, problem.ray[:, 1], at.turn)
+    r, depth = reprojection(at.T, problem.f, problem.c, problem.ray / problem.inverse[:, None], uv)
+    square = (r * r).sum(1)
     inlier = problem.near & (depth > MIN_DEPTH) & (square < threshold_px**2)
     return inlier, (torch.where(inlier, square, 0.0).sum(-1) / inlier.sum(-1).clamp_min(1)).sqrt()
