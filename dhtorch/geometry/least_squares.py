@@ -9,6 +9,7 @@ is contiguous over points.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import torch
@@ -338,7 +339,17 @@ def choose(mask: Tensor, new: S, old: S) -> S:
 
     Gradient: to the chosen ones.
     """
-    return pytree.tree_map(lambda a, b: None if a is None else _where(mask, a, b), new, old)
+    return pytree.tree_map(partial(_either, mask), new, old, is_leaf=_is_pose)
+
+
+def _either(mask: Tensor, new: Any, old: Any) -> Any:
+    if _is_pose(new):  # not one walk deeper: every step of every fit comes here
+        return Pose(_where(mask, new.R, old.R), _where(mask, new.t, old.t))
+    return None if new is None else _where(mask, new, old)
+
+
+def _is_pose(x: Any) -> bool:
+    return isinstance(x, Pose)
 
 
 def _where(mask: Tensor, a: Tensor, b: Tensor) -> Tensor:

@@ -23,36 +23,42 @@ def check(where: str, **args: tuple[Tensor | None, str]) -> dict[str, int]:
     Raises:
         ValueError: the number of axes, a fixed size or a shared axis differs from the pattern.
     """
+    if torch.compiler.is_compiling():
+        return _bound(where, args)
+    seen = tuple([(pattern, None if x is None else x.shape) for x, pattern in args.values()])
+    sizes = _right.get(seen)
+    if sizes is None:
+        sizes = _bound(where, args)
+        if len(_right) >= REMEMBERED:
+            _right.clear()
+        _right[seen] = sizes
+    return dict(sizes)
+
+
+#: Calls that were right: a fit asks the same of the same shapes at every step.
+REMEMBERED = 4096
+_right: dict[tuple[tuple[str, torch.Size | None], ...], dict[str, int]] = {}
+
+
+def _bound(where: str, args: dict[str, tuple[Tensor | None, str]]) -> dict[str, int]:
     sizes: dict[str, int] = {}
     for name, (x, pattern) in args.items():
         if x is None:
             continue
-        axes, shape = _axes(pattern), x.shape
+        axes = pattern.split()
+        shape = tuple(x.shape)
         if axes[0] == "*":
             axes = axes[1:]
             shape = shape[len(shape) - len(axes) :] if len(shape) >= len(axes) else shape
         ok = len(axes) == len(shape)
         for axis, size in zip(axes, shape, strict=False):
-            ok = ok and (axis if isinstance(axis, int) else sizes.setdefault(axis, size)) == size
+            ok = ok and (int(axis) == size if axis.isdigit() else sizes.setdefault(axis, size) == size)
         if not ok:
             bound = ", ".join(f"{k}={v}" for k, v in sizes.items())
             raise ValueError(
                 f"{where}: {name} has shape {tuple(x.shape)}, expected ({pattern}) with {bound or 'any sizes'}"
             )
     return sizes
-
-
-#: Patterns that were read once; a step of a fit asks for the same few every time.
-_read: dict[str, tuple[str | int, ...]] = {}
-
-
-def _axes(pattern: str) -> tuple[str | int, ...]:
-    found = None if torch.compiler.is_compiling() else _read.get(pattern)
-    if found is None:
-        found = tuple(int(axis) if axis.isdigit() else axis for axis in pattern.split())
-        if not torch.compiler.is_compiling():
-            _read[pattern] = found
-    return found
 
 
 def is_static(x: Tensor) -> bool:

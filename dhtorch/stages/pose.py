@@ -264,7 +264,7 @@ def _truncated(
     """The cost that search and refinement share, Σ rho(min(r², threshold²)), points behind the camera in full: with its
     normal equations, and alone."""
     limits = torch.where(usable, threshold_px * threshold_px, 0.0).to(points.dtype)
-    xyz, uv = points.split((3, 2), 1)
+    xyz, uv = points[:, :3], points[:, 3:]
 
     def truncated(r: Tensor, depth: Tensor) -> Tensor:
         square = (r * r).sum(1)
