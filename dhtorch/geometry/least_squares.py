@@ -72,7 +72,8 @@ def linearise(
     (aw, bw) = (minus * w).unbind(1)
     aa, bb = square.unbind(1)
     ra, rb = (plane - (uv - c[..., None]) / f).unbind(1)
-    w, zero = w[:, 0], torch.zeros_like(a)
+    w = w[:, 0]
+    zero = torch.zeros_like(a)
     columns = (na * b, -1 - bb, 1 + aa, a * b, nb, a, w, zero, zero, w, aw, bw, ra, rb)  # u and v in turn
     return torch.stack(columns, 1).unflatten(1, (7, 2)) * f[:, None], z
 
@@ -329,7 +330,8 @@ def minimise(
             return choose(better, proposal, T), torch.where(better, found, best.cost)
         there = evaluate(proposal)
         better = ok & (there.cost < best.cost)
-        T, best = choose(better, proposal, T), Normal(*(_where(better, a, b) for a, b in zip(there, best, strict=True)))
+        T = choose(better, proposal, T)
+        best = Normal(*(_where(better, a, b) for a, b in zip(there, best, strict=True)))
         factor = torch.where(better, factor * 0.1, factor * 10)
     return T, best.cost
 

@@ -100,7 +100,8 @@ def most_probable(problem: Problem, start: Pose, o: FitOptions) -> Solution:
     values.
     """
     whole, (problem, close) = problem, _used_first(problem)
-    at, straight = Unknowns(start, None), torch.zeros_like(start.t)
+    at = Unknowns(start, None)
+    straight = torch.zeros_like(start.t)
     none, far, rigid = (torch.full_like(start.t[:, 0], x) for x in (0.0, o.far_weight, RIGID))
 
     def solve(
@@ -121,7 +122,8 @@ def most_probable(problem: Problem, start: Pose, o: FitOptions) -> Solution:
         turned, lower = solve(both, noise, far, loose, o.steps)
         worth = least - lower > o.turn_gain * least + SLACK
         both, precision = choose(worth, turned, both), torch.where(worth, loose, rigid)
-    near, both = near._replace(turn=straight), both if o.turn_sigma > 0 else both._replace(turn=straight)
+    near = near._replace(turn=straight)
+    both = both if o.turn_sigma > 0 else both._replace(turn=straight)
     scales = noise[:, : close.near.shape[1]]
     cost_near, cost_both = (_near_cost(close, x, scales, o) for x in (near, both))
     believed = cost_both <= cost_near * (1 + o.max_rise) + SLACK

@@ -67,10 +67,10 @@ def distinct_triples(
     check("distinct_triples", draws=(draws, "B H 3"), count=(count, "B"))
     left = (count[:, None, None] - torch.arange(3, device=count.device)).clamp_min(1)
     first, second, third = torch.minimum((draws * left).long(), left - 1).unbind(-1)
-    second = second + (second >= first)
+    second = torch.where(second >= first, second + 1, second)
     low, high = torch.minimum(first, second), torch.maximum(first, second)
-    third = third + (third >= low)
-    third = third + (third >= high)
+    third = torch.where(third >= low, third + 1, third)
+    third = torch.where(third >= high, third + 1, third)
     return torch.minimum(torch.stack((first, second, third), -1), (count - 1).clamp_min(0)[:, None, None])
 
 

@@ -8,6 +8,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+#: Calls that are remembered before all are forgotten.
+REMEMBERED = 4096
+
+#: Patterns and shapes that were right, and their sizes: a fit asks the same at every step.
+_right: dict[tuple[tuple[str, torch.Size | None], ...], dict[str, int]] = {}
+
 
 def check(where: str, **args: tuple[Tensor | None, str]) -> dict[str, int]:
     """Check tensors against axis patterns such as ``"B N 2"``; equal letters must have equal sizes.
@@ -33,11 +39,6 @@ def check(where: str, **args: tuple[Tensor | None, str]) -> dict[str, int]:
             _right.clear()
         _right[seen] = sizes
     return dict(sizes)
-
-
-#: Calls that were right: a fit asks the same of the same shapes at every step.
-REMEMBERED = 4096
-_right: dict[tuple[tuple[str, torch.Size | None], ...], dict[str, int]] = {}
 
 
 def _bound(where: str, args: dict[str, tuple[Tensor | None, str]]) -> dict[str, int]:
