@@ -27,7 +27,7 @@ class Record:
 
     def map(self, fn: Callable[[Tensor], Tensor]) -> Self:
         """Apply ``fn`` to every tensor, nested records included; ``None`` stays ``None``."""
-        return dataclasses.replace(self, **{k: _map_value(v, fn) for k, v in _items(self)})  # type: ignore[type-var]
+        return type(self)(**{k: _map_value(v, fn) for k, v in _items(self)})
 
     def to(self, *args: Any, **kwargs: Any) -> Self:
         """Move to a device and/or floating dtype, as ``Tensor.to``.
@@ -90,10 +90,18 @@ def in_pieces(fn: Callable[..., R], size: int, *batch: Any) -> R:
 
     ``fn`` must treat every item alike. Gradient: that of ``fn``.
     """
-    count = len(pytree.tree_leaves(batch)[0])
+    count = len(_first(batch[0]))
     if count <= size:
         return fn(*batch)
     return collate(fn(*(x[i : i + size] for x in batch)) for i in range(0, count, size))
+
+
+def _first(x: Any) -> Tensor:
+    """The first tensor of a tensor or record, without a walk through all of it."""
+    while isinstance(x, Record):
+        x = next(value for _, value in _items(x) if value is not None)
+    found: Tensor = x
+    return found
 
 
 def _items(rec: Record) -> list[tuple[str, Any]]:

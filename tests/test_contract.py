@@ -429,6 +429,7 @@ ROWS = [
     Row(affine.step, lambda b, n, d: (*pyramids(b, n, d), *nearby(b, n, d), torch.eye(2, dtype=d).expand(b, n, 2, 2)), "dtype batch capture gradcheck empty shuffle padding nan raises", (2, 3, 4), (0, 1), bad=wrong_last_axis(2), atol=1e-4),
     Row(p3p.p3p, triples, "dtype batch vmap capture shuffle padding", (0, 1), atol=1e-4),
     Row(least_squares.linearise, planes, "dtype batch vmap capture gradcheck empty raises", grad=(0, 1, 2, 3, 4), bad=lambda a: (*a[:4], a[4][..., 1:])),
+    Row(least_squares.reprojection, planes, "dtype batch vmap capture gradcheck empty raises", grad=(0, 1, 2, 3, 4), bad=lambda a: (*a[:4], a[4][..., 1:])),
     Row(least_squares.robust, lambda b, n, d: (uniform(b, n, dtype=d), "cauchy", 0.5), "dtype batch vmap capture gradcheck empty shuffle padding nan", (0,), (0,)),
     Row(least_squares.gauss_newton_step, lambda b, n, d: (poses(b, d), positive(b, n, d), uniform(b, 6, dtype=d)), "dtype batch vmap capture"),
     Row(least_squares.trial_step, lambda b, n, d: (poses(b, d), positive(b, n, d), uniform(b, 6, dtype=d)), "dtype batch capture raises", bad=wrong_last_axis(2)),
@@ -442,6 +443,7 @@ ROWS = [
     Row(near_far.step, nine, "dtype batch vmap capture raises", bad=wrong_last_axis(2)),
     Row(near_far.trial_step, nine, "dtype batch vmap capture raises", bad=wrong_last_axis(2)),
     Row(near_far.straighten, lambda b, n, d: (pixels(b, n, d).mT, cameras(b, d).f, cameras(b, d).c, uniform(b, n, dtype=d, low=-0.5, high=0.5), uniform(b, 3, dtype=d, high=0.02)), "dtype batch vmap capture gradcheck empty raises", grad=(0, 1, 2, 3, 4), bad=wrong_last_axis(3)),
+    Row(near_far.fixed, lambda b, n, d: problems(b, n, d)[:1], "dtype batch vmap capture"),
     Row(near_far.linearise_tracks, lambda b, n, d: problems(b, n, d)[:2], "dtype batch vmap capture raises", bad=lambda a: (a[0].replace(uv=a[0].uv[..., 1:]), a[1])),
     Row(near_far.residuals, linear, "dtype batch vmap capture gradcheck raises", grad=(2,), bad=wrong_last_axis(2)),
     Row(near_far.squares, linear, "dtype batch vmap capture gradcheck raises", grad=(2,), bad=wrong_last_axis(2)),
@@ -551,6 +553,7 @@ ELSEWHERE = {
     *(f"dhtorch.distortion.{name}" for name in ("basis_of", "fields", "curves", "log_depth", "predicted", "fit")),
     "dhtorch.geometry.exact.filled",
     "dhtorch.geometry.least_squares.minimise",
+    "dhtorch.geometry.near_far.equations",
     *(
         f"dhtorch.geometry.lucas_kanade.{n}"
         for n in ("search", "step", "squares", "window_covariance", "for_some", "within")

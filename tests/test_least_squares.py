@@ -16,6 +16,7 @@ from dhtorch.geometry.least_squares import (
     minimise,
     move,
     normal_equations,
+    reprojection,
     robust,
     solve_spd,
     trial_step,
@@ -65,6 +66,14 @@ def test_points_behind_the_camera_have_finite_rows_and_their_true_depth():
     assert rows.isfinite().all() and torch.equal(depth, xyz[:, 2])
     clamped = torch.tensor([MIN_DEPTH, MIN_DEPTH, MIN_DEPTH, 2 * MIN_DEPTH], dtype=D)
     torch.testing.assert_close(rows[0, 6], f[0, :, None] * xyz[0, :2] / clamped + c[0, :, None] - uv[0])
+
+
+def test_residuals_without_a_jacobian_are_those_with_one_bit_for_bit():
+    T, f, c, xyz, uv = (x.to(torch.float32) for x in scene(3, 50))
+    xyz[1, 2, :9] = -1.0  # behind
+    rows, depth = linearise(T, f, c, xyz, uv)
+    r, z = reprojection(T, f, c, xyz, uv)
+    assert torch.equal(r, rows[:, 6]) and torch.equal(z, depth)
 
 
 # ------------------------------------------------------------------------------------------------ kernels
@@ -274,6 +283,26 @@ def test_the_first_step_is_damped_by_a_ten_thousandth():
 
     minimise(evaluate, torch.zeros(1, 2, dtype=D), 1, step=lambda x, A, g: (seen_H.append(A), (x, x[:, 0] == 0))[1])
     torch.testing.assert_close(seen_H[0] - H, 1e-4 * torch.diag_embed(H.diagonal(dim1=1, dim2=2)), rtol=1e-9, atol=0)
+
+
+def test_the_last_proposal_is_judged_by_its_cost_alone_and_may_be_rejected():
+    """A parabola around 3: with the cost alone the answer is the same, and one evaluation fewer is asked for."""
+    asked = []
+
+    def evaluate(x):
+        asked.append(x)
+        return Normal(((x - 3) ** 2).sum(-1), torch.eye(1, dtype=D).expand(2, 1, 1), x - 3)
+
+    def step(x, H, g):
+        return x - g * torch.tensor([[0.5], [2.5]], dtype=D), torch.ones(2, dtype=torch.bool)  # the second overshoots
+
+    start = torch.zeros(2, 1, dtype=D)
+    whole = minimise(evaluate, start, 2, step=step)
+    calls, _ = len(asked), asked.clear()
+    short = minimise(evaluate, start, 2, step=step, cost=lambda x: ((x - 3) ** 2).sum(-1))
+    assert calls == 3 and len(asked) == 2
+    assert all(torch.equal(a, b) for a, b in zip(whole, short, strict=True))
+    assert whole[0].tolist() == [[2.25], [0.0]] and whole[1].tolist() == [0.5625, 9.0]
 
 
 def test_minimise_descends_to_the_optimum_and_leaves_what_is_no_number():

@@ -146,6 +146,21 @@ def test_a_baseline_of_a_tenth_of_a_millimetre_is_one():
 # ------------------------------------------------------------------------------------------------ all tracks
 
 
+def test_without_a_turn_the_equations_are_those_of_the_pose_at_a_turn_of_zero():
+    problem, at = scene(turn=0.0)
+    weight, precision = torch.tensor([0.3, 0.7], dtype=D), torch.tensor([2e3, 5e4], dtype=D)
+    normal, cost = near_far.equations(problem, NOISE, weight, precision, kernel="cauchy", bend=1.5)
+    still = at._replace(turn=torch.zeros_like(at.turn))
+    whole, pose = normal(still), normal(at._replace(turn=None))
+    torch.testing.assert_close(pose.H, whole.H[:, :6, :6], rtol=1e-12, atol=1e-9)
+    torch.testing.assert_close(pose.g, whole.g[:, :6], rtol=1e-12, atol=1e-9)
+    assert torch.equal(pose.cost, whole.cost)
+    for x in (at, still, at._replace(turn=None)):
+        assert torch.equal(cost(x), normal(x).cost)
+    moved, ok = near_far.step(at._replace(turn=None), pose.H, pose.g)
+    assert moved.turn is None and ok.all() and not torch.equal(moved.T.R, at.T.R)
+
+
 @pytest.mark.parametrize("kernel", [None, "huber", "cauchy", "geman_mcclure"])
 def test_normal_equations_are_the_schur_complement_of_one_with_all_inverse_depths(kernel):
     problem, at = scene()

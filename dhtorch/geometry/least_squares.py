@@ -9,6 +9,7 @@ is contiguous over points.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import torch
@@ -63,20 +64,43 @@ def linearise(
     (``tests/test_least_squares.py``).
     """
     check("linearise", R=(T.R, "B 3 3"), f=(f, "B 2"), c=(c, "B 2"), xyz=(xyz, "B 3 N"), uv=(uv, "B 2 N"))
-    Y = torch.baddbmm(T.t[..., None], T.R, xyz)
-    z = Y[:, 2]
-    w = 1 / z.clamp_min(MIN_DEPTH)
+    plane, w, z = _seen(T, xyz)
     f = f[..., None]
-    plane = Y[:, :2] * w[:, None]  # (a, b): where the point is seen at z = 1
     minus, square = -plane, plane * plane
     (a, b) = plane.unbind(1)
     (na, nb) = minus.unbind(1)
-    (aw, bw) = (minus * w[:, None]).unbind(1)
+    (aw, bw) = (minus * w).unbind(1)
     aa, bb = square.unbind(1)
     ra, rb = (plane - (uv - c[..., None]) / f).unbind(1)
+    w = w[:, 0]
     zero = torch.zeros_like(a)
     columns = (na * b, -1 - bb, 1 + aa, a * b, nb, a, w, zero, zero, w, aw, bw, ra, rb)  # u and v in turn
     return torch.stack(columns, 1).unflatten(1, (7, 2)) * f[:, None], z
+
+
+def reprojection(
+    T: Pose,
+    f: Tensor,  # (B, 2) px
+    c: Tensor,  # (B, 2) px
+    xyz: Tensor,  # (B, 3, N) m, planes
+    uv: Tensor,  # (B, 2, N) ideal px, planes
+) -> tuple[Tensor, Tensor]:
+    """The residuals (B, 2, N) px and the depth (B, N) of :func:`linearise`, the same bits, without the Jacobian.
+
+    Gradient: to pose, f, c, xyz and uv. Raises ValueError for wrong shapes.
+    """
+    check("reprojection", R=(T.R, "B 3 3"), f=(f, "B 2"), c=(c, "B 2"), xyz=(xyz, "B 3 N"), uv=(uv, "B 2 N"))
+    plane, _, z = _seen(T, xyz)
+    f = f[..., None]
+    return (plane - (uv - c[..., None]) / f) * f, z
+
+
+def _seen(T: Pose, xyz: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Where points are seen at z = 1 (B, 2, N), one over their depth (B, 1, N), safe for points behind, and z."""
+    Y = torch.baddbmm(T.t[..., None], T.R, xyz)
+    z = Y[:, 2:]
+    w = z.clamp_min(MIN_DEPTH).reciprocal()
+    return Y[:, :2] * w, w, z[:, 0]
 
 
 def robust(square: Tensor, kernel: str | None, scale: float) -> tuple[Tensor, Tensor]:
@@ -147,13 +171,18 @@ def normal_equations(
     Gradient: to rows and weights. Raises ValueError for wrong shapes.
     """
     N = check("normal_equations", rows=(rows, "B n 2 N"), weight=(weight, "B N"))["N"]
-    sums: Tensor | None = None
-    for part, share in zip(rows.split(block or max(N, 1), -1), weight.split(block or max(N, 1), -1), strict=True):
-        weighted = (part[:, :-1] * share[:, None, None]).flatten(2)
-        whole = part.flatten(2).transpose(1, 2)
-        sums = torch.bmm(weighted, whole) if sums is None else torch.baddbmm(sums, weighted, whole)
-    assert sums is not None  # an empty tensor is split into one
+    if block is None or block >= N:
+        sums = torch.bmm(*_factors(rows, weight))
+    else:
+        sums = torch.bmm(*_factors(rows[..., :block], weight[..., :block]))
+        for k in range(block, N, block):
+            sums = torch.baddbmm(sums, *_factors(rows[..., k : k + block], weight[..., k : k + block]))
     return sums[..., :-1], sums[..., -1]
+
+
+def _factors(rows: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Matrices whose product is Σ w J (J, r)ᵀ (B, n, n + 1)."""
+    return (rows[:, :-1] * weight[:, None, None]).flatten(2), rows.flatten(2).transpose(1, 2)
 
 
 def solve_spd(
@@ -271,6 +300,7 @@ def minimise(
     T: S,
     steps: int,
     *,
+    cost: Callable[[S], Tensor] | None = None,
     damping: float = 1e-4,
     step: Callable[[Any, Tensor, Tensor], tuple[Any, Tensor]] = gauss_newton_step,
 ) -> tuple[S, Tensor]:
@@ -280,6 +310,7 @@ def minimise(
         evaluate: cost and normal equations at a pose; its mask or weights may be recomputed there.
         T: start; a pose, or another record of unknowns that ``step`` can move.
         steps: how many proposals.
+        cost: the cost (B,) of ``evaluate`` alone: the last proposal is only judged, no step follows.
         damping: initial factor of the diagonal; ×0.1 after an accepted step, ×10 after a rejected one.
         step: ``(T, H, g) -> (T, ok)``, the Gauss–Newton step.
 
@@ -289,25 +320,38 @@ def minimise(
     Gradient: none is meant to flow here; take :func:`gauss_newton_step` from the detached result.
     """
     best = evaluate(T)
-    kept, shape = pytree.tree_flatten((T, best))
     factor = torch.full_like(best.cost, damping)
-    for _ in range(steps):
+    for k in range(steps):
         diagonal = torch.diag_embed(best.H.diagonal(dim1=-2, dim2=-1))
         proposal, ok = step(T, best.H + factor[:, None, None] * diagonal, best.g)
-        found = evaluate(proposal)
-        better = ok & (found.cost < best.cost)
-        kept = [_where(better, a, b) for a, b in zip(pytree.tree_leaves((proposal, found)), kept, strict=True)]
-        T, best = pytree.tree_unflatten(kept, shape)
+        if k == steps - 1:
+            found = evaluate(proposal).cost if cost is None else cost(proposal)
+            better = ok & (found < best.cost)
+            return choose(better, proposal, T), torch.where(better, found, best.cost)
+        there = evaluate(proposal)
+        better = ok & (there.cost < best.cost)
+        T = choose(better, proposal, T)
+        best = Normal(*(_where(better, a, b) for a, b in zip(there, best, strict=True)))
         factor = torch.where(better, factor * 0.1, factor * 10)
     return T, best.cost
 
 
 def choose(mask: Tensor, new: S, old: S) -> S:
-    """Batch elements of ``new`` where ``mask`` (B,) holds, of ``old`` elsewhere; trees of tensors (B, …).
+    """Batch elements of ``new`` where ``mask`` (B,) holds, of ``old`` elsewhere; trees of tensors (B, …) or None.
 
     Gradient: to the chosen ones.
     """
-    return pytree.tree_map(lambda a, b: _where(mask, a, b), new, old)
+    return pytree.tree_map(partial(_either, mask), new, old, is_leaf=_is_pose)
+
+
+def _either(mask: Tensor, new: Any, old: Any) -> Any:
+    if _is_pose(new):  # not one walk deeper: every step of every fit comes here
+        return Pose(_where(mask, new.R, old.R), _where(mask, new.t, old.t))
+    return None if new is None else _where(mask, new, old)
+
+
+def _is_pose(x: Any) -> bool:
+    return isinstance(x, Pose)
 
 
 def _where(mask: Tensor, a: Tensor, b: Tensor) -> Tensor:

@@ -25,8 +25,8 @@ from dhtorch.geometry.least_squares import (
 from dhtorch.geometry.near_far import (
     Problem,
     Unknowns,
+    equations,
     linearise_tracks,
-    normal,
     prior,
     residuals,
     squares,
@@ -75,7 +75,7 @@ class FitOptions(NamedTuple):
 class Solution(NamedTuple):
     """The unknowns at the optimum, and the weights under which it is one."""
 
-    at: Unknowns
+    at: Unknowns  # with a turn, zero where none was believed
     noise: Tensor  # (B, N) px²
     far_weight: Tensor  # (B,) 0 where far tracks were not believed
     turn_precision: Tensor  # (B,) 1/rad²
@@ -100,28 +100,30 @@ def most_probable(problem: Problem, start: Pose, o: FitOptions) -> Solution:
     values.
     """
     whole, (problem, close) = problem, _used_first(problem)
-    at = Unknowns(start, torch.zeros_like(start.t))
+    at = Unknowns(start, None)
+    straight = torch.zeros_like(start.t)
     none, far, rigid = (torch.full_like(start.t[:, 0], x) for x in (0.0, o.far_weight, RIGID))
 
     def solve(
         at: Unknowns, noise: Tensor, far: Tensor, precision: Tensor, steps: int, problem: Problem = problem
     ) -> tuple[Unknowns, Tensor]:
-        def evaluate(at: Unknowns) -> Normal:
-            return normal(problem, at, noise, far, precision, kernel=o.kernel, bend=o.bend)
-
-        return minimise(evaluate, at, steps, step=trial_step)
+        evaluate, judge = equations(problem, noise, far, precision, kernel=o.kernel, bend=o.bend)
+        return minimise(evaluate, at, steps, cost=judge, step=trial_step)
 
     half = o.near_steps // 2
     near, _ = solve(at, noise_scale(close, at), none, rigid, half, close)
     near, _ = solve(near, noise_scale(close, near), none, rigid, o.near_steps - half, close)
-    both, cost = solve(near, noise_scale(problem, near), far, rigid, o.steps)
+    both, _ = solve(near, noise_scale(problem, near), far, rigid, o.steps)
     noise, precision = noise_scale(problem, both), rigid
     if o.turn_sigma > 0:
-        both, cost = solve(both, noise, far, rigid, o.steps // 2)
+        both, least = solve(both, noise, far, rigid, o.steps // 2)
+        both = both._replace(turn=straight)
         loose = torch.full_like(rigid, o.turn_sigma**-2)
         turned, lower = solve(both, noise, far, loose, o.steps)
-        worth = cost - lower > o.turn_gain * cost + SLACK
+        worth = least - lower > o.turn_gain * least + SLACK
         both, precision = choose(worth, turned, both), torch.where(worth, loose, rigid)
+    near = near._replace(turn=straight)
+    both = both if o.turn_sigma > 0 else both._replace(turn=straight)
     scales = noise[:, : close.near.shape[1]]
     cost_near, cost_both = (_near_cost(close, x, scales, o) for x in (near, both))
     believed = cost_both <= cost_near * (1 + o.max_rise) + SLACK
@@ -157,20 +159,22 @@ def _used_first(problem: Problem) -> tuple[Problem, Problem]:
 def _translates(problem: Problem, at: Unknowns, noise: Tensor, far: Tensor, precision: Tensor, o: FitOptions) -> Tensor:
     """Whether (B,) the cost is far below that of the best rotation without translation, under the same noise."""
 
-    free = at.turn.new_tensor([1.0] * 3 + [0.0] * 3 + [1.0] * 3)  # a trace of t would be a baseline to a far track
+    free = noise.new_tensor([1.0] * 3 + [0.0] * 3 + [1.0] * 3)  # a trace of t would be a baseline to a far track
+
+    normal, judge = equations(problem, noise, far, precision, kernel=o.kernel, bend=o.bend)
 
     def evaluate(at: Unknowns) -> Normal:
-        cost, H, g = normal(problem, at, noise, far, precision, kernel=o.kernel, bend=o.bend)
-        return Normal(cost, H * free * free[:, None] + torch.diag(1 - free), g * free)
+        there, H, g = normal(at)
+        return Normal(there, H * free * free[:, None] + torch.diag(1 - free), g * free)
 
     still = Unknowns(Pose(at.T.R, torch.zeros_like(at.T.t)), at.turn)
-    turned, rotation = minimise(evaluate, still, o.steps, step=trial_step)
-    shown = rotation - evaluate(at).cost > o.translation_gain * rotation + SLACK
+    turned, rotation = minimise(evaluate, still, o.steps, cost=judge, step=trial_step)
+    shown = rotation - judge(at) > o.translation_gain * rotation + SLACK
     costs = [_costs(problem, x, noise, o) for x in (turned, at)]
     for part in NEAREST:
         nearest = _nearest(problem, part)
         share = torch.where(nearest, 1.0, torch.where(problem.near | problem.far, far[:, None], 0.0))
-        without, found = ((cost * share).sum(-1) for cost in costs)
+        without, found = ((each * share).sum(-1) for each in costs)
         better = without - found > o.translation_gain * without + SLACK
         shown = shown | (better & (nearest.sum(-1) >= MIN_PART))
     return shown
@@ -191,7 +195,7 @@ def noise_scale(problem: Problem, at: Unknowns, rounds: int = 3) -> Tensor:
     what the last one found.
     """
     noise = torch.ones_like(problem.inverse)
-    linear = linearise_tracks(problem, at)
+    linear = linearise_tracks(problem, at, columns=False)
     for _ in range(rounds):
         size = squares(problem, linear, noise).sqrt()
         near = median(size, problem.near & linear.front) / MEDIAN_2D
@@ -237,7 +241,7 @@ def pose_covariance(problem: Problem, solution: Solution, o: FitOptions) -> tupl
 
 def _costs(problem: Problem, at: Unknowns, noise: Tensor, o: FitOptions) -> Tensor:
     """Robust cost (B, N) of every track, of weight 1."""
-    rho, _ = robust(squares(problem, linearise_tracks(problem, at), noise), o.kernel, o.bend)
+    rho, _ = robust(squares(problem, linearise_tracks(problem, at, columns=False), noise), o.kernel, o.bend)
     return rho
 
 

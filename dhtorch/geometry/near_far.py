@@ -18,6 +18,7 @@ shutter bundle adjustment", 2012.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -56,21 +57,26 @@ class Unknowns(NamedTuple):
     """What is solved for."""
 
     T: Pose
-    turn: Tensor  # (B, 3) rad per unit of y
+    turn: Tensor | None  # (B, 3) rad per unit of y; None: none, and none is looked for
 
 
 def moved(at: Unknowns, xi: Tensor) -> Unknowns:
-    """The unknowns displaced by xi (B, 9): a tangent vector of the pose, then the turn. Gradient: to both."""
-    check("moved", turn=(at.turn, "B 3"), xi=(xi, "B 9"))
-    return Unknowns(move(at.T, xi[:, :6]), at.turn + xi[:, 6:])
+    """The unknowns displaced by xi (B, 9): a tangent vector of the pose, then the turn; (B, 6) where there is none.
+
+    Gradient: to both. Raises ValueError for wrong shapes.
+    """
+    check("moved", turn=(at.turn, "B 3"), xi=(xi, "B 6" if at.turn is None else "B 9"))
+    return Unknowns(move(at.T, xi[:, :6]), None if at.turn is None else at.turn + xi[:, 6:])
 
 
 def step(at: Unknowns, H: Tensor, g: Tensor) -> tuple[Unknowns, Tensor]:
     """The unknowns after one Gauss–Newton step, H (B, 9, 9) and g (B, 9), and ``ok`` (B,); unmoved where H is singular.
 
+    Without a turn H is (B, 6, 6) and g (B, 6).
+
     Gradient: to all three. Raises ValueError for wrong shapes.
     """
-    check("step", turn=(at.turn, "B 3"), H=(H, "B 9 9"), g=(g, "B 9"))
+    check("step", turn=(at.turn, "B 3"), H=(H, "B n n"), g=(g, "B n"))
     xi, ok = solve_spd(H, -g[..., None])
     return moved(at, xi[..., 0]), ok
 
@@ -80,7 +86,7 @@ def trial_step(at: Unknowns, H: Tensor, g: Tensor) -> tuple[Unknowns, Tensor]:
 
     Gradient: none. Raises ValueError for wrong shapes.
     """
-    check("trial_step", turn=(at.turn, "B 3"), H=(H, "B 9 9"), g=(g, "B 9"))
+    check("trial_step", turn=(at.turn, "B 3"), H=(H, "B n n"), g=(g, "B n"))
     with torch.no_grad():
         xi, info = torch.linalg.solve_ex(H.double(), -g.double())
         return moved(at, xi.to(g.dtype)), info == 0
@@ -110,64 +116,101 @@ def _straight(seen: Tensor, y: Tensor, turn: Tensor) -> Tensor:
     return ray[:, :2] / torch.where(z.abs() < 0.1, 0.1, z)  # beyond any shutter: stays finite
 
 
+class Fixed(NamedTuple):
+    """What a problem's tracks are at z = 1, wherever the pose is."""
+
+    seen: Tensor  # (B, 2, N) measured in camera 1
+    shape: Tensor  # (B, 3, N) the noise's covariance there, up to scale: xx, xy, yy
+    height: Tensor  # (B, N) of the ray in camera 0
+    nearest: Tensor  # (B, 1) 1/m, largest q of the near tracks
+
+
+def fixed(problem: Problem) -> Fixed:
+    """To be worked out once for several linearisations. Gradient: as :func:`linearise_tracks`."""
+    f0, f1 = problem.f[:, :1], problem.f[:, 1:]
+    return Fixed(
+        seen=(problem.uv - problem.c[..., None]) / problem.f[..., None],
+        shape=problem.shape / torch.cat((f0 * f0, f0 * f1, f1 * f1), 1)[..., None],
+        height=problem.ray[:, 1] / problem.ray[:, 2],
+        nearest=torch.where(problem.near, problem.inverse, 0.0).amax(-1, keepdim=True).detach(),
+    )
+
+
 class Linear(NamedTuple):
     """The tracks of a problem, linearised at z = 1: two equations each, before their inverse depth is eliminated."""
 
-    u: Tensor  # (B, 7, N), along u: six columns of the pose, then the residual
-    v: Tensor  # (B, 7, N), along v
+    u: Tensor  # (B, 7, N), along u: six columns of the pose, then the residual; or (B, 1, N), the residual alone
+    v: Tensor  # (B, 7, N) or (B, 1, N), along v
     slope: Tensor  # (B, 2, N) m, d r / d q
     variance: Tensor  # (B, N) 1/m², of q before this track is read: infinite for far tracks, 0 for one at infinity
     front: Tensor  # (B, N) bool, in front of camera 1 and not at the epipole; others are finite and have no meaning
+    fixed: Fixed
 
 
-def linearise_tracks(problem: Problem, at: Unknowns) -> Linear:
+def linearise_tracks(problem: Problem, at: Unknowns, *, columns: bool = True, known: Fixed | None = None) -> Linear:
     """Residuals and their Jacobian at the sensor's inverse depths, and at the most probable ones of far tracks.
+
+    Without ``columns`` the residuals alone, the same bits: enough for :func:`squares`. ``known`` is :func:`fixed` of
+    the problem, where it was worked out before.
 
     Gradient: to measurements, cameras, rays and the sensor's q; the far tracks' q is held at its optimum, where it has
     no first-order effect. Raises ValueError for wrong shapes.
     """
     check("linearise_tracks", ray=(problem.ray, "B 3 N"), uv=(problem.uv, "B 2 N"), turn=(at.turn, "B 3"))
-    seen = _straight((problem.uv - problem.c[..., None]) / problem.f[..., None], _height(problem), at.turn)
+    known = fixed(problem) if known is None else known
+    seen = known.seen if at.turn is None else _straight(known.seen, known.height, at.turn)
     a, t = turned(at.T.R, problem.ray), at.T.t[..., None]
     with torch.no_grad():
-        free = _inverse_depth(a, t, seen, _noise_shape(problem))
+        free = _inverse_depth(a, t, seen, known.shape)
         # A point cannot lie beyond infinity: there q is known, and nothing is eliminated.
         variance = torch.where(free < 0, 0.0, torch.inf).to(free.dtype)
     q = torch.where(problem.near, problem.inverse, free.clamp_min(0))
     variance = torch.where(problem.near, problem.variance, variance)
     Y = a + q[:, None] * t
     # At the epipole a track fits any pose if only its point is near enough, and then holds it as if it were a vice.
-    nearest = torch.where(problem.near, problem.inverse, 0.0).amax(-1, keepdim=True).detach()
-    front = (Y[:, 2] > MIN_DEPTH) & (problem.near | (q < MAX_NEARER * nearest))
+    front = (Y[:, 2] > MIN_DEPTH) & (problem.near | (q < MAX_NEARER * known.nearest))
     w = 1 / torch.where(front, Y[:, 2], 1.0)
-    plane, k = Y[:, :2] * w[:, None], q * w
+    plane = Y[:, :2] * w[:, None]
+    slope = (t[:, :2] - plane * t[:, 2:]) * w[:, None]
+    if not columns:
+        r = plane - seen
+        return Linear(r[:, :1], r[:, 1:], slope, variance, front, known)
+    k = q * w
     (x, y) = plane.unbind(1)
     (x_r, y_r) = (plane - seen).unbind(1)
     (xx, yy) = (1 + plane * plane).unbind(1)
     (xk, yk) = (plane * -k[:, None]).unbind(1)
     xy, zero = x * y, torch.zeros_like(x)
     u, v = torch.stack((-xy, xx, -y, k, zero, xk, x_r), 1), torch.stack((-yy, xy, x, zero, k, yk, y_r), 1)
-    return Linear(u, v, (t[:, :2] - plane * t[:, 2:]) * w[:, None], variance, front)
+    return Linear(u, v, slope, variance, front, known)
 
 
 def residuals(
     problem: Problem,
     linear: Linear,
     noise: Tensor,  # (B, N) px²
+    *,
+    turn: bool = True,
 ) -> Tensor:
     """Whitened rows (B, 10, 2, N), inverse depths eliminated: six columns of the pose, three of the turn, the residual.
 
     Args:
         problem, linear: tracks and :func:`linearise_tracks` of them.
         noise: scale of the tracks' ``shape``.
+        turn: whether it has columns; (B, 7, 2, N) without.
 
     Gradient: to ``linear``, variance excepted, and noise. Raises ValueError for wrong shapes.
     """
     check("residuals", u=(linear.u, "B 7 N"), noise=(noise, "B N"))
-    m0, m1 = (m[:, None] for m in _whitener(problem, linear, noise))
+    return _rows(linear, _sphere(linear.fixed, noise), turn)
+
+
+def _rows(linear: Linear, sphere: tuple[Tensor, Tensor, Tensor], turn: bool) -> Tensor:
+    m0, m1 = (m[:, None] for m in _whitener(linear, sphere))
     rows = m0 * linear.u[:, :, None] + m1 * linear.v[:, :, None]
-    turn = rows[:, :3] * _height(problem)[:, None, None]
-    return torch.cat((rows[:, :6], turn, rows[:, 6:]), 1)
+    if not turn:
+        return rows
+    return torch.cat((rows[:, :6], rows[:, :3] * linear.fixed.height[:, None, None], rows[:, 6:]), 1)
 
 
 def squares(
@@ -179,9 +222,13 @@ def squares(
 
     Gradient: as :func:`residuals`. Raises ValueError for wrong shapes.
     """
-    check("squares", u=(linear.u, "B 7 N"), noise=(noise, "B N"))
-    m0, m1 = _whitener(problem, linear, noise)
-    return _square(linear, m0 * linear.u[:, 6:] + m1 * linear.v[:, 6:])
+    check("squares", u=(linear.u, "B n N"), noise=(noise, "B N"))
+    return _lengths(linear, _sphere(linear.fixed, noise))
+
+
+def _lengths(linear: Linear, sphere: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+    m0, m1 = _whitener(linear, sphere)
+    return _square(linear, m0 * linear.u[:, -1:] + m1 * linear.v[:, -1:])
 
 
 def normal(
@@ -197,22 +244,53 @@ def normal(
     """Cost and normal equations (n = 9) of near tracks with weight 1, far tracks with ``far_weight``, turns near zero.
 
     Args:
-        problem, at, noise: as in :func:`linearise_tracks` and :func:`residuals`.
+        problem, at, noise: as in :func:`linearise_tracks` and :func:`residuals`. Without a turn n = 6.
         far_weight: of a far track's robust cost; 0 leaves them out.
         turn_precision: of the turn around zero; a huge one holds it there.
         kernel, bend: robust kernel of a whitened residual and where it bends, see ``least_squares.robust``.
 
     Gradient: as :func:`residuals`. Raises ValueError for wrong shapes or an unknown kernel.
     """
-    linear = linearise_tracks(problem, at)
-    rows = residuals(problem, linear, noise)
-    rho, weight = robust(_square(linear, rows[:, -1]), kernel, bend)
+    return equations(problem, noise, far_weight, turn_precision, kernel=kernel, bend=bend)[0](at)
+
+
+def equations(
+    problem: Problem,
+    noise: Tensor,  # (B, N) px²
+    far_weight: Tensor,  # (B,)
+    turn_precision: Tensor,  # (B,) 1/rad²
+    *,
+    kernel: str | None,
+    bend: float,
+) -> tuple[Callable[[Unknowns], Normal], Callable[[Unknowns], Tensor]]:
+    """:func:`normal` as a function of the unknowns, and its cost (B,) alone, the same bits; for several places.
+
+    Gradient: as :func:`residuals`.
+    """
+    known = fixed(problem)
+    sphere = _sphere(known, noise)
     share = torch.where(problem.near, 1.0, torch.where(problem.far, far_weight[:, None], 0.0))
-    H, g = normal_equations(rows, torch.where(linear.front, weight * share, 0.0), block=SUM_LANES)
-    known = prior(turn_precision.to(g.dtype))
-    turn = torch.cat((torch.zeros_like(g[:, :6]), at.turn), -1)
-    cost = (rho * share).sum(-1) + turn_precision * (at.turn * at.turn).sum(-1)
-    return Normal(cost, H + torch.diag_embed(known), g + known * turn)
+
+    def total(rho: Tensor, turn: Tensor | None) -> Tensor:
+        cost = (rho * share).sum(-1)
+        return cost if turn is None else cost + turn_precision * (turn * turn).sum(-1)
+
+    def normal(at: Unknowns) -> Normal:
+        linear = linearise_tracks(problem, at, known=known)
+        rows = _rows(linear, sphere, at.turn is not None)
+        rho, weight = robust(_square(linear, rows[:, -1]), kernel, bend)
+        H, g = normal_equations(rows, torch.where(linear.front, weight * share, 0.0), block=SUM_LANES)
+        if at.turn is None:
+            return Normal(total(rho, None), H, g)
+        precision = prior(turn_precision.to(g.dtype))
+        turn = torch.cat((torch.zeros_like(g[:, :6]), at.turn), -1)
+        return Normal(total(rho, at.turn), H + torch.diag_embed(precision), g + precision * turn)
+
+    def cost(at: Unknowns) -> Tensor:
+        square = _lengths(linearise_tracks(problem, at, columns=False, known=known), sphere)
+        return total(robust(square, kernel, bend)[0], at.turn)
+
+    return normal, cost
 
 
 def _square(linear: Linear, r: Tensor) -> Tensor:
@@ -224,12 +302,6 @@ def prior(turn_precision: Tensor) -> Tensor:
     """Information (B, 9) that is there before any track: none on the pose."""
     zero = torch.zeros_like(turn_precision)
     return torch.stack((*[zero] * 6, *[turn_precision] * 3), -1)
-
-
-def _noise_shape(problem: Problem) -> Tensor:
-    """The noise's covariance (B, 3, N) at z = 1, up to scale."""
-    f0, f1 = problem.f[:, :1], problem.f[:, 1:]
-    return problem.shape / torch.cat((f0 * f0, f0 * f1, f1 * f1), 1)[..., None]
 
 
 def _inverse_depth(a: Tensor, t: Tensor, seen: Tensor, shape: Tensor) -> Tensor:
@@ -246,17 +318,21 @@ def _inverse_depth(a: Tensor, t: Tensor, seen: Tensor, shape: Tensor) -> Tensor:
     return -(p * d).sum(1) / (d * d).sum(1).clamp_min(1e-24)
 
 
-def _whitener(problem: Problem, linear: Linear, noise: Tensor) -> tuple[Tensor, Tensor]:
+def _sphere(known: Fixed, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """a, b, d (B, N) of L⁻¹ = [[a, 0], [−b d, d]], which makes the noise S = L Lᵀ of a track round."""
+    xx, xy, yy = (known.shape * noise[:, None]).unbind(1)
+    b = xy / xx
+    return xx.rsqrt(), b, (yy - b * xy).rsqrt()
+
+
+def _whitener(linear: Linear, sphere: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     """The columns (B, 2, N) of a matrix M with MᵀM = (S + variance s sᵀ)⁻¹, singular where the variance is infinite.
 
     With S = L Lᵀ the whitened slope e = L⁻¹ s is a vector of the plane. Only the residual along it depends on q: of its
     weight, 1 / (1 + |e|² variance) is left. M turns e to the first axis and scales that.
     """
-    xx, xy, yy = (_noise_shape(problem) * noise[:, None]).unbind(1)
+    a, b, d = sphere
     s0, s1 = linear.slope.unbind(1)
-    b = xy / xx
-    a = xx.rsqrt()
-    d = (yy - b * xy).rsqrt()  # L⁻¹ = [[a, 0], [−b d, d]]
     e0, e1 = a * s0, d * (s1 - b * s0)
     square = e0 * e0 + e1 * e1
     flat = square < 1e-12  # the pixel does not depend on q
@@ -269,7 +345,3 @@ def _whitener(problem: Problem, linear: Linear, noise: Tensor) -> tuple[Tensor, 
         torch.stack((left0 * a - left1 * bd, -e1 * a - e0 * bd), 1),
         torch.stack((left1 * d, e0 * d), 1),
     )
-
-
-def _height(problem: Problem) -> Tensor:
-    return problem.ray[:, 1] / problem.ray[:, 2]

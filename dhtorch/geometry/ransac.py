@@ -88,16 +88,16 @@ def msac_cost(
     Source: P. Torr, A. Zisserman, "MLESAC" (CVIU 2000), the truncated score.
     """
     sizes = check("msac_cost", poses=(poses, "B 4 P"), points=(points, "B 6 M"), limits=(limits, "B M"))
-    uv, xyz = points.split((2, 4), 1)
+    uv, xyz = points[:, :2, None], points[:, 2:]
     pairs = max(RESIDUALS // max(sizes["P"] * sizes["M"], 1), 1)
     costs = []
     for b in range(0, len(points), pairs):  # few pairs at a time keep the temporaries in cache
         part = slice(b, b + pairs)
-        x, y, z = torch.bmm(poses[part].transpose(1, 2), xyz[part]).unflatten(1, (3, -1)).unbind(1)
-        w = z.clamp_min_(MIN_DEPTH).reciprocal_()  # points behind the camera land far outside the image
-        x = x.mul_(w).sub_(uv[part, :1])
-        y = y.mul_(w).sub_(uv[part, 1:])
-        costs.append(torch.minimum(x.mul_(x).add_(y.mul_(y)), limits[part, None]).sum(-1))
+        Y = torch.bmm(poses[part].transpose(1, 2), xyz[part]).unflatten(1, (3, -1))
+        w = Y[:, 2:].clamp_min_(MIN_DEPTH).reciprocal_()  # points behind the camera land far outside the image
+        r = Y[:, :2].mul_(w).sub_(uv[part])
+        x, y = r.mul_(r).unbind(1)
+        costs.append(torch.minimum(x.add_(y), limits[part, None]).sum(-1))
     return torch.cat(costs)
 
 
@@ -129,7 +129,7 @@ def search(
     M, K = sizes["M"], 4 * sizes["H"]
     if keep > K:
         raise ValueError(f"search: draws has shape {tuple(draws.shape)}, expected at least {keep} solutions")
-    xyz, uv = points.split((3, 2), 1)
+    xyz, uv = points[:, :3], points[:, 3:]
     uv, one = uv - c[..., None], torch.ones_like(uv[:, :1])
     triples = distinct_triples(draws, count)
     picked = _take(torch.cat((uv / f[..., None], one, xyz), 1), triples.flatten(1)[:, None])

@@ -8,6 +8,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+#: Calls that are remembered before all are forgotten.
+REMEMBERED = 4096
+
+#: Patterns and shapes that were right, and their sizes: a fit asks the same at every step.
+_right: dict[tuple[tuple[str, torch.Size | None], ...], dict[str, int]] = {}
+
 
 def check(where: str, **args: tuple[Tensor | None, str]) -> dict[str, int]:
     """Check tensors against axis patterns such as ``"B N 2"``; equal letters must have equal sizes.
@@ -23,6 +29,19 @@ def check(where: str, **args: tuple[Tensor | None, str]) -> dict[str, int]:
     Raises:
         ValueError: the number of axes, a fixed size or a shared axis differs from the pattern.
     """
+    if torch.compiler.is_compiling():
+        return _bound(where, args)
+    seen = tuple([(pattern, None if x is None else x.shape) for x, pattern in args.values()])
+    sizes = _right.get(seen)
+    if sizes is None:
+        sizes = _bound(where, args)
+        if len(_right) >= REMEMBERED:
+            _right.clear()
+        _right[seen] = sizes
+    return dict(sizes)
+
+
+def _bound(where: str, args: dict[str, tuple[Tensor | None, str]]) -> dict[str, int]:
     sizes: dict[str, int] = {}
     for name, (x, pattern) in args.items():
         if x is None:

@@ -24,6 +24,7 @@ from dhtorch.geometry.least_squares import (
     minimise,
     move,
     normal_equations,
+    reprojection,
     robust,
     solve_spd,
     trial_step,
@@ -239,14 +240,14 @@ def _robust_pose(
     found, keep = cost[:, 0].isfinite(), cost.shape[1]
     used = torch.arange(index.shape[1], device=index.device) < count[:, None]
     near, used, fk, ck = (x.repeat_interleave(keep, 0) for x in (near, used, f, c))
-    cost_of = _truncated(near, used, fk, ck, threshold_px=options.threshold_px)
+    normal, cost_of = _truncated(near, used, fk, ck, threshold_px=options.threshold_px)
     flat = Pose(poses.R.flatten(0, 1), poses.t.flatten(0, 1))
-    flat, cost = minimise(cost_of, flat, options.local_optimisation, step=trial_step)
+    flat, cost = minimise(normal, flat, options.local_optimisation, cost=cost_of, step=trial_step)
     best = cost.view(-1, keep).argmin(1) + keep * torch.arange(len(f), device=f.device)
-    cost_of = _truncated(
+    normal, cost_of = _truncated(
         points, usable, f, c, threshold_px=options.threshold_px, kernel=options.kernel, kernel_px=options.kernel_px
     )
-    T, _ = minimise(cost_of, flat[best], options.polish_steps, step=trial_step)
+    T, _ = minimise(normal, flat[best], options.polish_steps, cost=cost_of, step=trial_step)
     return Pose(se3.orthonormal(T.R.double()), T.t.double()), found
 
 
@@ -259,19 +260,27 @@ def _truncated(
     threshold_px: float,
     kernel: str | None = None,
     kernel_px: float = 1.0,
-) -> Callable[[Pose], Normal]:
-    """The cost that search and refinement share: Σ rho(min(r², threshold²)), points behind the camera in full."""
+) -> tuple[Callable[[Pose], Normal], Callable[[Pose], Tensor]]:
+    """The cost that search and refinement share, Σ rho(min(r², threshold²)), points behind the camera in full: with its
+    normal equations, and alone."""
     limits = torch.where(usable, threshold_px * threshold_px, 0.0).to(points.dtype)
-    xyz, uv = points.split((3, 2), 1)
+    xyz, uv = points[:, :3], points[:, 3:]
 
-    def evaluate(T: Pose) -> Normal:
+    def truncated(r: Tensor, depth: Tensor) -> Tensor:
+        square = (r * r).sum(1)
+        return torch.where(depth > MIN_DEPTH, torch.minimum(square, limits), limits)
+
+    def normal(T: Pose) -> Normal:
         rows, depth = linearise(T, f, c, xyz, uv)
-        square = (rows[:, 6] * rows[:, 6]).sum(1)
-        square = torch.where(depth > MIN_DEPTH, torch.minimum(square, limits), limits)
+        square = truncated(rows[:, 6], depth)
         rho, weight = robust(square, kernel, kernel_px)
         return Normal(rho.sum(-1), *normal_equations(rows, torch.where(square < limits, weight, 0.0)))
 
-    return evaluate
+    def cost(T: Pose) -> Tensor:
+        rho, _ = robust(truncated(*reprojection(T, f, c, xyz, uv)), kernel, kernel_px)
+        return rho.sum(-1)
+
+    return normal, cost
 
 
 def map_pose(
@@ -409,6 +418,7 @@ def _fit_all(o: FitOptions, threshold_px: float, first: PoseFit, problem: Proble
         far_noise = torch.where(problem.far, found.noise, 0.0).amax(-1)
         variance = torch.where(problem.far.any(-1), far_noise, found.noise.amax(-1))
         t_snr = covariance.mahalanobis(at.T.t, cov[:, 3:6, 3:6])
+    assert at.turn is not None  # most_probable answers one, of zeros where it believes none
 
     def answer(x: Tensor) -> Tensor:
         return torch.where(ok.view(-1, *[1] * (x.ndim - 1)), x, torch.nan).to(tracks.uv_1.dtype)
@@ -463,9 +473,10 @@ def _near_far(samples: Samples, tracks: Tracks, camera_0: Camera, camera_1: Came
 
 def _reprojection(problem: Problem, at: near_far.Unknowns, threshold_px: float) -> tuple[Tensor, Tensor]:
     """Near tracks (B, N) whose point, at the sensor's depth, falls close to where they were seen; rms px of these."""
-    y = problem.ray[:, 1]
-    uv = near_far.straighten(problem.uv, problem.f, problem.c, y, at.turn)
-    rows, depth = linearise(at.T, problem.f, problem.c, problem.ray / problem.inverse[:, None], uv)
-    square = (rows[:, 6] * rows[:, 6]).sum(1)
+    uv = problem.uv
+    if at.turn is not None:
+        uv = near_far.straighten(uv, problem.f, problem.c, problem.ray[:, 1], at.turn)
+    r, depth = reprojection(at.T, problem.f, problem.c, problem.ray / problem.inverse[:, None], uv)
+    square = (r * r).sum(1)
     inlier = problem.near & (depth > MIN_DEPTH) & (square < threshold_px**2)
     return inlier, (torch.where(inlier, square, 0.0).sum(-1) / inlier.sum(-1).clamp_min(1)).sqrt()
