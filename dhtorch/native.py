@@ -1,12 +1,12 @@
-"""Inner loops of the sweep and its fits, of pyramids, of what is read around samples, of depth tokens, of the search for
-points and of the registration of their windows as compiled code, for those who ask for it; nothing needs it.
+"""Inner loops of the sweep and its fits, of pyramids, of what is read around samples, of tokens, of the search for points
+and of the registration of their windows as compiled code, for those who ask for it; nothing needs it.
 
     python -m dhtorch.native            compile ``native*.cpp``, with the system's C++ compiler, into the user's cache
     DHTORCH_NATIVE=1 python …           use it, in loader workers as well; or dhtorch.native.load() in a program
 
 ``dhtorch.dense``, ``dhtorch.geometry.sweep``, ``pyramid``, ``lookup``, ``lucas_kanade`` and ``affine`` ask here whether
 tensors may be handed over; where not (nothing was loaded, another device or type, under vmap, a compiler or a graph)
-they do the same in torch, which is the reference. The sweep then answers alike bit for bit and its fits up to rounding:
+they do the same in torch, which is the reference. Tokens and the sweep are alike bit for bit, its fits up to rounding:
 no more than one gate in 200 differs, and 99 of 100 depths by less than a tenth of their sigma. A pyramid and what is
 read around samples do up to one rounding of a number. The search and the registration do up to the rounding of sums
 over a window: half of the places that were searched for are equal and half of those that were registered lie within
