@@ -1,5 +1,5 @@
-"""Inner loops of the sweep and its fits, of pyramids, of what is read around samples, of tokens, of the search for points
-and of the registration of their windows as compiled code, for those who ask for it; nothing needs it.
+"""Inner loops of the sweep and its fits, of pyramids, of tokens, of what is read around samples, of the search for
+points and of the registration of their windows as compiled code, for those who ask for it; nothing needs it.
 
     python -m dhtorch.native            compile ``native*.cpp``, with the system's C++ compiler, into the user's cache
     DHTORCH_NATIVE=1 python …           use it, in loader workers as well; or dhtorch.native.load() in a program
