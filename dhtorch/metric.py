@@ -72,9 +72,9 @@ BEND: Final = 0.03
 class Chosen(NamedTuple):
     """How probable the models are, and what the anchors say of sigma; for reports."""
 
-    model: Tensor  # (B,) int64, the most probable one's place in ``names``; -1 where there is none
+    model: Tensor  # (B,) int64, the taken one's place in ``names``; -1 where there is none
     names: tuple[str, ...]
-    weight: Tensor  # (B, K) probability; the chosen one's is that of the likeliest
+    weight: Tensor  # (B, K) probability by the evidence of all anchors; the taken one need not be the likeliest
     factor: Tensor  # (B,) by which sigma was stretched
 
 
@@ -207,12 +207,11 @@ def _chosen(task: Task, names: tuple[str, ...]) -> tuple[Fit, Chosen]:
         factor = _stretch(points, left, taken)
         best = asked.gather(1, taken)
         # What the anchors left out do not tell from the most probable model shares alike with it.
-        weight = weight.scatter(1, best, weight.amax(-1, keepdim=True))
-        weight = weight / weight.sum(-1, keepdim=True)
-        rivals = weight.scatter(1, best, 2.0).topk(min(RIVALS, len(names)), -1).indices
+        share = weight.scatter(1, best, weight.amax(-1, keepdim=True))
+        rivals = share.scatter(1, best, 2.0).topk(min(RIVALS, len(names)), -1).indices
         model = torch.where(some, best[:, 0], -1)
     fits = distortion.fit(task, place[rivals], points.used, distortion.MANY)
-    return fits._replace(evidence=weight.gather(1, rivals).log()), Chosen(model, names, weight, factor)
+    return fits._replace(evidence=share.gather(1, rivals).log()), Chosen(model, names, weight, factor)
 
 
 def _left_out(task: Task, model: Tensor) -> _Left:

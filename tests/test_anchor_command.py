@@ -36,6 +36,9 @@ def test_maps_are_written_in_metres_and_stay(tmp_path, maps, room, capsys):
     found = json.loads((out / "anchor.json").read_text())
     assert [row["frame"] for row in found["frames"]] == [0, 3]
     assert found["whole"]["held"]["unanchored"] == 0
+    for row in (frame["anchored"] for frame in found["frames"]):
+        assert 0 <= row["probability"] <= row["likeliest_probability"] <= 1
+        assert (row["probability"] == row["likeliest_probability"]) == (row["model"] == row["likeliest"])
     again = data.open(out)
     truth = room.truth(3)["depth"]
     depth = again[1].depth

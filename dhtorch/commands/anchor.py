@@ -172,6 +172,9 @@ def _row(x: Tensor, found: DepthMap, chosen: metric.Chosen) -> Row:
     best = int(chosen.model)
     row: Row = {"model": None if best < 0 else chosen.names[best], "silent": 1 - _share(keep, there)}
     row["probability"] = None if best < 0 else float(chosen.weight[0, best])
+    likeliest = int(chosen.weight[0].argmax())
+    row["likeliest"] = None if best < 0 else chosen.names[likeliest]
+    row["likeliest_probability"] = None if best < 0 else float(chosen.weight[0, likeliest])
     if not bool(keep.any()):
         return row | {"scale": None, "change": None, "sigma": None}
     ratio = (found.depth / x)[keep].double()
