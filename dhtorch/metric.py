@@ -53,6 +53,9 @@ SCATTERED, QUARTERS = 4, 4
 #: Relative error below which nobody asks which of two models fits a near return better.
 EXACT: Final = 0.002
 
+#: Loss by which models differ through rounding alone.
+ROUNDING: Final = 1e-6
+
 #: What is lost by a model that could not be fitted.
 LOST: Final = 10.0
 
@@ -248,7 +251,7 @@ def _simplest(points: Anchors, left: _Left, head: Tensor) -> Tensor:
     refused = told & (bent | drifts)
     mean = (block.mass * block.mean).sum(-1).masked_fill(refused, torch.inf)
     more, error = _against(block.mean, mean.argmin(-1, keepdim=True).expand(-1, n), block.mass)
-    good = (more <= error) & mean.isfinite()
+    good = (more <= error.clamp_min(ROUNDING)) & mean.isfinite()
     return good.to(torch.int8).argmax(-1)
 
 

@@ -65,6 +65,18 @@ def test_a_limit_decides_the_exit_code(tmp_path, room, capsys):
     assert "Exceeded" in (tmp_path / "out" / "anchor.html").read_text()
 
 
+def test_a_hole_in_a_file_is_no_value_of_any_kind_and_a_sensor_beside_itself_is_told(tmp_path, room, capsys):
+    for k in range(2):
+        depth = room[k].depth[0].numpy()
+        np.save(tmp_path / f"{k:04d}.npy", np.where(np.arange(128) < 20, 0, depth))
+    words = [f"depth={tmp_path}", "most=1", "kind=affine"]
+    assert run.main(["anchor", *ROOM, *LITTLE[:1], *words, f"out={tmp_path / 'out'}"]) == run.DONE
+    assert "of one sensor" in capsys.readouterr().out
+    depth = data.open(tmp_path / "out")[0].depth
+    assert (depth[..., :20] == 0).all()
+    assert (depth[..., 20:] > 0).double().mean() > 0.5
+
+
 @pytest.mark.parametrize(
     ("word", "said"),
     [

@@ -57,6 +57,9 @@ KEYED = ("data", "method", "seed", "dtype", "cutoff", "steps", "past", "kind", "
 #: Modules that decide what is found beside those that the settings name.
 ROOTS = ("dhtorch.metric", "dhtorch.offers", "dhtorch.data.depth_maps", "dhtorch.export.frames")
 
+#: Median sigma / depth below which maps and near returns are of one source: no two sensors agree so well.
+ALIKE = 5e-4
+
 NOTE = "Maps are coloured from near (blue) to far (red), each by its own range; silence is left blank."
 
 
@@ -139,7 +142,7 @@ def _anchored(task: Task, maps: DepthMaps, i: int) -> tuple[Frame, DepthMap, Row
     s, given = task.settings, maps[i]
     assert given is not None  # frames without a map are not asked for
     frame = _shown(task, i)
-    x = given.to(frame.camera.f)
+    x = torch.where(given > 0, given, torch.nan).to(frame.camera.f)  # a 0 of a file is no value, of whatever kind
     trace: Trace = {}
     views: list[int] = []
     with torch.no_grad():
@@ -219,8 +222,13 @@ def _said(name: str, kind: str, whole: Row, before: int) -> list[str]:
         changed = "" if alone == n else f"; the others were multiplied by {middle['scale']:.4g} (median of all)"
         first = f"{name}: {maps}{again}, {alone} left as {'they are' if n != 1 else 'it is'}{changed}."
     near, far = (f"{whole['anchors'][k]:g}" for k in ("near", "far"))
+    alike = middle["sigma"] < ALIKE
     return [
         first,
+        *(
+            ["  The near returns are on the maps as if both were of one sensor: what it is wrong by is not in sigma."]
+            * alike
+        ),
         f"  Sigma is {middle['sigma']:.1%} of the depth (median), {held['silent']:.1%} of the pixels are silent.",
         f"  A map is held by {near} near returns and {far} far answers (medians); "
         f"{held['unanchored']:.0%} of the maps could not be anchored.",
