@@ -219,8 +219,12 @@ def _said(name: str, kind: str, whole: Row, before: int) -> list[str]:
     maps = f"{n} map{'s' * (n != 1)}"
     first = f"{name}: {maps}{again} put into metres."
     if kind == "metric":
-        changed = "" if alone == n else f"; the others were multiplied by {middle['scale']:.4g} (median of all)"
-        first = f"{name}: {maps}{again}, {alone} left as {'they are' if n != 1 else 'it is'}{changed}."
+        times = f"multiplied by {middle['scale']:.4g} (median of all)"
+        left = f"{alone} left as {'they are' if n != 1 else 'it is'}"
+        first = f"{name}: {maps}{again}, {left}{'' if alone == n else f'; the others were {times}'}."
+        first = (
+            first if alone else f"{name}: {maps}{again}, none left as {'they were' if n != 1 else 'it was'}: {times}."
+        )
     near, far = (f"{whole['anchors'][k]:g}" for k in ("near", "far"))
     alike = middle["sigma"] < ALIKE
     return [
