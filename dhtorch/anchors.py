@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch.codes import Source
@@ -33,15 +34,13 @@ SHARED: Final = 0.5
 BLOCKS: Final = (6, 8)
 CORRELATED: Final = 0.3
 
-#: Anchors that stand beside each other: the next one within this share of the picture's longer side.
-BESIDE: Final = 0.04
-
 
 class Anchors(NamedTuple):
     """What is known in metres, on pixels of the map; (B, N) each."""
 
     share: Tensor  # (B, N, 2) place, share of width and height
     x: Tensor  # the map there
+    within: Tensor  # standard deviation of the map about the pixel that is read
     depth: Tensor  # m
     var: Tensor  # of log depth, what each has alone
     shared: Tensor  # standard deviation of log depth that all far ones have in common
@@ -116,34 +115,25 @@ def _read(x: Tensor, share: Tensor, told: tuple[Tensor, ...]) -> Anchors:
     common = torch.where(near, 0.0, (common.square() + FAR_SHARED**2).sqrt())
     share = torch.where(use[..., None], share, 0.5)
     told_x = torch.where(use, value, 1.0)
-    return Anchors(share=share, x=told_x, depth=z, var=var, shared=common, near=near, used=use)
+    within = torch.where(use, at_anchors(spread_within(x), share)[0], 0.0)
+    return Anchors(share=share, x=told_x, within=within, depth=z, var=var, shared=common, near=near, used=use)
+
+
+def spread_within(x: Tensor) -> Tensor:
+    """Standard deviation (B, h, w) by which a map differs about each of its pixels: a return and the value of the map
+    stand somewhere in theirs, evenly up to the next pixel on either side. A step to no value (NaN) is none.
+
+    Gradient: none.
+    """
+    total = torch.zeros_like(x.detach())
+    for axis, pad in ((-2, (0, 0, 1, 1)), (-1, (1, 1))):
+        n = x.shape[axis]
+        step = F.pad(x.detach().diff(dim=axis).square().nan_to_num(0.0), pad)
+        total = total + 0.5 * (step.narrow(axis, 0, n) + step.narrow(axis, 1, n))
+    return (total / 3).sqrt()
 
 
 def at_anchors(x: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
     """Values (B, N) of a map (B, h, w) at the pixels nearest to places (B, N, 2), and whether these are inside."""
     h, w = x.shape[-2:]
     return nearest(x, share * share.new_tensor([w, h]) - 0.5)
-
-
-def nugget(points: Anchors, r: Tensor, aspect: float) -> Tensor:
-    """Variance (B, 1) of residuals ``r`` (B, N) that near anchors do not share with the one beside them: their own
-    noise, not the map's shape. Robust: by the median of squared differences; infinite where none stand together.
-
-    Args:
-        points: the anchors.
-        r: residuals of log depth.
-        aspect: height / width of the picture.
-
-    Gradient: none.
-    """
-    with torch.no_grad():
-        use = points.used & points.near
-        place = points.share * points.share.new_tensor([1.0, aspect]) / max(1.0, aspect)
-        apart = torch.cdist(place, place)
-        apart = torch.where(use[:, :, None] & use[:, None], apart, torch.inf)
-        apart = apart + torch.diag_embed(torch.full_like(r, torch.inf)).nan_to_num(0.0, posinf=torch.inf)
-        gap, at = apart.min(-1)
-        square = 0.5 * (r - r.gather(1, at)).square()
-        beside = use & (gap < BESIDE)
-        found = torch.where(beside, square, torch.nan).nanquantile(0.683, -1, keepdim=True)
-        return found.nan_to_num(torch.inf)

@@ -203,6 +203,14 @@ def predicted(fit: Fit, task: Task) -> tuple[Tensor, Tensor]:
     return mean, (torch.cat((slope, phi), -1) @ fit.spread).square().sum(-1)
 
 
+def reading(head: Tensor, points: Anchors) -> Tensor:
+    """Variance (B, K, N) of the log depth that heads (B, K, 2) give anchors, by where in its pixel each stands.
+    Gradient: none."""
+    with torch.no_grad():
+        y = (points.x[:, None] * head[..., :1] + head[..., 1:]).clamp_min(LEAST_HEAD)
+        return (points.within[:, None] * head[..., :1] / y).square()
+
+
 # -------------------------------------------------------------------------------------------------------------- fitting
 
 

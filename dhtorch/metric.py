@@ -20,8 +20,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dhtorch import distortion
-from dhtorch.anchors import BLOCKS, CORRELATED, FLOOR, Anchors, at_anchors, gathered, nugget
+from dhtorch import distortion, scatter
+from dhtorch.anchors import BLOCKS, CORRELATED, FLOOR, Anchors, at_anchors, gathered, spread_within
 from dhtorch.codes import Gate, Source, first_reason
 from dhtorch.distortion import HEADS, MODELS, WITHIN, Fit, Task
 from dhtorch.geometry.covariance import median
@@ -53,17 +53,14 @@ SCATTERED, QUARTERS = 4, 4
 #: Relative error below which nobody asks which of two models fits a near return better.
 EXACT: Final = 0.002
 
+#: Loss by which models differ through rounding alone.
+ROUNDING: Final = 1e-6
+
 #: What is lost by a model that could not be fitted.
 LOST: Final = 10.0
 
 #: Bounds of what the anchors left out do to sigma, and how many leave it as it is.
 STRETCH, UNMOVED = (0.3, 4.0), 20
-
-#: Relative scatter of a map without near returns; share of scatter that stays where near returns explain all of it.
-SCATTER, LEAST = 0.01, 0.3
-
-#: Share of a step between pixels that is in doubt at most.
-AT_STEPS: Final = 0.5
 
 #: Relative error at which the head's start bends from least squares to least absolute values.
 BEND: Final = 0.03
@@ -72,9 +69,9 @@ BEND: Final = 0.03
 class Chosen(NamedTuple):
     """How probable the models are, and what the anchors say of sigma; for reports."""
 
-    model: Tensor  # (B,) int64, the most probable one's place in ``names``; -1 where there is none
+    model: Tensor  # (B,) int64, the taken one's place in ``names``; -1 where there is none
     names: tuple[str, ...]
-    weight: Tensor  # (B, K) probability; the chosen one's is that of the likeliest
+    weight: Tensor  # (B, K) probability by the evidence of all anchors; the taken one need not be the likeliest
     factor: Tensor  # (B,) by which sigma was stretched
 
 
@@ -97,10 +94,10 @@ def anchor(
     motion's) is an unknown of the fit and no part of the answer.
 
     Sigma is the covariance of what was fitted, stretched until anchors that were left out (scattered blocks, and whole
-    quarters of the picture) lie within it as often as they should; what the models disagree by; how far near returns
-    scatter about the map beyond their own noise, the noise being what neighbours do not share; and a share of the steps
-    between pixels where near returns disagree with the map. It is against the anchors' own metre: what all near returns
-    are wrong by, nothing here can tell.
+    quarters of the picture) lie within it as often as they should; what the models disagree by; and how far near
+    returns scatter about the map where it is as rough as around a pixel, more where they are off in places
+    (:mod:`dhtorch.scatter`). It is against the anchors' own metre: what all near returns are wrong by, nothing here can
+    tell.
 
     Args:
         depth_map: values (B, h, w) over the field of the picture; not finite, or not positive where depth is meant,
@@ -143,10 +140,11 @@ def anchor(
     x = torch.where(known, x, torch.ones_like(x))
     if kind == "ordinal":
         x, at = _ordered(x, points), _ordered(points.x, points)
-        points = points._replace(x=at)
+        within = at_anchors(spread_within(torch.where(known, x, torch.nan)), points.share)[0]
+        points = points._replace(x=at, within=torch.where(points.used, within, 0.0))
     elif kind != "metric":  # values of any unit: 1 is the median of the anchored ones
         unit = median(points.x.detach().abs(), points.used).clamp_min(1e-12)
-        x, points = x / unit[..., None], points._replace(x=points.x / unit)
+        x, points = x / unit[..., None], points._replace(x=points.x / unit, within=points.within / unit)
     task = _task(x, known, points, of_depth=kind != "inverse")
     fits, chosen = _chosen(task, _OF_KIND[kind])
     if trace is not None:
@@ -207,12 +205,11 @@ def _chosen(task: Task, names: tuple[str, ...]) -> tuple[Fit, Chosen]:
         factor = _stretch(points, left, taken)
         best = asked.gather(1, taken)
         # What the anchors left out do not tell from the most probable model shares alike with it.
-        weight = weight.scatter(1, best, weight.amax(-1, keepdim=True))
-        weight = weight / weight.sum(-1, keepdim=True)
-        rivals = weight.scatter(1, best, 2.0).topk(min(RIVALS, len(names)), -1).indices
+        share = weight.scatter(1, best, weight.amax(-1, keepdim=True))
+        rivals = share.scatter(1, best, 2.0).topk(min(RIVALS, len(names)), -1).indices
         model = torch.where(some, best[:, 0], -1)
     fits = distortion.fit(task, place[rivals], points.used, distortion.MANY)
-    return fits._replace(evidence=weight.gather(1, rivals).log()), Chosen(model, names, weight, factor)
+    return fits._replace(evidence=share.gather(1, rivals).log()), Chosen(model, names, weight, factor)
 
 
 def _left_out(task: Task, model: Tensor) -> _Left:
@@ -229,7 +226,8 @@ def _left_out(task: Task, model: Tensor) -> _Left:
     noise = (WITHIN * fit.noise[..., :1]).clamp_max(1.0).square() * points.var[:, None]
     asked = every & points.used[:, None] & fit.evidence.isfinite()[..., None]
     r = torch.where(asked, points.depth.log()[:, None] - mean, torch.nan)
-    return _Left(*(part.unflatten(1, (model.shape[1], len(turns))) for part in (r, var + noise)))
+    var = var + noise + distortion.reading(fit.head, points)
+    return _Left(*(part.unflatten(1, (model.shape[1], len(turns))) for part in (r, var)))
 
 
 def _simplest(points: Anchors, left: _Left, head: Tensor) -> Tensor:
@@ -253,7 +251,7 @@ def _simplest(points: Anchors, left: _Left, head: Tensor) -> Tensor:
     refused = told & (bent | drifts)
     mean = (block.mass * block.mean).sum(-1).masked_fill(refused, torch.inf)
     more, error = _against(block.mean, mean.argmin(-1, keepdim=True).expand(-1, n), block.mass)
-    good = (more <= error) & mean.isfinite()
+    good = (more <= error.clamp_min(ROUNDING)) & mean.isfinite()
     return good.to(torch.int8).argmax(-1)
 
 
@@ -316,10 +314,9 @@ def _joined(task: Task, fits: Fit, chosen: Chosen, x: Tensor, known: Tensor) -> 
         spread = (
             share[..., None, None] * (chosen.factor.square()[:, None, None, None] * torch.stack(var, 1) + apart)
         ).sum(1)
-        r = task.points.depth.log() - distortion.predicted(fits, task)[0][:, 0]
-        step = log - _around(log, known)
-        local, doubt = _scatter(task.points, r, x), _at_steps(task.points, r, step)
-        return log, (spread + local + (doubt * step).square()).sqrt()
+        mean, of_fit = (part[:, 0] for part in distortion.predicted(fits, task))
+        told = distortion.reading(fits.head[:, :1], task.points)[:, 0], chosen.factor[:, None] * of_fit.sqrt()
+        return log, (spread + scatter.variance(task.points, task.points.depth.log() - mean, told, log, known)).sqrt()
 
 
 def _each(fits: Fit) -> list[Tensor]:
@@ -350,32 +347,6 @@ def _everywhere(task: Task, fit: Fit, x: Tensor) -> tuple[Tensor, Tensor]:
         along = torch.cat((slope, curve), -1)
         var = maps[:, 1] + 2 * (along * maps[:, 2:].mT).sum(-1) + (along @ of_value).square().sum(-1)
     return log.view_as(x), var.clamp_min(0).view_as(x)
-
-
-def _scatter(points: Anchors, r: Tensor, x: Tensor) -> Tensor:
-    """Variance (B, 1, 1) by which the map is off from pixel to pixel: by how much near returns scatter about it beyond
-    what neighbours do not share, which is their own noise as far as they state it."""
-    near = points.used & points.near
-    held = torch.where(near, r.abs(), torch.nan).nanquantile(0.683, -1, keepdim=True).square()
-    own = torch.minimum(nugget(points, r, x.shape[-2] / x.shape[-1]), median(points.var, near))
-    found = (held - own).clamp_min(0) + LEAST**2 * held
-    return found.nan_to_num(SCATTER**2)[..., None]
-
-
-def _at_steps(points: Anchors, r: Tensor, step: Tensor) -> Tensor:
-    """Share (B, 1, 1) of the step between a pixel and those around it by which near returns disagree with the map."""
-    near = points.used & points.near
-    height = at_anchors(step.abs(), points.share)[0]
-    steep = near & (height >= median(height, near))
-    share = torch.where(steep, r.abs() / (0.674 * height.clamp_min(1e-9)), torch.nan).nanmedian(-1).values
-    return share.nan_to_num(AT_STEPS).clamp_max(AT_STEPS)[:, None, None]
-
-
-def _around(x: Tensor, known: Tensor) -> Tensor:
-    """Mean (B, h, w) of the known ones of the 3 x 3 pixels around each."""
-    mask = known.to(x)[:, None]
-    total, count = (F.avg_pool2d(m, 3, 1, 1) for m in (torch.where(known, x, 0.0)[:, None], mask))
-    return torch.where(known, (total / count.clamp_min(1e-6))[:, 0], x)
 
 
 def _answered(

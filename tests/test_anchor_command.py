@@ -36,6 +36,9 @@ def test_maps_are_written_in_metres_and_stay(tmp_path, maps, room, capsys):
     found = json.loads((out / "anchor.json").read_text())
     assert [row["frame"] for row in found["frames"]] == [0, 3]
     assert found["whole"]["held"]["unanchored"] == 0
+    for row in (frame["anchored"] for frame in found["frames"]):
+        assert 0 <= row["probability"] <= row["likeliest_probability"] <= 1
+        assert (row["probability"] == row["likeliest_probability"]) == (row["model"] == row["likeliest"])
     again = data.open(out)
     truth = room.truth(3)["depth"]
     depth = again[1].depth
@@ -60,6 +63,18 @@ def test_a_limit_decides_the_exit_code(tmp_path, room, capsys):
     assert run.main(["anchor", *ROOM, *LITTLE, *words]) == run.SOME_FAILED
     assert "exceeded: scale is 0.33" in capsys.readouterr().out
     assert "Exceeded" in (tmp_path / "out" / "anchor.html").read_text()
+
+
+def test_a_hole_in_a_file_is_no_value_of_any_kind_and_a_sensor_beside_itself_is_told(tmp_path, room, capsys):
+    for k in range(2):
+        depth = room[k].depth[0].numpy()
+        np.save(tmp_path / f"{k:04d}.npy", np.where(np.arange(128) < 20, 0, depth))
+    words = [f"depth={tmp_path}", "most=1", "kind=affine"]
+    assert run.main(["anchor", *ROOM, *LITTLE[:1], *words, f"out={tmp_path / 'out'}"]) == run.DONE
+    assert "of one sensor" in capsys.readouterr().out
+    depth = data.open(tmp_path / "out")[0].depth
+    assert (depth[..., :20] == 0).all()
+    assert (depth[..., 20:] > 0).double().mean() > 0.5
 
 
 @pytest.mark.parametrize(

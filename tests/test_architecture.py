@@ -16,7 +16,7 @@ LEVELS = [
     {"geometry"},
     {"records", "drawing"},
     {"stages", "data", "evaluate", "export", "synthetic", "testing", "calibration", "anchors"},
-    {"method", "frames", "distortion"},
+    {"method", "frames", "distortion", "scatter"},
     {"pair", "window", "methods", "first_release", "views", "offers"},
     {"stream", "dense", "rig", "metric"},
     {"evidence", "causes"},

@@ -9,7 +9,7 @@ import pytest
 import torch
 from contract import PROMISES, NoMasksAsNumbers, Row, equal, leaves, reorder, take, tensor_map
 
-from dhtorch import anchors, causes, dense, distortion, evidence, method, metric, pair, verdict, views, window
+from dhtorch import anchors, causes, dense, distortion, evidence, method, metric, pair, scatter, verdict, views, window
 from dhtorch.evaluate import holdout, probe
 from dhtorch.geometry import (
     affine,
@@ -549,8 +549,9 @@ ELSEWHERE = {
     *(f"dhtorch.causes.{name}" for name in ("turned", "name_cause", "decided", "watch")),
     "dhtorch.evaluate.detection.auroc",
     "dhtorch.metric.anchor",
-    *(f"dhtorch.anchors.{name}" for name in ("gathered", "at_anchors", "nugget")),
+    *(f"dhtorch.anchors.{name}" for name in ("gathered", "at_anchors", "spread_within")),
     *(f"dhtorch.distortion.{name}" for name in ("basis_of", "fields", "curves", "log_depth", "predicted", "fit")),
+    *("dhtorch.distortion.reading", "dhtorch.scatter.variance"),
     "dhtorch.geometry.exact.filled",
     "dhtorch.geometry.least_squares.minimise",
     "dhtorch.geometry.near_far.equations",
@@ -763,7 +764,21 @@ ESTIMATORS = (arms, clusters, registration, blur, filling, sharpness)
 
 
 def public_functions():
-    parts = [method, pair, views, window, dense, anchors, distortion, metric, evidence, causes, verdict, *ESTIMATORS]
+    parts = [
+        method,
+        pair,
+        views,
+        window,
+        dense,
+        anchors,
+        distortion,
+        scatter,
+        metric,
+        evidence,
+        causes,
+        verdict,
+        *ESTIMATORS,
+    ]
     for package in ("geometry", "stages", "evaluate", "integrate"):
         module = importlib.import_module(f"dhtorch.{package}")
         found = pkgutil.iter_modules(module.__path__, f"dhtorch.{package}.")

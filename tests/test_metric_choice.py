@@ -19,7 +19,9 @@ def points():
     share = cell.repeat(2 * PER_BLOCK, 1)[None]
     near = (torch.arange(share.shape[1]) < share.shape[1] // 2)[None]
     one = torch.ones_like(share[..., 0])
-    return Anchors(share, x=one, depth=one, var=1e-4 * one, shared=0 * one, near=near, used=torch.ones_like(near))
+    return Anchors(
+        share, x=one, within=0 * one, depth=one, var=1e-4 * one, shared=0 * one, near=near, used=torch.ones_like(near)
+    )
 
 
 def taken(points, near, far, seed=0):

@@ -57,6 +57,9 @@ KEYED = ("data", "method", "seed", "dtype", "cutoff", "steps", "past", "kind", "
 #: Modules that decide what is found beside those that the settings name.
 ROOTS = ("dhtorch.metric", "dhtorch.offers", "dhtorch.data.depth_maps", "dhtorch.export.frames")
 
+#: Median sigma / depth below which maps and near returns are of one source: no two sensors agree so well.
+ALIKE = 5e-4
+
 NOTE = "Maps are coloured from near (blue) to far (red), each by its own range; silence is left blank."
 
 
@@ -137,7 +140,7 @@ def _anchored(task: Task, maps: DepthMaps, i: int) -> tuple[Frame, DepthMap, Row
     s, given = task.settings, maps[i]
     assert given is not None  # frames without a map are not asked for
     frame = _shown(task, i)
-    x = given.to(frame.camera.f)
+    x = torch.where(given > 0, given, torch.nan).to(frame.camera.f)  # a 0 of a file is no value, of whatever kind
     trace: Trace = {}
     views: list[int] = []
     with torch.no_grad():
@@ -170,6 +173,9 @@ def _row(x: Tensor, found: DepthMap, chosen: metric.Chosen) -> Row:
     best = int(chosen.model)
     row: Row = {"model": None if best < 0 else chosen.names[best], "silent": 1 - _share(keep, there)}
     row["probability"] = None if best < 0 else float(chosen.weight[0, best])
+    likeliest = int(chosen.weight[0].argmax())
+    row["likeliest"] = None if best < 0 else chosen.names[likeliest]
+    row["likeliest_probability"] = None if best < 0 else float(chosen.weight[0, likeliest])
     if not bool(keep.any()):
         return row | {"scale": None, "change": None, "sigma": None}
     ratio = (found.depth / x)[keep].double()
@@ -211,11 +217,20 @@ def _said(name: str, kind: str, whole: Row, before: int) -> list[str]:
     maps = f"{n} map{'s' * (n != 1)}"
     first = f"{name}: {maps}{again} put into metres."
     if kind == "metric":
-        changed = "" if alone == n else f"; the others were multiplied by {middle['scale']:.4g} (median of all)"
-        first = f"{name}: {maps}{again}, {alone} left as {'they are' if n != 1 else 'it is'}{changed}."
+        times = f"multiplied by {middle['scale']:.4g} (median of all)"
+        left = f"{alone} left as {'they are' if n != 1 else 'it is'}"
+        first = f"{name}: {maps}{again}, {left}{'' if alone == n else f'; the others were {times}'}."
+        first = (
+            first if alone else f"{name}: {maps}{again}, none left as {'they were' if n != 1 else 'it was'}: {times}."
+        )
     near, far = (f"{whole['anchors'][k]:g}" for k in ("near", "far"))
+    alike = middle["sigma"] < ALIKE
     return [
         first,
+        *(
+            ["  The near returns are on the maps as if both were of one sensor: what it is wrong by is not in sigma."]
+            * alike
+        ),
         f"  Sigma is {middle['sigma']:.1%} of the depth (median), {held['silent']:.1%} of the pixels are silent.",
         f"  A map is held by {near} near returns and {far} far answers (medians); "
         f"{held['unanchored']:.0%} of the maps could not be anchored.",

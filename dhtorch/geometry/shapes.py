@@ -32,7 +32,10 @@ def check(where: str, **args: tuple[Tensor | None, str]) -> dict[str, int]:
     if torch.compiler.is_compiling():
         return _bound(where, args)
     seen = tuple([(pattern, None if x is None else x.shape) for x, pattern in args.values()])
-    sizes = _right.get(seen)
+    try:
+        sizes = _right.get(seen)
+    except TypeError:  # a size that is only a symbol yet cannot be looked up
+        return _bound(where, args)
     if sizes is None:
         sizes = _bound(where, args)
         if len(_right) >= REMEMBERED:

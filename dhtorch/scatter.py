@@ -1,0 +1,164 @@
+"""How far a map in metres is off from pixel to pixel, as its near returns show it: what no model holds of sigma.
+
+Three things are told apart. A return stands somewhere in its pixel and so does the value of the map, so that on a slope
+both differ though neither is wrong. What is left goes with how rough the map is around: two levels, of the flatter and
+the rougher half of the returns. And where returns are off by far more than that, so are the pixels around them on the
+same surface.
+
+Alphabet: ``r`` residual of log depth at anchors; ``read`` its variance by where in the pixel they stand; ``h`` how
+rough the map is; ``G`` candidates of a level.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from dhtorch.anchors import Anchors, at_anchors
+from dhtorch.geometry.covariance import median
+
+#: Relative scatter of a map without near returns.
+SCATTER: Final = 0.01
+
+#: How that goes with roughness.
+OF_ROUGH: Final = 0.5
+
+#: Side of the window in which a map is rough, as a share of its longer side.
+WINDOW: Final = 0.03
+
+#: Share of errors that lie within one sigma.
+SHARE: Final = 0.683
+
+#: Share of a Cauchy distribution's scale that so many lie within.
+WITHIN: Final = 1.84
+
+#: Candidates, as powers of ten from, to and how many: levels of relative error, and of error by roughness.
+LEVELS, SLOPES = (-5, 0, 51), (-3, 1, 41)
+
+#: Widths of the kernels of what is off in places: share of the longer side, and log depth.
+PLACE, DEPTH = 0.04, 0.05
+
+#: Weight of what no return says against those around a pixel.
+NOTHING: Final = 0.3
+
+#: Depths between which what is off in places is found.
+BINS: Final = 48
+
+#: From how many sigmas on a return is off by more than the map's scatter.
+BEYOND: Final = 2.0
+
+
+def variance(
+    points: Anchors,
+    r: Tensor,  # (B, N)
+    told: tuple[Tensor, Tensor],  # (B, N) variance by reading; standard deviation of the fit
+    log: Tensor,  # (B, h, w) log depth of the map
+    known: Tensor,  # (B, h, w) bool
+) -> Tensor:
+    """Variance (B, h, w) of log depth from pixel to pixel; that of a usual map where there are no near returns.
+
+    What the fit itself may be off by is no scatter: as far as its sigma reaches, residuals are taken from their middle.
+
+    Gradient: none. Cost: that of a few images; anchors are seen on a coarse grid of places and depths.
+    Raises ValueError for wrong shapes.
+    """
+    read, of_fit = told
+    with torch.no_grad():
+        near = points.used & points.near
+        r = r - median(r, near).maximum(-of_fit).minimum(of_fit)
+        rough = _roughness(log, known)
+        h = at_anchors(rough, points.share)[0].clamp_min(1e-9)
+        flat, slope = _levels(r, read, h, near)
+        some = near.any(-1, keepdim=True)
+        flat, slope = torch.where(some, flat, SCATTER), torch.where(some, slope, OF_ROUGH)
+        excess = (r.square() - BEYOND**2 * (flat.square() + (slope * h).square() + read)).clamp_min(0)
+        off = _in_places(points.share, at_anchors(log, points.share)[0], (excess, near), log, known)
+        return flat.square()[..., None] + (slope[..., None] * rough).square() + off
+
+
+def _roughness(x: Tensor, known: Tensor) -> Tensor:
+    """How far (B, h, w) pixels stand from the mean of those around them, root mean square over the same window."""
+    side = max(3, 2 * round(0.5 * WINDOW * max(x.shape[-2:])) + 1)
+    return _around((x - _around(x, known, side)).square(), known, side).sqrt()
+
+
+def _around(x: Tensor, known: Tensor, side: int) -> Tensor:
+    """Mean (B, h, w) of the known ones of the pixels around each; 0 where it is not known itself."""
+    mask = known.to(x)[:, None]
+    total, count = (F.avg_pool2d(m, side, 1, side // 2) for m in (torch.where(known, x, 0.0)[:, None], mask))
+    return torch.where(known, (total / count.clamp_min(1e-6))[:, 0], 0.0)
+
+
+def _levels(r: Tensor, read: Tensor, h: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
+    """Level (B, 1) within which 68 % of the errors of the flatter half lie, and by roughness ``h`` of the rougher half.
+
+    A return either stands where the map's value was taken or beside it: each is as likely, errors are Cauchy's. Their
+    likeliest level says how much each return counts as one that is read where it stands.
+    """
+    steep = near & (h >= median(h, near))
+    levels, slopes = (torch.logspace(*of).to(r) for of in (LEVELS, SLOPES))
+    levels = levels.square()[None, :, None].expand(len(r), -1, r.shape[1])
+    flat = _held(r.abs(), _read_there(r, levels, read, near & ~steep))
+    slopes = torch.cat((torch.zeros_like(slopes[:1]), slopes))
+    levels = (flat.square() / WITHIN**2).clamp_min(1e-10)[..., None] + (slopes[:, None] * h[:, None]).square()
+    beyond = (r.square() - flat.square()).clamp_min(0).sqrt() / h
+    return flat, _held(beyond, _read_there(r, levels, read, steep)).clamp_max(10.0 ** SLOPES[1])
+
+
+def _read_there(r: Tensor, levels: Tensor, read: Tensor, among: Tensor) -> Tensor:
+    """How probable (B, N) it is that anchors are read where they stand, under the likeliest of ``levels`` (B, G, N),
+    squared scales of their errors; 0 of those that are not ``among`` them."""
+    there, beside = (
+        1 / (v.sqrt() * (1 + r[:, None].square() / v)) for v in (levels, levels + read[:, None] / WITHIN**2)
+    )
+    like = torch.where(among[:, None], (there + beside).log(), 0.0).sum(-1)
+    best = like.argmax(-1)[:, None, None].expand(-1, -1, r.shape[1])
+    return torch.where(among, (there / (there + beside)).gather(1, best)[:, 0], 0.0)
+
+
+def _held(value: Tensor, weight: Tensor) -> Tensor:
+    """Weighted quantile (B, 1) of values (B, N) at ``SHARE``."""
+    value, order = value.sort(-1)
+    sums = weight.gather(1, order).cumsum(-1)
+    at = (sums < SHARE * sums[:, -1:]).sum(-1, keepdim=True).clamp_max(value.shape[1] - 1)
+    return value.gather(1, at)
+
+
+def _in_places(
+    share: Tensor,  # (B, N, 2)
+    level: Tensor,  # (B, N) log depth of the map at anchors
+    found: tuple[Tensor, Tensor],  # (B, N) what they are off by, squared; which count
+    log: Tensor,  # (B, h, w)
+    known: Tensor,  # (B, h, w)
+) -> Tensor:
+    """Mean (B, h, w) of what anchors are off by, of those around each pixel and about as deep: a bilateral grid."""
+    excess, used = found
+    rows, columns = log.shape[-2:]
+    sides = [columns / max(rows, columns), rows / max(rows, columns)]
+    low = torch.where(known, log, torch.inf).flatten(1).amin(-1, keepdim=True)
+    high = torch.where(known, log, -torch.inf).flatten(1).amax(-1, keepdim=True)
+    width = torch.where(low < high, high - low, 1.0)
+    low = torch.where(low < high, low, 0.0)
+    step = (width / (BINS - 1)).clamp_min(DEPTH)
+    bins = low + width * torch.linspace(0, 1, BINS).to(log)
+    of_place = [
+        _kernel(share[..., k] * side, side * torch.linspace(0, 1, max(3, round(2 * side / PLACE))).to(log)[None], PLACE)
+        for k, side in enumerate(sides)
+    ]
+    of_depth = _kernel(level, bins, step[..., None]) * used[:, None]
+    place = of_place[1][:, :, None] * of_place[0][:, None]  # (B, rows, columns, N)
+    both = torch.stack((of_depth, of_depth * excess[:, None]), 1)  # (B, 2, BINS, N)
+    grid = torch.einsum("byxn,bckn->bckyx", place, both)
+    v, u = torch.meshgrid(*((2 * torch.arange(n).to(log) + 1) / n - 1 for n in (rows, columns)), indexing="ij")
+    at = 2 * (log - low[..., None]) / width[..., None] - 1
+    where = torch.stack((u.expand_as(at), v.expand_as(at), at), -1)[:, None]
+    mass, total = F.grid_sample(grid, where, padding_mode="border", align_corners=True)[:, :, 0].unbind(1)
+    return total / (mass + NOTHING)
+
+
+def _kernel(at: Tensor, node: Tensor, length: float | Tensor) -> Tensor:
+    """Of places (B, N) and nodes (B or 1, K): (B, K, N)."""
+    return (-0.5 * ((at[:, None] - node[..., None]) / length).square()).exp()

@@ -1,0 +1,79 @@
+"""How far an anchored map is off from pixel to pixel: only as far as near returns show it, and where they do."""
+
+import torch
+
+from dhtorch.anchors import Anchors, at_anchors, spread_within
+from dhtorch.scatter import SCATTER, variance
+
+HW = (60, 80)
+
+
+def seen(log, truth, n=500, seed=0):
+    """Near returns of a map: residuals, and what the map differs by within a pixel."""
+    g = torch.Generator().manual_seed(seed)
+    share = torch.rand(len(log), n, 2, generator=g, dtype=torch.float64)
+    r = at_anchors(truth, share)[0] - at_anchors(log, share)[0]
+    one = torch.ones_like(r)
+    points = Anchors(share, one, 0 * one, one, 1e-4 * one, 0 * one, one > 0, one > 0)
+    return points, r, (at_anchors(spread_within(log), share)[0].square(), 0 * one)
+
+
+def room():
+    """Log depth (1, h, w) of a floor and a box before it; True on the box."""
+    v, u = torch.meshgrid(*(torch.linspace(0, 1, k, dtype=torch.float64) for k in HW), indexing="ij")
+    box = (u > 0.3) & (u < 0.6) & (v > 0.3) & (v < 0.7)
+    return torch.where(box, 0.2, 1.2 - 0.5 * v)[None], box[None]
+
+
+def sigma(log, truth, **options):
+    return variance(*seen(log, truth, **options), log, torch.ones_like(log, dtype=torch.bool)).sqrt()
+
+
+def test_a_map_that_returns_follow_is_not_in_doubt():
+    truth, _ = room()
+    assert sigma(truth, truth).max() < 1e-3
+
+
+def test_noise_of_the_map_is_found():
+    truth, _ = room()
+    for level in (0.01, 0.05):
+        noise = level * torch.randn(truth.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+        found = sigma(truth + noise, truth)
+        within = (noise.abs() <= found).double().mean()
+        assert 0.6 < within < 0.85
+
+
+def test_an_object_that_was_moved_is_in_doubt_and_not_what_is_around_it():
+    truth, box = room()
+    found = sigma(torch.where(box, truth + 0.4, truth), truth)
+    assert found[box].median() > 0.2
+    assert found[~box].median() < 0.02
+
+
+def test_blurred_edges_are_in_doubt():
+    truth, _ = room()
+    blurred = torch.nn.functional.avg_pool2d(truth[:, None], 9, 1, 4, count_include_pad=False)[:, 0]
+    off = (blurred - truth).abs()
+    found = sigma(blurred, truth)
+    assert found[off > 0.1].median() > 5 * found[off < 0.005].median()
+    assert (off <= 2 * found).double().mean() > 0.9
+
+
+def test_without_near_returns_a_usual_map_is_meant():
+    truth, _ = room()
+    points, r, told = seen(truth, truth)
+    none = points._replace(near=points.near & False)
+    found = variance(none, r, told, truth, torch.ones_like(truth, dtype=torch.bool)).sqrt()
+    assert torch.allclose(found.amin(), torch.tensor(SCATTER, dtype=torch.float64), rtol=0.2)
+
+
+def test_alone_as_in_a_batch():
+    truth, box = room()
+    log = torch.cat((torch.where(box, truth + 0.4, truth), 2 * truth + 1))
+    both = sigma(log, log + 0.01 * truth)
+    points, r, told = seen(log, log + 0.01 * truth)
+    for k in range(2):
+        one = Anchors(*(part[k : k + 1] for part in points))
+        told_one = (told[0][k : k + 1], told[1][k : k + 1])
+        alone = variance(one, r[k : k + 1], told_one, log[k : k + 1], torch.ones_like(log[:1], dtype=torch.bool))
+        assert torch.allclose(alone.sqrt(), both[k : k + 1], rtol=1e-9)
