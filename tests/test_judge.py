@@ -1,6 +1,8 @@
 """Is a depth right: what speaks for and against pixels, numbers of a frame, and that silence is never called right."""
 
+import json
 import math
+from pathlib import Path
 
 import pytest
 import torch
@@ -12,8 +14,9 @@ from dhtorch.evaluate.holdout import range_split
 from dhtorch.evidence import Said
 from dhtorch.synthetic import SyntheticRoom
 from dhtorch.tree import collate, stack
-from dhtorch.verdict import cut, decided, share
+from dhtorch.verdict import QUICK, cut, decided, share
 
+RESULTS = Path(__file__).resolve().parents[1] / "benchmarks" / "results"
 NEAR, ANCHOR, OTHERS = 2.0, 5, (0, 2, 8, 11)
 METHOD = AUTO.replace(n=768)
 SMALL = {"method": METHOD, "size": 160}
@@ -106,6 +109,30 @@ def test_a_camera_that_only_turns_knows_nothing_of_what_is_far():
     found = judge(1.3 * true, near[1], stack([near[0], near[2]]), **SMALL)
     far = at_grid(true, found) > 1.2 * NEAR
     assert (found.state == State.CONSISTENT)[far].float().mean() < 0.003
+
+
+def test_quick_leaves_a_metre_unknown_where_the_motion_comes_out_short(room, true, anchor):
+    """Motions that few points hold loosely are too short: of a true map they would say that it is too far."""
+
+    def by_points(method, k):
+        return judge(true, anchor, range_split(room[k], NEAR), method=method, views=False, size=160).scale_far[0]
+
+    beside = (ANCHOR - 1, ANCHOR + 1)
+    loose = torch.stack([by_points(QUICK.replace(triangulate={"min_t_snr": 10.0}), k) for k in beside])
+    assert (loose[:, 0] > 1.05).all()
+    assert (loose[:, 1] > 1).any(), "a false alarm"
+    assert all(by_points(QUICK, k).isnan().all() for k in beside)
+    assert by_points(QUICK, ANCHOR + 3).isfinite().all(), "a wider way is known well enough"
+
+
+@pytest.mark.parametrize("name", ["judge_study", "judge_study_streams"])
+def test_what_quick_missed_by_points_alone_it_was_silent_on(name):
+    """As docs/judge.md says of the committed results."""
+    rows = json.loads((RESULTS / f"{name}.json").read_text())["rows"]
+    wide = [row for row in rows if row["method"] == "judge" and row["pair"] is not None and row["baseline"]]
+    told = [row for row in wide if row["quick_far.none"] is not None]
+    assert 0 < len(told) < len(wide)
+    assert all(row[f"quick_far.10_{side}"] for row in told for side in ("long", "short"))
 
 
 def test_the_sensors_own_metre_is_told_by_a_trajectory_alone(room, others):
