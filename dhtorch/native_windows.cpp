@@ -1,4 +1,4 @@
-// A few numbers about the window around each sample: extremes of depth, brightness, sums of squared gradients. Twin of
+// A few numbers about the window around each sample: extremes of depth, brightness, texture. Twin of
 // what dhtorch/geometry/lookup.py reads for stages 2 and 3, which is the reference: whole numbers are exact, sums are
 // taken in torch's order. One thread, no gradient. Callers check shapes, types and strides.
 
@@ -200,16 +200,20 @@ struct Sums {
   }
 };
 
+// Where rows of grey values lie, and how far apart.
+struct Rows {
+  const float* first;
+  int64_t step;
+};
+
 // Gradients of one point's window, of its inner pixels in the order in which torch sums them, which of interleaved pixels
 // is column by column.
 template <int64_t SIZE>
-void gradients(const uint8_t* at, const Windows& w, bool whole, float* __restrict slopes) {
+void gradients(const Rows& grey, const Windows& w, bool whole, float* __restrict slopes) {
   const int64_t size = SIZE ? SIZE : w.size, inner = size - 2;
-  float grey[WIDE * ROOM] = {};  // what happens to lie beside a window is computed, too, and costs more where it is no number
-  for (int64_t y = 0; y < size; ++y) grey_row<SIZE>(at + y * w.row, w, whole, grey + y * ROOM);
   const int64_t down = 2 * POINTS * (whole ? 1 : inner), right = 2 * POINTS * (whole ? inner : 1);
   for (int64_t y = 0; y < inner; ++y) {
-    const float *a = grey + y * ROOM, *b = a + ROOM, *c = b + ROOM;
+    const float *a = grey.first + y * grey.step, *b = a + grey.step, *c = b + grey.step;
     float g_x[WIDE], g_y[WIDE];
     for (int64_t x = 0; x < WIDE; ++x) {
       g_x[x] = fused(b[x + 2] - b[x], 2.0f, (a[x + 2] - a[x]) + (c[x + 2] - c[x]));
@@ -222,26 +226,63 @@ void gradients(const uint8_t* at, const Windows& w, bool whole, float* __restric
   }
 }
 
-// picture of bytes; found (3, B, N): sums of gx², gx gy and gy² of the Sobel filters over all but the outermost pixels.
-// Windows are at most WIDE pixels wide.
-void window_gradients(Tensor picture, Tensor pixel, Tensor found, int64_t image, int64_t channel, int64_t row,
-                      int64_t column, int64_t channels, int64_t height, int64_t width, int64_t size, bool whole) {
+// Gradients of a window whose pixels are read for it alone.
+template <int64_t SIZE>
+void read_gradients(const uint8_t* at, const Windows& w, bool whole, float* slopes) {
+  float grey[WIDE * ROOM] = {};  // what happens to lie beside a window is computed, too, and costs more where it is no number
+  for (int64_t y = 0; y < (SIZE ? SIZE : w.size); ++y) grey_row<SIZE>(at + y * w.row, w, whole, grey + y * ROOM);
+  gradients<SIZE>({grey, ROOM}, w, whole, slopes);
+}
+
+// Grey values of an interleaved picture, where its windows have more rows than it has vectors; nothing elsewhere.
+bool grey_picture(const uint8_t* at, const Windows& w, bool whole, std::vector<float>& grey) {
+  const int64_t all = w.height * w.width;
+  if (!whole || w.n * w.size * WIDE < all) return false;
+  grey.resize(all + ROOM);
+  for (int64_t k = 0; k < all; ++k) {
+    grey[k] = over<255000>(static_cast<float>(299 * at[3 * k] + 587 * at[3 * k + 1] + 114 * at[3 * k + 2]));
+  }
+  return true;
+}
+
+// The smaller eigenvalue of ((a, b), (b, c)), as dhtorch/geometry/small.py finds it.
+inline float smaller(float a, float b, float c) {
+  const float half = (a - c) / 2, middle = (a + c) / 2, square = half * half + b * b;
+  return middle - (square > 0 ? std::sqrt(square) : square);
+}
+
+// picture of bytes; found (1, B, N): smaller eigenvalue of the mean gradient matrix, by the Sobel filters over all but the
+// outermost pixels. Windows are at most WIDE pixels wide. With `whole` interleaved pixels become grey as whole numbers.
+void window_texture(Tensor picture, Tensor pixel, Tensor found, int64_t image, int64_t channel, int64_t row, int64_t column,
+                    int64_t channels, int64_t height, int64_t width, int64_t size, bool whole) {
   Windows w = windows(pixel, image, channel, row, column, channels, height, width, size);
   const uint8_t* from = data<uint8_t>(picture);
   w.end = from + w.batch * channels * height * width;
-  const int64_t all = w.batch * w.n, inner = size - 2;
-  std::vector<float> slopes(2 * inner * inner * POINTS);
+  const int64_t inner = size - 2;
+  std::vector<float> slopes(2 * inner * inner * POINTS), grey;
   float* to = data<float>(found);
-  for (int64_t i = 0; i < all; i += POINTS) {
-    const int64_t count = std::min(POINTS, all - i);
-    for (int64_t p = 0; p < count; ++p) {
-      const uint8_t* at = from + w.first((i + p) / w.n, (i + p) % w.n);
-      (size == 9 ? gradients<9> : gradients<0>)(at, w, whole, slopes.data() + p);
-    }
-    Sums sums;
-    for (int64_t e = 0; e < inner * inner; ++e) sums.add(slopes.data() + 2 * e * POINTS, slopes.data() + (2 * e + 1) * POINTS);
-    for (int64_t s = 0; s < 3; ++s) {
-      for (int64_t p = 0; p < count; ++p) to[s * all + i + p] = sums.part[s][p] + sums.whole[s][p];
+  const float count = 16.0f * inner * inner;
+  for (int64_t b = 0; b < w.batch; ++b, to += w.n) {
+    const bool once = grey_picture(from + b * image, w, whole, grey);
+    for (int64_t k = 0; k < w.n; k += POINTS) {
+      const int64_t several = std::min(POINTS, w.n - k);
+      for (int64_t p = 0; p < several; ++p) {
+        const int64_t first = w.first(b, k + p);
+        float* own = slopes.data() + p;
+        if (once) {
+          const Rows rows = {grey.data() + (first - b * image) / 3, width};
+          (size == 9 ? gradients<9> : gradients<0>)(rows, w, whole, own);
+        } else {
+          (size == 9 ? read_gradients<9> : read_gradients<0>)(from + first, w, whole, own);
+        }
+      }
+      Sums sums;
+      for (int64_t e = 0; e < inner * inner; ++e) sums.add(slopes.data() + 2 * e * POINTS, slopes.data() + (2 * e + 1) * POINTS);
+      for (int64_t p = 0; p < several; ++p) {
+        float each[3];
+        for (int64_t s = 0; s < 3; ++s) each[s] = sums.part[s][p] + sums.whole[s][p];
+        to[k + p] = smaller(each[0], each[1], each[2]) / count;
+      }
     }
   }
 }
@@ -256,12 +297,12 @@ STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
       "window_brightness(Tensor picture, Tensor pixel, Tensor(a!) found, int image, int channel, int row, int column, "
       "int channels, int height, int width, int size) -> ()");
   m.def(
-      "window_gradients(Tensor picture, Tensor pixel, Tensor(a!) found, int image, int channel, int row, int column, "
+      "window_texture(Tensor picture, Tensor pixel, Tensor(a!) found, int image, int channel, int row, int column, "
       "int channels, int height, int width, int size, bool whole) -> ()");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) {
   m.impl("window_extremes", TORCH_BOX(&window_extremes));
   m.impl("window_brightness", TORCH_BOX(&window_brightness));
-  m.impl("window_gradients", TORCH_BOX(&window_gradients));
+  m.impl("window_texture", TORCH_BOX(&window_texture));
 }

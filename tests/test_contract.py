@@ -546,7 +546,7 @@ ELSEWHERE = {
     *(f"dhtorch.dense.{name}" for name in ("partner_of", "pose_variance")),
     *(f"dhtorch.verdict.{name}" for name in ("judge", "judged", "decided", "cut", "share")),
     *(f"dhtorch.evidence.{name}" for name in ("references", "silent", "by_answers", "by_views", "by_maps")),
-    *(f"dhtorch.causes.{name}" for name in ("turned", "name_cause", "decided", "watch")),
+    *(f"dhtorch.causes.{name}" for name in ("turned", "name_cause", "decided", "watch", "ray_lengths")),
     "dhtorch.evaluate.detection.auroc",
     "dhtorch.metric.anchor",
     *(f"dhtorch.anchors.{name}" for name in ("gathered", "at_anchors", "spread_within")),

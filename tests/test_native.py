@@ -81,7 +81,7 @@ def test_pyramids_agree_up_to_one_rounding(loaded, monkeypatch, channels, kind, 
 @needs_compiler
 @pytest.mark.parametrize("layout", ["interleaved", "planar", "grey", "bgr of rgba"])
 @pytest.mark.parametrize("block", [3, 7, 9])
-def test_numbers_about_windows_agree_bit_for_bit(loaded, monkeypatch, layout, block):
+def test_numbers_about_windows_agree_textures_up_to_rounding(loaded, monkeypatch, layout, block):
     image = volume(2, 1 if layout == "grey" else 3, 41, 53, most=256)
     if layout == "interleaved":
         image = image.contiguous(memory_format=torch.channels_last)
@@ -94,7 +94,7 @@ def test_numbers_about_windows_agree_bit_for_bit(loaded, monkeypatch, layout, bl
     camera = Camera(f=torch.full((2, 2), 50.0), c=torch.full((2, 2), 20.0))
     frame = Frame(image=image, depth=depth, camera=camera, conf=None)
     calls = []
-    for name in ("extremes", "brightness", "gradients"):
+    for name in ("extremes", "brightness", "texture"):
         was = getattr(torch.ops.dhtorch, f"window_{name}")
         monkeypatch.setattr(
             torch.ops.dhtorch, f"window_{name}", lambda *a, was=was, **k: (calls.append(1), was(*a, **k))
@@ -109,7 +109,7 @@ def test_numbers_about_windows_agree_bit_for_bit(loaded, monkeypatch, layout, bl
 
 @needs_compiler
 def test_windows_that_compiled_code_cannot_read_are_torchs(loaded, monkeypatch):
-    for name in ("extremes", "brightness", "gradients"):
+    for name in ("extremes", "brightness", "texture"):
         monkeypatch.setattr(torch.ops.dhtorch, f"window_{name}", None)
     image, uv = torch.rand(1, 3, 31, 32), torch.rand(1, 9, 2) * 30
     assert min_eigenvalue(image, uv).shape == (1, 9), "numbers that are no bytes"

@@ -25,7 +25,7 @@ _THOUSANDTHS = (299.0, 587.0, 114.0)
 NUMBERS = 1 << 18
 
 #: Operations of compiled code → the type of pixels that they read, and how many numbers they find.
-COMPILED = {"extremes": (torch.float32, 2), "brightness": (torch.uint8, 4), "gradients": (torch.uint8, 3)}
+COMPILED = {"extremes": (torch.float32, 2), "brightness": (torch.uint8, 4), "texture": (torch.uint8, 1)}
 
 #: Widest windows that compiled code reads, px.
 WIDEST = 16

@@ -88,16 +88,16 @@ def msac_cost(
     Source: P. Torr, A. Zisserman, "MLESAC" (CVIU 2000), the truncated score.
     """
     sizes = check("msac_cost", poses=(poses, "B 4 P"), points=(points, "B 6 M"), limits=(limits, "B M"))
-    uv, xyz = points[:, :2, None], points[:, 2:]
+    uv, xyz = points[:, :2], points[:, 2:]
     pairs = max(RESIDUALS // max(sizes["P"] * sizes["M"], 1), 1)
     costs = []
     for b in range(0, len(points), pairs):  # few pairs at a time keep the temporaries in cache
         part = slice(b, b + pairs)
-        Y = torch.bmm(poses[part].transpose(1, 2), xyz[part]).unflatten(1, (3, -1))
-        w = Y[:, 2:].clamp_min_(MIN_DEPTH).reciprocal_()  # points behind the camera land far outside the image
-        r = Y[:, :2].mul_(w).sub_(uv[part])
-        x, y = r.mul_(r).unbind(1)
-        costs.append(torch.minimum(x.add_(y), limits[part, None]).sum(-1))
+        x, y, z = torch.bmm(poses[part].transpose(1, 2), xyz[part]).unflatten(1, (3, -1)).unbind(1)
+        w = z.clamp_min_(MIN_DEPTH).reciprocal_()  # points behind the camera land far outside the image
+        x = x.mul_(w).sub_(uv[part, :1])
+        y = y.mul_(w).sub_(uv[part, 1:])  # both at once saves three calls, and a compiler's fusing them
+        costs.append(torch.minimum(x.mul_(x).add_(y.mul_(y)), limits[part, None]).sum(-1))
     return torch.cat(costs)
 
 

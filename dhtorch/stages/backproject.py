@@ -94,8 +94,9 @@ def backproject(
     xyz = cam.unproject(frame.camera, uv.nan_to_num(0.0, 0.0, 0.0), depth)  # no gradient to what is no number
     usable = returned & ~(unsure | beyond)
     usable = usable & (xyz.detach().abs().amax(-1) < torch.inf)  # a pixel outside the lens model has no ray
-    halvings = edge.int() + shine.int() + white.int()
-    confidence = (level.to(depth.dtype) / 2).clamp(0, 1) * 0.5**halvings
+    confidence = (level.to(depth.dtype) / 2).clamp(0, 1)
+    for doubt in (edge, shine, white):
+        confidence = torch.where(doubt, confidence / 2, confidence)
     return Samples(
         uv=uv,
         depth=depth,
@@ -207,6 +208,10 @@ def _whole_brightness(image: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor,
 
 def _bits(*masks: tuple[Tensor, int]) -> Tensor:
     """One int32 bit set of (mask, bit) pairs; of eight bits at most, which a byte holds."""
+    if torch.compiler.is_compiling():  # which makes one loop of all
+        return sum(
+            (torch.where(mask, bit, 0) for mask, bit in masks[1:]), torch.where(masks[0][0], masks[0][1], 0)
+        ).int()
     held = torch.stack([mask for mask, _ in masks])
     bits = torch.tensor([bit for _, bit in masks], dtype=torch.uint8, device=held.device)
     return torch.where(held, bits.view(-1, *[1] * (held.dim() - 1)), 0).sum(0, dtype=torch.int32)

@@ -74,15 +74,16 @@ def min_eigenvalue(
     Gradient: to the image; at equal eigenvalues the subgradient without the split is taken.
     """
     check("min_eigenvalue", image=(image, "B C H W"), uv=(uv, "B N 2"))
-    a, b, c = summarise(image, pixels(uv), block + 2, _gradient_sums, grey=True, compiled="gradients")
-    smaller, _ = eigenvalues(a, b, c)
-    return smaller / (16 * block * block)
+    (found,) = summarise(image, pixels(uv), block + 2, _texture, grey=True, compiled="texture")
+    return found
 
 
-def _gradient_sums(grey: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Σ gx², Σ gx gy and Σ gy² of the Sobel filters over all but the outermost pixels (size, size, P)."""
+def _texture(grey: Tensor) -> tuple[Tensor]:
+    """Smaller eigenvalue (P,) of the mean of ((gx², gx gy), (gx gy, gy²)), by the Sobel filters over all but the
+    outermost pixels (size, size, P)."""
     gx, gy = _sobel(grey)
-    return (gx * gx).sum((0, 1)), (gx * gy).sum((0, 1)), (gy * gy).sum((0, 1))
+    smaller, _ = eigenvalues((gx * gx).sum((0, 1)), (gx * gy).sum((0, 1)), (gy * gy).sum((0, 1)))
+    return (smaller / (16 * len(gx) * len(gx)),)
 
 
 def _sobel(grey: Tensor) -> tuple[Tensor, Tensor]:
