@@ -12,7 +12,16 @@ from torch.utils.data import DataLoader
 from dhtorch import testing as writers
 from dhtorch.codes import State
 from dhtorch.commands import run
-from dhtorch.commands.judge import _cut, _off_at_least, _said, _share_at_least, _wrong_at_least, exceeded, parse_limits
+from dhtorch.commands.judge import (
+    _cut,
+    _drift_at_least,
+    _off_at_least,
+    _said,
+    _share_at_least,
+    _wrong_at_least,
+    exceeded,
+    parse_limits,
+)
 from dhtorch.data.depth_maps import open_maps
 from dhtorch.data.files import FormatError
 from dhtorch.export import png
@@ -111,6 +120,12 @@ def test_bounds_of_a_recording():
     assert _off_at_least([row(1.02, 1.08), row(1.03, 1.2), row(0.5, 0.6)], "scale", 1.0) == pytest.approx(0.02)
     assert _off_at_least([row(0.8, 0.9)], "scale", 1.0) == pytest.approx(0.1)
     assert _off_at_least([{"scale": None}], "scale", 1.0) is None
+    sound, far = row(0.97, 1.02), row(1.1, 1.2)
+    assert _drift_at_least([sound, far]) == pytest.approx(1.1 - 1.02)
+    assert _drift_at_least([sound, row(0.99, 1.05), {"scale": None}]) == 0
+    assert _drift_at_least(10 * [sound] + [far]) == 0, "one of eleven"
+    assert _drift_at_least(9 * [sound] + 3 * [far]) == pytest.approx(1.1 - 1.02)
+    assert _drift_at_least([far, {"scale": None}]) is None
     assert _share_at_least(0, 0) is None
     assert _share_at_least(1, 1) < 0.3 < _share_at_least(20, 20)
     few = {"wrong": {"value": 0.5, "low": 0.1, "high": 0.9}, "pixels": 100, "share_cannot_know": 0.9}

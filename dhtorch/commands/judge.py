@@ -48,6 +48,7 @@ LIMITS = {
     "scale": "|scale - 1| of the median frame, at least",
     "shift": "|shift| of the median frame, m, at least",
     "tilt": "tilt of the median frame, at least",
+    "drift": "by how much the scale differs between frames, at least",
     "causes": "share of the windows in which a cause is named, at least",
     "unknown": "share of the pixels with a depth of which nothing can be known",
 }
@@ -282,6 +283,7 @@ def _whole(found: Found) -> Row:
         "scale": _off_at_least(rows, "scale", 1.0),
         "shift": _off_at_least(rows, "shift", 0.0),
         "tilt": _off_at_least(rows, "tilt", 0.0),
+        "drift": _drift_at_least(rows),
         "causes": _share_at_least(sum(kinds.values()), len(able)),
         "unknown": count["cannot_know"] / pixels if pixels else None,
     }
@@ -310,6 +312,17 @@ def _off_at_least(rows: Sequence[Row], name: str, sound: float) -> float | None:
     return max(low - sound, sound - high, 0.0)
 
 
+def _drift_at_least(rows: Sequence[Row]) -> float | None:
+    """By how much the scales of frames differ: what it is at least where depth is too far, minus what it is at most where
+    it is too near, a tenth of the frames left out at either end; 0 where one scale is in all intervals."""
+    known = [row["scale"] for row in rows if row["scale"] is not None]
+    if len(known) < 2:
+        return None
+    low, high = (sorted(x[bound] for x in known) for bound in ("low", "high"))
+    rest = len(known) // 10
+    return max(low[-1 - rest] - high[rest], 0.0)
+
+
 def _wrong_at_least(rows: Sequence[Row]) -> float | None:
     """Lower bounds of the frames' shares that are wrong, averaged by the pixels of which something is known."""
     known = [(row["wrong"]["low"], row["pixels"] * (1 - row["share_cannot_know"])) for row in rows if row["wrong"]]
@@ -330,6 +343,8 @@ def _said(name: str, whole: Row, notes: Sequence[str] = ()) -> list[str]:
     unknown = "no depth" if held["unknown"] is None else f"{held['unknown']:.1%} cannot be known"
     scale = "scale cannot be known" if middle["scale"] is None else f"scale {middle['scale']:.3f}"
     lines = [f"{name}: {many(whole['frames'], 'frame')}: {wrong}, {unknown}; {scale}"]
+    if held["drift"]:
+        lines.append(f"  the scale differs by {held['drift']:.3f} at least between frames")
     for cause, n in sorted(whole["causes"].items(), key=lambda item: -item[1]):
         lines.append(f"  likely cause in {n} of {many(whole['windows'], 'window')}: {cause}")
     if whole["ceiling"] is not None and not any(cause.startswith("cut at") for cause in whole["causes"]):
