@@ -313,8 +313,8 @@ def _off_at_least(rows: Sequence[Row], name: str, sound: float) -> float | None:
 
 
 def _drift_at_least(rows: Sequence[Row]) -> float | None:
-    """By how much the scales of frames differ: what it is at least where depth is too far, minus what it is at most where
-    it is too near, a tenth of the frames left out at either end; 0 where one scale is in all intervals."""
+    """By how much the scales of frames differ: what one is at least where depth is too far, minus what one is at most
+    where it is too near, a tenth of the frames left out at either end; 0 where one scale is in all intervals."""
     known = [row["scale"] for row in rows if row["scale"] is not None]
     if len(known) < 2:
         return None
