@@ -492,7 +492,7 @@ TABLES |= {
     "judge": judge,
     "judge real": judged_real,
     "clients": clients,
-    "anchor": partial(anchored, "anchor_study", "anchor_study_streams"),
+    "anchor": partial(anchored, "anchor_study", "anchor_study_streams", "anchor_study_rooms"),
 }
 TABLES |= {"every pixel": partial(every_pixel, "dense", "dense_streams")}
 TABLES |= {"pixels by scene": partial(pixels_by_scene, "dense")}

@@ -41,6 +41,7 @@ EXPERIMENTS = {
     "dense_streams": "experiment=dense_comparison data=streams experiment.anchors=6 experiment.rooms=[]",
     "anchor_study": "experiment=anchor_study data=shared_scenes",
     "anchor_study_streams": "experiment=anchor_study data=streams",
+    "anchor_study_rooms": "experiment=anchor_study data=synthetic_seeds",
     "shared_scenes": "experiment=opencv_twin data=shared_scenes",
     "room_exact": "experiment=opencv_twin data=synthetic_seeds data.lidar=exact data.image_noise=0",
     "room_phone": "experiment=opencv_twin data=synthetic_seeds",
