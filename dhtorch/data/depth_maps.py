@@ -60,7 +60,7 @@ class DepthMaps:
     def notes(self) -> list[str]:
         """What a reader of the answer has to know of how files were matched."""
         missing, n = len(self.files) - len(self.frames), len(self.files)
-        found = [f"{missing} of {n} frames have no map."] if missing else []
+        found = [f"{missing} of {n} frames {'has' if missing == 1 else 'have'} no map."] if missing else []
         ordered = ["No file has a frame's number: files were matched in their order."]
         return found + (ordered if self.by == "order" else [])
 
