@@ -6,8 +6,10 @@ Random scenes: points 0.5 to 2.5 m away seen by a 640x480 camera, pixels with 0.
 by any other pixel. Ours is seat 5 of ``paper`` with 64 hypotheses, enough for half the points being wrong. Peers, pair
 after pair: ``cv2.solvePnPRansac`` with AP3P and with USAC MAGSAC, both followed by ``cv2.solvePnPRefineLM`` on the
 inliers; PoseLib with at least 100 iterations (its default of 1000 would be no fair peer); pycolmap where it is
-installed. Mode ``compiled`` is ``torch.compile`` of the seat. Ours runs under ``torch.inference_mode``, as one would
-run it where nothing is to be learned.
+installed. Mode ``compiled`` is ``torch.compile`` of the seat with calls from kernel to kernel in C++ as well
+(``options={"cpp_wrapper": True}``), which takes longer to compile once, mode ``native`` the seat with the compiled code
+of ``python -m dhtorch.native``. Ours runs under ``torch.inference_mode``, as one would run it where nothing is to be
+learned.
 
 Errors: median rotation error in degrees over a hundred pairs; that of the translation is printed above the table.
 """
@@ -30,7 +32,7 @@ from torch import Tensor
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.pair import uniform_draws
-from dhtorch.records import Camera, Pose, Samples, Tracks
+from dhtorch.records import Camera, Pose, PoseFit, Samples, Tracks
 from dhtorch.stages.pose import pnp_ransac
 
 HW, FOCAL, THRESHOLD_PX, HYPOTHESES = (480, 640), 525.0, 3.0, 64
@@ -128,16 +130,22 @@ def errors(found: Pose, truth: Pose) -> Iterator[tuple[float, float]]:
     yield from zip((turn * 180 / np.pi).tolist(), (shift * 1e3).tolist(), strict=True)
 
 
+def natively(call: Callable[[], PoseFit]) -> PoseFit:
+    """What a call answers with compiled code."""
+    with harness.natively():
+        return call()
+
+
 def measure(batch: int, n: int, outliers: float, options: Any, compile_too: bool) -> list[dict[str, Any]]:
-    """Rows of one size: eager and compiled against every peer."""
+    """Rows of one size: eager, native and compiled against every peer."""
     draws = uniform_draws(torch.arange(batch), batch, HYPOTHESES)
     samples, tracks, camera, _ = scene(batch, n, outliers, seed=1)
     seat = partial(pnp_ransac, samples, tracks, camera, camera, draws)
-    calls: dict[str, Callable[[], Any]] = {"eager": seat}
+    calls: dict[str, Callable[[], Any]] = {"eager": seat, "native": partial(natively, seat)}
     seconds = 0.0
     if compile_too:
         torch.compiler.reset()
-        fast = torch.compile(pnp_ransac)
+        fast = torch.compile(pnp_ransac, options={"cpp_wrapper": True})
         start = time.perf_counter()
         calls["compiled"] = partial(fast, samples, tracks, camera, camera, draws)
         calls["compiled"]()
@@ -146,20 +154,23 @@ def measure(batch: int, n: int, outliers: float, options: Any, compile_too: bool
     calls |= {name: partial(each, peer, pairs) for name, peer in PEERS.items()}
     found = harness.in_turn([*calls.values()], repeats=options.repeats, clock=options.clock, warm_up=2)
     times = {name: [t / batch for t in side] for name, side in zip(calls, found, strict=True)}
-    wrong: dict[str, list[tuple[float, float]]] = {name: [] for name in ("eager", *PEERS)}
+    wrong: dict[str, list[tuple[float, float]]] = {name: [] for name in ("eager", "native", *PEERS)}
     for seed in range(-(-96 // batch)):
         samples, tracks, camera, T = scene(batch, n, outliers, seed=100 + seed)
-        wrong["eager"] += errors(pnp_ransac(samples, tracks, camera, camera, draws).T_1_from_0, T)
+        ask = partial(pnp_ransac, samples, tracks, camera, camera, draws)
+        wrong["eager"] += errors(ask().T_1_from_0, T)
+        wrong["native"] += errors(natively(ask).T_1_from_0, T)
         for name, peer in PEERS.items():
             wrong[name] += errors(each(peer, arrays(samples, tracks)), T)
     middle = {name: np.nanmedian(np.array(w), 0) for name, w in wrong.items()}
     title = f"pnp_n{n}_b{batch}" + (f"_o{outliers:.0%}".rstrip("%") if outliers != 0.3 else "")
     print(f"{title}: " + ", ".join(f"{k} {a:.4f}° {b:.3f} mm" for k, (a, b) in middle.items()))
     rows = []
-    for mode in ("eager", "compiled") if compile_too else ("eager",):
+    for mode in ("eager", "native", "compiled") if compile_too else ("eager", "native"):
         for name in PEERS:
             more: dict[str, Any] = {"mode": mode, "n": n, "batch": batch, "bar": name == "opencv_ap3p"}
-            more |= {"ours_error": middle["eager"][0], "peer_error": middle[name][0]}
+            own = "native" if mode == "native" else "eager"
+            more |= {"ours_error": middle[own][0], "peer_error": middle[name][0]}
             more |= {"warm_up_s": seconds} if mode == "compiled" else {}
             rows.append(harness.row(title, times[mode], name, times[name], **more))
     return rows

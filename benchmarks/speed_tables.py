@@ -23,6 +23,7 @@ BARS = (
     ("pnp", "pnp_n500_b16", "eager", 1.0, "pose, 500 points, B = 16"),
     ("pnp", "pnp_n500_b1", "eager", 3.0, "pose, 500 points, B = 1"),
     ("pnp", "pnp_n500_b1", "compiled", 1.0, "pose, 500 points, B = 1"),
+    ("pnp", "pnp_n500_b1", "native", 1.0, "pose, 500 points, B = 1"),
     ("triangulate", "triangulate_100k", "eager", 0.03, "triangulation, 100,000 points"),
     ("pair", "pair_paper_b1", "eager", 1.3, "`paper`, whole pair, B = 1"),
     ("pair", "pair_paper_b8", "eager", 1.0, "`paper`, whole pair, B = 8"),

@@ -1,18 +1,19 @@
 """Inner loops of the sweep and its fits, of pyramids, of tokens, of what is read around samples, of the search for
-points and of the registration of their windows as compiled code, for those who ask for it; nothing needs it.
+points, of the registration of their windows and of poses as compiled code, for those who ask for it; nothing needs it.
 
     python -m dhtorch.native            compile ``native*.cpp``, with the system's C++ compiler, into the user's cache
     DHTORCH_NATIVE=1 python …           use it, in loader workers as well; or dhtorch.native.load() in a program
 
-``dhtorch.dense``, ``dhtorch.geometry.sweep``, ``pyramid``, ``lookup``, ``lucas_kanade`` and ``affine`` ask here whether
-tensors may be handed over; where not (nothing was loaded, another device or type, under vmap, a compiler or a graph)
-they do the same in torch, which is the reference. Tokens and the sweep are alike bit for bit, its fits up to rounding:
-no more than one gate in 200 differs, and 99 of 100 depths by less than a tenth of their sigma. A pyramid and what is
-read around samples do up to one rounding of a number. The search and the registration do up to the rounding of sums
-over a window: half of the places that were searched for are equal and half of those that were registered lie within
-1e-4 px, 99 of 100 lie within a tenth of their sigma, and no more than one verdict in 200 changes. Nothing is ever
-compiled or downloaded without the command above. The file in the cache is named after its sources, torch's version and
-the processor, whose widest vectors it uses.
+``dhtorch.dense``, ``dhtorch.stages.pose``, ``dhtorch.geometry.sweep``, ``pyramid``, ``lookup``, ``lucas_kanade``,
+``affine`` and ``near_far`` ask here whether tensors may be handed over; where not (nothing was loaded, another device
+or type, under vmap, a compiler or a graph) they do the same in torch, which is the reference. Tokens and the sweep are
+alike bit for bit, its fits up to rounding: no more than one gate in 200 differs, and 99 of 100 depths by less than a
+tenth of their sigma. A pyramid and what is read around samples do up to one rounding of a number. The search and the
+registration do up to the rounding of sums over a window: half of the places that were searched for are equal and half
+of those that were registered lie within 1e-4 px, 99 of 100 lie within a tenth of their sigma, and no more than one
+verdict in 200 changes. Of poses, whose costs and equations it sums, 99 of 100 lie within a hundredth of their sigma.
+Nothing is ever compiled or downloaded without the command above. The file in the cache is named after its sources,
+torch's version and the processor, whose widest vectors it uses.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from dhtorch.archive import processor
 
 SOURCES = tuple(
     Path(__file__).with_name(f"native{part}.cpp")
-    for part in ("", "_search", "_affine", "_pyramid", "_fit", "_windows", "_tokens")
+    for part in ("", "_search", "_affine", "_pyramid", "_fit", "_windows", "_tokens", "_pose", "_tracks")
 )
 
 #: What the sources share.

@@ -9,7 +9,21 @@ import pytest
 import torch
 from contract import PROMISES, NoMasksAsNumbers, Row, equal, leaves, reorder, take, tensor_map
 
-from dhtorch import anchors, causes, dense, distortion, evidence, method, metric, pair, scatter, verdict, views, window
+from dhtorch import (
+    anchors,
+    causes,
+    dense,
+    distortion,
+    evidence,
+    method,
+    metric,
+    pair,
+    scatter,
+    stereo,
+    verdict,
+    views,
+    window,
+)
 from dhtorch.evaluate import holdout, probe
 from dhtorch.geometry import (
     affine,
@@ -234,10 +248,6 @@ def nine(batch, n, dtype):
     A = uniform(batch, 9, 12, dtype=dtype)
     at = near_far.Unknowns(poses(batch, dtype), uniform(batch, 3, dtype=dtype))
     return at, A @ A.mT + 0.1 * torch.eye(9, dtype=dtype), uniform(batch, 9, dtype=dtype)
-
-
-def symmetric_solve(M, b):
-    return least_squares.solve_spd(M + M.mT, b)
 
 
 def triples(batch, n, dtype):
@@ -501,6 +511,9 @@ ROWS = [
 ELSEWHERE = {
     *(f"dhtorch.stages.given.{name}" for name in ("from_frames", "without")),
     "dhtorch.geometry.graphless.spared",
+    "dhtorch.geometry.least_squares.has_graph",
+    "dhtorch.geometry.near_far.squares_at",
+    "dhtorch.geometry.p3p.p3p_of_planes",
     *(f"dhtorch.stages.sample.{name}" for name in ("spiral", "vogel", "grid")),
     *(f"dhtorch.geometry.shapes.{name}" for name in ("check", "is_static", "is_transformed")),
     *(f"dhtorch.geometry.reference.{name}" for name in ("patch", "nearest", "luma", "offsets", "levels")),
@@ -524,7 +537,18 @@ ELSEWHERE = {
     "dhtorch.geometry.se3.turn_between",
     *(
         f"dhtorch.integrate.recording.{name}"
-        for name in ("ask", "place", "chain", "build", "coverage", "sensed", "recovered", "swept", "mapped")
+        for name in (
+            "ask",
+            "place",
+            "chain",
+            "build",
+            "build_grids",
+            "coverage",
+            "sensed",
+            "recovered",
+            "swept",
+            "mapped",
+        )
     ),
     "dhtorch.geometry.filters.gaussian_taps",
     "dhtorch.window.ask_window",
@@ -543,7 +567,8 @@ ELSEWHERE = {
     *(f"dhtorch.geometry.sweep.{name}" for name in ("add_costs", "level", "misfit", "rivals")),
     *(f"dhtorch.dense.{name}" for name in ("complete", "map_hw", "options", "pixels", "resized", "sensed", "shipped")),
     *(f"dhtorch.dense.{name}" for name in ("swept", "views_asked", "worthiest")),
-    *(f"dhtorch.dense.{name}" for name in ("partner_of", "pose_variance")),
+    "dhtorch.dense.partner_of",
+    *(f"dhtorch.stereo.{name}" for name in ("best_planes", "fitted", "pose_variance")),
     *(f"dhtorch.verdict.{name}" for name in ("judge", "judged", "decided", "cut", "share")),
     *(f"dhtorch.evidence.{name}" for name in ("references", "silent", "by_answers", "by_views", "by_maps")),
     *(f"dhtorch.causes.{name}" for name in ("turned", "name_cause", "decided", "watch", "ray_lengths")),
@@ -551,7 +576,8 @@ ELSEWHERE = {
     "dhtorch.metric.anchor",
     *(f"dhtorch.anchors.{name}" for name in ("gathered", "at_anchors", "spread_within")),
     *(f"dhtorch.distortion.{name}" for name in ("basis_of", "fields", "curves", "log_depth", "predicted", "fit")),
-    *("dhtorch.distortion.reading", "dhtorch.scatter.variance"),
+    *(f"dhtorch.distortion.{name}" for name in ("reading", "freedom_of", "leans")),
+    "dhtorch.scatter.variance",
     "dhtorch.geometry.exact.filled",
     "dhtorch.geometry.least_squares.minimise",
     "dhtorch.geometry.near_far.equations",
@@ -773,6 +799,7 @@ def public_functions():
         anchors,
         distortion,
         scatter,
+        stereo,
         metric,
         evidence,
         causes,

@@ -305,6 +305,17 @@ def test_the_last_proposal_is_judged_by_its_cost_alone_and_may_be_rejected():
     assert whole[0].tolist() == [[2.25], [0.0]] and whole[1].tolist() == [0.5625, 9.0]
 
 
+def test_a_last_step_that_could_not_be_solved_is_not_taken_however_little_it_costs():
+    def evaluate(x):
+        return Normal(x[:, 0], torch.eye(1, dtype=D).expand(2, 1, 1), x)
+
+    def step(x, H, g):
+        return x - 1, torch.tensor([True, False])
+
+    x, cost = minimise(evaluate, torch.full((2, 1), 5.0, dtype=D), 1, step=step)
+    assert x[:, 0].tolist() == cost.tolist() == [4.0, 5.0]
+
+
 def test_minimise_descends_to_the_optimum_and_leaves_what_is_no_number():
     T, f, c, xyz, uv = scene(3, 20, off=0.0)
 

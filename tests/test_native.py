@@ -1,25 +1,31 @@
 """Compiled code answers as torch does, the sweep bit for bit, a search for points and the registration of their windows
 up to the rounding of sums; nothing is compiled, loaded or used that nobody asked for."""
 
+import inspect
 import platform
 import shutil
 import subprocess
 import sys
 
 import pytest
+import test_map_pose
+import test_near_far
 import torch
 from torch.autograd import forward_ad
+from torch.utils._pytree import tree_leaves
 
-from dhtorch import WINDOW, dense, native
+from dhtorch import WINDOW, dense, native, stereo
 from dhtorch.codes import PoseCode, Source
 from dhtorch.evaluate.holdout import range_split
-from dhtorch.geometry import affine, least_squares, neighbours, pyramid, se3, sweep
+from dhtorch.geometry import affine, least_squares, near_far, neighbours, p3p, pyramid, ransac, se3, sweep
 from dhtorch.geometry import lucas_kanade as lk
-from dhtorch.geometry.camera import Camera
+from dhtorch.geometry.camera import Camera, project, unproject
 from dhtorch.geometry.filters import gaussian
-from dhtorch.records import NO_HINT, Frame, Map, PoseFit, Shutter, TrackHint
+from dhtorch.geometry.near_far import Problem
+from dhtorch.records import NO_HINT, Frame, Map, PoseFit, Samples, Shutter, TrackHint, Tracks
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.holes import classify, min_eigenvalue
+from dhtorch.stages.pose import SEARCH_POINTS, map_pose, pnp_ransac
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 from dhtorch.synthetic import SyntheticRoom
 from dhtorch.transform import patch_tokens
@@ -281,11 +287,11 @@ def test_what_hides_and_how_sure_motions_are_agrees(loaded, monkeypatch, turning
     fit = PoseFit(T, cov[:, :6, :6], none[:, None] > 1, none.long(), none, none, none, code, shutter)
     motion = torch.randn(2, 13, 50, 2, generator=g)
     motion[0, :2] = 0.0
-    found, expected = both_ways(lambda: dense.pose_variance(base, view, fit, q, motion), monkeypatch)
+    found, expected = both_ways(lambda: stereo.pose_variance(base, view, fit, q, motion), monkeypatch)
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=0.0)
     for code in (PoseCode.OK, PoseCode.TOO_FEW):
         lost = fit.replace(code=torch.full_like(fit.code, code), cov=fit.cov * torch.nan, shutter=None)
-        a, b = both_ways(lambda lost=lost: dense.pose_variance(base, view, lost, q, motion), monkeypatch)
+        a, b = both_ways(lambda lost=lost: stereo.pose_variance(base, view, lost, q, motion), monkeypatch)
         assert torch.equal(a, b) and not a.any(), "what is not known is no number"
 
 
@@ -398,6 +404,17 @@ def test_compiled_code_has_the_constants_of_torchs():
         f"LEAST_GAIN = {sweep.GAIN[0]}f, MOST_GAIN = {sweep.GAIN[1]}f, FLAT = 1e-8f;",
     ):
         assert line in native.SOURCES[4].read_text()
+    for line in (
+        f"MIN_HEIGHT = {p3p.MIN_HEIGHT}, MAX_COSINE = 1 - 1e-12;".replace("0.001", "1e-3"),
+        f"MIN_DEPTH = {least_squares.MIN_DEPTH:g}f, DAMPING = 1e-4f;".replace("e-06", "e-6"),
+        f"SEARCH_POINTS = {SEARCH_POINTS}, PREVIEW = 32, SHORTLIST = 32, KEEP = 2;",
+    ):
+        assert line in native.SOURCES[7].read_text()
+    kept = f"MAX_NEARER = {near_far.MAX_NEARER}f, BEHIND = 1e4f, MIN_DEPTH = 1e-6f;"
+    assert kept in native.SOURCES[8].read_text() and near_far.BEHIND == 1e4 and least_squares.MIN_DEPTH == 1e-6
+    searched, minimised = (inspect.signature(f).parameters for f in (ransac.search, least_squares.minimise))
+    assert [searched[k].default for k in ("preview", "shortlist", "keep")] == [32, 32, 2]
+    assert minimised["damping"].default == 1e-4 and p3p.MAX_COSINE == 1 - 1e-12
     assert sweep.FLAT == 1e-8
     assert affine.DAMPING == (2 / 255 / 2) ** 2 and least_squares.MIN_PIVOT == 1e-6
     assert lk.RATIO[0] == -lk.RATIO[1] and {*lk.TOP, *lk.BETWEEN, *lk.FINEST} <= {1, 2}
@@ -507,6 +524,138 @@ def test_a_registration_of_pixels_that_are_no_numbers_is_rejected_alike(loaded, 
     assert bool(found.cov[found.ok].isfinite().all())
 
 
+def near_pairs(batch, n, wrong, seed=0):
+    """Points 0.5 to 2.5 m away seen again with 0.3 px of noise, a share of them anywhere: what seat 5 is asked with."""
+    g = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape):
+        return torch.rand(*shape, generator=g)
+
+    camera = Camera(500 + 50 * uniform(batch, 2), 300 + 20 * uniform(batch, 2))
+    uv_0, depth = 640 * uniform(batch, n, 2), 0.5 + 2 * uniform(batch, n)
+    xyz = unproject(camera, uv_0, depth)
+    T = se3.exp(0.1 * torch.randn(batch, 6, generator=g))
+    uv_1 = project(camera, se3.apply(T, xyz)) + 0.3 * torch.randn(batch, n, 2, generator=g)
+    uv_1 = torch.where(uniform(batch, n, 1) < wrong, 640 * uniform(batch, n, 2), uv_1)
+    zero, code = torch.zeros(batch, n), torch.zeros(batch, n, dtype=torch.int32)
+    samples = Samples(uv_0, depth, 0.01 * depth, xyz, zero, code, zero, code)
+    tracks = Tracks(uv_0, uv_1, zero, zero, torch.eye(2).expand(batch, n, 2, 2), uniform(batch, n) < 0.9)
+    return samples, tracks, camera, camera, uniform(batch, 64, 3)
+
+
+def poses_alike(found, expected):
+    assert torch.equal(found.code, expected.code)
+    assert (found.inlier != expected.inlier).float().mean() <= 0.001
+    sigma = expected.cov.diagonal(dim1=1, dim2=2).sqrt()
+    turn, shift = (getattr(found.T_1_from_0, k) - getattr(expected.T_1_from_0, k) for k in ("R", "t"))
+    apart = torch.cat((turn.abs().flatten(1) / sigma[:, :3].amax(1, keepdim=True), shift.abs() / sigma[:, 3:]), 1)
+    assert apart[expected.ok].quantile(0.99) <= 0.01
+    return int(expected.ok.sum())  # poses
+
+
+@needs_compiler
+@pytest.mark.parametrize(("batch", "n", "wrong"), [(3, 700, 0.3), (20, 100, 0.4), (40, 12, 0.2)])
+def test_a_pose_from_near_points_agrees_up_to_rounding(loaded, monkeypatch, batch, n, wrong):
+    args = near_pairs(batch, n, wrong)
+    found, expected = both_ways(lambda: pnp_ransac(*args), monkeypatch)
+    assert poses_alike(found, expected) > batch // 2
+    for options in ({"local_optimisation": 0, "polish_steps": 0}, {"polish_steps": 3, "threshold_px": 1.5}):
+        poses_alike(*both_ways(lambda o=options: pnp_ransac(*args, **o), monkeypatch))
+    alone = [pnp_ransac(*(x[k : k + 1] for x in args)) for k in range(2)]
+    for one, k in zip(alone, range(2), strict=True):
+        assert torch.equal(one.T_1_from_0.R[0].nan_to_num(), found.T_1_from_0.R[k].nan_to_num()), "its company is told"
+
+
+@needs_compiler
+def test_what_leaves_no_pose_is_told_alike(loaded, monkeypatch):
+    samples, tracks, *rest = near_pairs(7, 60, 0.2)
+    xyz, uv_1, valid = samples.xyz.clone(), tracks.uv_1.clone(), tracks.valid.clone()
+    valid[0] = False
+    valid[1, 2:] = False
+    xyz[2] = torch.nan
+    xyz[3] = torch.linspace(1, 2, 60)[:, None] * torch.tensor([0.1, 0.2, 1.0])  # a line
+    xyz[4] = xyz[4, :1]
+    uv_1[5] = torch.inf
+    args = (samples.replace(xyz=xyz), tracks.replace(uv_1=uv_1, valid=valid), *rest)
+    found, expected = both_ways(lambda: pnp_ransac(*args), monkeypatch)
+    assert torch.equal(found.code, expected.code)
+    assert found.code.tolist()[:3] == [PoseCode.TOO_FEW] * 3 and found.code[6] == PoseCode.OK
+    assert bool(found.T_1_from_0.R[:6].isnan().all())
+
+
+@needs_compiler
+def test_poses_in_another_type_by_a_kernel_or_with_a_graph_are_torchs(loaded, monkeypatch):
+    samples, tracks, camera, _, draws = near_pairs(2, 90, 0.2)
+    asked, pose = [], torch.ops.dhtorch.robust_pose
+    monkeypatch.setattr(torch.ops.dhtorch, "robust_pose", lambda **given: (asked.append(1), pose(**given)))
+    pnp_ransac(samples, tracks, camera, camera, draws)
+    assert asked == [1]
+    pnp_ransac(samples, tracks, camera, camera, draws, kernel="huber")
+    pnp_ransac(*(x.to(torch.float64) for x in (samples, tracks, camera, camera)), draws)
+    assert asked == [1]
+    leaf = tracks.uv_1.clone().requires_grad_()
+
+    def shift():
+        (grad,) = torch.autograd.grad(
+            pnp_ransac(samples, tracks.replace(uv_1=leaf), camera, camera, draws).T_1_from_0.t.sum(), leaf
+        )
+        return grad
+
+    torch.testing.assert_close(*both_ways(shift, monkeypatch), atol=1e-6, rtol=1e-3)
+
+
+def every_track(turning):
+    """Tracks of every kind, as many as compiled code takes; their unknowns and noise."""
+    problem, at = test_near_far.scene()
+    problem = Problem(problem.f, problem.c, *(x.repeat(*[1] * (x.ndim - 1), 16) for x in tree_leaves(problem)[2:]))
+    noise = test_near_far.NOISE.repeat(1, 16)
+    return (
+        problem.to(torch.float32),
+        at._replace(T=at.T.to(torch.float32), turn=at.turn.float() if turning else None),
+        noise.float(),
+    )
+
+
+@needs_compiler
+@pytest.mark.parametrize("turning", [False, True])
+def test_equations_of_tracks_agree_up_to_rounding(loaded, monkeypatch, turning):
+    problem, at, noise = every_track(turning)
+    told = (problem, noise, torch.tensor([0.1, 0.7]), torch.tensor([1e4, 10.0]))
+    asked, call = [], torch.ops.dhtorch.track_equations
+    monkeypatch.setattr(torch.ops.dhtorch, "track_equations", lambda **given: (asked.append(1), call(**given)))
+
+    def ask(kernel="geman_mcclure", told=told, at=at):
+        normal, cost = near_far.equations(*told, kernel=kernel, bend=2.0)
+        return (*normal(at), cost(at))
+
+    found, expected = both_ways(ask, monkeypatch)
+    assert len(asked) == 2
+    for a, b in zip(found, expected, strict=True):
+        assert a.shape == b.shape and (a - b).abs().amax() <= 2e-4 * b.abs().amax()
+    for i in range(6):  # each column, whatever its unit
+        torch.testing.assert_close(found[1][:, i, i], expected[1][:, i, i], rtol=1e-3, atol=0)
+    ask(kernel="cauchy")
+    wide = [x.to(torch.float64) for x in told]
+    ask(told=wide, at=at._replace(T=at.T.to(torch.float64), turn=None if at.turn is None else at.turn.double()))
+    leaf = at.T.t.clone().requires_grad_()
+    assert ask(at=at._replace(T=at.T.replace(t=leaf)))[0].requires_grad
+    assert len(asked) == 2, "in torch"
+    (square, front), (wanted, ahead) = both_ways(lambda: near_far.squares_at(problem, at)(noise), monkeypatch)
+    assert torch.equal(front, ahead) and 0 < front.float().mean() < 1
+    torch.testing.assert_close(square, wanted, rtol=1e-3, atol=1e-3)
+
+
+@needs_compiler
+def test_a_pose_from_all_tracks_agrees_to_far_less_than_its_sigma(loaded, monkeypatch):
+    args, _, _, _ = test_map_pose.pairs(6, near=80, far=220, turn=0.01)
+    args = [x.to(torch.float32) for x in args]
+    found, expected = both_ways(lambda: map_pose(*args), monkeypatch)
+    assert poses_alike(found, expected) == 6
+    assert not torch.equal(found.T_1_from_0.t, expected.T_1_from_0.t), "not compiled"
+    alone = map_pose(*(x[2:3] for x in args))
+    assert torch.equal(alone.T_1_from_0.t[0], found.T_1_from_0.t[2]), "its company is told"
+
+
 @needs_compiler
 def test_a_point_is_told_the_same_in_any_company(loaded, seen_twice):
     here, there, uv = seen_twice
@@ -597,6 +746,15 @@ def test_a_torch_held_to_narrower_vectors_has_a_file_of_its_own(monkeypatch):
     monkeypatch.setenv("ATEN_CPU_CAPABILITY", "avx2")
     assert (flags, native._vectors()) == (("-march=native",), ("-march=x86-64-v3",))
     assert native.library() != own
+
+
+def test_another_torch_and_another_processor_have_a_file_of_their_own(monkeypatch):
+    files = [native.library()]
+    with monkeypatch.context() as other:
+        other.setattr(torch, "__version__", "1.0")
+        files.append(native.library())
+    monkeypatch.setattr(native, "processor", lambda: "another, AVX2")
+    assert len({*files, native.library()}) == 3
 
 
 def test_a_compiler_that_is_missing_or_fails_is_told(tmp_path, monkeypatch):

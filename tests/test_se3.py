@@ -128,6 +128,17 @@ def test_a_retraction_acts_from_the_left():
     torch.testing.assert_close(se3.to_matrix(se3.retract(T, xi)), expected)
 
 
+def test_a_rotation_that_drifted_is_one_again_and_keeps_its_first_row():
+    R = poses(seed=5).R
+    torch.testing.assert_close(se3.orthonormal(R), R, rtol=0, atol=1e-14)
+    drifted = R + 1e-3 * drawn(12, seed=6).view(-1, 3, 3)[:4]
+    found = se3.orthonormal(drifted)
+    torch.testing.assert_close(found @ found.mT, torch.eye(3, dtype=R.dtype).expand(4, 3, 3), rtol=0, atol=1e-14)
+    torch.testing.assert_close(torch.linalg.det(found), torch.ones(4, dtype=R.dtype))
+    torch.testing.assert_close(found[:, 0], torch.nn.functional.normalize(drifted[:, 0], dim=-1))
+    assert (found - R).abs().max() < 5e-3
+
+
 # ------------------------------------------------------------------------------------------------ motions as matrices
 
 

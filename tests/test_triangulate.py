@@ -142,6 +142,9 @@ def test_no_pose_and_no_baseline_stay_silent_with_finite_gradients():
     assert (estimate.gate == Gate.NO_POSE).all() and estimate.depth.isnan().all()
     estimate.parallax_deg.sum().backward()
     assert uv_1.grad.isfinite().all()
+    for code, gate in ((PoseCode.REFUTED, Gate.POSE_REFUTED), (PoseCode.NO_BASELINE, Gate.NO_BASELINE)):
+        told = two_view(samples, tracks, lost.replace(code=torch.full_like(fit.code, code)), camera_0, camera_1)
+        assert (told.gate == gate).all()
     still = fit.replace(T_1_from_0=se3.identity(2, nan))
     uv_1 = tracks.uv_0.clone().requires_grad_()
     estimate = two_view(samples, tracks.replace(uv_1=uv_1), still, camera_0, camera_0)

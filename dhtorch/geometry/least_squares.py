@@ -19,7 +19,7 @@ from torch.autograd.forward_ad import unpack_dual
 from torch.utils import _pytree as pytree
 
 from dhtorch.geometry.se3 import Pose
-from dhtorch.geometry.shapes import check
+from dhtorch.geometry.shapes import check, is_static
 from dhtorch.geometry.small import product
 
 #: Points nearer to the camera plane than this (m), or behind it, are not in front.
@@ -218,9 +218,9 @@ def solve_spd(
         pivot = L.diagonal(dim1=-2, dim2=-1).amin(-1)  # NaN for a NaN matrix, and so not above the limit
         ok = (info == 0) & (pivot > MIN_PIVOT) & (rhs * 0 == 0).flatten(1).all(1)
         bad = ~ok[:, None, None]
-        L = torch.where(bad, eye, L)
-    A = torch.where(bad, eye, A)
-    rhs = rhs.masked_fill(bad, 0.0)
+    if not _all(ok):
+        L, A = torch.where(bad, eye, L), torch.where(bad, eye, A)
+        rhs = rhs.masked_fill(bad, 0.0)
     start = torch.cholesky_solve(rhs.detach(), L)
     x = start + torch.cholesky_solve(rhs - product(A, start), L)
     return (x * s)[:, :n].to(b.dtype), ok
@@ -240,7 +240,7 @@ def implicit(equations: Callable[[Tensor], Tensor], g: Tensor) -> Tensor:
     Raises ValueError for wrong shapes.
     """
     n = check("implicit", g=(g, "B n"))["n"]
-    if not (g.requires_grad or unpack_dual(g).tangent is not None):
+    if not has_graph(g):
         return torch.zeros_like(g)
     with torch.no_grad():
         steps = DIFFERENCE * torch.eye(n, dtype=g.dtype, device=g.device)[:, None].expand(n, *g.shape)
@@ -249,6 +249,11 @@ def implicit(equations: Callable[[Tensor], Tensor], g: Tensor) -> Tensor:
         known = (info == 0) & inverse.isfinite().flatten(1).all(1)
         inverse = torch.where(known[:, None, None], inverse, 0.0)
     return -(inverse * (g - g.detach())[:, None]).sum(-1)
+
+
+def has_graph(x: Tensor) -> bool:
+    """Whether a derivative is asked of what becomes of ``x``, backward or forward. Gradient: none."""
+    return x.requires_grad or unpack_dual(x).tangent is not None
 
 
 def gauss_newton_step(T: Pose, H: Tensor, g: Tensor) -> tuple[Pose, Tensor]:
@@ -273,12 +278,13 @@ def move(
     Gradient: to T and xi. Raises ValueError for wrong shapes.
     """
     check("move", R=(T.R, "B 3 3"), xi=(xi, "B 6"))
-    omega = xi[:, :3, None]
+    half, t = (0.5 * xi).split(3, 1)
+    half = half[..., None]
     M = torch.cat((T.R, T.t[..., None]), -1)
-    once = torch.linalg.cross(omega, M, dim=1)
-    twice = torch.linalg.cross(omega, once, dim=1)
-    M = M + (once + 0.5 * twice) / (1 + 0.25 * (omega * omega).sum(1, keepdim=True))
-    return Pose(M[..., :3], M[..., 3] + xi[:, 3:])
+    once = torch.linalg.cross(half, M, dim=1)
+    twice = torch.linalg.cross(half, once, dim=1)
+    M = M + (once + twice) * (2 / (1 + (half * half).sum(1, keepdim=True)))
+    return Pose(M[..., :3], M[..., 3] + (t + t))
 
 
 def trial_step(T: Pose, H: Tensor, g: Tensor) -> tuple[Pose, Tensor]:
@@ -320,20 +326,31 @@ def minimise(
     Gradient: none is meant to flow here; take :func:`gauss_newton_step` from the detached result.
     """
     best = evaluate(T)
+    eye = torch.eye(best.H.shape[-1], dtype=best.H.dtype, device=best.H.device)
     factor = torch.full_like(best.cost, damping)
     for k in range(steps):
-        diagonal = torch.diag_embed(best.H.diagonal(dim1=-2, dim2=-1))
-        proposal, ok = step(T, best.H + factor[:, None, None] * diagonal, best.g)
+        proposal, ok = step(T, best.H * (1 + factor[:, None, None] * eye), best.g)
         if k == steps - 1:
             found = evaluate(proposal).cost if cost is None else cost(proposal)
             better = ok & (found < best.cost)
+            if _all(better):
+                return proposal, found
             return choose(better, proposal, T), torch.where(better, found, best.cost)
         there = evaluate(proposal)
         better = ok & (there.cost < best.cost)
+        if _all(better):
+            T, best = proposal, there
+            factor = factor * 0.1
+            continue
         T = choose(better, proposal, T)
         best = Normal(*(_where(better, a, b) for a, b in zip(there, best, strict=True)))
         factor = torch.where(better, factor * 0.1, factor * 10)
     return T, best.cost
+
+
+def _all(mask: Tensor) -> bool:
+    """Whether a mask holds everywhere, where values may be looked at: then nothing need be chosen."""
+    return not is_static(mask) and bool(mask.all())
 
 
 def choose(mask: Tensor, new: S, old: S) -> S:

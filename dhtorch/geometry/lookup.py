@@ -7,7 +7,7 @@ in; ``corner`` (B, N, 2) integer (u, v) of a patch's top-left pixel.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import torch
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dhtorch import native
 from dhtorch.geometry.exact import LANES
-from dhtorch.geometry.shapes import check
+from dhtorch.geometry.shapes import check, is_transformed
 
 #: ITU-R BT.601 luma, the weights of ``cv2.cvtColor`` (``tests/test_lookup.py``).
 LUMA = (0.299, 0.587, 0.114)
@@ -81,16 +81,16 @@ def summarise(
     middle, fill = middle.flatten(), -(B * N) % LANES
     if fill:
         middle = torch.nn.functional.pad(middle, (0, fill), value=(size // 2) * (u + v))
-    down, right = (torch.arange(-(size // 2) * k, (size - size // 2) * k, k, **whole) for k in (v, u))
     at_once = max(NUMBERS // (C * size * size * LANES), 1) * LANES
     read = partial(_read, flat, (C, c))
     compiling = torch.compiler.is_compiling()
+    around = (_around.__wrapped__ if is_transformed() else _around)(size, (v, u), **whole)
     if compiling:
         middle, at_once = _in_memory(middle), len(middle)  # computed once per point and not again for every pixel
     if u == C == 3 and image.dtype == torch.uint8 and (compiling or (grey and _product_is_exact(image))):
         read, grey = partial(_read_rows, flat, grey), False
     parts = (middle,) if len(middle) <= at_once else middle.split(at_once)
-    seen = (read(down, right, part) for part in parts)
+    seen = (read(around, part) for part in parts)
     numbers = [reduce(luma(pixels, 0)[0] if grey else pixels) for pixels in seen]
     joined = numbers[0] if len(parts) == 1 else [torch.cat(x) for x in zip(*numbers, strict=True)]
     return tuple((x[: B * N] if fill else x).view(B, N) for x in joined)
@@ -107,9 +107,17 @@ def read_whole(found: Tensor, pixel: Tensor, size: int) -> Tensor:
     return found.flatten(1).gather(1, torch.add(x, y, alpha=found.shape[2]).long())
 
 
-def _read(flat: Tensor, channels: tuple[int, int], down: Tensor, right: Tensor, middle: Tensor) -> Tensor:
+@lru_cache(maxsize=32)
+def _around(size: int, steps: tuple[int, int], *, device: torch.device, dtype: torch.dtype) -> Tensor:
+    """Flat indices (size, size, 1) of a patch's pixels, less that of its middle, by the ``steps`` to the next row and
+    column; the same few patches are asked for again and again."""
+    down, right = (torch.arange(-(size // 2) * k, (size - size // 2) * k, k, device=device, dtype=dtype) for k in steps)
+    return (down[:, None] + right)[..., None]
+
+
+def _read(flat: Tensor, channels: tuple[int, int], around: Tensor, middle: Tensor) -> Tensor:
     """Pixels (C, size, size, P) of patches, by flat index of their middle; how many channels, and the steps there."""
-    index = (down[:, None] + right)[..., None] + middle
+    index = around + middle
     C, c = channels
     if torch.compiler.is_compiling():
         return torch.stack([flat[index + k * c] for k in range(C)])
@@ -118,22 +126,29 @@ def _read(flat: Tensor, channels: tuple[int, int], down: Tensor, right: Tensor, 
     return (rows[0] if C == 1 else torch.stack(rows)).view(C, *index.shape)
 
 
-def _read_rows(flat: Tensor, grey: bool, down: Tensor, right: Tensor, middle: Tensor) -> Tensor:
+def _read_rows(flat: Tensor, grey: bool, around: Tensor, middle: Tensor) -> Tensor:
     """Pixels (3, size, size, P) of patches of an interleaved uint8 picture, or their ``grey`` values.
 
     Rows of pixels are read as blocks of memory. Grey values come out of one matrix product, whose sums of whole
     numbers below 2²⁴ are exact in whatever order they are taken.
     """
-    size = len(right)
+    size = len(around)
     blocks = flat.as_strided((max(flat.numel() - 3 * size + 1, 0), 3 * size), (1, 1))
-    first = (down - 3 * (size // 2))[:, None] + middle
+    first = around[:, 0] + middle
     if torch.compiler.is_compiling():
         pixels = blocks[first].unflatten(-1, (size, 3)).permute(3, 0, 2, 1)
         return _in_memory(luma(pixels, 0)[0] if grey else pixels)
     rows = blocks.index_select(0, first.flatten()).float()
-    weight = torch.eye(size, device=flat.device)[..., None] * torch.tensor(_THOUSANDTHS, device=flat.device)
-    values = (weight.flatten(1) @ rows.t()).div_(255 * 1000)
+    weights = (_weights.__wrapped__ if is_transformed() else _weights)(size, flat.device)
+    values = (weights @ rows.t()).div_(255 * 1000)
     return values.view(size, size, -1).transpose(0, 1)
+
+
+@lru_cache(maxsize=32)
+def _weights(size: int, device: torch.device) -> Tensor:
+    """The matrix (size, 3 size) that makes a row of pixels grey."""
+    weight = torch.eye(size, dtype=torch.float32, device=device)[..., None]
+    return (weight * torch.tensor(_THOUSANDTHS, dtype=torch.float32, device=device)).flatten(1)
 
 
 def _in_memory(x: Tensor) -> Tensor:

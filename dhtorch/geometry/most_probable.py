@@ -30,6 +30,7 @@ from dhtorch.geometry.near_far import (
     prior,
     residuals,
     squares,
+    squares_at,
     trial_step,
 )
 from dhtorch.geometry.se3 import Pose
@@ -170,6 +171,8 @@ def _translates(problem: Problem, at: Unknowns, noise: Tensor, far: Tensor, prec
     still = Unknowns(Pose(at.T.R, torch.zeros_like(at.T.t)), at.turn)
     turned, rotation = minimise(evaluate, still, o.steps, cost=judge, step=trial_step)
     shown = rotation - judge(at) > o.translation_gain * rotation + SLACK
+    if not is_static(shown) and bool(shown.all()):
+        return shown
     costs = [_costs(problem, x, noise, o) for x in (turned, at)]
     for part in NEAREST:
         nearest = _nearest(problem, part)
@@ -195,11 +198,12 @@ def noise_scale(problem: Problem, at: Unknowns, rounds: int = 3) -> Tensor:
     what the last one found.
     """
     noise = torch.ones_like(problem.inverse)
-    linear = linearise_tracks(problem, at, columns=False)
+    square_of = squares_at(problem, at)
     for _ in range(rounds):
-        size = squares(problem, linear, noise).sqrt()
-        near = median(size, problem.near & linear.front) / MEDIAN_2D
-        far = median(size, problem.far & linear.front) / MEDIAN_1D
+        square, front = square_of(noise)
+        size = square.sqrt()
+        near = median(size, problem.near & front) / MEDIAN_2D
+        far = median(size, problem.far & front) / MEDIAN_1D
         far = torch.where(problem.far.any(-1, keepdim=True), far, near)
         factor = torch.where(problem.far, far, near)
         noise = (noise * factor * factor).clamp(MIN_NOISE_PX**2, MAX_NOISE_PX**2)
@@ -241,8 +245,8 @@ def pose_covariance(problem: Problem, solution: Solution, o: FitOptions) -> tupl
 
 def _costs(problem: Problem, at: Unknowns, noise: Tensor, o: FitOptions) -> Tensor:
     """Robust cost (B, N) of every track, of weight 1."""
-    rho, _ = robust(squares(problem, linearise_tracks(problem, at, columns=False), noise), o.kernel, o.bend)
-    return rho
+    square, _ = squares_at(problem, at)(noise)
+    return robust(square, o.kernel, o.bend)[0]
 
 
 def _near_cost(problem: Problem, at: Unknowns, noise: Tensor, o: FitOptions) -> Tensor:

@@ -24,15 +24,19 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from dhtorch import native
 from dhtorch.geometry.exact import SUM_LANES
 from dhtorch.geometry.least_squares import MIN_DEPTH, Normal, move, normal_equations, robust, solve_spd
-from dhtorch.geometry.se3 import Pose
+from dhtorch.geometry.se3 import Pose, hat
 from dhtorch.geometry.shapes import check
 from dhtorch.geometry.small import turned
 from dhtorch.tree import Record, record
 
 #: A far track is not closer to the anchor than the nearest point of the sensor by more than this factor.
 MAX_NEARER = 2.0
+
+#: The robust kernel that compiled code knows.
+COMPILED = "geman_mcclure"
 
 #: Squared residual (in units of its variance) of a point behind a camera: far beyond every kernel.
 BEHIND = 1e4
@@ -111,7 +115,7 @@ def straighten(
 def _straight(seen: Tensor, y: Tensor, turn: Tensor) -> Tensor:
     """:func:`straighten` at z = 1: where (u, v, 1) - y · turn x (u, v, 1) passes it."""
     ray = torch.cat((seen, torch.ones_like(seen[:, :1])), 1)
-    ray = ray - torch.linalg.cross(turn[..., None] * y[:, None], ray, dim=1)
+    ray = ray - y[:, None] * turned(hat(turn), ray)
     z = ray[:, 2:]
     return ray[:, :2] / torch.where(z.abs() < 0.1, 0.1, z)  # beyond any shutter: stays finite
 
@@ -159,9 +163,11 @@ def linearise_tracks(problem: Problem, at: Unknowns, *, columns: bool = True, kn
     check("linearise_tracks", ray=(problem.ray, "B 3 N"), uv=(problem.uv, "B 2 N"), turn=(at.turn, "B 3"))
     known = fixed(problem) if known is None else known
     seen = known.seen if at.turn is None else _straight(known.seen, known.height, at.turn)
-    a, t = turned(at.T.R, problem.ray), at.T.t[..., None]
+    t = at.T.t[..., None]
+    # Where the ray and the plane of the epipolar line go, in one product.
+    a, line = turned(torch.cat((at.T.R, torch.linalg.cross(t, at.T.R, dim=1)), 1), problem.ray).chunk(2, 1)
     with torch.no_grad():
-        free = _inverse_depth(a, t, seen, known.shape)
+        free = _inverse_depth(a, t, line, seen, known.shape)
         # A point cannot lie beyond infinity: there q is known, and nothing is eliminated.
         variance = torch.where(free < 0, 0.0, torch.inf).to(free.dtype)
     q = torch.where(problem.near, problem.inverse, free.clamp_min(0))
@@ -169,7 +175,7 @@ def linearise_tracks(problem: Problem, at: Unknowns, *, columns: bool = True, kn
     Y = a + q[:, None] * t
     # At the epipole a track fits any pose if only its point is near enough, and then holds it as if it were a vice.
     front = (Y[:, 2] > MIN_DEPTH) & (problem.near | (q < MAX_NEARER * known.nearest))
-    w = 1 / torch.where(front, Y[:, 2], 1.0)
+    w = 1 / Y[:, 2].masked_fill(~front, 1.0)
     plane = Y[:, :2] * w[:, None]
     slope = (t[:, :2] - plane * t[:, 2:]) * w[:, None]
     if not columns:
@@ -226,6 +232,29 @@ def squares(
     return _lengths(linear, _sphere(linear.fixed, noise))
 
 
+def squares_at(problem: Problem, at: Unknowns) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
+    """:func:`squares` at one place as a function of the noise (B, N) px², and which tracks are in front (B, N).
+
+    Gradient: as :func:`residuals`.
+    """
+    known = fixed(problem)
+
+    linear: Linear | None = None
+
+    def found(noise: Tensor) -> tuple[Tensor, Tensor]:
+        nonlocal linear
+        sphere = _sphere(known, noise)
+        given = _given(problem, known, sphere, at) if native.serves(noise) else None
+        if given is not None:  # in compiled code, up to rounding: see dhtorch.native
+            square, front = torch.empty_like(noise), torch.empty_like(problem.near)
+            torch.ops.dhtorch.track_squares(**given, square=square, front=front)
+            return square, front
+        linear = linearise_tracks(problem, at, columns=False, known=known) if linear is None else linear
+        return _lengths(linear, sphere), linear.front
+
+    return found
+
+
 def _lengths(linear: Linear, sphere: tuple[Tensor, Tensor, Tensor]) -> Tensor:
     m0, m1 = _whitener(linear, sphere)
     return _square(linear, m0 * linear.u[:, -1:] + m1 * linear.v[:, -1:])
@@ -271,26 +300,56 @@ def equations(
     sphere = _sphere(known, noise)
     share = torch.where(problem.near, 1.0, torch.where(problem.far, far_weight[:, None], 0.0))
 
-    def total(rho: Tensor, turn: Tensor | None) -> Tensor:
-        cost = (rho * share).sum(-1)
+    def total(cost: Tensor, turn: Tensor | None) -> Tensor:
         return cost if turn is None else cost + turn_precision * (turn * turn).sum(-1)
 
+    def with_prior(cost: Tensor, H: Tensor, g: Tensor, turn: Tensor | None) -> Normal:
+        if turn is None:
+            return Normal(cost, H, g)
+        precision = prior(turn_precision.to(g.dtype))
+        towards = torch.cat((torch.zeros_like(g[:, :6]), turn), -1)
+        return Normal(total(cost, turn), H + torch.diag_embed(precision), g + precision * towards)
+
+    def compiled(at: Unknowns, columns: bool) -> Normal | None:
+        """Cost, H and g of the tracks in compiled code (:mod:`dhtorch.native`), up to the rounding of sums."""
+        given = _given(problem, known, sphere, at) if kernel == COMPILED and native.serves(share) else None
+        if given is None:
+            return None
+        B, n = len(share) if columns else 0, 6 if at.turn is None else 9
+        found = Normal(share.new_empty(len(share)), share.new_empty(B, n, n), share.new_empty(B, n))
+        torch.ops.dhtorch.track_equations(**given, share=share, **found._asdict(), bend=bend)
+        return found
+
     def normal(at: Unknowns) -> Normal:
+        found = compiled(at, columns=True)
+        if found is not None:
+            return with_prior(*found, at.turn)
         linear = linearise_tracks(problem, at, known=known)
         rows = _rows(linear, sphere, at.turn is not None)
         rho, weight = robust(_square(linear, rows[:, -1]), kernel, bend)
         H, g = normal_equations(rows, torch.where(linear.front, weight * share, 0.0), block=SUM_LANES)
-        if at.turn is None:
-            return Normal(total(rho, None), H, g)
-        precision = prior(turn_precision.to(g.dtype))
-        turn = torch.cat((torch.zeros_like(g[:, :6]), at.turn), -1)
-        return Normal(total(rho, at.turn), H + torch.diag_embed(precision), g + precision * turn)
+        return with_prior((rho * share).sum(-1), H, g, at.turn)
 
     def cost(at: Unknowns) -> Tensor:
+        found = compiled(at, columns=False)
+        if found is not None:
+            return total(found.cost, at.turn)
         square = _lengths(linearise_tracks(problem, at, columns=False, known=known), sphere)
-        return total(robust(square, kernel, bend)[0], at.turn)
+        return total((robust(square, kernel, bend)[0] * share).sum(-1), at.turn)
 
     return normal, cost
+
+
+def _given(
+    problem: Problem, known: Fixed, sphere: tuple[Tensor, Tensor, Tensor], at: Unknowns
+) -> dict[str, Tensor] | None:
+    """What compiled code is told of tracks and unknowns; None where it cannot be told."""
+    a, b, d = sphere
+    turn = at.T.t.new_empty(0, 3) if at.turn is None else at.turn.contiguous()
+    told = {k: getattr(problem, k) for k in ("ray", "inverse", "variance", "near")} | known._asdict()
+    told |= {"a": a, "b": b, "d": d, "R": at.T.R.contiguous(), "t": at.T.t.contiguous(), "turn": turn}
+    whole = problem.ray.shape[-1] % SUM_LANES == 0
+    return told if whole and native.serves(*told.values()) else None
 
 
 def _square(linear: Linear, r: Tensor) -> Tensor:
@@ -304,12 +363,12 @@ def prior(turn_precision: Tensor) -> Tensor:
     return torch.stack((*[zero] * 6, *[turn_precision] * 3), -1)
 
 
-def _inverse_depth(a: Tensor, t: Tensor, seen: Tensor, shape: Tensor) -> Tensor:
+def _inverse_depth(a: Tensor, t: Tensor, line: Tensor, seen: Tensor, shape: Tensor) -> Tensor:
     """Maximum-likelihood q (B, N) of a track without depth: its pixel, moved onto the epipolar line along the noise.
 
-    ``a`` (B, 3, N) is the anchor's ray turned into camera 1. Negative where the rays part; 0 without baseline.
+    ``a`` (B, 3, N) is the anchor's ray turned into camera 1, ``line`` = t × a. Negative where the rays part; 0 without
+    baseline.
     """
-    line = torch.linalg.cross(t.expand_as(a), a, dim=1)
     n, last = line[:, :2], line[:, 2]
     m = shape[:, :2] * n[:, :1] + shape[:, 1:] * n[:, 1:]
     lift = ((n * seen).sum(1) + last) / (n * m).sum(1).clamp_min(1e-30)
@@ -336,8 +395,8 @@ def _whitener(linear: Linear, sphere: tuple[Tensor, Tensor, Tensor]) -> tuple[Te
     e0, e1 = a * s0, d * (s1 - b * s0)
     square = e0 * e0 + e1 * e1
     flat = square < 1e-12  # the pixel does not depend on q
-    unit = torch.where(flat, 1.0, square).rsqrt()
-    e0, e1 = torch.where(flat, 1.0, e0 * unit), torch.where(flat, 0.0, e1 * unit)
+    unit = square.masked_fill(flat, 1.0).rsqrt()
+    e0, e1 = (e0 * unit).masked_fill(flat, 1.0), (e1 * unit).masked_fill(flat, 0.0)
     free = linear.variance.isinf()
     left = (1 + square * linear.variance.masked_fill(free, 0.0)).rsqrt().masked_fill(free & ~flat, 0.0)
     left0, left1, bd = left * e0, left * e1, b * d

@@ -67,10 +67,21 @@ def p3p(
     check("p3p", rays=(rays, "* 3 3"), xyz=(xyz, "* 3 3"))
     if rays.shape != xyz.shape:
         raise ValueError(f"p3p: rays have shape {tuple(rays.shape)}, xyz {tuple(xyz.shape)}, expected equal shapes")
+    R, t, valid = p3p_of_planes(*(x.movedim((-2, -1), (0, 1)) for x in (rays, xyz)))
+    # (row, column, root, *) → (*, root, row, column)
+    return R.movedim((2, 0, 1), (-3, -2, -1)), t.movedim((1, 0), (-2, -1)), valid.movedim(0, -1)
+
+
+def p3p_of_planes(
+    rays: Tensor,  # (3, 3, *) point, coordinate
+    xyz: Tensor,  # (3, 3, *) point, coordinate: m
+) -> tuple[Tensor, Tensor, Tensor]:
+    """:func:`p3p` of planes: R (3, 3, 4, *), t (3, 4, *) and valid (4, *), rows first, the root before the triples.
+
+    Gradient: none.
+    """
     with torch.no_grad():
-        j, X = (
-            x.movedim((-2, -1), (0, 1)).to(torch.float64, memory_format=torch.contiguous_format) for x in (rays, xyz)
-        )
+        j, X = (x.to(torch.float64, memory_format=torch.contiguous_format) for x in (rays, xyz))
         j = j / (j * j).sum(1, keepdim=True).sqrt()  # (point, coordinate, *)
         side = X.roll(-1, 0) - X
         m = (j * j.roll(-1, 0)).sum(1)
@@ -86,10 +97,7 @@ def p3p(
         Y = (d * longest.sqrt())[:, None] * j[:, :, None]  # (point, coordinate, root, *)
         R, t = _align(torch.cat((Y, X[:, :, None]), 2).to(xyz.dtype))
         eye = torch.eye(3, dtype=R.dtype, device=R.device).view(3, 3, *[1] * valid.ndim)
-        R = torch.where(valid, R, eye)
-        t = t.masked_fill(~valid, 0.0)
-    # (row, column, root, *) → (*, root, row, column)
-    return R.movedim((2, 0, 1), (-3, -2, -1)), t.movedim((1, 0), (-2, -1)), valid.movedim(0, -1)
+        return torch.where(valid, R, eye), t.masked_fill(~valid, 0.0), valid
 
 
 def _ranges(m: Tensor, a: Tensor) -> Tensor:

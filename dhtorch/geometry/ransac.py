@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dhtorch.geometry.covariance import median
 from dhtorch.geometry.least_squares import MIN_DEPTH
-from dhtorch.geometry.p3p import p3p
+from dhtorch.geometry.p3p import p3p_of_planes
 from dhtorch.geometry.se3 import Pose
 from dhtorch.geometry.shapes import check
 
@@ -133,16 +133,17 @@ def search(
     uv, one = uv - c[..., None], torch.ones_like(uv[:, :1])
     triples = distinct_triples(draws, count)
     picked = _take(torch.cat((uv / f[..., None], one, xyz), 1), triples.flatten(1)[:, None])
-    picked = picked.unflatten(2, triples.shape[1:]).permute(0, 2, 3, 1)  # (B, H, point, ray and coordinates)
-    R, t, valid = p3p(picked[..., :3], picked[..., 3:])
-    poses = torch.cat((R, t[..., None]), -1).permute(0, 4, 3, 2, 1).flatten(3)  # (B, column, row, K)
+    rays, places = picked.unflatten(2, triples.shape[1:]).permute(3, 1, 0, 2).split(3, 1)  # (point, coordinate, B, H)
+    R, t, valid = p3p_of_planes(rays, places)
+    poses = torch.cat((R, t[:, None]), 1).permute(3, 1, 0, 2, 4).flatten(3)  # (B, column, row, K)
     lenses = poses * torch.cat((f, one[:, 0, :1]), 1)[:, None, :, None]
     points = torch.cat((uv, xyz, one), 1)
     used = torch.arange(M, device=count.device) < count[:, None]
     limits = torch.where(used, threshold_px**2, 0.0).to(points.dtype)
     some = min(preview, M)
     seen = _take(points, even_slots(count, some)[:, None])
-    cost = msac_cost(lenses.flatten(2), seen, limits[:, :some]).masked_fill(~valid.mT.flatten(1), torch.inf)
+    cost = msac_cost(lenses.flatten(2), seen, limits[:, :some])
+    cost = cost.masked_fill(~valid.transpose(0, 1).flatten(1), torch.inf)
     cost, index = cost.topk(min(max(shortlist, keep), K), largest=False)
     full = msac_cost(_take(lenses, index[:, None, None]).flatten(2), points, limits)
     # The preview is part of the whole, so the greater cost is the whole one, save that infinity stays.

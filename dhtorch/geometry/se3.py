@@ -113,9 +113,8 @@ def hat(v: Tensor) -> Tensor:
 
     kornia's ``So3.hat`` gives the same bits and takes half as long again, in every step of a refinement.
     """
-    x, y, z = v.unbind(-1)
-    zero = torch.zeros_like(x)
-    return torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).unflatten(-1, (3, 3))
+    eye = torch.eye(3, dtype=v.dtype, device=v.device)
+    return torch.linalg.cross(v[..., None], eye.expand(*v.shape[:-1], 3, 3), dim=-2)
 
 
 def exp(xi: Tensor) -> Pose:

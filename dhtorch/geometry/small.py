@@ -67,10 +67,10 @@ def product_of_planes(A: Tensor, B: Tensor) -> Tensor:
 
 
 def turned(
-    R: Tensor,  # (B, 3, 3)
+    R: Tensor,  # (B, m, 3)
     x: Tensor,  # (B, 3, N)
 ) -> Tensor:
-    """R x of vectors in planes (B, 3, N); :func:`dhtorch.geometry.se3.rotate` is the same of points (B, N, 3).
+    """R x of vectors in planes (B, m, N); :func:`dhtorch.geometry.se3.rotate` is the same of points (B, N, 3).
 
     Gradient: to both.
     """

@@ -36,6 +36,9 @@ OFFSETS = tuple((i, j) for i in range(-3, 4) for j in range(-4, 5) if (i + j) % 
 #: less than a misfit (half of the signs), more than a fit. In signs.
 STEP, JUMP, UNSEEN = 3, 18, 11
 
+#: Sides that a surface comes to a pixel from.
+PATHS = 4
+
 #: Most views whose costs one byte can add up.
 VIEWS = 8
 

@@ -83,11 +83,12 @@ def backproject(
     if uv.dim() == 2:
         uv = uv.expand(sizes["B"], *uv.shape)
     check("backproject", uv=(uv, "B N 2"), f=(frame.camera.f, "B 2"))
-    depth, level, edge = _read_depth(frame, uv, search_px or 0, edge_rel)
+    pixel = pixels(uv)
+    depth, level, edge = _read_depth(frame, uv, pixel, search_px or 0, edge_rel)
     if search_px is None and frame.sparse is not None:
-        found = zip(_read_depth(frame, uv, SPARSE_SEARCH_PX, edge_rel), (depth, level, edge), strict=True)
+        found = zip(_read_depth(frame, uv, pixel, SPARSE_SEARCH_PX, edge_rel), (depth, level, edge), strict=True)
         depth, level, edge = (torch.where(frame.sparse[:, None], a, b) for a, b in found)
-    border, dim, white, shine = _appearance(frame.image, uv, dark, saturated, highlight)
+    border, dim, white, shine = _appearance(frame.image, pixel, dark, saturated, highlight)
     returned = depth > 0
     beyond = torch.zeros_like(returned) if near_limit is None else depth > near_limit
     unsure = returned & (level < min_conf)
@@ -118,12 +119,17 @@ def backproject(
     )
 
 
-def _read_depth(frame: Frame, uv: Tensor, search_px: int, edge_rel: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Depth (B, N), 0 = none; sensor confidence level (B, N); whether returns around it differ (B, N)."""
+def _read_depth(
+    frame: Frame, uv: Tensor, pixel: Tensor, search_px: int, edge_rel: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Depth (B, N), 0 = none; sensor confidence level (B, N); whether returns around it differ (B, N).
+
+    ``pixel`` is the image's pixel at ``uv``, and the map's as well where both are of one size.
+    """
     h, w = frame.depth.shape[-2:]
     place = cam.depth_pixels(frame.camera, frame.hw, frame.depth_camera, (h, w), uv)
     size = min(max(NEIGHBOURHOOD, 2 * search_px + 1), h, w)
-    pixel = pixels(place)
+    pixel = pixel if place is uv else pixels(place)
     if whole_is_faster((h, w), uv.shape[1], size):
         low, high = (read_whole(x, pixel, size) for x in _whole_extremes(frame.depth, size))
     else:
@@ -171,12 +177,11 @@ def _nearest_return(depth: Tensor, place: Tensor, size: int, search_px: int) -> 
     return torch.where(reachable.gather(-1, pick), found.to(place.dtype), place)
 
 
-def _appearance(image: Tensor, uv: Tensor, dark: float, saturated: float, highlight: float) -> tuple[Tensor, ...]:
+def _appearance(image: Tensor, pixel: Tensor, dark: float, saturated: float, highlight: float) -> tuple[Tensor, ...]:
     """What the picture alone decides, (B, N) each: at the border, too dark, clipped at white, a highlight."""
     hw = (image.shape[-2], image.shape[-1])
-    pixel = pixels(uv)
     size = min(NEIGHBOURHOOD, *hw)
-    whole = whole_is_faster(hw, uv.shape[1], size) and image.dtype == torch.uint8
+    whole = whole_is_faster(hw, pixel.shape[1], size) and image.dtype == torch.uint8
     seen = (
         _whole_brightness(image, size)
         if whole

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
+from dhtorch import native
 from dhtorch.codes import PoseCode, first_reason
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import covariance, near_far, ransac, se3
@@ -19,6 +20,7 @@ from dhtorch.geometry.least_squares import (
     MIN_DEPTH,
     Normal,
     choose,
+    has_graph,
     implicit,
     linearise,
     minimise,
@@ -176,7 +178,9 @@ def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, camera: Came
         moved, _ = linearise(move(start, xi), f.detach(), c.detach(), xyz.detach(), uv.detach())
         return _weighed(options, moved, inlier)[1]
 
-    T, inverse = move(move(start, x[..., 0]), implicit(equations, g)), x[..., 1:]
+    T = move(start, x[..., 0])
+    if has_graph(g):
+        T = move(T, implicit(equations, g))
     with torch.no_grad():
         n_inlier = inlier.sum(-1)
         enough = n_inlier >= options.min_inlier
@@ -193,6 +197,7 @@ def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, camera: Came
         total = torch.where(inlier, square, 0.0).detach().sum(-1)
         rms_px = (total / n_inlier.clamp_min(1)).sqrt()
         sigma_px = (total / (2 * n_inlier - 6).clamp_min(1)).sqrt().clamp_min(MIN_SIGMA_PX)
+        inverse = x[..., 1:]
         cov = (inverse + inverse.transpose(1, 2)) * (0.5 * sigma_px * sigma_px)[:, None, None]
         # With H = L Lᵀ, the lower end of L is the factor of the translation's information, the rotation eliminated.
         lower = torch.linalg.cholesky_ex(H.detach()).L[:, 3:, 3:]
@@ -234,6 +239,9 @@ def _robust_pose(
     points: Tensor, usable: Tensor, f: Tensor, c: Tensor, draws: Tensor, options: _Options
 ) -> tuple[Pose, Tensor]:
     """Search, refine the best two, polish the better: a float64 pose (exactly a rotation) and whether there is one."""
+    given = (points, usable, f.contiguous(), c.contiguous(), draws.contiguous())
+    if options.kernel is None and native.serves(*given):
+        return _compiled(given, options)
     index, count = ransac.usable_first(usable, min(SEARCH_POINTS, usable.shape[1]))
     near = points.gather(2, index[:, None].expand(-1, 5, -1))
     poses, cost = ransac.search(near, count, f, c, draws, threshold_px=options.threshold_px)
@@ -249,6 +257,29 @@ def _robust_pose(
     )
     T, _ = minimise(normal, flat[best], options.polish_steps, cost=cost_of, step=trial_step)
     return Pose(se3.orthonormal(T.R.double()), T.t.double()), found
+
+
+def _compiled(given: tuple[Tensor, ...], o: _Options) -> tuple[Pose, Tensor]:
+    """:func:`_robust_pose` in compiled code (:mod:`dhtorch.native`), the same up to the rounding of sums."""
+    points, usable, f, c, draws = given
+    B = len(points)
+    R = points.new_empty(B, 3, 3, dtype=torch.float64)
+    t = points.new_empty(B, 3, dtype=torch.float64)
+    found = torch.empty_like(usable[:, 0])
+    torch.ops.dhtorch.robust_pose(
+        points=points,
+        usable=usable,
+        f=f,
+        c=c,
+        draws=draws,
+        R=R,
+        t=t,
+        found=found,
+        threshold_px=o.threshold_px,
+        local_optimisation=o.local_optimisation,
+        polish_steps=o.polish_steps,
+    )
+    return Pose(R, t), found
 
 
 def _truncated(
@@ -405,7 +436,8 @@ def _fit_all(o: FitOptions, threshold_px: float, first: PoseFit, problem: Proble
     _, H, g = normal(problem, found.at)
     at, solved = near_far.step(found.at, H.detach(), g.detach())
     fixed = problem.detach()
-    at = near_far.moved(at, implicit(lambda xi: normal(fixed, near_far.moved(found.at, xi)).g, g))
+    if has_graph(g):
+        at = near_far.moved(at, implicit(lambda xi: normal(fixed, near_far.moved(found.at, xi)).g, g))
     with torch.no_grad():
         cov, known = pose_covariance(problem, found, o)
         finite = at.T.R.isfinite().flatten(1).all(1) & at.T.t.isfinite().all(1)
