@@ -30,8 +30,10 @@ SLOPES, LEANS = 2, 4
 #: of the range.
 LENGTHS, RANGE = (0.3, 0.13), 0.4
 
-#: Degrees of freedom of Student's t: as heavy a tail as keeps a fit where nearly half of the anchors are wrong.
+#: Degrees of freedom of Student's t: as heavy a tail as keeps a fit where nearly half of the anchors are wrong; and
+#: lighter ones, for near returns that are found to have no such tail.
 FREEDOM: Final = 1.0
+LIGHTER: Final = (2.0, 4.0, 8.0, 30.0)
 
 #: Share of a t distribution's scale that 68 % lie within.
 WITHIN: Final = 1.84
@@ -226,6 +228,7 @@ class _Problem(NamedTuple):
     start: Tensor  # (M, 2)
     head_sd: Tensor  # (M, 2)
     sd: Tensor  # (M, Q)
+    freedom: Tensor  # (M, N) degrees of freedom
     basis: Basis
 
     def missed(self, xi: Tensor) -> tuple[Tensor, Tensor]:
@@ -247,7 +250,7 @@ class _Problem(NamedTuple):
 
     def next_noise(self, r: Tensor, noise: Tensor) -> Tensor:
         """Factors (M, 2) that residuals ask for: one step of expectation and maximisation."""
-        w = _student(r, self.square(noise)) * r.square() / self.var
+        w = _student(r, self.square(noise), self.freedom) * r.square() / self.var
         share = self.weight * torch.stack((self.near, ~self.near))
         return _bounded((((share * w).sum(-1) + STATED) / (share.sum(-1) + STATED)).mT)
 
@@ -255,7 +258,7 @@ class _Problem(NamedTuple):
         """What is zero at the optimum, (M, P + 2)."""
         r, A = self.missed(xi)
         square = self.square(noise)
-        pull = self.weight * _student(r, square) / square * r
+        pull = self.weight * _student(r, square, self.freedom) / square * r
         return torch.cat(((A.mT @ pull[..., None])[..., 0] - xi, self.next_noise(r, noise) - noise), -1)
 
 
@@ -264,9 +267,9 @@ def _bounded(square: Tensor) -> Tensor:
     return square.maximum(low**2).minimum(high**2).sqrt()
 
 
-def _student(r: Tensor, square: Tensor) -> Tensor:
+def _student(r: Tensor, square: Tensor, freedom: Tensor) -> Tensor:
     """Weights of residuals under Student's t."""
-    return (FREEDOM + 1) / (FREEDOM + r.square() / square)
+    return (freedom + 1) / (freedom + r.square() / square)
 
 
 def fit(
@@ -274,6 +277,7 @@ def fit(
     model: Tensor,  # (B, K) int64
     used: Tensor,  # (B, N) bool, or (B, K, N)
     steps: int = STEPS,
+    freedom: Tensor | None = None,  # (B,) of near anchors
 ) -> Fit:
     """Models fitted to the anchors that are used.
 
@@ -283,6 +287,9 @@ def fit(
     Gradient: head and beta to the map's values and the anchors' depth and variance, by the implicit function theorem.
     """
     p = _problem(task, model, used)
+    if freedom is not None:
+        lighter = freedom.repeat_interleave(model.shape[1])[:, None]
+        p = p._replace(freedom=torch.where(p.near, lighter, p.freedom))
     asked = torch.is_grad_enabled() and any(t.requires_grad for t in (p.x, p.log, p.var))
     with torch.no_grad():
         xi, noise, ok = _optimum(p, steps)
@@ -302,6 +309,23 @@ def fit(
     return Fit(model, *(part.unflatten(0, model.shape) for part in found))
 
 
+def freedom_of(r: Tensor, points: Anchors) -> Tensor:
+    """Degrees of freedom (B,) under which residuals (B, N) of near anchors are likeliest. Gradient: none."""
+    with torch.no_grad():
+        near = points.used & points.near
+        weight = points.weight(points.used) * near
+        u = r.square() / points.var
+        tried = u.new_tensor([FREEDOM, *LIGHTER])[:, None, None]
+        square = (median(u, near) / 0.455).clamp_min(NEAR_NOISE[0] ** 2).expand(len(tried), -1, -1)
+        mass = weight.sum(-1, keepdim=True).clamp_min(1e-9)
+        for _ in range(30):
+            square = ((weight * _student(u.sqrt(), square, tried) * u).sum(-1, keepdim=True) / mass).clamp_min(1e-12)
+        half = 0.5 * (tried + 1)
+        like = half.lgamma() - (0.5 * tried).lgamma() - 0.5 * (tried * square).log()
+        like = (weight * (like - half * (u / square / tried).log1p())).sum(-1)
+        return tried[like.argmax(0), 0, 0]
+
+
 def _problem(task: Task, model: Tensor, used: Tensor) -> _Problem:
     points, basis = task.points, task.basis
     B, K = model.shape
@@ -312,7 +336,7 @@ def _problem(task: Task, model: Tensor, used: Tensor) -> _Problem:
     of = list(MODELS.values())
     head = torch.tensor([m.head for m in of], device=model.device)[model]
     short = torch.tensor([m.short for m in of], device=model.device)[model]
-    rest = torch.cat((curves(basis, points.x), _lean(points)), -1)[:, None].expand(B, K, -1, -1)
+    rest = torch.cat((curves(basis, points.x), leans(points)), -1)[:, None].expand(B, K, -1, -1)
     sd = points.x.new_tensor([_deviations(m) for m in of])[model.flatten()]
     start = task.start.gather(1, head[..., None].expand(-1, -1, 2))
     believed = torch.stack((OF_SCALE * start[..., 0] * (head > 0), OF_SHIFT * task.level * (head > 1)), -1)
@@ -327,6 +351,7 @@ def _problem(task: Task, model: Tensor, used: Tensor) -> _Problem:
         start=start.flatten(0, 1),
         head_sd=believed.flatten(0, 1),
         sd=sd,
+        freedom=torch.full_like(each(points.x), FREEDOM),
         basis=basis,
     )
 
@@ -337,8 +362,9 @@ def _deviations(model: Model) -> list[float]:
     return [model.tilt] * SLOPES + field + [model.curve] * KNOTS + [1.0] * LEANS
 
 
-def _lean(points: Anchors) -> Tensor:
-    """What a wrong motion does to far answers (B, N, LEANS): a wrong scale, and a lean that grows with depth."""
+def leans(points: Anchors) -> Tensor:
+    """What a wrong motion does to the log depth of far answers (B, N, LEANS), one standard deviation each: a wrong
+    scale, and a lean that grows with depth."""
     z, side = points.depth / median(points.depth, points.used), 2 * points.share - 1
     lean = torch.stack((torch.ones_like(z), z - 1, z * side[..., 0], z * side[..., 1]), -1).clamp(-3, 3)
     return points.shared[..., None] * lean
@@ -353,7 +379,7 @@ def _optimum(p: _Problem, steps: int) -> tuple[Tensor, Tensor, Tensor]:
     eye = torch.eye(xi.shape[1]).to(xi)
     for _ in range(steps):
         square = p.square(noise)
-        W = A * (p.weight * _student(r, square) / square)[..., None]
+        W = A * (p.weight * _student(r, square, p.freedom) / square)[..., None]
         step, ok = solve_spd(W.mT @ A + eye, W.mT @ r[..., None] - xi[..., None])
         xi = xi + step[..., 0]
         xi = torch.cat((torch.maximum(xi[:, :1], least), xi[:, 1:]), -1)
@@ -367,10 +393,10 @@ def _laplace(p: _Problem, xi: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Te
     r, A = p.missed(xi)
     square = p.square(noise)
     eye = torch.eye(xi.shape[1]).to(xi)
-    H = (A * (p.weight * _student(r, square) / square)[..., None]).mT @ A + eye
+    H = (A * (p.weight * _student(r, square, p.freedom) / square)[..., None]).mT @ A + eye
     L, info = torch.linalg.cholesky_ex(H)
     ok = (info == 0) & L.isfinite().flatten(1).all(-1)
-    log_t = -0.5 * (FREEDOM + 1) * (r.square() / square / FREEDOM).log1p() - 0.5 * square.log()
+    log_t = -0.5 * (p.freedom + 1) * (r.square() / square / p.freedom).log1p() - 0.5 * square.log()
     L = torch.where(ok[:, None, None], L, eye)
     volume = L.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     evidence = (p.weight * log_t).sum(-1) - 0.5 * xi.square().sum(-1) - volume

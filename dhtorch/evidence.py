@@ -19,7 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dhtorch import dense
+from dhtorch import stereo
 from dhtorch.codes import Flag
 from dhtorch.geometry import neighbours, se3, sweep
 from dhtorch.geometry.camera import resize_pixels
@@ -123,7 +123,7 @@ def by_answers(
 def by_views(
     depth: Tensor,  # (B, h, w) m, 0 = the map says nothing
     base: sweep.Base,
-    partners: list[dense.Partner],
+    partners: list[stereo.Partner],
     tolerance: float,
 ) -> Said:
     """How the map fits the pictures of other views, whatever their exposure, beside other depths along the same rays.
@@ -149,7 +149,7 @@ def by_views(
 def by_maps(
     depth: Tensor,  # (B, h, w) m, 0 = the map says nothing
     base: sweep.Base,
-    partners: list[dense.Partner],
+    partners: list[stereo.Partner],
     maps: list[Tensor],  # (B, h', w') m of each partner, 0 = says nothing
     tolerance: float,
 ) -> Said:
@@ -183,14 +183,14 @@ def by_maps(
     return said
 
 
-def _by_view(q: Tensor, base: sweep.Base, partner: dense.Partner, tolerance: float) -> tuple[Tensor, Tensor]:
+def _by_view(q: Tensor, base: sweep.Base, partner: stereo.Partner, tolerance: float) -> tuple[Tensor, Tensor]:
     """Evidence (B, h, w) of one view in sigmas, NaN where it says nothing, and whether it would have told an error."""
     view, picture, fit, _ = partner
     here = sweep.fit_windows(base, view, picture, q, radius=RADIUS)
     plane = 0.03 * q.flatten(1).amax(-1)
     seen = here.seen & ~sweep.hidden(sweep.travel(base, view), q, plane) & base.known.unflatten(-1, base.hw)
-    own = (here.noise + dense.GREY_NOISE**2) / (INDEPENDENT * here.contrast)
-    shared = dense.pose_variance(base, view, fit, q, here.motion)
+    own = (here.noise + stereo.GREY_NOISE**2) / (INDEPENDENT * here.contrast)
+    shared = stereo.pose_variance(base, view, fit, q, here.motion)
     sigma = ((own + shared) / q.square().clamp_min(1e-12) + tolerance**2).sqrt()
     step = torch.where(q > 0, here.step / q.clamp_min(1e-9), 0.0)  # of log(1 / d)
     best, factor, beside = _rivals(q, base, partner)
@@ -206,7 +206,7 @@ def _by_view(q: Tensor, base: sweep.Base, partner: dense.Partner, tolerance: flo
     return misfit, fits & alone & (SIGMAS * sigma <= TELLS) & seen
 
 
-def _rivals(q: Tensor, base: sweep.Base, partner: dense.Partner) -> tuple[Tensor, Tensor, Tensor]:
+def _rivals(q: Tensor, base: sweep.Base, partner: stereo.Partner) -> tuple[Tensor, Tensor, Tensor]:
     """Of other depths along the rays: the best correlation, its factor on q, and the best of those a fifth away or a
     little more; (B, h, w) each."""
     best, factor = torch.zeros_like(q), torch.ones_like(q)

@@ -53,6 +53,9 @@ SCATTERED, QUARTERS = 4, 4
 #: Relative error below which nobody asks which of two models fits a near return better.
 EXACT: Final = 0.002
 
+#: Standard errors by which far answers must tell a shift worse that near returns meet as exactly as that; else one.
+SURE: Final = 2.0
+
 #: Loss by which models differ through rounding alone.
 ROUNDING: Final = 1e-6
 
@@ -61,6 +64,12 @@ LOST: Final = 10.0
 
 #: Bounds of what the anchors left out do to sigma, and how many leave it as it is.
 STRETCH, UNMOVED = (0.3, 4.0), 20
+
+#: Least probability of a power that is part of sigma: less changes no interval that nine of ten errors lie in.
+RARE: Final = 0.1
+
+#: Steps of the fit of a power.
+POWER_STEPS: Final = 30
 
 #: Relative error at which the head's start bends from least squares to least absolute values.
 BEND: Final = 0.03
@@ -88,13 +97,14 @@ def anchor(
 
     Robust fits (Student's t) tie the map to the anchors: nothing, a scale, a scale and a shift; on top a tilt or a
     field over the picture and a correction over depth, both Gaussian processes, so that they are zero away from
-    anchors. How far anchors are off by themselves is found with each fit, and how probable they are under it (its
-    evidence) says which may be taken; it is, in place of a plain head, only where anchors that were left out bear it
-    out. Its two nearest rivals are part of sigma. An error that all far answers share (the
-    motion's) is an unknown of the fit and no part of the answer.
+    anchors. How far anchors are off by themselves is found with each fit, and how heavy the tails of near returns are
+    with the answer's. How probable the anchors are under a fit (its evidence) says which may be taken; it is, in place
+    of a plain head, only where anchors that were left out bear it out. Its two nearest rivals are part of sigma. An
+    error that all far answers share (the motion's) is an unknown of the fit and no part of the answer.
 
     Sigma is the covariance of what was fitted, stretched until anchors that were left out (scattered blocks, and whole
-    quarters of the picture) lie within it as often as they should; what the models disagree by; and how far near
+    quarters of the picture) lie within it as often as they should; what the models disagree by, and a power of the map
+    where near returns do not tell it from them; and how far near
     returns scatter about the map where it is as rough as around a pixel, more where they are off in places
     (:mod:`dhtorch.scatter`). It is against the anchors' own metre: what all near returns are wrong by, nothing here can
     tell.
@@ -208,7 +218,9 @@ def _chosen(task: Task, names: tuple[str, ...]) -> tuple[Fit, Chosen]:
         share = weight.scatter(1, best, weight.amax(-1, keepdim=True))
         rivals = share.scatter(1, best, 2.0).topk(min(RIVALS, len(names)), -1).indices
         model = torch.where(some, best[:, 0], -1)
-    fits = distortion.fit(task, place[rivals], points.used, distortion.MANY)
+        mean, _ = distortion.predicted(every.pick(best), task)
+        freedom = distortion.freedom_of(points.depth.log() - mean[:, 0], points)
+    fits = distortion.fit(task, place[rivals], points.used, distortion.MANY, freedom)
     return fits._replace(evidence=share.gather(1, rivals).log()), Chosen(model, names, weight, factor)
 
 
@@ -246,7 +258,7 @@ def _simplest(points: Anchors, left: _Left, head: Tensor) -> Tensor:
     worse, error = _against(block.mean, simpler, of_far)
     place = torch.arange(n, device=far.device)
     told = (points.used & ~points.near).sum(-1, keepdim=True) >= FEWEST
-    bent = (place == max(1, n - 2)) & (worse > error)
+    bent = (place == max(1, n - 2)) & (worse > torch.where(block.met <= EXACT, SURE, 1.0) * error)
     drifts = (place == n - 1) & (worse >= 0)
     refused = told & (bent | drifts)
     mean = (block.mass * block.mean).sum(-1).masked_fill(refused, torch.inf)
@@ -270,6 +282,7 @@ class _Blocks(NamedTuple):
 
     mean: Tensor  # (B, C, blocks)
     mass: Tensor  # (B, 1, blocks) share of all, as far as anchors of one block count as fewer
+    met: Tensor  # (B, C) median relative error of near returns
 
 
 def _lost(points: Anchors, left: _Left) -> _Blocks:
@@ -288,7 +301,7 @@ def _lost(points: Anchors, left: _Left) -> _Blocks:
     count = total[:, :1].scatter_add(2, block, known.to(loss))
     mean = total.scatter_add(2, block.expand_as(loss), torch.where(known, loss, 0.0)) / count.clamp_min(1)
     mass = count / (1 + CORRELATED * (count - 1).clamp_min(0))
-    return _Blocks(mean, mass / mass.sum(-1, keepdim=True).clamp_min(1e-9))
+    return _Blocks(mean, mass / mass.sum(-1, keepdim=True).clamp_min(1e-9), near.nan_to_num(torch.inf))
 
 
 def _stretch(points: Anchors, left: _Left, taken: Tensor) -> Tensor:
@@ -315,8 +328,50 @@ def _joined(task: Task, fits: Fit, chosen: Chosen, x: Tensor, known: Tensor) -> 
             share[..., None, None] * (chosen.factor.square()[:, None, None, None] * torch.stack(var, 1) + apart)
         ).sum(1)
         mean, of_fit = (part[:, 0] for part in distortion.predicted(fits, task))
+        spread = spread + _of_a_power(task, (mean, fits.noise[:, 0], fits.model[:, 0]), x, log)
         told = distortion.reading(fits.head[:, :1], task.points)[:, 0], chosen.factor[:, None] * of_fit.sqrt()
         return log, (spread + scatter.variance(task.points, task.points.depth.log() - mean, told, log, known)).sqrt()
+
+
+def _of_a_power(task: Task, found: tuple[Tensor, Tensor, Tensor], x: Tensor, log: Tensor) -> Tensor:
+    """Variance (B, h, w) of log depth: how far a power of the map, fitted to near returns, is from the answer, as far
+    as anchors leave it as probable. Over a short range a line and a power are alike, and beyond it they are not; far
+    answers tell them apart as far as an error that all of them may share lets them."""
+    points = task.points
+    mean, noise, model = found
+    near = points.used & points.near
+    weight = points.weight(near)
+    square = (noise[:, :1].square() * points.var).clamp_min(distortion.LEAST_NOISE**2)
+    A = _line(points.x)
+    target = points.depth.log()
+    eye = 1e-9 * torch.eye(2).to(A)
+    w = weight / square
+    for _ in range(POWER_STEPS):
+        W = A * w[..., None]
+        line, ok = solve_spd(W.mT @ A + eye, W.mT @ target[..., None])
+        r = target - (A @ line)[..., 0]
+        w = weight / (square + r.square())
+    better = (weight * (((target - mean).square() / square).log1p() - (r.square() / square).log1p())).sum(-1)
+    better = better + _told_apart(points, target - mean, r)
+    prior = x.new_tensor([m.prior for m in MODELS.values()])
+    share = torch.sigmoid(better + MODELS["affine"].prior - prior[model])
+    asked = ok & (share >= RARE) & (near.sum(-1) >= FEWEST) & (~near | (points.x > 0)).all(-1)
+    apart = (_line(x) @ line[:, None])[..., 0] - log
+    return torch.where(asked, share, 0.0)[:, None, None] * torch.where(x > 0, apart, 0.0).square()
+
+
+def _told_apart(points: Anchors, one: Tensor, other: Tensor) -> Tensor:
+    """By how much the middle of the far answers is more probable (B,), as a logarithm, under the second of two
+    residuals (B, N) than under the first: one draw, of what all far answers may be off by together."""
+    far = points.used & ~points.near
+    together = median(distortion.leans(points).square().sum(-1), far)
+    told = 0.5 * (median(one, far).square() - median(other, far).square()) / together.clamp_min(FLOOR**2)
+    return torch.where(far.sum(-1) >= FEWEST, told[:, 0], 0.0)
+
+
+def _line(x: Tensor) -> Tensor:
+    """One and the logarithm of values (..., 2); 0 of what has none."""
+    return torch.stack((torch.ones_like(x), torch.where(x > 0, x, 1.0).log()), -1)
 
 
 def _each(fits: Fit) -> list[Tensor]:

@@ -1,9 +1,9 @@
 """How far a map in metres is off from pixel to pixel, as its near returns show it: what no model holds of sigma.
 
-Three things are told apart. A return stands somewhere in its pixel and so does the value of the map, so that on a slope
-both differ though neither is wrong. What is left goes with how rough the map is around: two levels, of the flatter and
-the rougher half of the returns. And where returns are off by far more than that, so are the pixels around them on the
-same surface.
+Four things are told apart. A return stands somewhere in its pixel and so does the value of the map, so that on a slope
+both differ though neither is wrong. What returns have by themselves is not the map's. What is left goes with how rough
+the map is around: two levels, of the flatter and the rougher half of the returns. And where returns are off by far more
+than that, so are the pixels around them on the same surface.
 
 Alphabet: ``r`` residual of log depth at anchors; ``read`` its variance by where in the pixel they stand; ``h`` how
 rough the map is; ``G`` candidates of a level.
@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dhtorch.anchors import Anchors, at_anchors
+from dhtorch.anchors import FLOOR, Anchors, at_anchors
 from dhtorch.geometry.covariance import median
 
 #: Relative scatter of a map without near returns.
@@ -50,6 +50,12 @@ BINS: Final = 48
 #: From how many sigmas on a return is off by more than the map's scatter.
 BEYOND: Final = 2.0
 
+#: Returns off by more of these levels are no witnesses of what returns have by themselves.
+OUTSIDE: Final = 3.0
+
+#: Neighbours that a return is held against.
+AROUND: Final = 4
+
 
 def variance(
     points: Anchors,
@@ -75,8 +81,40 @@ def variance(
         some = near.any(-1, keepdim=True)
         flat, slope = torch.where(some, flat, SCATTER), torch.where(some, slope, OF_ROUGH)
         excess = (r.square() - BEYOND**2 * (flat.square() + (slope * h).square() + read)).clamp_min(0)
-        off = _in_places(points.share, at_anchors(log, points.share)[0], (excess, near), log, known)
-        return flat.square()[..., None] + (slope[..., None] * rough).square() + off
+        level = at_anchors(log, points.share)[0]
+        off = _in_places(points.share, level, (excess, near), log, known)
+        calm = near & (h <= median(h, near)) & (r.abs() <= OUTSIDE * flat)
+        least = flat.square() * (2 / calm.sum(-1, keepdim=True).clamp_min(2)).sqrt()  # what a variance is known to
+        of_map = (flat.square() - _of_returns(points, r, level, calm)).maximum(least)
+        return of_map[..., None] + (slope[..., None] * rough).square() + off
+
+
+def _of_returns(points: Anchors, r: Tensor, level: Tensor, among: Tensor) -> Tensor:
+    """Variance (B, 1) that returns have by themselves, less its standard error and at most what they state.
+
+    Map and returns are two instruments on one surface. Residuals go with how a return differs from its neighbours as
+    far as they are the return's, and not as far as they are the map's.
+
+    Source: F. Grubbs, "On estimating precision of measuring instruments and product variability", 1948.
+    """
+    pair = among[:, None] & among[:, :, None] & ~torch.eye(r.shape[1], dtype=torch.bool, device=r.device)
+    apart = torch.cdist(points.share, points.share, compute_mode="donot_use_mm_for_euclid_dist")
+    apart = torch.where(pair, apart, torch.inf)
+    apart, other = apart.topk(min(AROUND, r.shape[1]), largest=False)
+    some = apart.isfinite().all(-1)
+
+    def beside(value: Tensor) -> Tensor:
+        """By how much (B, N) it differs from the mean of its neighbours."""
+        around = value[:, None].expand(-1, value.shape[1], -1).gather(2, other)
+        return torch.where(some, value - around.mean(-1), 0.0)
+
+    d_r, d_map = beside(r), beside(level)
+    product = (d_r + d_map) * d_r / (1 + 1 / AROUND)
+    n = some.sum(-1, keepdim=True).clamp_min(1)
+    mean = product.sum(-1, keepdim=True) / n
+    error = torch.where(some, product - mean, 0.0).square().sum(-1, keepdim=True).sqrt() / n
+    stated = median(points.var - FLOOR**2, among).clamp_min(0)
+    return (mean - error).clamp_min(0).minimum(torch.where(some.any(-1, keepdim=True), stated, 0.0))
 
 
 def _roughness(x: Tensor, known: Tensor) -> Tensor:

@@ -3,8 +3,10 @@
 import pytest
 import torch
 
-from dhtorch import anchor
+from dhtorch import anchor, scatter
+from dhtorch.anchors import FLOOR, Anchors, gathered
 from dhtorch.codes import Gate, Source
+from dhtorch.distortion import freedom_of
 from dhtorch.records import DepthMap, Estimate, Samples
 from dhtorch.studies.baselines import scale_shift
 from dhtorch.studies.compare import anchor_study
@@ -44,6 +46,32 @@ def test_faults_are_taken_out(name):
     assert error(found, truth) < 0.015 < ((x - truth).abs() / truth).median()
     if name in ("scale_short", "shift"):  # a slope that goes with depth is not told from a scale by few returns
         assert ((found.depth - truth).abs() <= 2 * found.sigma).double().mean() > 0.9
+
+
+@pytest.mark.parametrize(("drawn", "expected"), [("normal", 30.0), ("cauchy", 1.0), ("half wrong", 1.0)])
+def test_tails_of_returns_are_found(drawn, expected):
+    truth, near, _ = world(batch=2, n=800)
+    points = gathered(truth, [near], HW)
+    g = torch.Generator().manual_seed(1)
+    r = 0.004 * torch.randn(points.x.shape, generator=g, dtype=torch.float64)
+    if drawn == "cauchy":
+        r = r / torch.randn(r.shape, generator=g, dtype=torch.float64)
+    if drawn == "half wrong":
+        r = torch.where(torch.rand(r.shape, generator=g) < 0.4, r + 0.5, r)
+    assert freedom_of(r, points).tolist() == [expected, expected]
+
+
+def test_returns_with_normal_noise_are_worth_what_least_squares_makes_of_them():
+    off = {"ours": [], "least squares": []}
+    for seed in range(12):
+        truth, near, _ = world(seed=seed, noise=0.006)
+        points = gathered(1.3 * truth, [near], HW)
+        use = points.used[0]
+        s, t = scale_shift.least_squares(points.x[0][use], points.depth[0][use])
+        off["least squares"].append(float((s * 1.3 * truth + t - truth).abs()[truth > 2].mean()))
+        found = anchor(1.3 * truth, [near], kind="affine")
+        off["ours"].append(float((found.depth - truth).abs()[truth > 2].mean()))
+    assert sum(off["ours"]) < 1.1 * sum(off["least squares"])
 
 
 def test_a_map_that_is_right_is_left_alone():
@@ -229,6 +257,47 @@ def test_anchors_that_are_all_wrong_are_no_reason_to_be_sure():
     found = anchor(truth, [near.replace(depth=near.depth * factor), far.replace(depth=far.depth * factor)])
     kept = found.keep
     assert not kept.any() or float((found.sigma / found.depth)[kept].median()) > 0.1
+
+
+@pytest.mark.parametrize(
+    ("of_return", "of_map", "stated"), [(0.005, 0.0, 0.01), (0.0, 0.005, 0.01), (0.005, 0.005, 0.01), (0.005, 0, 0.002)]
+)
+def test_noise_that_returns_have_by_themselves_is_told_from_the_maps(of_return, of_map, stated):
+    """Residuals of noisy returns and of a noisy map are alike: which of both it is, the surface tells."""
+    g = torch.Generator().manual_seed(2)
+    share = torch.rand(4, 400, 2, generator=g, dtype=torch.float64)
+    e_return, e_map = torch.randn(2, 4, 400, generator=g, dtype=torch.float64).unbind()
+    surface = 0.05 * (share * 6).sin().sum(-1)
+    one = torch.ones_like(surface)
+    var = (stated**2 + FLOOR**2) * one
+    points = Anchors(share, one, 0 * one, one, var, 0 * one, near=one > 0, used=one > 0)
+    level = surface + of_map * e_map
+    own = scatter._of_returns(points, surface + of_return * e_return - level, level, points.near).sqrt()
+    most = min(of_return, stated)
+    assert (own <= most + 0.0015).all() and (own >= 0.6 * most).all()
+
+
+def test_a_power_that_near_returns_do_not_refute_is_part_of_sigma():
+    """Near returns of some noise tell a bent map no better by a power than by a line; exact ones refute the power."""
+    truth, near, _ = world(noise=0.005)
+    bent = 2 * (truth / 2) ** 0.85
+    found = anchor(bent, near)
+    assert ((found.depth - truth).abs() <= 2 * found.sigma).double().mean() > 0.95
+    truth, near, _ = world(noise=0.0)
+    found = anchor(1.1 * truth + 0.2, near)
+    assert float((found.sigma / found.depth).median()) < 0.01 and error(found, truth) < 0.01
+
+
+def test_numbers_with_one_scene_left_out():
+    rows = [
+        {"scene": scene, "truth": "simulated", "method": by, "median_rel": e * k, "within_sigma": 0.7 + 0.01 * k}
+        | {"within_2sigma": 0.95}
+        for k, scene in enumerate("abc", 1)
+        for by, e in {"anchor": 0.01, "raw": 0.05, "near least squares": 0.04}.items()
+    ]
+    found = anchor_study.one_left_out(rows, ["simulated"])["anchor.within_sigma_one_left_out"]
+    assert [found[k] for k in ("value", "low", "high")] == pytest.approx([0.72, 0.715, 0.725])
+    assert not anchor_study.one_left_out(rows[:3], ["simulated"])
 
 
 def test_disparity_may_have_zeros_and_holes():

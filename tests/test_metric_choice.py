@@ -56,6 +56,22 @@ def test_what_bends_a_map_far_answers_must_bear_out(points, seed):
     assert taken(points, near, (0.1, 0.1, 0.02, 0.1), seed) == AFFINE
 
 
+def test_a_shift_that_near_returns_meet_exactly_is_not_refuted_by_one_standard_error(points):
+    """Far answers that happen to tell it a little worse outweigh returns which a line merely tells better."""
+    draw = torch.Generator().manual_seed(0)
+    kept = {}
+    for met in (0.0005, 0.01):
+        kept[met] = 0
+        for _ in range(40):
+            noise = torch.randn(4, points.x.shape[1], generator=draw, dtype=torch.float64)
+            far = torch.tensor([0.020, 0.020, 0.023, 0.1])[:, None] * noise
+            near = torch.tensor([0.1, 0.1, met, 0.1])[:, None] * noise[:1]
+            r = torch.where(points.near, near, far)[None, :, None]
+            place = _simplest(points, _Left(r, torch.full_like(r, 1e-4)), torch.tensor([AFFINE]))
+            kept[met] += int(place) == AFFINE
+    assert kept[0.0005] > kept[0.01] + 5
+
+
 def test_a_model_that_cannot_be_fitted_is_not_taken(points):
     assert taken(points, (None, 0.01, 0.01, 0.01), (None, 0.02, 0.02, 0.02)) == SCALE
     assert taken(points, (0.1, 0.1, 0.1, None), (0.1, 0.1, 0.1, None)) == RAW

@@ -94,7 +94,8 @@ def run(
 
     Rows: one a scene, fault (``truth``) and method, with ``median_rel`` (median relative error beyond the near limit),
     ``within_sigma`` and ``within_2sigma`` (pixels with truth, answered) and ``answered``; of ours also ``models``, how
-    often each was taken. Summary: see :data:`BARS`; ``anchor.<fault>_median`` for every fault (median over scenes).
+    often each was taken. Summary: see :data:`BARS`, each also as ``<number>_one_left_out`` (median, least and
+    greatest with one scene left out); ``anchor.<fault>_median`` for every fault (median over scenes).
 
     Args:
         scenes: with a near limit; those without, sparse ones and those with a role are noted and left out.
@@ -131,7 +132,7 @@ def run(
                 found.setdefault((name, by), []).append(row)
         outcome.n_pairs += len(frames)
         outcome.rows += [_row(scene, by, name) | _joined(rows) for (name, by), rows in found.items()]
-    outcome.summary = summary(outcome.rows, names)
+    outcome.summary = summary(outcome.rows, names) | one_left_out(outcome.rows, names)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome.summary))
 
 
@@ -172,6 +173,22 @@ def summary(rows: Sequence[Row], names: Sequence[str]) -> Row:
     for key in ("within_sigma", "within_2sigma"):
         means = [_mean([r[key] for r in networks if r["scene"] == scene]) for scene in scenes]
         found[f"anchor.{key}"] = bootstrap.interval(means, statistic="mean").entry("1")
+    return found
+
+
+def one_left_out(rows: Sequence[Row], names: Sequence[str]) -> Row:
+    """The numbers of :data:`BARS` with one scene after the other left out: median, least and greatest."""
+    scenes = sorted({row["scene"] for row in rows if row.get("median_rel") is not None})
+    turns = [summary([row for row in rows if row["scene"] != scene], names) for scene in scenes]
+    found: Row = {}
+    for key in BARS:
+        values = sorted(turn[key]["value"] for turn in turns if turn.get(key, {}).get("value") is not None)
+        if len(scenes) > 1 and values:
+            middle = float(torch.tensor(values, dtype=torch.float64).median())
+            found[f"{key}_one_left_out"] = bootstrap.single(middle, len(values)) | {
+                "low": values[0],
+                "high": values[-1],
+            }
     return found
 
 

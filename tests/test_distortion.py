@@ -1,0 +1,78 @@
+"""What may be wrong with a map, piece by piece: heads, fields, corrections, and what a fit does not know of them."""
+
+import pytest
+import torch
+
+from dhtorch import distortion
+from dhtorch.anchors import Anchors
+from dhtorch.distortion import HEADS, MODELS, Fit, Task
+
+HW = (6, 8)
+
+
+def points(n=40, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    share = torch.rand(1, n, 2, generator=g, dtype=torch.float64)
+    x = 1 + 3 * torch.rand(1, n, generator=g, dtype=torch.float64)
+    one = torch.ones_like(x)
+    return Anchors(share, x, 0.1 * one, x, 1e-4 * one, 0 * one, one > 0, one > 0)
+
+
+def basis(of_depth=True):
+    x = torch.linspace(1, 4, 48, dtype=torch.float64).view(1, *HW)
+    return distortion.basis_of(x, x > 0, of_depth=of_depth)
+
+
+@pytest.mark.parametrize("of_depth", [True, False])
+def test_a_head_gives_depth_or_its_inverse(of_depth):
+    x, head = torch.tensor([0.5, 2.0, -9.0]).double(), torch.tensor([2.0, 1.0], dtype=torch.float64)
+    log, slope = distortion.log_depth(head, x, basis(of_depth))
+    y = torch.tensor([2.0, 5.0, distortion.LEAST_HEAD]).double()
+    torch.testing.assert_close(log, y.log() * (1 if of_depth else -1))
+    by_hand = torch.func.jacrev(lambda h: distortion.log_depth(h, x, basis(of_depth))[0])(head)
+    torch.testing.assert_close(slope[:2], by_hand[:2])
+
+
+def test_a_map_of_one_value_has_a_correction_too():
+    flat = torch.full((1, *HW), 2.0, dtype=torch.float64)
+    found = distortion.basis_of(flat, flat > 0)
+    assert (
+        found.width.tolist() == [[1.0]] and distortion.curves(found, torch.full((1, 3), 2.0).double()).isfinite().all()
+    )
+
+
+def test_short_fields_are_those_of_near_neighbours():
+    where = torch.tensor([[[0.5, 0.5], [0.6, 0.5], [0.9, 0.9]]], dtype=torch.float64)
+    found = distortion.fields(basis(), where, torch.tensor([[False, True]]))
+    assert found.shape[:3] == (1, 2, 3)
+    torch.testing.assert_close(found[0, :, :, :2], (2 * where - 1).expand(2, -1, -1))
+    kernel = found[0, :, :, distortion.SLOPES :] @ found[0, :, :, distortion.SLOPES :].mT
+    torch.testing.assert_close(kernel.diagonal(dim1=-2, dim2=-1), torch.ones(2, 3).double(), atol=0.1, rtol=0)
+    assert kernel[0, 0, 1] > kernel[1, 0, 1] > kernel[1, 0, 2] and kernel[0, 0, 2] > kernel[1, 0, 2]
+
+
+def test_freedom_is_less_likely_than_none():
+    prior = {name: model.prior for name, model in MODELS.items()}
+    assert prior["raw"] == 0 > prior["scale"] > prior["affine"] > prior["affine_tilt"] > prior["affine_long_4"]
+    assert prior["raw"] > prior["raw_tilt"]
+
+
+def test_what_a_fit_does_not_know_is_carried_to_the_anchors():
+    anchors, of = points(), basis()
+    size = distortion.SLOPES + len(of.node) + distortion.KNOTS
+    head = torch.tensor([[[1.5, 0.2]]], dtype=torch.float64)
+    spread = torch.zeros(1, 1, 2 + size, 2 + size, dtype=torch.float64)
+    spread[..., 0, 0], spread[..., 1, 1] = 0.03, 0.05
+    fit = Fit(
+        model=torch.tensor([[list(MODELS).index("affine")]]),
+        head=head,
+        beta=torch.zeros(1, 1, size, dtype=torch.float64),
+        spread=spread,
+        noise=torch.ones(1, 1, 2, dtype=torch.float64),
+        evidence=torch.zeros(1, 1, dtype=torch.float64),
+    )
+    mean, var = distortion.predicted(fit, Task(anchors, of, head.expand(1, len(HEADS), 2), anchors.x[:, :1]))
+    y = 1.5 * anchors.x + 0.2
+    torch.testing.assert_close(mean[0], y.log())
+    torch.testing.assert_close(var[0], ((0.03 * anchors.x) ** 2 + 0.05**2) / y**2)
+    torch.testing.assert_close(distortion.reading(head, anchors)[0], (0.1 * 1.5 / y) ** 2)
