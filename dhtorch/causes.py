@@ -3,6 +3,7 @@
 A fault that all frames share leaves a pattern: undo the right one, and the depth explains how points moved between the
 pictures. Points are tracked once; under each hypothesis only their depth changes, and with it where the other picture
 should show them. The one that explains clearly more than none at all, and more than any of another kind, is named.
+Where the camera stands still no depth moves a point; maps beside the sensor are then held against its near returns.
 
 Alphabet: P pairs of a window of frames, N samples; a *miss* is how far a track ends from where a depth says, in pixels
 of a picture 640 wide; the *loss* of a pair is the mean of miss² / (miss² + c²), between 0 and 1.
@@ -20,7 +21,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dhtorch import tree
+from dhtorch import dense, tree
+from dhtorch.codes import Flag
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.lookup import magnified, nearest
@@ -48,6 +50,13 @@ SAVES, ERRORS, BEYOND = 0.04, 3.0, 0.015
 
 #: Share of what a map misses beyond what the sensor's near returns miss that its cause must explain.
 EXPLAINED = 0.75
+
+#: Without motions: ratio of a map to a near return at which the loss is a half, and the longer side of the grid of
+#: returns.
+HALF_RATIO, GRID = 1.1, 64
+
+#: Way of a camera that stands still at most, as a share of the median return.
+STILL = 0.005
 
 #: Frames that a depth may be early or late at most, and the factors on the focal length that are tried.
 LAG = 5
@@ -148,6 +157,7 @@ class Named(NamedTuple):
     loss: Mapping[str, float]  # hypothesis → mean loss over the pairs, "none" among them
     n_pairs: int  # pairs that could tell
     pairs: Sequence[tuple[int, int]] = ()  # that were looked at, as places in the window
+    by: str = "tracks"  # what told: tracks | returns (then n_pairs counts frames)
 
 
 def name_cause(
@@ -170,7 +180,8 @@ def name_cause(
 
     Where all frames carry a pose of their own (``T_world_from_cam``) misses under that motion count half, so that a
     unit or a focal length, which motions fitted to the same depth swallow, shows. Without, a unit of the sensor's own
-    depth cannot be known and is not named.
+    depth cannot be known and is not named. Where fewer than four pairs have a motion, ``maps`` are held against the
+    sensor's near returns in the frames themselves.
 
     Raises:
         ValueError: fewer than two frames, or not one map for each.
@@ -182,25 +193,90 @@ def name_cause(
         found = "none" if maps is None else len(maps)
         raise ValueError(f"name_cause: found {len(frames)} frames and {found} maps, expected two or more, as many maps")
     with torch.no_grad():
-        watched = watch(frames, method) if watched is None else watched
-        if not watched.pairs:
-            return Named(None, None, {}, 0)
-        window = Window(
-            anchors=tree.collate([frames[i] for i, _ in watched.pairs]),
-            others=tree.collate([frames[j] for _, j in watched.pairs]),
-            samples=tree.collate(watched.samples),
-            tracks=tree.collate(watched.tracks),
-            maps=maps,
-            depths=[frame.depth for frame in frames],
-            pairs=watched.pairs,
-            method=method,
-            seed=seed,
-        )
-        asked = {cause.name: cause for cause in window.hypotheses()}
-        named = decided({name: window.loss(cause) for name, cause in asked.items()})._replace(pairs=watched.pairs)
-        if named.cause is None or window.explains(asked[named.cause]):
+        named = _by_tracks(frames, maps, method, seed, watch(frames, method) if watched is None else watched)
+        moves = named.n_pairs >= FEWEST and not _stands(frames)
+        if maps is None or named.cause is not None or moves:
             return named
-        return named._replace(cause=None, kind=None)
+        told = _by_returns(frames, maps, method)
+        return told if told.n_pairs >= FEWEST else named
+
+
+def _by_tracks(
+    frames: Sequence[Frame], maps: Sequence[Tensor] | None, method: Method, seed: int, watched: Watched
+) -> Named:
+    """What the motion of points between pictures names."""
+    if not watched.pairs:
+        return Named(None, None, {}, 0)
+    window = Window(
+        anchors=tree.collate([frames[i] for i, _ in watched.pairs]),
+        others=tree.collate([frames[j] for _, j in watched.pairs]),
+        samples=tree.collate(watched.samples),
+        tracks=tree.collate(watched.tracks),
+        maps=maps,
+        depths=[frame.depth for frame in frames],
+        pairs=watched.pairs,
+        method=method,
+        seed=seed,
+    )
+    asked = {cause.name: cause for cause in window.hypotheses()}
+    named = decided({name: window.loss(cause) for name, cause in asked.items()})._replace(pairs=watched.pairs)
+    if named.cause is None or window.explains(asked[named.cause]):
+        return named
+    return named._replace(cause=None, kind=None)
+
+
+def _stands(frames: Sequence[Frame]) -> bool:
+    """Whether a trajectory says that the camera stays in its place, so that motions tell depths nothing apart."""
+    poses = [frame.T_world_from_cam for frame in frames]
+    at = [pose.t for pose in poses if pose is not None]
+    if len(at) < len(poses):
+        return False
+    way = (torch.cat(at) - at[0]).norm(dim=-1).max()
+    returns = torch.cat([frame.depth[frame.depth > 0] for frame in frames])
+    return len(returns) > 0 and bool(way < STILL * returns.median())
+
+
+def _by_returns(frames: Sequence[Frame], maps: Sequence[Tensor], method: Method) -> Named:
+    """What near returns name where no motion is known; a frame is one witness here as a pair is elsewhere."""
+    places = sorted({round((len(frames) - 1) * k / (PAIRS - 1)) for k in range(PAIRS)})
+    told = {i: _returns(frames[i], method) for i in places}
+    # Those of one place in the picture know no focal length.
+    asked = [NONE, *(cause for cause in CAUSES if cause.kind != "focal length")]
+    losses = {}
+    for cause in asked:
+        held = [
+            _off(told[i], maps[i + cause.lag], cause, frames[i]) if 0 <= i + cause.lag < len(maps) else None
+            for i in places
+        ]
+        losses[cause.name] = torch.stack([torch.tensor(torch.nan) if x is None else x for x in held])
+    named = decided(losses)._replace(by="returns")
+    if named.cause is None:
+        return named
+    before, after = losses[NONE.name], losses[named.cause]
+    known = before.isfinite() & after.isfinite()
+    explained = (before - after)[known].mean() >= EXPLAINED * before[known].mean()
+    return named if bool(explained) else named._replace(cause=None, kind=None)
+
+
+def _returns(frame: Frame, method: Method) -> tuple[Tensor, Tensor]:
+    """Places (1, N, 2) px of a grid over a picture, and the near return (1, N) m there, 0 without one or at an edge."""
+    straight = frame if frame.depth_camera is not None else frame.replace(camera=cam.ideal(frame.camera))
+    found = method.backproject(straight, dense.pixels(frame, dense.map_hw(frame.hw, GRID)))
+    fine = found.usable & ((found.flag & (Flag.DEPTH_EDGE | Flag.SPECULAR)) == 0)
+    return found.uv, torch.where(fine, found.depth, 0.0)
+
+
+def _off(told: tuple[Tensor, Tensor], depth: Tensor, cause: Cause, frame: Frame) -> Tensor:
+    """Mean loss of a map (1, h, w) with a fault undone at near returns; NaN where it meets too few."""
+    uv, returned = told
+    depth = _undone(depth.to(returned), cause, frame.replace(depth_camera=None))
+    at = nearest(depth, cam.resize_pixels(uv, frame.hw, (depth.shape[-2], depth.shape[-1])))[0].nan_to_num(
+        0.0, 0.0, 0.0
+    )
+    at = at * _ratio(returned, at) if cause.scaled else at
+    both = (returned > 0) & (at > 0)
+    miss = torch.where(both, at / torch.where(both, returned, 1.0), 1.0).log() / math.log(HALF_RATIO)
+    return _mean_over(miss.square() / (miss.square() + 1), both)[0].cpu()
 
 
 def decided(losses: Mapping[str, Tensor]) -> Named:
@@ -287,14 +363,14 @@ class Window:
         own = self.maps is None
         returns = self.anchors.depth
         if own:
-            returns = self._undone(torch.cat([self.depths[i] for i in place]), cause, scaled[0])
+            returns = _undone(torch.cat([self.depths[i] for i in place]), cause, scaled[0])
         view = scaled[0].replace(depth=returns)
         samples = self.method.backproject(view, self.samples.uv).replace(trackability=self.samples.trackability)
         told = torch.where(samples.usable, samples.depth, 0.0)
         depth = told
         if self.maps is not None and not sensor:
             picture = scaled[0].replace(depth_camera=None)
-            depth = self._undone(torch.cat([self.maps[i] for i in place]).to(told), cause, picture)
+            depth = _undone(torch.cat([self.maps[i] for i in place]).to(told), cause, picture)
             at = cam.resize_pixels(self.samples.uv, view.hw, (depth.shape[-2], depth.shape[-1]))
             depth = nearest(depth, at)[0].nan_to_num(0.0, 0.0, 0.0)
             depth = depth * _ratio(told, depth) if cause.scaled else depth
@@ -304,15 +380,6 @@ class Window:
         if given is not None:
             found = 0.5 * (torch.where(found.isfinite(), found, 1.0) + given)
         return torch.where(there, found, torch.nan)
-
-    @staticmethod
-    def _undone(depth: Tensor, cause: Cause, view: Frame) -> Tensor:
-        """Maps (P, h, w) as they should be, over the field of the pictures or of a camera of their own."""
-        depth = cause.undo(depth)
-        if not cause.ray:
-            return depth
-        hw = (depth.shape[-2], depth.shape[-1])
-        return depth / ray_lengths(view.depth_camera or cam.resize(view.camera, view.hw, hw), hw)
 
     @staticmethod
     def _scaled(frame: Frame, factor: float) -> Frame:
@@ -350,9 +417,23 @@ class Window:
         uv = cam.project(cameras[1], torch.where(ahead[..., None], there, 1.0))
         miss = (uv - self.tracks.uv_1).norm(dim=-1) * (640 / self.anchors.hw[1])
         loss = torch.where(ahead, miss.square() / (miss.square() + HALF_PX**2), 1.0)
-        n = used.sum(-1)
-        mean = torch.where(used, loss, 0.0).sum(-1) / n.clamp_min(1)
-        return torch.where(n >= 12, mean, torch.nan)
+        return _mean_over(loss, used)
+
+
+def _mean_over(loss: Tensor, used: Tensor) -> Tensor:
+    """Mean (P,) of the losses (P, N) that count; NaN of too few."""
+    n = used.sum(-1)
+    mean = torch.where(used, loss, 0.0).sum(-1) / n.clamp_min(1)
+    return torch.where(n >= 12, mean, torch.nan)
+
+
+def _undone(depth: Tensor, cause: Cause, view: Frame) -> Tensor:
+    """Maps (P, h, w) as they should be, over the field of the pictures or of a camera of their own."""
+    depth = cause.undo(depth)
+    if not cause.ray:
+        return depth
+    hw = (depth.shape[-2], depth.shape[-1])
+    return depth / ray_lengths(view.depth_camera or cam.resize(view.camera, view.hw, hw), hw)
 
 
 def _ratio(told: Tensor, depth: Tensor) -> Tensor:

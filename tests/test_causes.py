@@ -5,7 +5,7 @@ import re
 import pytest
 import torch
 
-from dhtorch.causes import CAUSES, NONE, TRACKING, decided, name_cause, ray_lengths, turned, watch
+from dhtorch.causes import CAUSES, NONE, TRACKING, Watched, decided, name_cause, ray_lengths, turned, watch
 from dhtorch.evaluate.holdout import range_split
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.lookup import magnified
@@ -14,6 +14,7 @@ from dhtorch.synthetic.depth_faults import mirrored
 
 N, FIRST = 16, 4
 METHOD = TRACKING.replace(n=256)
+UNWATCHED = Watched((), (), ())  # no pair in which anything moves
 
 
 @pytest.fixture(scope="module")
@@ -112,6 +113,51 @@ def test_nothing_is_named_where_nothing_can_be_tracked(frames):
     found = name_cause(blank, method=METHOD)
     assert found.cause is None
     assert found.n_pairs == 0
+
+
+@pytest.fixture(scope="module")
+def still(frames):
+    """One view six times, its near returns each time with noise of their own."""
+    near = range_split(frames[0], 2.5).replace(T_world_from_cam=None)
+    noise = [torch.randn(near.depth.shape, generator=torch.Generator().manual_seed(k)) for k in range(6)]
+    return [near.replace(depth=near.depth * (1 + 0.003 * x)) for x in noise]
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_camera_that_stands_still_names_faults_of_maps_by_near_returns(name, frames, still):
+    kind, plant = FAULTS[name]
+    maps = [plant(frames[0].depth)] * len(still)
+    found = name_cause(still, maps, watched=UNWATCHED)
+    assert (found.kind, found.by, found.n_pairs) == (kind, "returns", 6)
+
+
+def test_a_camera_that_is_said_to_stand_still_is_one(frames, still):
+    """Tracks that do not move fit every depth alike, whatever the trajectory."""
+    held = [f.replace(T_world_from_cam=frames[0].T_world_from_cam) for f in still]
+    seen = watch(held, METHOD)
+    assert len(seen.pairs) >= 4
+    maps = [mirrored(frames[0].depth)] * len(held)
+    assert name_cause(held, maps, method=METHOD, watched=seen).kind == "mirrored"
+    own = name_cause([f.replace(depth=maps[0]) for f in held], method=METHOD, watched=seen)
+    assert own.cause is None, "its own returns are nothing to hold it against"
+
+
+def test_a_camera_that_stands_still_names_no_fault_after_the_nearest(frames, still):
+    true = frames[0].depth
+    column = torch.linspace(-1, 1, true.shape[-1])
+    for spoilt in (
+        true,
+        1.1 * true,
+        0.4 * true,
+        true**1.2,
+        true**0.7,
+        true * (1 + 0.3 * column),
+        0 * true,
+        0 * true + 2,
+    ):
+        assert name_cause(still, [spoilt] * len(still), watched=UNWATCHED).cause is None
+    holes = [f.replace(depth=0 * f.depth) for f in still]
+    assert name_cause(holes, [1000 * true] * len(still), watched=UNWATCHED).n_pairs == 0
 
 
 def test_one_map_a_frame(frames):

@@ -15,6 +15,7 @@ from dhtorch.commands import run
 from dhtorch.commands.judge import (
     _cut,
     _drift_at_least,
+    _factor,
     _off_at_least,
     _said,
     _share_at_least,
@@ -161,6 +162,15 @@ def test_a_guessed_field_of_view_is_told(tmp_path, room):
         assert run.main([*words, f"output={tmp_path}"]) == run.DONE
     told = json.loads((tmp_path / "judge.json").read_text())["intrinsics_guessed"]
     assert told.startswith("intrinsics are a guess") and "60" in told
+
+
+def test_a_factor_is_legible_whatever_it_is():
+    assert [_factor(x) for x in (1.0004, 999.19, 0.00099945, 9.99e29)] == [
+        "1.000",
+        "999.190",
+        "0.0009995",
+        "9.99e+29",
+    ]
 
 
 def test_limits():

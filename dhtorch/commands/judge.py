@@ -246,7 +246,7 @@ def _window(found: Found, first: int, size: int, settings: Mapping[str, Any]) ->
             blank = torch.zeros(next(iter(shapes)))
             named = causes.name_cause(frames, [blank if m is None else m for m in given], seed=settings["seed"])
     number = found.scene.recording.number
-    row: Row = {"frames": [int(number[first]), int(number[first + size - 1])], "pairs": named.n_pairs}
+    row: Row = {"frames": [int(number[first]), int(number[first + size - 1])], "pairs": named.n_pairs, "by": named.by}
     cut = _cut([found.by_number[k] for k in number[first : first + size].tolist() if k in found.by_number])
     if named.cause is None and cut is not None:
         return row | {"cause": f"cut at {cut:.3g} m", "kind": "cut", "loss": dict(named.loss)}
@@ -341,7 +341,7 @@ def _said(name: str, whole: Row, notes: Sequence[str] = ()) -> list[str]:
     held, middle = whole["held"], whole["median"]
     wrong = "nothing can be known" if whole["wrong"] is None else f"{whole['wrong']:.1%} of what is known is wrong"
     unknown = "no depth" if held["unknown"] is None else f"{held['unknown']:.1%} cannot be known"
-    scale = "scale cannot be known" if middle["scale"] is None else f"scale {middle['scale']:.3f}"
+    scale = "scale cannot be known" if middle["scale"] is None else f"scale {_factor(middle['scale'])}"
     lines = [f"{name}: {many(whole['frames'], 'frame')}: {wrong}, {unknown}; {scale}"]
     if held["drift"]:
         lines.append(f"  the scale differs by {held['drift']:.3f} at least between frames")
@@ -350,6 +350,11 @@ def _said(name: str, whole: Row, notes: Sequence[str] = ()) -> list[str]:
     if whole["ceiling"] is not None and not any(cause.startswith("cut at") for cause in whole["causes"]):
         lines.append(f"  cut at {whole['ceiling']:.3g} m: what is farther is said to lie there")
     return lines + [f"  {note}" for note in notes]
+
+
+def _factor(value: float) -> str:
+    """A factor, legible where it is a unit's or beyond all sense."""
+    return f"{value:.3f}" if 0.1 <= value < 1e4 else f"{value:.4g}"
 
 
 def _page(place: Path, found: Found, whole: Row, over: Sequence[str]) -> Path:

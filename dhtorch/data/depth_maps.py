@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dhtorch.console import many
 from dhtorch.data import files
 from dhtorch.data.codecs.exr import read_exr
 from dhtorch.data.codecs.npy import read_npz
@@ -131,10 +132,10 @@ def _matched(place: Path, found: Sequence[Path], number: Sequence[int]) -> tuple
     elif not told & frames and len(found) == len(number):
         in_order = sorted(found, key=_numbers)
         return [*in_order], "order"
-    said = f"{len(found)} files"
+    said = many(len(found), "file")
     if told:
         said += f" numbered {_range(told)}, {len(told & frames)} of them with a frame's number"
-    raise FormatError(place, "depth", said, f"one for each of {len(number)} frames, numbered {_range(frames)}")
+    raise FormatError(place, "depth", said, f"one for each of {many(len(number), 'frame')}, numbered {_range(frames)}")
 
 
 def _numbers(file: Path) -> list[int]:
