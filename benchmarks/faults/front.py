@@ -38,8 +38,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("backproject", "search_px is None and frame.sparse is not None", "frame.sparse is not None"),
         (
             "backproject",
-            "_read_depth(frame, uv, SPARSE_SEARCH_PX, edge_rel), (",
-            "_read_depth(frame, uv, 2, edge_rel), (",
+            "_read_depth(frame, uv, pixel, SPARSE_SEARCH_PX, edge_rel), (",
+            "_read_depth(frame, uv, pixel, 2, edge_rel), (",
         ),
         ("backproject", "torch.where(frame.sparse[:, None], a, b)", "a"),
         ("backproject", "level < min_conf", "level <= min_conf"),
@@ -116,8 +116,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("two_view", "(behind, Gate.BEHIND),\n", ""),
         (
             "two_view",
-            "(still[:, None].expand_as(tracked), Gate.NO_BASELINE),\n        (~posed, Gate.NO_POSE),",
-            "(~posed, Gate.NO_POSE),\n        (still[:, None].expand_as(tracked), Gate.NO_BASELINE),",
+            "(still[:, None].expand_as(tracked), Gate.NO_BASELINE)",
+            "(still[:, None].expand_as(tracked), Gate.NO_POSE)",
         ),
         (
             "two_view",
@@ -170,6 +170,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
             "torch.ones_like(uv)",
             "what stands in for a place that is no track is not seen",
         ),
+        ("two_view", "expand_as(tracked), Gate.POSE_REFUTED)", "expand_as(tracked), Gate.NO_POSE)"),
     ],
     "stages.score": [
         ("rank", "(parallax + half_parallax_deg)", "(parallax + 2.0)"),
