@@ -12,11 +12,11 @@ import dhtorch
 
 ROOT = Path(dhtorch.__file__).parent
 LEVELS = [
-    {"tree", "codes", "storage", "closure", "archive", "console", "leash", "lock", "native"},
+    {"tree", "codes", "storage", "closure", "archive", "older", "console", "leash", "lock", "native"},
     {"geometry"},
     {"records", "drawing"},
     {"stages", "data", "evaluate", "export", "synthetic", "testing", "calibration", "anchors"},
-    {"method", "frames", "distortion", "scatter"},
+    {"method", "frames", "distortion", "scatter", "stereo"},
     {"pair", "window", "methods", "first_release", "views", "offers"},
     {"stream", "dense", "rig", "metric"},
     {"evidence", "causes"},

@@ -206,7 +206,7 @@ def test_names_a_millisecond_apart_are_one_instant(tmp_path: Path) -> None:
     first.rename(first.with_name(first.name.replace("100.000", "100.001")))
     second.rename(second.with_name(second.name.replace("100.017", "100.019")))
     recording = stored(root)
-    assert recording.number.tolist() == [0, 2, 3] and recording.report == ("1 images without intrinsics: left out",)
+    assert recording.number.tolist() == [0, 2, 3] and recording.report == ("1 image without intrinsics: left out",)
 
 
 def test_first_and_last_images_need_a_pose_too(tmp_path: Path) -> None:
@@ -252,9 +252,9 @@ def test_a_frame_missing_in_the_middle_is_skipped_and_reported(tmp_path: Path) -
     recording = stored(root)
     assert recording.number.tolist() == [0, 2, 4, 6]  # of seven images
     assert recording.report == (
-        "1 images without depth: left out",
-        "1 images without confidence: left out",
-        "1 images without intrinsics: left out",
+        "1 image without depth: left out",
+        "1 image without confidence: left out",
+        "1 image without intrinsics: left out",
     )
     check_same(recording, [frames[i] for i in (0, 2, 4, 7)], 1 / 1000)
 
@@ -266,7 +266,7 @@ def test_confidence_is_that_of_the_depth_map(tmp_path: Path) -> None:
     writers.write_arkitscenes(root, {"vga_wide": image, "lowres_depth": depths}, trajectory=image)
     assert torch.equal(stored(root)[0].conf, depths[1].conf)
     drop(root, "confidence", "100.007")  # the other one is near the image too, but belongs to another depth map
-    with pytest.raises(FormatError, match="1 images without confidence: left out"):
+    with pytest.raises(FormatError, match="1 image without confidence: left out"):
         stored(root)
 
 

@@ -102,7 +102,7 @@ def test_failed_registration_is_rejected(tmp_path: Path) -> None:
     lasers[1] = lasers[1].replace(depth=lasers[1].depth * 0.9)
     writers.write_ca1m(tmp_path / "ca1m-val-1.tar", frames, lasers, without=[(0, "gt/depth.png")])
     recording = data.open(tmp_path)
-    assert recording.report == ("1 frames without gt/depth: no truth",)
+    assert recording.report == ("1 frame without gt/depth: no truth",)
     none, bad = recording.truth(0), recording.truth(1)
     assert none["depth"].shape == (1, *VGA_HW) and not none["depth"].any() and math.isnan(none["disagreement"])
     assert not bad["depth"].any() and float(bad["disagreement"]) == pytest.approx(0.111, abs=0.005)
@@ -115,9 +115,9 @@ def test_a_member_missing_in_the_middle_is_skipped_and_reported(tmp_path: Path) 
     recording = data.open(file)
     assert recording.number.tolist() == [0, 2, 5]
     assert set(recording.report) == {
-        "1 frames without gt/rt: left out",
-        "1 frames without wide/depth/confidence: left out",
-        "1 frames without wide/image: left out",
+        "1 frame without gt/rt: left out",
+        "1 frame without wide/depth/confidence: left out",
+        "1 frame without wide/image: left out",
     }
     check_same(recording, [frames[i] for i in (0, 2, 5)], 1 / 1000)
     assert recording.truth(2)["depth"].any()  # the laser's camera taken for that of the image, scaled

@@ -169,7 +169,6 @@ def test_frames_by_number_in_any_order(tmp_path: Path, codec: str, b_frames: int
     np.testing.assert_allclose(codec_video.video_times(file), np.arange(N) / 60, atol=1e-6)
     order = [*range(N), *random.Random(0).choices(range(N), k=40), *reversed(range(N))]
     assert [number(codec_video.read_video_frame(file, i)) for i in order] == order
-    assert codec_video.count_decodable(file) == N
 
 
 @pytest.mark.parametrize("codec", ["libx264", "libx265"])
@@ -204,7 +203,7 @@ def test_a_damaged_frame_never_shifts_the_others(tmp_path: Path) -> None:
     for at, size in places[10:13]:  # the second key frame and what follows
         whole[at + 4 : at + size] = bytes(size - 4)
     file.write_bytes(bytes(whole))
-    assert codec_video.video_header(file).n == N and codec_video.count_decodable(file) < N
+    assert codec_video.video_header(file).n == N
     with pytest.raises(FormatError, match=r"a.mp4: frame 10: found"):
         codec_video.read_video_frame(file, 10)
     for i in (*range(10), *range(20, N)):

@@ -6,23 +6,12 @@ import statistics
 import numpy as np
 import pytest
 import torch
+from random_answers import random_points
 
 from dhtorch import tree
 from dhtorch.evaluate import bootstrap, correlation, curves, errors, holdout, reliability, risk
 from dhtorch.evaluate.holdout import Rule
 from dhtorch.records import Estimate
-
-
-def random_points(n, seed=0, ties=False, silent=0.3):
-    g = np.random.default_rng(seed)
-    true = g.uniform(2, 6, n)
-    depth = true * np.exp(g.normal(0, 0.3, n))
-    score = g.integers(0, 6, n) / 5 if ties else g.uniform(0, 1, n)
-    keep = g.uniform(size=n) > silent
-    t = torch.from_numpy
-    return errors.points(
-        t(depth), t(true), t(score), sigma=t(0.2 * true), residual_px=t(g.uniform(0, 3, n)), keep=t(keep)
-    )
 
 
 def test_errors_equal_numpy():

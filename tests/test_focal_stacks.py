@@ -78,7 +78,7 @@ def test_fod500_sample_that_lacks_something_is_left_out_and_shifts_nothing(tmp_p
     stacks = formats.open_stacks(tmp_path)
     assert stacks.names == ("000000", "000003")
     assert stacks.report == (
-        "sample 000001: 4 pictures and 1 depth maps: left out",
+        "sample 000001: 4 pictures and 1 depth map: left out",
         "sample 000002: 5 pictures and 0 depth maps: left out",
     )
     assert torch.equal(stacks[1].images, want[3].images) and torch.equal(stacks[1].depth, want[3].depth)
@@ -255,7 +255,7 @@ def test_ddff12_stacks_of_one_room_are_one_scene(tmp_path: Path) -> None:
     fails("option per_scene: found 0, expected at least 1", file, per_scene=0)
     stack_writers.write_fod500(tmp_path / "fod", {0: stack(0), 7: stack(7)})
     assert formats.open_stacks(tmp_path / "fod").by_scene() == {"000000": [0], "000007": [1]}, "each a scene of its own"
-    with pytest.raises(ValueError, match="found 1 scenes of 2 stacks, expected one for each"):
+    with pytest.raises(ValueError, match="found 1 scene of 2 stacks, expected one for each"):
         Stacks("x", "images", raw.load, ("a", "b"), scenes=("room",))
 
 

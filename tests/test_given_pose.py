@@ -7,13 +7,16 @@ import torch
 from sample_dicts import GAP, frames, room
 
 from dhtorch.codes import Gate, PoseCode
+from dhtorch.geometry import camera as cam
 from dhtorch.geometry import conventions, se3
 from dhtorch.methods import METHODS
-from dhtorch.records import GivenPose, StartPose
+from dhtorch.records import Camera, GivenPose, Pose, Samples, StartPose, Tracks
 from dhtorch.stages import given
+from dhtorch.studies.baselines.device_pose import given_pose
 from dhtorch.synthetic import SyntheticRoom
 from dhtorch.transform import ExtendDepth, ExtendedDataset, SampleError
-from dhtorch.tree import collate
+from dhtorch.transform import given as of_samples
+from dhtorch.tree import collate, stack
 
 N = 400
 SIGMA = (0.004, 0.008)
@@ -167,6 +170,29 @@ def test_one_wrong_pose_of_a_batch_silences_its_pair_alone(pairs):
     assert fit.ok.tolist() == [True, False, True]
     alone = asked(tuple(x[2:] if k < 3 else x for k, x in enumerate(pairs)), given.stated(mixed[2:]))[0]
     assert torch.equal(alone.gate[0], estimate.gate[2])
+    assert fit.inlier.any(1).tolist() == [True, False, True]
+
+
+def test_a_pose_that_explains_a_third_of_the_returns_in_some_reading_has_no_name():
+    """Twice the motion, the wrong way round: read as the inverse it fits what is far away, and that is not enough."""
+    camera = Camera(torch.tensor([[500.0, 500.0]]), torch.tensor([[320.0, 240.0]]))
+    g = torch.Generator().manual_seed(0)
+    depth = torch.cat((torch.linspace(0.5, 2.0, 39), torch.linspace(20.0, 22.0, 21)))
+    xyz = torch.cat((torch.rand(60, 2, generator=g) - 0.5, torch.ones(60, 1)), 1) * depth[:, None]
+    T = se3.identity(1, torch.zeros(1)).replace(t=torch.tensor([[0.2, 0.0, 0.0]]))
+    uv = cam.project(camera, se3.apply(T, xyz[None]))
+    zero = torch.zeros(1, 60)
+    samples = Samples(uv, depth[None], 0.001 * depth[None], xyz[None], zero + 1, zero.int(), zero + 1, zero.int())
+    tracks = Tracks(uv, uv, zero, zero, torch.eye(2).expand(1, 60, 2, 2), zero == 0)
+    motion = given.stated(T.replace(t=-2 * T.t), sigma=(1e-3, 1e-3))
+    fit = given.hold(motion, samples, tracks, camera, camera, given_pose(T, 60))
+    assert fit.code.tolist() == [PoseCode.REFUTED] and fit.looks.tolist() == [0] and not fit.inlier.any()
+    motion = given.stated(T.replace(t=0.5 * T.t), sigma=(1e-3, 1e-3))
+    fit = given.hold(motion, samples, tracks, camera, camera, given_pose(T, 60))
+    assert fit.code.tolist() == [PoseCode.REFUTED] and int(fit.n_inlier) == 21 and not fit.inlier.any()
+    motion = given.stated(T.replace(t=-T.t), sigma=(1e-3, 1e-3))
+    fit = given.hold(motion, samples, tracks, camera, camera, given_pose(T, 60))
+    assert conventions.CONVENTIONS[int(fit.looks)] == "the inverse"
 
 
 def test_refining_starts_from_the_given_pose(pairs):
@@ -216,10 +242,36 @@ def test_frames_may_carry_the_pose(pairs):
     method.replace(views=2)(placed[0], several, trace=trace)
     codes = [view["fit"].code.tolist() for view in trace["views"]]
     assert codes[0] == [PoseCode.OK] * 3 and PoseCode.OK not in codes[1]
+    two = stack([placed[1], placed[1].replace(T_world_from_cam=pairs[3][0])])
+    motions = given.from_frames(placed[0], two).T_1_from_0
+    assert motions.t.shape == (2, 3, 3) and not motions.t[1].any()
+    torch.testing.assert_close(motions.t[0], se3.relative(*pairs[3]).t.float())
     with pytest.raises(ValueError, match="T_world_from_cam is absent"):
         method(placed[0], pairs[1].replace(T_world_from_cam=None))
     with pytest.raises(ValueError, match=r"given.sigma: found \(1,\)"):
         given.from_frames(*placed, sigma=(1,))
+
+
+def test_axes_are_turned_into_ours():
+    """Forward, a turn to the left: along x and about z of a robot's camera, along z and against y of ours."""
+    turn = se3.exp(torch.tensor([[0.0, 0.0, 0.3, 0.0, 0.0, 0.0]], dtype=torch.float64)).R
+    T = Pose(turn, torch.tensor([[1.0, 0.2, 0.1]], dtype=torch.float64))
+    found = conventions.in_axes(T, conventions.AXES["robot axes (x forward, y left, z up)"])
+    torch.testing.assert_close(found.t, torch.tensor([[-0.2, -0.1, 1.0]], dtype=torch.float64))
+    torch.testing.assert_close(se3.log(found)[0, :3], torch.tensor([0.0, -0.3, 0.0], dtype=torch.float64))
+
+
+def test_errors_of_two_poses_in_a_world_are_one_of_the_motion(pairs):
+    worlds, little = [T[:1].to(torch.float64) for T in pairs[3]], 1e-6
+    eye = torch.eye(6, dtype=torch.float64)
+    columns = []
+    for xi in little * eye:
+        moved = se3.relative(se3.compose(se3.exp(xi[None]), worlds[0]), worlds[1])
+        columns.append(se3.log(se3.compose(moved, se3.invert(se3.relative(*worlds))))[0] / little)
+    A = torch.stack(columns, 1)
+    cov = torch.diag(torch.arange(1.0, 7.0, dtype=torch.float64))[None]
+    found = conventions.relative_covariance(worlds[1], cov, 2 * cov)
+    torch.testing.assert_close(found[0], A @ (3 * cov[0]) @ A.T, rtol=1e-4, atol=1e-4)
 
 
 # ---------------------------------------------------------------------------------------------------- in samples
@@ -249,6 +301,9 @@ def test_samples_state_poses_in_many_ways(sample):
     relative = {**sample, "pose": T[:3].numpy()}
     one = transform(pose_kind="1_from_0", other_pose=None)(relative)
     torch.testing.assert_close(one["dhtorch.T_1_from_0"], T, atol=1e-5, rtol=0)
+    turned = {**sample, "pose": torch.as_tensor(gl).float() @ T @ torch.as_tensor(gl).float()}
+    one = transform(pose_kind="1_from_0", other_pose=None, pose_axes="gl")(turned)
+    torch.testing.assert_close(one["dhtorch.T_1_from_0"], T, atol=1e-5, rtol=0)
     mm = {**sample, "pose": T[:3] * torch.tensor([1, 1, 1, 1000.0])}
     one = transform(pose_kind="1_from_0", other_pose=None, pose_unit="mm")(mm)
     torch.testing.assert_close(one["dhtorch.T_1_from_0"], T, atol=1e-4, rtol=0)
@@ -263,6 +318,7 @@ def test_samples_state_poses_in_many_ways(sample):
 def test_samples_state_covariances(sample):
     two = transform(pose_cov=(0.01, 0.02))(sample)
     torch.testing.assert_close(two["dhtorch.pose_cov"].diagonal(), torch.tensor([1e-4] * 3 + [4e-4] * 3))
+    assert not transform(pose_cov=(0.0, 0.0))(sample)["dhtorch.pose_cov"].any(), "known exactly"
     sample["cov"] = torch.diag(torch.tensor([0.5e-4] * 3 + [2e-4] * 3)).numpy()
     each = transform(pose_cov="cov")(sample)["dhtorch.pose_cov"]
     assert each.diagonal()[:3].sum() == pytest.approx(3e-4, rel=1e-4), "two cameras, two errors"
@@ -302,6 +358,15 @@ def test_what_is_no_pose_is_refused(sample, change, said):
     assert not blank["dhtorch.valid"].any() and blank["dhtorch.pose_looks"] == 0
 
 
+def test_of_several_views_the_first_that_is_refuted_gives_the_name(pairs):
+    _, fit, *_ = asked(pairs, given.stated(se3.relative(*pairs[3])))
+    wrong = fit.replace(code=torch.full_like(fit.code, PoseCode.REFUTED))
+    both = [wrong.replace(looks=torch.tensor(looks)) for looks in ([0, 3, 5], [4, 6, 7])]
+    with pytest.warns(UserWarning, match="camera: the near returns contradict the pose; looks like"):
+        found = of_samples.keys([fit, *both], torch.tensor([True, True, False]), "camera")
+    assert found["pose_looks"].tolist() == [4, 3, 0]
+
+
 def test_a_pose_that_is_not_known_leaves_a_hole(sample):
     sample["pose"] = sample["pose"] * torch.nan
     with warnings.catch_warnings():
@@ -318,6 +383,7 @@ def test_a_pose_that_is_not_known_leaves_a_hole(sample):
         ({"pose_unit": "inch"}, "pose_unit"),
         ({"pose_cov": (1.0,)}, "pose_cov"),
         ({"other_pose": None}, "expected other_pose"),
+        ({"pose": torch.eye(4).tolist(), "other_pose": None}, "pose: found pose_kind"),
         ({"pose": None}, "other_pose without pose"),
     ],
 )

@@ -177,7 +177,7 @@ def test_a_scene_without_trajectory_or_depth_has_no_answer():
     assert experiment.verdict(asked(blind))[0] is None
     silent = asked(empty)
     assert silent.verdict == "undecided" and silent.rows[0]["note"] == "nothing to ask" and len(silent.rows) == 9
-    with pytest.raises(ValueError, match="found 1 frames of synthetic_room and links=10, expected at least two"):
+    with pytest.raises(ValueError, match="found 1 frame of synthetic_room and links=10, expected at least two"):
         asked(room(hw=(96, 128), n_frames=1), links=10)
 
 

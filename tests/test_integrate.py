@@ -477,6 +477,22 @@ def test_recovered_points_widen_the_map_beyond_the_sensor(walked):
     assert torch.equal(again.distance, both.distance) and torch.equal(again.key, both.key)
 
 
+def test_of_two_grids_each_is_what_it_is_alone_and_frames_are_read_once(walked, monkeypatch):
+    room, answers = walked
+    places = recording.place(room, answers)
+    alone = [
+        recording.build(room, empty(voxel), answers, places, sources=sources, cutoff=2.0)
+        for voxel, sources in ((0.05, [Source.SENSOR]), (0.1, [Source.SENSOR, Source.RECOVERED]))
+    ]
+    reads, read = [], type(room).__getitem__
+    monkeypatch.setattr(type(room), "__getitem__", lambda self, k: reads.append(k) or read(self, k))
+    both = recording.build_grids(room, [empty(0.05), empty(0.1)], answers, places, cutoff=2.0)
+    assert sorted(reads) == sorted(places.poses)
+    for one, other in zip(alone, both, strict=True):
+        for name in ("key", "distance", "weight", "features"):
+            assert torch.equal(getattr(one, name), getattr(other, name)), name
+
+
 def test_memory_is_that_of_the_blocks(room):
     _, volume, _ = room
     assert volume.bytes == len(volume.key) * (8 + 512 * (4 + 3 * 4 + 1 + (1 + 3) * 2))

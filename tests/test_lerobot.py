@@ -327,7 +327,7 @@ def test_missing_and_shuffled_rows_are_reported(tmp_path: Path) -> None:
     assert torch.equal(recording[2].image, episodes()[1][3].image)
     rewrite(file, lambda t: t.take([0, 2, 1]))
     recording = data.open(tmp_path, episode=1)
-    assert recording.number.tolist() == [0, 3] and "1 rows out of order: left out" in recording.report[0]
+    assert recording.number.tolist() == [0, 3] and "1 row out of order: left out" in recording.report[0]
 
 
 def test_a_shorter_video_is_an_error_where_it_ends(tmp_path: Path) -> None:

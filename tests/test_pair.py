@@ -83,10 +83,6 @@ def test_map_takes_the_sensor_first(views):
 # ---------------------------------------------------------------------------------------------------- company
 
 
-def codes_equal(a, b):
-    return torch.equal(a.gate, b.gate) and torch.equal(a.n_views, b.n_views)
-
-
 def test_an_answer_does_not_depend_on_its_company(views):
     torch.set_num_threads(1)
     pairs = views[0]

@@ -81,7 +81,7 @@ def test_by_baseline_takes_the_earliest_within_tolerance() -> None:
         (lambda: pairs.by_choice(line(5), stride=0), r"pairs.stride: found 0"),
         (lambda: pairs.by_choice(line(3), stride=3, past=True), r"found no two of 3 frames of line at stride 3, past"),
         (lambda: pairs.by_gap(line(5)), r"pairs.gap: line knows no gap of its own, expected a number of frames"),
-        (lambda: pairs.by_gap(line(1), 1), r"pairs.gap: found 1 for 1 frames"),
+        (lambda: pairs.by_gap(line(1), 1), r"pairs.gap: found 1 for 1 frame"),
         (lambda: pairs.by_time(line(5), -1), r"pairs.seconds: found -1, expected a positive number"),
         (lambda: pairs.by_time(line(5, times=None), 1), r"pairs.seconds: line has no time stamps"),
         (lambda: pairs.by_time(line(5), 1, tolerance=-1), r"pairs.tolerance: found -1, expected 0 or more"),

@@ -10,8 +10,6 @@ from by_hand import levels as levels_by_hand
 from dhtorch.geometry import pyramid as module
 from dhtorch.geometry.pyramid import GRAD_X, GRAD_Y, GREY, MARGIN, REACH, build_pyramid
 
-PLANES = (GREY, GRAD_X, GRAD_Y)
-
 
 def noise(B, C, H, W, seed=0, dtype=torch.float64):
     return torch.rand(B, C, H, W, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)

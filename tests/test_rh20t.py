@@ -157,7 +157,7 @@ def test_depth_is_paired_by_time(tmp_path: Path) -> None:
     stamps["depth"][1] += 40  # nobody's partner now
     np.save(file, stamps, allow_pickle=True)
     recording = data.open(root, serials=[FIXED])
-    assert recording.number.tolist() == [0, 2] and "1 images without depth within 0.02 s" in recording.report[0]
+    assert recording.number.tolist() == [0, 2] and "1 image without depth within 0.02 s" in recording.report[0]
     torch.testing.assert_close(recording[1].depth, still()[2].depth, atol=1e-3, rtol=0)
 
 
@@ -170,7 +170,7 @@ def test_stamps_that_do_not_fit_the_video_are_reported(tmp_path: Path) -> None:
     assert len(recording) == 3 and "4 color stamps for 3 frames" in recording.report[1]
     np.save(file, {"color": [stamps[0], stamps[0], stamps[2]], "depth": []}, allow_pickle=True)
     recording = data.open(root, serials=[FIXED])
-    assert recording.number.tolist() == [0, 2] and "1 color frames whose stamp is not later" in recording.report[1]
+    assert recording.number.tolist() == [0, 2] and "1 color frame whose stamp is not later" in recording.report[1]
 
 
 def test_outliers_of_a_lossy_high_byte_are_dropped(tmp_path: Path) -> None:
@@ -283,7 +283,7 @@ def test_frames_in_a_gap_of_the_tcp_are_left_out(tmp_path: Path) -> None:
     entries = read_npy(file)
     np.save(file, {s: e[:2] for s, e in entries.items()}, allow_pickle=True)
     recording = data.open(root, serials=[HAND])
-    assert recording.number.tolist() == [0, 1] and "1 frames in a gap of the tcp stream" in recording.report[0]
+    assert recording.number.tolist() == [0, 1] and "1 frame in a gap of the tcp stream" in recording.report[0]
     same_scene(recording, moving()[:2])
     file.unlink()
     recording = data.open(root, serials=[HAND])

@@ -22,6 +22,7 @@ from dhtorch.commands import complete, completed
 from dhtorch.commands.completed import Task
 from dhtorch.commands.judge import exceeded, parse_limits
 from dhtorch.commands.layouts import layout_of
+from dhtorch.console import many
 from dhtorch.data import depth_maps
 from dhtorch.data import files as data_files
 from dhtorch.data.depth_maps import DepthMaps
@@ -212,9 +213,9 @@ def _said(name: str, kind: str, whole: Row, before: int) -> list[str]:
     held, middle, n = whole["held"], whole["median"], whole["frames"]
     again = f" ({before} left untouched)" if before else ""
     if middle["scale"] is None:
-        return [f"{name}: none of {n} maps could be anchored{again}: too few near returns."]
+        return [f"{name}: none of {many(n, 'map')} could be anchored{again}: too few near returns."]
     alone = sum(count for model, count in whole["models"].items() if model == "raw")
-    maps = f"{n} map{'s' * (n != 1)}"
+    maps = many(n, "map")
     first = f"{name}: {maps}{again} put into metres."
     if kind == "metric":
         times = f"multiplied by {middle['scale']:.4g} (median of all)"

@@ -24,6 +24,7 @@ from dhtorch.codes import Gate, Source, names, words
 from dhtorch.commands import completed
 from dhtorch.commands.completed import EXTRAS, Row, Task
 from dhtorch.commands.layouts import LAYOUTS, confident, layout_of, own_cameras
+from dhtorch.console import many
 from dhtorch.data import files as data_files
 from dhtorch.data.pairs import by_choice
 from dhtorch.data.scene import Scene, scenes_of
@@ -155,7 +156,7 @@ def closing(task: Task) -> Iterator[None]:
             _close(task)
     except KeyboardInterrupt:
         n = sum(task.name(i) in task.done for i in task.frames)
-        stay = f"{n} of {len(task.frames)} frames in {task.folder} are whole and stay"
+        stay = f"{n} of {many(len(task.frames), 'frame')} in {task.folder} are whole and stay"
         raise KeyboardInterrupt(f"{stay}; the same command does the rest") from None
 
 
@@ -310,7 +311,7 @@ def _said(task: Task, before: int) -> str:
     reasons = ", ".join(f"{words(name.upper())} {share:.1%}" for name, share in silent.most_common())
     layout, (h, w) = task.layout, rows[0]["hw"]
     lines = [
-        f"{task.scene.name}: {len(rows)} frame{'s' * (len(rows) != 1)}{f' ({before} left untouched)' * (before > 0)}"
+        f"{task.scene.name}: {many(len(rows), 'frame')}{f' ({before} left untouched)' * (before > 0)}"
         f" of {w}x{h}: {sensor}, {swept}, {none}{f' ({reasons})' * bool(reasons)}",
         f"  steps of {1e3 * layout.unit:g} mm reach {layout.reach:.1f} m"
         + (f": {unfit:.2%} of the pixels do not fit and are silent (unit=, arrays=true)" if unfit else ""),

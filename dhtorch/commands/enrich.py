@@ -18,6 +18,7 @@ from typing import Any
 from dhtorch import archive, dense, lock, storage
 from dhtorch.codes import Gate, Source, names, words
 from dhtorch.commands import enrich_page
+from dhtorch.console import many
 from dhtorch.data.files import need
 from dhtorch.data.rig import Rig
 from dhtorch.data.scene import Scene, scenes_of
@@ -129,7 +130,7 @@ def _make(work: Work, settings: Mapping[str, Any], progress: Progress) -> tuple[
     engine = engines.run(
         settings["engine"], work.rows, positions, workers=settings["workers"], address=settings["address"]
     )
-    with closing(progress(engine, f"{len(work.whole)} frames", len(positions))) as answers:  # type: ignore[type-var]
+    with closing(progress(engine, many(len(work.whole), "frame"), len(positions))) as answers:  # type: ignore[type-var]
         for k, each in todo.items():
             for piece in (piece for files in each.values() for piece in files if piece.name not in done):
                 made = islice(answers, len(piece.rows))
@@ -357,7 +358,7 @@ def _said(work: Work, owns: Sequence[Row], before: int, complaints: Sequence[str
     size = sum(path.stat().st_size for path in work.out.rglob("*") if path.is_file())
     frames = sum(own["length"] for own in owns)
     left = f" ({before} left untouched)" if before else ""
-    lines = [f"{work.out}: {len(owns)} episode{'s' * (len(owns) != 1)}{left}, {frames} frames, {size / 1e6:.1f} MB"]
+    lines = [f"{work.out}: {many(len(owns), 'episode')}{left}, {many(frames, 'frame')}, {size / 1e6:.1f} MB"]
     for name, shares, reasons in enrich_page.by_camera(owns):
         kinds = ", ".join(f"{kind} {share:.1%}" for kind, share in shares.items())
         why = ", ".join(f"{words(gate)} {share:.1%}" for gate, share in reasons.items())

@@ -78,7 +78,7 @@ def page(about: Row, owns: Sequence[Row]) -> str:
     title = f"{about['data']['source']}: what became of its pixels"
     frames = sum(own["length"] for own in owns)
     step = f"depth in steps of {1e3 * about['step_m']:.3g} mm" if about["step_m"] else "depth as it was found"
-    episodes = f"{len(owns)} episode{'s' * (len(owns) != 1)}, {frames} frames"
+    episodes = f"{many(len(owns), 'episode')}, {many(frames, 'frame')}"
     lead = f"{episodes}; {step}; dhtorch {about['version']}, method {about['method']}"
     tables = [table for table in (_cameras(owns), _refuted(owns), _worst(owns)) if table.rows]
     figures = [figure for figure in (_along(owns), _why(owns)) if figure is not None]

@@ -24,8 +24,8 @@ import torch
 from torch import Tensor
 
 from dhtorch import data
-from dhtorch.console import EPILOG, markup, progress, terminal
-from dhtorch.data import FormatError, files
+from dhtorch.console import EPILOG, many, markup, progress, terminal
+from dhtorch.data import FormatError, doors, files
 from dhtorch.data import intrinsics as told
 from dhtorch.data.recording import Recording
 from dhtorch.data.survey import Survey, survey_pictures, survey_recording
@@ -93,7 +93,7 @@ def main(argv: Sequence[str]) -> int:
                 sheets.append(write_sheet(survey, out))
                 print(f"wrote {sheets[-1]}\n")
     except KeyboardInterrupt:
-        stay = f"{len(sheets)} contact sheet{'s' * (len(sheets) != 1)} in {out} stay; " if sheets else ""
+        stay = f"{many(len(sheets), 'contact sheet')} in {out} stay; " if sheets else ""
         raise KeyboardInterrupt(f"{stay}the same command looks again") from None
     return 0
 
@@ -189,12 +189,12 @@ def _named(path: Path, format: str) -> Found:
 
 def _recognised(path: Path, follow_links: bool) -> Found | None:
     """What stands at this very path: a recording wins over focal stacks, these over loose pictures."""
-    with files.inside(None if follow_links else path):
+    with doors.inside(None if follow_links else path):
         for name, reader in (data.FORMATS | formats.STACK_FORMATS).items():
             if evidence := reader.recognise(path):
                 return Found(path, "recording" if name in data.FORMATS else "stacks", name, evidence)
     if path.is_dir() and (count := sum(file.suffix.lower() in _PICTURES for file in path.iterdir())):
-        return Found(path, "pictures", "loose pictures", f"{count} pictures of no known format")
+        return Found(path, "pictures", "loose pictures", f"{many(count, 'picture')} of no known format")
     return None
 
 
@@ -255,7 +255,7 @@ def classified(folder: Path) -> tuple[list[Path], list[Path]]:
 
 def _loose(capture: Found, frames: int) -> Iterator[Survey]:
     """Some of the pictures and depth maps of a folder, the latter taken to be in millimetres."""
-    with files.inside(None if capture.follow_links else capture.path):
+    with doors.inside(None if capture.follow_links else capture.path):
         yield from _loose_inside(capture, frames)
 
 

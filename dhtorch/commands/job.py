@@ -14,6 +14,7 @@ from typing import Any
 import torch
 
 from dhtorch import archive, console, storage
+from dhtorch.console import many
 from dhtorch.data import files as data_files
 from dhtorch.data import scenes_of
 from dhtorch.data.scene import Scene
@@ -127,7 +128,7 @@ def _show(result: Mapping[str, Any], written: Sequence[Path], *, swept: bool) ->
         report.print_brief(result)
     few = {r["scene"]: r["n_few"] for r in result["rows"] if r["pair"] is None and r.get("n_few")}
     for scene, n in few.items() if not swept else ():
-        print(f"{scene}: {n} pair{'s' * (n > 1)} dropped, fewer than {MIN_CANDIDATES} candidates each")
+        print(f"{scene}: {many(n, 'pair')} dropped, fewer than {MIN_CANDIDATES} candidates each")
     if result["verdict"]:
         print(f"{result['verdict']}: {result['why']}")
     advice = report.advice(result)
@@ -136,7 +137,7 @@ def _show(result: Mapping[str, Any], written: Sequence[Path], *, swept: bool) ->
         end="\n" * bool(advice),
     )
     beside = len(written) - 1
-    more = f" and {beside} picture{'s' * (beside > 1)} and points beside it" if beside else ""
+    more = f" and {many(beside, 'picture')} and points beside it" if beside else ""
     print(f"wrote {written[0]}{more}")
 
 

@@ -124,7 +124,7 @@ def captured(path: Path, format: str = "auto") -> list[Found]:
     if len(depths) == 1:
         raise NothingToDo(f"{path}: one frame; a second view from another place is needed for what the sensor lacks")
     if depths:
-        what = f"{len(pictures)} pictures and {len(depths)} depth maps of no known format"
+        what = f"{many(len(pictures), 'picture')} and {many(len(depths), 'depth map')} of no known format"
         raise NothingToDo(f"{path}: {what}; a layout of docs/data.md is needed, as rgb/ beside depth/")
     what = f"{many(len(pictures), 'picture')} without depth"
     raise NothingToDo(f"{path}: {what}; a sensor's depth of what is near is needed, it gives the metre (docs/data.md)")
@@ -345,7 +345,7 @@ def _next(made: Made, shown: str) -> str:
     cause = next(iter(made.broken.values()), "")
     broken = f" {many(n, 'frame')} of {name} could not be read ({cause})." if n else ""
     if made.left:
-        more = f"the same command does more of the {made.left} frames left (minutes=null: all)"
+        more = f"the same command does more of the {many(made.left, 'frame')} left (minutes=null: all)"
         return f"Next: open {shown}; {more}.{broken}"
     read = {name: value for name, value in made.task.settings["data"].items() if value is not None}
     also = "".join(f" data.{name}={_written(value)}" for name, value in read.items())

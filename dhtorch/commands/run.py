@@ -356,7 +356,7 @@ def _sweep(engine: Any, overrides: Sequence[str], folder: Path, again: str, show
     shares = ", ".join(f"{counts[state]} {words}" for state, words in STATES.items())
     with console.unsaid():
         _compare([Path(j.return_value.folder) for j in jobs if j.return_value.state != "failed"], folder)
-        print(f"{len(jobs)} job{'s' * (len(jobs) != 1)}: {shares}", flush=True)
+        print(f"{console.many(len(jobs), 'job')}: {shares}", flush=True)
     if not counts["failed"]:
         return DONE
     common = set.intersection(*(set(job.overrides) for job in jobs))

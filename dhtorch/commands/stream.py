@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from dhtorch import storage
+from dhtorch.console import many
 from dhtorch.data import files
 from dhtorch.data.scene import Scene, scenes_of
 from dhtorch.evaluate.holdout import range_split
@@ -82,4 +83,4 @@ def _said(scene: Row) -> str:
     share = "no sample lacks a return" if scene["recovered"] is None else f"{scene['recovered']:.1%} of holes answered"
     cuts = f"; cuts at {', '.join(map(str, scene['cuts']))}" if scene["cuts"] else ""
     speed = f"{scene['frames_per_second']:.2f} frames/s"
-    return f"{scene['scene']}: {scene['n_frames']} frames, {speed}, {share}, {scene['mib']:.0f} MiB held{cuts}"
+    return f"{scene['scene']}: {many(scene['n_frames'], 'frame')}, {speed}, {share}, {scene['mib']:.0f} MiB held{cuts}"

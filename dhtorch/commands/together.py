@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from dhtorch import console
+from dhtorch.console import many
 
 #: Below the sweep's folder.
 NOTES = ".progress"
@@ -89,10 +90,10 @@ def _draw(notes: Path, n_jobs: int, stop: threading.Event) -> None:
 
     columns: Sequence[Any] = ("{task.description}", BarColumn(), "{task.percentage:.0f} %", TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(f"0 of {n_jobs} jobs", total=n_jobs)
+        task = bar.add_task(f"0 of {many(n_jobs, 'job')}", total=n_jobs)
         while not stop.wait(PAUSE):
             done, whole, at = read(notes)
-            said = f"{whole} of {n_jobs} jobs" + (f", {', '.join(at[:2])}" if at else "")
+            said = f"{whole} of {many(n_jobs, 'job')}" + (f", {', '.join(at[:2])}" if at else "")
             bar.update(task, completed=done, description=said)
 
 

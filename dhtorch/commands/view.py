@@ -15,6 +15,7 @@ import torch
 
 from dhtorch import archive
 from dhtorch.commands.job import PLACE
+from dhtorch.console import many
 from dhtorch.data import FormatError
 from dhtorch.data.scene import scenes_of
 from dhtorch.integrate.sweeps import Sweep
@@ -124,7 +125,7 @@ def _show(scene: Exhibit, page: str | None, save: str | None, folder: Path) -> l
             save = str(folder / "view.rrd")
         else:
             rrd.spawn(scene)
-            said.append(f"{scene.name}: {len(scene.shots)} pairs in Rerun's viewer")
+            said.append(f"{scene.name}: {many(len(scene.shots), 'pair')} in Rerun's viewer")
     if page is not None:
         path = html.write(Path(page), scene)
         said.append(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB): open it in any browser")

@@ -18,7 +18,8 @@ from typing import Any, Final, Protocol
 from dhtorch import console
 from dhtorch.data import arkitscenes, ca1m, driving, frames_dir, lerobot, record3d, rectified, rh20t, rlds, stray, tum
 from dhtorch.data import intrinsics as told
-from dhtorch.data.files import FormatError, inside
+from dhtorch.data.doors import inside
+from dhtorch.data.files import FormatError
 from dhtorch.data.recording import Recording, Recordings
 from dhtorch.data.scene import Given, Scene, Scenes, scenes_of
 

@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dhtorch.console import many
 from dhtorch.data import convert, files
 from dhtorch.data.clocks import nearest, poses_at
 from dhtorch.data.files import FormatError
@@ -129,7 +130,7 @@ def read(
         return [Recording(**fields, report=tuple(report))]
     load_truth = _truth_loader(places, laser, times, load, max_truth_gap, max_disagreement)
     if (without := load_truth.depths.count(None)) > 0:
-        report.append(f"{without} frames without laser depth within {max_truth_gap} s: no truth")
+        report.append(f"{many(without, 'frame')} without laser depth within {max_truth_gap} s: no truth")
     return [MeasuredRecording(**fields, load_truth=load_truth, report=tuple(report))]
 
 
@@ -308,7 +309,7 @@ def _kept(root: Path, name: str, has: dict[str, np.ndarray], report: list[str]) 
     keep = np.ones_like(has["depth"])
     for what, mask in has.items():
         if (lost := int((keep & ~mask).sum())) > 0:
-            report.append(f"{lost} images without {what}: left out")
+            report.append(f"{many(lost, 'image')} without {what}: left out")
         keep &= mask
     if not keep.any():
         raise FormatError(root, f"frames of {name}", "; ".join(report), "images with depth, intrinsics and pose")

@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dhtorch.console import many
 from dhtorch.data import convert, files
 from dhtorch.data.codecs import tarballs, tiff
 from dhtorch.data.files import FormatError
@@ -192,7 +193,7 @@ def _recording(
     for what in needed:
         kept = [key for key in keys if what in frames[key]]
         if len(kept) < len(keys):
-            report.append(f"{len(keys) - len(kept)} frames without {what}: left out")
+            report.append(f"{many(len(keys) - len(kept), 'frame')} without {what}: left out")
         keys = kept
     if not keys:
         raise FormatError(archive, "frames", "; ".join(report) or "none", f"members {', '.join(needed)}")
@@ -213,7 +214,7 @@ def _recording(
     if "gt/depth" not in spans:
         return Recording(**fields, report=tuple(report))
     if (without := int((spans["gt/depth"][:, 0] < 0).sum())) > 0:
-        report.append(f"{without} frames without gt/depth: no truth")
+        report.append(f"{many(without, 'frame')} without gt/depth: no truth")
     return MeasuredRecording(**fields, load_truth=_LoadTruth(load, max_disagreement), report=tuple(report))
 
 

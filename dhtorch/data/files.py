@@ -4,8 +4,7 @@ Every function returns plain numpy arrays or Python values and checks lengths an
 bytes. Whatever is wrong with a file is a :class:`FormatError`: one line with the file, the field, what was found and
 what was expected.
 
-Two doors stand here for all readers. :func:`opened` is the only way to a file's bytes: regular files alone, inside the
-capture. :func:`allow` is the law of memory: whoever is about to make much of few bytes asks first.
+Bytes come through the doors of :mod:`dhtorch.data.doors`.
 
 Alphabet: ``hw`` (height, width); depth and disparity maps are (h, w) float32.
 """
@@ -16,18 +15,17 @@ import importlib
 import json
 import os
 import re
-import stat
 import struct
 import zlib
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+
+from dhtorch.data.doors import FormatError, allow, opened, unreadable
 
 #: No camera of ours comes near this; a header that claims more is damaged or hostile.
 MAX_PIXELS = 64_000_000
@@ -35,9 +33,6 @@ MAX_BYTES = 256_000_000  # of an array or a file
 MAX_TEXT_BYTES = 64_000_000  # of a table or a JSON document
 #: Numbers that an error message shows.
 LISTED = 64
-
-#: What opening a capture or reading one frame may take: so many bytes, or so many times what was asked for.
-MAX_MEMORY, GROWTH = 256 << 20, 8
 
 #: Bytes that Python's own objects take, at most: of a line and a word of a table; of an object, a list, a text and an
 #: entry of a JSON document.
@@ -50,20 +45,6 @@ _LINE_ENDS = "\n\r\v\f\x1c\x1d\x1e\x85\u2028\u2029"
 DEFLATE = 1032
 _JPEG_PIXELS = 8 * 1024
 _MAX_SCANS, _MAX_SCANNED = 1000, 20 * MAX_PIXELS  # of a JPEG: passes over the picture, and pixels of all of them
-
-
-class FormatError(ValueError):
-    """A file is not what its format promises: ``file: field: found …, expected …`` in one line.
-
-    Survives pickling, so it arrives intact from a data-loader worker.
-    """
-
-    def __init__(self, file: str | Path, field: str = "", found: object = "", expected: object = "") -> None:
-        super().__init__(str(file), field, _short(found), _short(expected, 400))
-
-    def __str__(self) -> str:
-        file, field, found, expected = self.args
-        return f"{file}: {field}: found {found}, expected {expected}" if field else file
 
 
 class ImageHeader(NamedTuple):
@@ -375,114 +356,6 @@ def read_bytes(file: Path, limit: int = MAX_BYTES) -> bytes:
             raise unreadable(file, error) from None
 
 
-@contextmanager
-def opened(file: Path) -> Iterator[BinaryIO]:
-    """A file of a capture, open for reading: the only way to its bytes.
-
-    Raises:
-        FormatError: missing, unreadable, a pipe, socket, device or folder (which might never answer), or a link that
-            leads out of the capture (see :func:`inside`).
-    """
-    try:
-        kind = file.stat().st_mode  # before it is opened: some devices act on that alone
-        _stay(file)
-        if not stat.S_ISREG(kind):
-            raise FormatError(file, "file", _KINDS.get(stat.S_IFMT(kind), "something else"), "a regular file")
-        stream = os.fdopen(os.open(file, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)), "rb")
-    except FormatError:
-        raise
-    except UNREADABLE as error:
-        raise unreadable(file, error) from None
-    with stream:
-        yield stream
-
-
-_KINDS = {
-    stat.S_IFIFO: "a pipe",
-    stat.S_IFSOCK: "a socket",
-    stat.S_IFCHR: "a device",
-    stat.S_IFBLK: "a device",
-    stat.S_IFDIR: "a folder",
-}
-
-
-def check_file(file: Path) -> int:
-    """Bytes of a file that a library will open by its name.
-
-    Raises:
-        FormatError: as :func:`opened`.
-    """
-    with opened(file) as stream:
-        return os.fstat(stream.fileno()).st_size
-
-
-#: The capture that is being read, and whether its links may lead out of it.
-_capture: ContextVar[Path | None] = ContextVar("capture", default=None)
-
-
-@contextmanager
-def inside(root: Path | None) -> Iterator[None]:
-    """Meanwhile links below ``root`` that lead out of it are refused; None: links are followed anywhere."""
-    before = _capture.set(root)
-    try:
-        yield
-    finally:
-        _capture.reset(before)
-
-
-def lies_in(file: Path, root: Path) -> bool:
-    """Whether a file, wherever links lead, lies in a capture: a folder, or the folder of a file."""
-    home = root.resolve()
-    return file.resolve().is_relative_to(home.parent if root.is_file() else home)
-
-
-def _stay(file: Path) -> None:
-    """Refuse a link that leads out of the capture that is being read."""
-    root = _capture.get()
-    if root is None or not file.is_relative_to(root):
-        return
-    if not lies_in(file, root):
-        raise FormatError(file, "link", "one that leads out of the capture", "a file inside (follow_links=true allows)")
-
-
-def allow(file: Path, field: str, takes: int, found: object, asked: int = 0) -> None:
-    """The law of memory: at most ``MAX_MEMORY`` bytes, or ``GROWTH`` times the bytes that were asked for.
-
-    Args:
-        file, field, found: for the error.
-        takes: bytes that are about to be taken, by a bound that costs nothing.
-        asked: bytes of the arrays asked for, of a shape that the file is long enough for.
-
-    Raises:
-        FormatError: more than that.
-    """
-    most = max(MAX_MEMORY, GROWTH * asked)
-    if takes > most:
-        raise FormatError(file, field, f"{found}: {takes} bytes of memory", f"at most {most}")
-
-
-def last_change(file: Path) -> int:
-    """When a file was changed last, ns: part of the key of whatever is kept of it in memory.
-
-    Raises:
-        FormatError: the file is missing or unreadable.
-    """
-    try:
-        return file.stat().st_mtime_ns
-    except UNREADABLE as error:
-        raise unreadable(file, error) from None
-
-
-#: What opening a file may raise; ValueError: a name that no file can have.
-UNREADABLE = (OSError, ValueError)
-
-
-def unreadable(file: Path, error: Exception) -> FormatError:
-    """What to raise instead of ``error``, one of ``UNREADABLE``."""
-    found = "no such file" if isinstance(error, FileNotFoundError) else error
-    return FormatError(file, "file", found, "a readable file")
-
-
 def natural(name: Path | str) -> tuple[object, ...]:
     """Key of an order in which 1, 2 and 10 follow one another, with or without leading zeros."""
     parts = re.split(r"(\d+)", str(name))
@@ -509,8 +382,3 @@ def _kind_name(kind: type | tuple[type, ...]) -> str:
 
 def _size(hw: tuple[int, int]) -> str:
     return f"{hw[1]}x{hw[0]}"
-
-
-def _short(value: object, limit: int = 120) -> str:
-    text = " ".join(str(value).split())
-    return text if len(text) <= limit else text[: limit - 1] + "…"

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from dhtorch.data import files
+from dhtorch.console import many
+from dhtorch.data import doors
 from dhtorch.data.codecs.parquet import read_columns
 from dhtorch.data.files import FormatError
 from dhtorch.data.lerobot_meta import Episode, Meta
@@ -24,7 +25,7 @@ def read_table(file: Path, more: tuple[str, ...]) -> dict[str, np.ndarray]:
     Raises:
         FormatError: a missing or damaged table or column.
     """
-    return _read_table(file, files.last_change(file), more)
+    return _read_table(file, doors.last_change(file), more)
 
 
 @lru_cache(maxsize=1)
@@ -59,9 +60,11 @@ def episode_rows(
     report = []
     keep = sound & _later(number, sound) & _later(stamp, sound)
     if not keep.all():
-        report.append(f"episode {episode.number}: {int((~keep).sum())} rows out of order: left out")
+        report.append(f"episode {episode.number}: {many(int((~keep).sum()), 'row')} out of order: left out")
     if episode.length is not None and episode.length != len(rows):
-        report.append(f"episode {episode.number}: {len(rows)} rows, {episode.length} according to meta/episodes")
+        report.append(
+            f"episode {episode.number}: {many(len(rows), 'row')}, {episode.length} according to meta/episodes"
+        )
     rows, number, stamp = rows[keep], number[keep], stamp[keep]
     if len(rows) == 0:
         raise FormatError(episode.data, f"episode {episode.number}", "no usable row", "frames")

@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 from dhtorch.data.codecs.zips import check_directory
-from dhtorch.data.files import MAX_BYTES, FormatError, opened, read_bytes
+from dhtorch.data.doors import opened
+from dhtorch.data.files import MAX_BYTES, FormatError, read_bytes
 
 MAX_MEMBERS = 2_000_000
 _LOCAL_HEADER = 30  # bytes before the name

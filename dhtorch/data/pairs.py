@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import torch
 
+from dhtorch.console import many
 from dhtorch.data.recording import Recording
 from dhtorch.data.rig import Rig
 from dhtorch.data.scene import Given, Scene
@@ -93,7 +94,7 @@ def by_gap(scene: Given, gap: int | None = None, stride: int | None = None) -> l
     gap = _positive_int("pairs.gap", gap)
     number = recording.number.tolist()
     if gap > number[-1] - number[0]:
-        span = f"{len(number)} frames ({recording.name}, frame numbers {number[0]} to {number[-1]})"
+        span = f"{many(len(number), 'frame')} ({recording.name}, frame numbers {number[0]} to {number[-1]})"
         raise ValueError(f"pairs.gap: found {gap} for {span}, expected at most {number[-1] - number[0]}")
     place = {k: i for i, k in enumerate(number)}
     anchors = range(0, len(number), _stride(recording, stride))
@@ -273,7 +274,7 @@ def _stride(recording: Recording, stride: int | None) -> int:
 
 def _some(pairs: list[Pair], recording: Recording, wanted: str) -> list[Pair]:
     if not pairs:
-        found = f"no two of {len(recording)} frames of {recording.name}"
+        found = f"no two of {many(len(recording), 'frame')} of {recording.name}"
         raise ValueError(f"pairs: found {found} at {wanted}, expected at least one pair")
     return pairs
 

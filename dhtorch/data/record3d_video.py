@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from dhtorch.data import convert, files
+from dhtorch.data import convert, doors, files
 from dhtorch.data.codecs import video
 from dhtorch.data.files import FormatError
 from dhtorch.data.recording import Recording
@@ -133,7 +133,7 @@ def _metadata(file: Path) -> tuple[dict[str, Any], Path]:
 
 def _tail(file: Path) -> bytes:
     try:
-        with files.opened(file) as stream:
+        with doors.opened(file) as stream:
             stream.seek(-min(_TAIL, stream.seek(0, 2)), 2)
             return stream.read()
     except OSError as error:

@@ -15,7 +15,8 @@ from typing import ClassVar, TypeVar, overload
 import torch
 from torch import Tensor
 
-from dhtorch.data.files import inside
+from dhtorch.console import many
+from dhtorch.data.doors import inside
 from dhtorch.records import Frame, Pose
 
 T = TypeVar("T")
@@ -60,7 +61,9 @@ class Recording(Sequence[Frame]):
         }
         for what, length in lengths.items():
             if length != n:
-                raise ValueError(f"recording {self.name}: found {length} {what}, expected one for each of {n} frames")
+                raise ValueError(
+                    f"recording {self.name}: found {length} {what}, expected one for each of {many(n, 'frame')}"
+                )
         if not bool((self.number.diff() > 0).all()):
             raise ValueError(f"recording {self.name}: number must increase strictly from frame to frame")
 
@@ -78,7 +81,7 @@ class Recording(Sequence[Frame]):
         )
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.name!r}, {self.format}, {len(self)} frames)"
+        return f"{type(self).__name__}({self.name!r}, {self.format}, {many(len(self), 'frame')})"
 
     def _position(self, index: int) -> int:
         i, n = operator.index(index), len(self)

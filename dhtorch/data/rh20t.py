@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dhtorch.console import many
 from dhtorch.data import convert, files
 from dhtorch.data.clocks import nearest
 from dhtorch.data.codecs.pickles import read_npy
@@ -236,7 +237,9 @@ class _Rig:
         at = nearest(np.array([t for _, t in colour]), np.array([t for _, t in other]), self.max_difference)
         pairs = [(k, other[j][0], t) for (k, t), j in zip(colour, at, strict=True) if j >= 0]
         if len(pairs) < len(colour):
-            notes.append(f"{len(colour) - len(pairs)} images without depth within {self.max_difference} s: left out")
+            notes.append(
+                f"{many(len(colour) - len(pairs), 'image')} without depth within {self.max_difference} s: left out"
+            )
         if not pairs:
             raise FormatError(file, "time stamps", f"no depth within {self.max_difference} s of any image", "pairs")
         return tuple((k, j) for k, j, _ in pairs), np.array([t for _, _, t in pairs])
@@ -264,7 +267,9 @@ class _Rig:
                 self.root / "transformed" / "tcp_base.npy", "time stamps", "none near an image", "overlap"
             )
         if not covered.all():
-            notes.append(f"camera {serial}: {int((~covered).sum())} frames in a gap of the tcp stream: left out")
+            notes.append(
+                f"camera {serial}: {many(int((~covered).sum()), 'frame')} in a gap of the tcp stream: left out"
+            )
         T = calibration_tcp(self.folder / "tcp.npy", self.arm)
         hand = self._extrinsics(self.arm.in_hand[0])
         c2w = hand_poses(self.arm, E, hand, T, tcp[covered], file)
@@ -296,14 +301,16 @@ def _stamps(lists: Any, kind: str, n: int, file: Path, notes: list[str]) -> list
     if not isinstance(stamps, list) or not stamps:
         raise FormatError(file, kind, type(stamps).__name__, "a list of Unix milliseconds")
     if len(stamps) != n:
-        notes.append(f"{len(stamps)} {kind} stamps for {n} frames: the first {min(n, len(stamps))} are used")
+        notes.append(
+            f"{many(len(stamps), f'{kind} stamp')} for {many(n, 'frame')}: the first {min(n, len(stamps))} are used"
+        )
     kept: list[tuple[int, float]] = []
     for k, stamp in enumerate(stamps[:n]):
         t = seconds(stamp, file, kind)
         if not kept or t > kept[-1][1]:
             kept.append((k, t))
     if (lost := min(n, len(stamps)) - len(kept)) > 0:
-        notes.append(f"{lost} {kind} frames whose stamp is not later than the one before: left out")
+        notes.append(f"{many(lost, f'{kind} frame')} whose stamp is not later than the one before: left out")
     return kept
 
 

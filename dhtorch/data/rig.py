@@ -14,6 +14,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from dhtorch.console import many
 from dhtorch.data.files import FormatError
 from dhtorch.data.recording import Recording, Recordings, TruthRecording
 from dhtorch.data.scene import Scene, Scenes
@@ -78,7 +79,7 @@ def joined(recordings: Sequence[Recording], *, tolerance: float | None = None, n
     camera, flat = torch.arange(C).repeat(n), places.flatten()
     first = recordings[0].number[places[:, 0]]
     truth = all(isinstance(r, TruthRecording) for r in recordings)
-    left = [f"{r.name}: {len(r) - n} frames without their instant: left out" for r in recordings if len(r) > n]
+    left = [f"{r.name}: {many(len(r) - n, 'frame')} without their instant: left out" for r in recordings if len(r) > n]
     make = TruthRig if truth else Rig
     return make(
         name=name or recordings[0].name.rpartition("/")[0] or recordings[0].name,

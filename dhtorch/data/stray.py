@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from dhtorch.console import many
 from dhtorch.data import convert, files
 from dhtorch.data.codecs import pickles
 from dhtorch.data.codecs.video import read_video_frame, video_header
@@ -301,7 +302,7 @@ def _with_pictures(load: _Load, n_rows: int, lost_first: bool | None) -> tuple[_
         why = "the edges of depth and picture say so" if lost_first is None else "option lost_first"
         report.append(f"rgb.mp4 lacks its {'first' if first else 'last'} picture ({why})")
     elif n != n_rows:
-        report.append(f"rgb.mp4 has {n} pictures for {n_rows} rows: the shorter counts")
+        report.append(f"rgb.mp4 has {many(n, 'picture')} for {many(n_rows, 'row')}: the shorter counts")
     shots = [_Shot(s.row, s.depth, s.conf, s.row.place - shift) for s in load.shots if 0 <= s.row.place - shift < n]
     if not shots:
         raise FormatError(load.video, "frames", f"{n} pictures", "at least one with depth and pose")

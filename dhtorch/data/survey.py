@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from dhtorch.console import many
 from dhtorch.data.files import FormatError
 from dhtorch.data.recording import Recording
 from dhtorch.geometry import camera as cameras
@@ -74,7 +75,7 @@ def survey_recording(
     out = Survey(recording.name, recording.format)
     n = len(recording)
     skipped = int(recording.number[-1] - recording.number[0]) + 1 - n
-    out.say("frames", f"{n}" + (f", {skipped} numbers missing in between" if skipped else ""))
+    out.say("frames", f"{n}" + (f", {many(skipped, 'number')} missing in between" if skipped else ""))
     _times(recording.times, recording.rate_hz, out)
     places = sorted({round(k * (n - 1) / max(frames - 1, 1)) for k in range(frames)})
     shots: dict[int, Frame] = {}
@@ -129,10 +130,10 @@ def _times(times: Tensor | None, rate_hz: float | None, out: Survey) -> None:
     out.say("rate", f"{measured} measured" + (f", {nominal}" if nominal else ""))
     out.say("duration", f"{float(times[-1] - times[0]):.3f} s")
     if bool((step <= 0).any()):
-        out.warn(f"time stamps do not increase at {int((step <= 0).sum())} places")
+        out.warn(f"time stamps do not increase at {many(int((step <= 0).sum()), 'place')}")
     gaps = step > 2.5 * middle
     if bool(gaps.any()):
-        out.warn(f"{int(gaps.sum())} gaps in time, the longest {float(step.max()):.3f} s")
+        out.warn(f"{many(int(gaps.sum()), 'gap')} in time, the longest {float(step.max()):.3f} s")
 
 
 def _pictures(shots: Sequence[Frame], out: Survey) -> None:

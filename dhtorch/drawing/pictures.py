@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dhtorch.codes import ROUTE_OF_HOLE, Gate, Hole, Route, Source, names, words
+from dhtorch.console import many
 from dhtorch.drawing import colours
 from dhtorch.drawing.axis import Axis, spanning
 from dhtorch.drawing.canvas import Canvas, Key, headed, save
@@ -163,7 +164,7 @@ def _scatter(canvas: Canvas, panel: Panel, true: np.ndarray, found: np.ndarray, 
 def _said(true: np.ndarray, found: np.ndarray, low: float, high: float) -> list[str]:
     """The answers in numbers."""
     error = np.abs(found / true - 1)
-    said = [f"{len(true)} answers", f"median error {100 * np.median(error):.1f} %"]
+    said = [many(len(true), "answer"), f"median error {100 * np.median(error):.1f} %"]
     said.append(f"within 10 %: {100 * (error < 0.1).mean():.0f} %")
     outside = int(((found < low) | (found > high)).sum())
     return [*said, *([f"{outside} beyond the axes"] if outside else [])]

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from dhtorch import archive, lock, storage
+from dhtorch.console import many
 from dhtorch.data.files import need
 from dhtorch.data.scene import Scene, scenes_of
 from dhtorch.extract import columns, engines, plan, shards
@@ -117,12 +118,12 @@ def _write(
     complaints: list[str] = []
     engine = engines.run(options.engine, rows, positions, workers=settings["workers"], address=options.address)
     try:
-        with closing(progress(engine, f"{len(whole)} frames", len(positions))) as answers:  # type: ignore[type-var]
+        with closing(progress(engine, many(len(whole), "frame"), len(positions))) as answers:  # type: ignore[type-var]
             for shard in todo:
                 kept = engines.kept(islice(answers, len(shard.rows)), options.on_error, rows, complaints)
                 counts[shard.name] = shards.write(folder, shard, kept, rows.wanted, shared)
     except KeyboardInterrupt:
-        whole_ones = f"{len(counts)} of {len(every)} shards in {folder} are whole and stay"
+        whole_ones = f"{len(counts)} of {many(len(every), 'shard')} in {folder} are whole and stay"
         raise KeyboardInterrupt(f"{whole_ones}; the same command does the rest") from None
     _say(folder, counts, len(done), complaints)
     return 0
@@ -193,7 +194,7 @@ def _say(folder: Path, counts: Mapping[str, Counter[str]], n_before: int, compla
     skipped = total.pop("skipped", 0)
     size = sum(file.stat().st_size for file in shards.shard_files(folder))
     before = f" ({n_before} left untouched)" if n_before else ""
-    print(f"{folder}: {len(counts)} shard{'s' * (len(counts) != 1)}{before}, {total.total()} rows, {size / 1e6:.1f} MB")
+    print(f"{folder}: {many(len(counts), 'shard')}{before}, {many(total.total(), 'row')}, {size / 1e6:.1f} MB")
     said = [
         f"{n} {name.replace('_', ' ')}" for name, n in (*total.items(), ("skipped", skipped)) if n and name != "none"
     ]

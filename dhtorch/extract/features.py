@@ -13,7 +13,8 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from dhtorch.data.codecs.parquet import parquet_header, read_columns
-from dhtorch.data.files import FormatError, last_change
+from dhtorch.data.doors import last_change
+from dhtorch.data.files import FormatError
 from dhtorch.extract.columns import PLACE
 from dhtorch.extract.shards import described, shard_files
 from dhtorch.transform.leaves import find

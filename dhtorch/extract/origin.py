@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from dhtorch.data import files
+from dhtorch.data import doors, files
 from dhtorch.data.files import FormatError, need
 from dhtorch.data.lerobot_meta import Episodes, Meta, read_episodes, read_meta
 from dhtorch.data.recording import Recording
@@ -152,7 +152,7 @@ class RobotSet:
         return found
 
     def _stays(self, path: Path) -> bool:
-        return self.bounds is None or files.lies_in(path, self.bounds)
+        return self.bounds is None or doors.lies_in(path, self.bounds)
 
     def batches(self, i: int, tasks: list[str]) -> Iterator[Any]:
         """As :meth:`Origin.batches`; ``frame_index`` and ``task_index`` are added where they are missing."""

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from dhtorch import archive, export, integrate
 from dhtorch.codes import Source, names, words
+from dhtorch.console import many
 from dhtorch.data import files as data_files
 from dhtorch.data.pairs import Pair
 from dhtorch.data.recording import Recording
@@ -95,7 +96,9 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
             found.append(made.row)
             rows += [*_pair_rows(made), made.row]
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"{len(found)} of {len(sources)} scenes in {folder} are whole and stay") from None
+        raise KeyboardInterrupt(
+            f"{len(found)} of {many(len(sources), 'scene')} in {folder} are whole and stay"
+        ) from None
     result = _result(settings, sources, rows, found)
     archive.write(folder / "result.json", result)
     print("\n".join(_said(row, row["cell_m"]) for row in found))
@@ -171,21 +174,17 @@ def _fused(
     def seen(volume: integrate.Volume) -> integrate.Surface:
         return integrate.points(volume, min_weight=settings["min_weight"])
 
-    def after(source: int, volume: integrate.Volume) -> None:
-        if source != Source.SENSOR:
-            points[stages[source]] = seen(volume) if wide is None else union(points["sensor"], seen(volume))
-        elif "sensor" not in points:  # of the finest
-            points["sensor"] = seen(volume)
+    def after(source: int, volumes: list[integrate.Volume]) -> None:
+        if source == Source.SENSOR or wide is None:
+            points[stages[source]] = seen(volumes[0])
+        else:
+            points[stages[source]] = union(points["sensor"], seen(volumes[-1]))
 
     options = {k: settings[k] for k in ("cutoff", "min_conf", "min_maps")} | {"progress": progress}
     options |= {"sigma_m": settings["sensor_sigma_m"], "sigma_rel": settings["sensor_sigma_rel"], "max_reach": REACH}
     empty = [integrate.empty(settings["voxel"], truncation=settings["truncation"])]
     empty += [] if wide is None else [integrate.empty(wide)]
-    asked = [list(stages)] if wide is None else [[Source.SENSOR], list(stages)]
-    volumes = [
-        recordings.build(recording, volume, answers, places, sources=sources, after=after, **options)
-        for volume, sources in zip(empty, asked, strict=True)
-    ]
+    volumes = recordings.build_grids(recording, empty, answers, places, sources=list(stages), after=after, **options)
     return volumes, points
 
 
@@ -302,16 +301,17 @@ def _pair_rows(scene: MappedScene) -> list[Row]:
 
 def _said(row: Row, cell: float) -> str:
     """One scene in words."""
-    placed = f"{row['n_frames']} of {row['n_frames'] + row['n_unplaced']} frames placed by {row['truth']} poses"
-    fragments = f"{row['n_fragments']} fragment{'s' * (row['n_fragments'] != 1)}"
+    placed = f"{row['n_frames']} of {many(row['n_frames'] + row['n_unplaced'], 'frame')} placed by {row['truth']} poses"
+    fragments = many(row["n_fragments"], "fragment")
     if not row["n_voxels"]:
         return f"{row['scene']}: {placed}, {fragments}; no surface"
     wider = f", {row['voxels_vs_sensor']:.3g} times the sensor's" if row["voxels_vs_sensor"] else ""
     wider += f" and {row['voxels_vs_sparse']:.3g} times those without a sweep" if row.get("voxels_vs_sparse") else ""
-    islands = f"{row['n_islands']} islands, the largest {row['largest_island']:.0%}"
+    islands = f"{many(row['n_islands'], 'island')}, the largest {row['largest_island']:.0%}"
     size = f"{row['n_points']:,} points" + (f", {row['n_triangles']:,} triangles" if row["n_triangles"] else "")
     return (
-        f"{row['scene']}: {placed}, {fragments}; {row['n_voxels']} voxels of {100 * cell:g} cm{wider}, {islands};"
+        f"{row['scene']}: {placed}, {fragments};"
+        f" {many(row['n_voxels'], 'voxel')} of {100 * cell:g} cm{wider}, {islands};"
         f" {size}, {row['volume_mib']:.1f} MiB, {row['seconds']:.1f} s"
     )
 

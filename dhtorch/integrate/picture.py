@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.codes import Source, names, words
+from dhtorch.console import many
 from dhtorch.drawing import Canvas, Key, Stroke, colours, headed, save
 from dhtorch.drawing.colours import INK, of_source
 from dhtorch.geometry import se3
@@ -55,7 +56,7 @@ def draw_map(
     shown = {code: n for code, n in counts.items() if n or code != Source.SWEPT}
     *first, last = (words(names(Source)[code]) for code in shown)
     sources = f"{', '.join(first)} and {last}".capitalize()
-    pictures = {headed(f"Map of {len(cameras)} views", title): picture[..., :3], sources: picture[..., 3:]}
+    pictures = {headed(f"Map of {many(len(cameras), 'view')}", title): picture[..., :3], sources: picture[..., 3:]}
     metre = float(lens.f[0, 0] / depth[depth > 0].median()) if bool((depth > 0).any()) else None
     _side_by_side(path, pictures, dots, shown, metre)
 

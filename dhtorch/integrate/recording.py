@@ -193,8 +193,16 @@ def chain(pairs: Sequence[tuple[int, int]], *, chosen: bool = False) -> list[tup
 
 
 def build(
+    recording: Recording, volume: Volume, answers: Sequence[PairEstimate], places: Places, **options: Any
+) -> Volume:
+    """The volume after all placed frames: :func:`build_grids` of one."""
+    (built,) = build_grids(recording, [volume], answers, places, **options)
+    return built
+
+
+def build_grids(
     recording: Recording,
-    volume: Volume,
+    volumes: Sequence[Volume],
     answers: Sequence[PairEstimate],
     places: Places,
     *,
@@ -205,11 +213,13 @@ def build(
     min_conf: int = 1,
     min_maps: int = 2,
     max_reach: float = 3.0,
-    after: Callable[[int, Volume], None] = lambda _source, _volume: None,
+    after: Callable[[int, list[Volume]], None] = lambda _source, _volumes: None,
     progress: Callable[[Iterable[Any], str, int], Iterable[Any]] = lambda items, _text, _total: items,
-) -> Volume:
-    """The volume after all placed frames: first what the sensor says, frame by frame, then what was recovered, and then
-    what was swept.
+) -> list[Volume]:
+    """The volumes after all placed frames: first what the sensor says, frame by frame, then what was recovered, and
+    then what was swept.
+
+    The sensor's depth enters every volume, each frame read once for all of them; the rest enters the last one alone.
 
     Of a swept map whole patches may be wrong together, and float where other frames see through. So room is made for
     all maps first (:func:`dhtorch.integrate.reserve`): whatever the order, every ray that passes a place speaks of it.
@@ -217,41 +227,49 @@ def build(
 
     Args:
         recording: read once more, frame by frame.
-        volume: with four feature channels: red, green, blue and score.
+        volumes: with four feature channels: red, green, blue and score.
         answers, places: from :func:`ask` and :func:`place`.
         sources: which of the three to fuse.
         cutoff: m; returns beyond it are hidden.
         sigma_m, sigma_rel, min_conf: the sensor's noise and least confidence, as in stage 2.
         min_maps: swept maps that must agree on a surface of which nothing else speaks; of fewer maps all.
         max_reach: in truncations; a depth whose twofold sigma exceeds it says nothing.
-        after: is told the volume after each source: (codes.Source, volume).
+        after: is told the volumes after each source: (codes.Source, volumes).
         progress: wraps the loop over frames: (items, text, number of items) → items.
 
     Returns:
-        Volume; recovered points are splats of 1.5 voxels, added where the sensor has no usable return.
+        Volumes; recovered points are splats of 1.5 voxels, added where the sensor has no usable return.
     """
+    *finer, volume = volumes
     maps = [a for a in answers if a.pair[0] in places.poses and a.swept is not None and a.swept.n]
     for answer in progress(maps, f"{recording.name}: room", len(maps)) if Source.SWEPT in sources else ():
         volume = reserve(volume, swept(recording, answer, places), max_reach=max_reach)
     if Source.SENSOR in sources:
+        noise: dict[str, Any] = {"sigma_m": sigma_m, "sigma_rel": sigma_rel, "min_conf": min_conf}
         for k in progress(list(places.poses), f"{recording.name}: sensor", len(places.poses)):
             frame = range_split(recording[k].to(volume.distance.dtype), cutoff)
-            options: dict[str, Any] = {"sigma_m": sigma_m, "sigma_rel": sigma_rel, "min_conf": min_conf}
-            one = sensed(frame, places.poses[k], radius=PATCH * volume.voxel if recording.sparse else None, **options)
-            volume = fuse(volume, one)
-        after(Source.SENSOR, volume)
+            *finer, volume = (
+                _with_sensor(v, frame, places.poses[k], recording.sparse, noise) for v in (*finer, volume)
+            )
+        after(Source.SENSOR, [*finer, volume])
     if Source.RECOVERED in sources:
         placed = [a for a in answers if a.pair[0] in places.poses and bool(a.recovered.any())]
         for answer in progress(placed, f"{recording.name}: recovered", len(placed)):
             one = recovered(answer, places.poses[answer.pair[0]], radius=PATCH * volume.voxel)
             volume = fuse(volume, one, source=Source.RECOVERED, max_reach=max_reach)
-        after(Source.RECOVERED, volume)
+        after(Source.RECOVERED, [*finer, volume])
     if Source.SWEPT in sources:
         for answer in progress(maps, f"{recording.name}: swept", len(maps)):
             volume = fuse(volume, swept(recording, answer, places), source=Source.SWEPT, max_reach=max_reach)
         volume = confirmed(volume, max(1, min(min_maps, len(maps))))
-        after(Source.SWEPT, volume)
-    return volume
+        after(Source.SWEPT, [*finer, volume])
+    return [*finer, volume]
+
+
+def _with_sensor(volume: Volume, frame: Frame, T_world_from_cam: Pose, sparse: bool, noise: dict[str, Any]) -> Volume:
+    """The volume with what the sensor says in one frame."""
+    radius = PATCH * volume.voxel if sparse else None
+    return fuse(volume, sensed(frame, T_world_from_cam, radius=radius, **noise))
 
 
 def coverage(xyz: Tensor, cell: float) -> dict[str, Any]:

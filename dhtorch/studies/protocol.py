@@ -15,25 +15,23 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset
 
 from dhtorch import tree
 from dhtorch.codes import Gate, Hole, names
-from dhtorch.data.files import set_opencv_threads
-from dhtorch.data.pairs import Pair, between, fixed
+from dhtorch.data.pairs import Pair, fixed
 from dhtorch.data.recording import Recording, TruthRecording
 from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import errors, holdout
 from dhtorch.geometry.lookup import nearest, patches, round_half_up
-from dhtorch.leash import follow_parent
 from dhtorch.method import Method, Trace
 from dhtorch.offers import Picked, choosing, picked
 from dhtorch.records import NO_HINT, Estimate, Frame, PoseFit, Samples, TrackHint, Tracks
+from dhtorch.studies.loading import Offers, PairData, load, moved, offered_views
+from dhtorch.studies.outcome import Example, Outcome
 from dhtorch.studies.rows import Row, overlay, scene_row, summarise
 from dhtorch.studies.shared_tracks import SharedTracks
 
 Pairs = Callable[[Scene], Sequence[Pair] | Sequence[tuple[int, int]]]
-Offers = Callable[[Recording, int], Sequence[int]]  # (recording, anchor) → positions of other views
 Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
 
 #: A pair with fewer candidates says nothing: it is dropped and counted.
@@ -205,6 +203,11 @@ class Protocol:
         asked = list(dict.fromkeys(v.offers for v in self.variants.values() if v.offers is not None))
         return partial(_all_offered, asked) if asked else None
 
+    def views(self, pairs: Sequence[Pair]) -> int:
+        """Views that are loaded of every pair: as many as some variant asks for, and as a short gap holds."""
+        wanted = max((v.method.views for v in self.variants.values() if v.offers is None), default=1)
+        return min([wanted, *(max(1, j - i) for i, j in pairs if isinstance(j, int))])
+
     def batch(self, settings: Settings, pairs: Sequence[Pair]) -> int:
         """Pairs per call: one where anchors are offered differently many views."""
         return settings.batch if self.offers is None and not any(pair.offered for pair in pairs) else 1
@@ -218,65 +221,6 @@ class Protocol:
         for v in self.variants.values():
             if v.two_frames or v.fit is not None or (v.ask is not None and not v.chooses):
                 fixed(pairs)
-
-
-@dataclass(frozen=True)
-class Example:
-    """The first pair of a scene, kept for figures and the point cloud (batch size 1)."""
-
-    scene: str
-    method: str
-    frame: Frame  # as the method saw it
-    samples: Samples
-    estimate: Estimate
-    truth: holdout.Truth
-    pair: str = ""  # the anchor and the views that were used, as numbers of the recording
-    cutoff: float | None = None  # m
-    asked: dict[str, Any] | None = (
-        None  # as dhtorch.dense.complete takes it; None where the method was not simply asked
-    )
-
-    def cpu(self) -> Example:
-        """The same on the CPU, for figures."""
-        moved = {k: getattr(self, k).to("cpu") for k in ("frame", "samples", "estimate", "truth")}
-        return replace(self, **moved)
-
-
-@dataclass
-class Outcome:
-    """What a job found: rows of a result file, the summary over scenes, and an example of each scene."""
-
-    rows: list[Row] = field(default_factory=list)
-    summary: dict[str, Any] = field(default_factory=dict)
-    examples: list[Example] = field(default_factory=list)
-    n_pairs: int = 0
-    question: str | None = None
-    expectation: str | None = None
-    verdict: str | None = None
-    why: str | None = None
-    points: dict[tuple[str, str, str], errors.Points] = field(default_factory=dict)  # (scene, variant, cohort) → pool
-
-    def decide(self, question: str, expectation: str, holds: bool | None, why: str) -> Outcome:
-        """The same with the answer to its question: True supported, False refuted, None undecided."""
-        words = {True: "supported", False: "refuted", None: "undecided"}
-        return replace(self, question=question, expectation=expectation, verdict=words[holds], why=why)
-
-    def scenes(self, variant: str, cohort: str = "full") -> dict[str, Row]:
-        """Scene → its row, for one variant; scenes with a role are left out."""
-        wanted = (variant, cohort, None, None)
-        return {r["scene"]: r for r in self.rows if (r["method"], r["truth"], r["pair"], r.get("role")) == wanted}
-
-
-def join(outcomes: Iterable[Outcome]) -> Outcome:
-    """Several runs as one: their variants must bear different names."""
-    whole = Outcome()
-    for part in outcomes:
-        whole.rows += part.rows
-        whole.summary |= part.summary
-        whole.examples += [e for e in part.examples if e.scene not in {x.scene for x in whole.examples}]
-        whole.n_pairs += part.n_pairs
-        whole.points |= part.points
-    return whole
 
 
 def run(
@@ -303,52 +247,18 @@ def run(
         chosen = [Pair(*pair) for pair in pairs(scene)]  # first: a data set without pairs of views says so
         protocol.allows(chosen)
         collected = _Collected(scene, protocol, settings)
-        loader, size = _load(scene.recording, chosen, protocol, settings), protocol.batch(settings, chosen)
+        data = PairData(scene.recording, chosen, settings.dtype, protocol.views(chosen), protocol.offers)
+        size = protocol.batch(settings, chosen)
+        loader = load(data, batch=size, workers=settings.workers)
         for at, items in zip(range(0, len(chosen), size), progress(loader, scene.name, len(loader)), strict=True):
-            moved = [_to(item, settings.device) for item in items]
-            collected.add(Batch(scene, chosen[at : at + size], collected.cutoff, *moved))
+            shown = moved(tuple(items), settings.device)
+            collected.add(Batch(scene, chosen[at : at + size], collected.cutoff, *shown))
         outcome.rows += collected.rows()
         outcome.examples += collected.examples
         outcome.n_pairs += len(chosen)
         outcome.points |= {(scene.name, *k): tree.collate(p) for k, p in collected.pooled.items()}
     outcome.summary = summarise(outcome.rows, list(protocol.variants), list(protocol.cohorts))
     return outcome
-
-
-#: anchor, further views, anchor with its truth as depth, kinds of surface, disagreement of truth and sensor, views
-#: around it
-Loaded = tuple[Frame, tuple[Frame, ...], Frame, Tensor, Tensor, tuple[Frame, ...]]
-
-
-class PairData(Dataset[Loaded]):
-    """Pairs of one recording for a data loader."""
-
-    def __init__(
-        self,
-        recording: Recording,
-        pairs: Sequence[Pair],
-        dtype: torch.dtype,
-        views: int = 1,
-        offers: Offers | None = None,
-    ) -> None:
-        self.recording, self.pairs, self.dtype, self.views, self.offers = recording, pairs, dtype, views, offers
-
-    def __len__(self) -> int:
-        return len(self.pairs)
-
-    def __getitem__(self, index: int) -> Loaded:
-        i, other = pair = Pair(*self.pairs[index])
-        own = between(i, other, self.views) if isinstance(other, int) else []
-        offered = _offered(pair, self.recording, self.offers)
-        frames = {k: self.recording[k].to(self.dtype) for k in sorted({i, *own, *offered})}
-        anchor = frames[i]
-        others, around = (tuple(frames[k] for k in some) for some in (own, offered))
-        if not isinstance(self.recording, TruthRecording):
-            return anchor, others, anchor, torch.zeros(1, 1, 1), torch.full((1,), torch.nan), around
-        exact = self.recording.truth(i)
-        known = anchor.replace(depth=exact["depth"].to(self.dtype), depth_camera=None)
-        disagreement = exact.get("disagreement", torch.full((1,), torch.nan))
-        return anchor, others, known, exact["surface"].float(), disagreement, around
 
 
 class _Collected:
@@ -441,7 +351,7 @@ class _Collected:
 
     def _offered(self, batch: Batch) -> dict[int, Frame]:
         """Position → frame, as variants see it, of all that are offered."""
-        positions = _offered(batch.pairs[0], self.scene.recording, self.protocol.offers)
+        positions = offered_views(batch.pairs[0], self.scene.recording, self.protocol.offers)
         return {k: self.protocol.hide(view, self.cutoff) for k, view in zip(positions, batch.around, strict=True)}
 
     def _view_of(
@@ -450,7 +360,7 @@ class _Collected:
         """Other views of one variant, and what they are told apart by from those of others."""
         if variant.offers is None and views:
             return variant.method.views, list(views[-variant.method.views :])
-        positions = tuple(_offered(batch.pairs[0], self.scene.recording, variant.offers))
+        positions = tuple(offered_views(batch.pairs[0], self.scene.recording, variant.offers))
         return positions, [offered[k] for k in positions]
 
     def _ask(
@@ -477,7 +387,7 @@ class _Collected:
     def _picked(self, answer: Answer) -> Picked | None:
         """Which frames a variant chose that was offered some."""
         pair, offers = answer.batch.pairs[0], self.variants[answer.variant].offers
-        offered = _offered(pair, self.scene.recording, offers)
+        offered = offered_views(pair, self.scene.recording, offers)
         if not offered:  # silent, where frames were asked for and there are none
             return None if offers is None else Picked(pair.anchor, (), 0)
         return picked(pair.anchor, offered, answer.trace)
@@ -509,25 +419,6 @@ class _Collected:
                 self.apart.setdefault((answer.variant, cohort, kind), []).append(errors.select(estimate, there))
 
 
-def _load(recording: Recording, pairs: list[Pair], protocol: Protocol, settings: Settings) -> DataLoader[Loaded]:
-    wanted = max((v.method.views for v in protocol.variants.values() if v.offers is None), default=1)
-    views = min([wanted, *(max(1, j - i) for i, j in pairs if isinstance(j, int))])  # a short gap holds fewer frames
-    return DataLoader(
-        PairData(recording, pairs, settings.dtype, views, protocol.offers),
-        batch_size=protocol.batch(settings, pairs),
-        num_workers=settings.workers if pairs else 0,
-        collate_fn=_collate,
-        worker_init_fn=_worker,
-        # A fork would copy the locks of whatever threads torch and OpenCV run here, and may never return.
-        multiprocessing_context="spawn" if settings.workers and pairs else None,
-    )
-
-
-def _offered(pair: Pair, recording: Recording, offers: Offers | None) -> Sequence[int]:
-    """The frames among which a variant chooses; none where it takes the pair's own."""
-    return pair.offered or (() if offers is None else offers(recording, pair.anchor))
-
-
 def _all_offered(asked: Sequence[Offers], recording: Recording, anchor: int) -> list[int]:
     return sorted({k for offers in asked for k in offers(recording, anchor)})
 
@@ -538,23 +429,6 @@ def _nowhere(image_0: Tensor, image_1: Tensor, uv_0: Tensor, *, hint: TrackHint 
     lost = torch.zeros_like(zero, dtype=torch.bool)
     cov = torch.eye(2).to(uv_0).expand(*zero.shape, 2, 2)
     return Tracks(uv_0=uv_0, uv_1=uv_0, error=zero, photometric=zero, cov=cov, valid=lost)
-
-
-def _collate(items: list[Loaded]) -> Loaded:
-    anchor, others, exact, surface, disagreement, around = zip(*items, strict=True)
-    views, offered = (tuple(tree.collate(v) for v in zip(*many, strict=True)) for many in (others, around))
-    return tree.collate(anchor), views, tree.collate(exact), torch.cat(surface), torch.cat(disagreement), offered
-
-
-def _to(item: Any, device: str) -> Any:
-    return tuple(_to(i, device) for i in item) if isinstance(item, tuple) else item.to(device)
-
-
-def _worker(_number: int) -> None:
-    """One thread in a worker of a loader, which ends with this process."""
-    follow_parent()
-    torch.set_num_threads(1)
-    set_opencv_threads(1)
 
 
 def _is_cut(cutoff: float | None) -> bool:

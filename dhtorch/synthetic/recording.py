@@ -17,6 +17,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Generator, Tensor
 
+from dhtorch.console import many
 from dhtorch.data.recording import TruthRecording, numbers
 from dhtorch.data.scene import Scene
 from dhtorch.geometry import se3
@@ -124,7 +125,7 @@ class SyntheticRoom(TruthRecording):
         return {**self.__dict__, "_frames": {}}  # a worker renders what it needs
 
     def __repr__(self) -> str:
-        return f"SyntheticRoom(seed={self.seed}, path={self.path!r}, lidar={self.lidar!r}, {len(self)} frames)"
+        return f"SyntheticRoom(seed={self.seed}, path={self.path!r}, lidar={self.lidar!r}, {many(len(self), 'frame')})"
 
     def truth(self, index: int) -> dict[str, Tensor]:
         """What is really there at the centre of every image pixel of frame ``index``.

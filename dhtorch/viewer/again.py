@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from dhtorch import archive
+from dhtorch import older
 
 #: Group of the settings → modules whose public functions it may name.
 NAMED = {
@@ -48,7 +48,7 @@ def parts(result: Mapping[str, Any], root: str | Path | None = None) -> dict[str
         ValueError: the settings name a function that is none of :data:`NAMED`, or one that takes other options.
         OSError: its data are not there.
     """
-    config = archive.today(result["config"])
+    config = older.today(result["config"])
     for group in NAMED:
         if not isinstance(config.get(group), Mapping):
             raise ValueError(f"result.config.{group}: found {config.get(group)!r}, expected settings with a _target_")

@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dhtorch.data.files import MAX_BYTES, FormatError, check_file, need, opened, unreadable
+from dhtorch.data.doors import check_file, opened, unreadable
+from dhtorch.data.files import MAX_BYTES, FormatError, need
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _FILTERS = {"gzip", "lzf", "shuffle", "fletcher32"}  # come with the library

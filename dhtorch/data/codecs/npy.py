@@ -18,7 +18,8 @@ from typing import NamedTuple
 import numpy as np
 
 from dhtorch.data.codecs.zips import check_directory
-from dhtorch.data.files import MAX_BYTES, FormatError, allow, read_bytes
+from dhtorch.data.doors import allow
+from dhtorch.data.files import MAX_BYTES, FormatError, read_bytes
 
 #: Bytes in which a header ends.
 _HEAD = 12_288

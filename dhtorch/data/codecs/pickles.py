@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from dhtorch.data import files
+from dhtorch.data import doors, files
 from dhtorch.data.codecs.npy import npy_header
 from dhtorch.data.files import FormatError
 from dhtorch.data.pickled_arrays import CALLS, NAMES, SCALARS, Name, Shell, built, filled, scalar
@@ -83,7 +83,7 @@ class _Machine:
         self.stack: list[Any] = []
         self.memo: dict[int, Any] = {}
         self.steps = self.nodes = 0
-        self.taken, self.most = 0, max(files.MAX_MEMORY, files.GROWTH * len(data))  # bytes of Python's own objects
+        self.taken, self.most = 0, max(doors.MAX_MEMORY, doors.GROWTH * len(data))  # bytes of Python's own objects
         self.budget = 4 * len(data) + 4096  # bytes that calls may make of this file; shared values could multiply
 
     def run(self) -> Any:
@@ -137,7 +137,7 @@ class _Machine:
     def take_memory(self, n: int) -> None:
         self.taken += n
         if self.taken > self.most:
-            files.allow(self.file, "pickle", self.taken, f"{self.steps} instructions", len(self.data))
+            doors.allow(self.file, "pickle", self.taken, f"{self.steps} instructions", len(self.data))
 
     def top(self, kind: type) -> Any:
         if type(self.stack[-1]) is not kind:

@@ -14,14 +14,14 @@ from __future__ import annotations
 import os
 from collections import OrderedDict
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from dhtorch.data.codecs.mp4 import FIRST, check_samples
-from dhtorch.data.files import FormatError, last_change, need, opened
+from dhtorch.data.doors import last_change, opened
+from dhtorch.data.files import FormatError, need
 
 MAX_VIDEO_PIXELS = 36_000_000  # 8K; a decoder holds up to 17 pictures
 _MAX_FRAMES = 10_000_000
@@ -105,17 +105,6 @@ def _luma(frame: Any) -> np.ndarray:
     plane, deep = frame.planes[0], frame.format.components[0].bits > 8
     rows = np.frombuffer(plane, "<u2" if deep else np.uint8).reshape(-1, plane.line_size // (2 if deep else 1))
     return rows[: frame.height, : frame.width].copy()
-
-
-def count_decodable(file: Path, *, all_frames: bool = False) -> int:
-    """Frames that really decode, by decoding them all; compare with ``video_header(file).n``."""
-    decoder = _decoder(file, all_frames)
-    found = 0
-    for i in range(len(decoder.table())):
-        with suppress(FormatError):
-            decoder.frame(i)
-            found += 1
-    return found
 
 
 def close_videos() -> None:

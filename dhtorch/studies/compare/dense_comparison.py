@@ -33,6 +33,7 @@ from dhtorch.records import DepthMap, Estimate, Frame, Pose, Samples
 from dhtorch.studies import protocol
 from dhtorch.studies.baselines import filling, stereo
 from dhtorch.studies.compare.exact_rooms import within_one
+from dhtorch.studies.outcome import join
 from dhtorch.studies.protocol import Batch, Outcome, Pairs, Progress, Protocol, Settings, Variant
 from dhtorch.studies.rows import Row
 
@@ -191,7 +192,7 @@ def run(
         cohorts: dict[str, protocol.Cohort] = {RECTIFIABLE: partial(_far, only=True), FULL: _far}
         whole = Protocol(variants, cohorts=cohorts, min_candidates=0 if turning else protocol.MIN_CANDIDATES)
         parts.append(protocol.run(asked, whole, some, settings, progress=progress))
-    outcome = protocol.join(parts)
+    outcome = join(parts)
     outcome.summary |= _summary(outcome, {scene.name: scene.place for scene in every}, indoor, peers)
     outcome.summary["dense.rotation_answered"] = turned(outcome)
     if rooms:

@@ -20,6 +20,7 @@ from dhtorch.evaluate import bootstrap, risk
 from dhtorch.evaluate.errors import Points
 from dhtorch.studies import protocol
 from dhtorch.studies.compare.method_comparison import leave_first_seed, named, seeds_of
+from dhtorch.studies.outcome import join
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
 from dhtorch.studies.rows import Row
 
@@ -85,7 +86,7 @@ def run(
         variants = _variants(methods, {gap: fixed[gap] for gap in asked_gaps}, settings.seed, seeds)
         whole = Protocol(variants, min_candidates=least)  # a turn is judged by its holes
         parts.append(protocol.run(some, whole, asked, settings, progress=progress))
-    outcome = protocol.join(parts)
+    outcome = join(parts)
     leave_first_seed(outcome, (*fixed.values(), "auto"), seeds)
     apart = {scene.name for scene in every if scene.role is not None}
     alone = {scene.name for scene in every if scene.name not in apart and _one_partner(scene, asked)}

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dhtorch.console import many
 from dhtorch.data import files
 from dhtorch.data.codecs import exr
 from dhtorch.data.files import FormatError
@@ -79,7 +80,9 @@ def read(
         max_depth=max_depth,
     )
     odd = [(k, *v) for k, v in samples.items() if k not in whole]
-    report = tuple(f"sample {k}: {len(a)} pictures and {len(b)} depth maps: left out" for k, a, b in odd)
+    report = tuple(
+        f"sample {k}: {many(len(a), 'picture')} and {many(len(b), 'depth map')}: left out" for k, a, b in odd
+    )
     return Stacks(root.resolve().name, "fod500", load, tuple(whole), root, report)
 
 

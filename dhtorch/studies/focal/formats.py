@@ -10,7 +10,8 @@ from types import ModuleType
 from typing import Any, Final
 
 from dhtorch.data import scenes_root
-from dhtorch.data.files import FormatError, inside
+from dhtorch.data.doors import inside
+from dhtorch.data.files import FormatError
 from dhtorch.studies.focal import ddff12, fod500, image_folder
 from dhtorch.studies.focal.stacks import Stacks
 

@@ -11,9 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dhtorch.console import many
 from dhtorch.data import files
 from dhtorch.data.codecs import tiff
-from dhtorch.data.files import FormatError, inside
+from dhtorch.data.doors import inside
+from dhtorch.data.files import FormatError
 from dhtorch.records import Camera
 from dhtorch.tree import Record, record
 
@@ -59,7 +61,7 @@ class Stacks(Sequence[FocalStack]):
         if not self.names:
             raise ValueError(f"stacks {self.name}: found none, expected at least one")
         if self.scenes is not None and len(self.scenes) != len(self.names):
-            found = f"{len(self.scenes)} scenes of {len(self.names)} stacks"
+            found = f"{many(len(self.scenes), 'scene')} of {many(len(self.names), 'stack')}"
             raise ValueError(f"stacks {self.name}: found {found}, expected one for each")
 
     def by_scene(self) -> dict[str, list[int]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dhtorch.console import many
 from dhtorch.data.survey import Survey, Tile, camera_words, pixel_kind, say_depths, warn_of_duplicates
 from dhtorch.studies.focal.stacks import FocalStack, Stacks
 
@@ -12,7 +13,7 @@ def survey_stacks(stacks: Stacks, shown: int = 8) -> Survey:
     stack: FocalStack = stacks[0]
     images = stack.images[0]
     s, c, h, w = images.shape
-    out.say("focal stacks", f"{len(stacks)}, of {s} pictures each")
+    out.say("focal stacks", f"{len(stacks)}, of {many(s, 'picture')} each")
     out.say("pictures", f"{w}x{h}, {pixel_kind(c, images)}")
     if stack.focus_m is None:
         out.warn("no focus distances: the order of the pictures is all that is known")

@@ -21,6 +21,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from dhtorch.console import many
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Given, Scene, scenes_of
 from dhtorch.evaluate import bootstrap
@@ -143,7 +144,7 @@ def chain_of(recording: Recording, links: int) -> list[Item]:
         ValueError: fewer than two frames, or no link to make.
     """
     if len(recording) < 2 or links < 1:
-        found = f"{len(recording)} frames of {recording.name} and links={links}"
+        found = f"{many(len(recording), 'frame')} of {recording.name} and links={links}"
         raise ValueError(f"icp: found {found}, expected at least two frames and one link")
     if recording.poses is None:
         return []

@@ -16,6 +16,7 @@ from dhtorch.data.scene import Given
 from dhtorch.evaluate import bootstrap
 from dhtorch.stages.sample import grid, vogel
 from dhtorch.studies import protocol
+from dhtorch.studies.outcome import join
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
 
 QUESTION = "Which part of the method does the result hang on?"
@@ -65,7 +66,7 @@ def run(
         progress=progress,
     )
     near.summary = {f"cutoff x0.5.{k}": v for k, v in near.summary.items()}
-    outcome = protocol.join([main, near])
+    outcome = join([main, near])
     ratios = {k: _ratio(outcome, k, name) for k in [*changed, "cutoff x0.5"] if k != name}
     for k, (value, count) in ratios.items():
         outcome.summary[f"{k}.median_rel_ratio"] = bootstrap.single(value, count)

@@ -15,6 +15,7 @@ from dhtorch.data.scene import Given
 from dhtorch.evaluate import bootstrap, errors, reliability, risk
 from dhtorch.studies import protocol
 from dhtorch.studies.cohorts import HeldOut, everything
+from dhtorch.studies.outcome import join
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
 from dhtorch.studies.rows import Row, summarise
 
@@ -49,7 +50,7 @@ def run(
         held = HeldOut(method, settings.seed)
         asked = Protocol({name: held.variant()}, {"heldout": held.heldout}, everything)
         parts.append(protocol.run(scenes, asked, pairs, settings, progress=progress))
-    outcome = protocol.join(parts)
+    outcome = join(parts)
     for row in outcome.rows:
         key = (row["scene"], row["method"], row["truth"])
         if row["pair"] is None and key in outcome.points:

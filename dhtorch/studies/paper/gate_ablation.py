@@ -17,6 +17,7 @@ from dhtorch.data.pairs import Pair, by_gap, by_scaled_gap
 from dhtorch.data.scene import Given, Scene
 from dhtorch.studies import protocol
 from dhtorch.studies.cohorts import HeldOut, everything
+from dhtorch.studies.outcome import join
 from dhtorch.studies.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings
 
 QUESTION = "Which gate carries the abstention, and how does the frame gap trade error for coverage?"
@@ -63,7 +64,7 @@ def run(
         scenes, Protocol(variants, {"heldout": split.heldout}, everything), pairs, settings, progress=progress
     )
     parts = [main, *sweep(scenes, split, at_gaps(factors, gaps), settings, progress)]
-    outcome = protocol.join(parts)
+    outcome = join(parts)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome.summary))
 
 

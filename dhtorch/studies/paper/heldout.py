@@ -19,6 +19,7 @@ from dhtorch.data.scene import Given
 from dhtorch.evaluate import bootstrap
 from dhtorch.studies import protocol
 from dhtorch.studies.cohorts import HeldOut, everything
+from dhtorch.studies.outcome import join
 from dhtorch.studies.protocol import Answer, Method, Outcome, Pairs, Progress, Protocol, Settings
 from dhtorch.studies.rows import Row
 
@@ -54,7 +55,7 @@ def run(
         part = protocol.run(scenes, asked, pairs, settings, progress=progress)
         part.summary |= {f"{name}.{k}": v for k, v in _judge(part.rows, name).items()}
         parts.append(part)
-    outcome = protocol.join(parts)
+    outcome = join(parts)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, next(iter(methods))))
 
 

@@ -19,6 +19,7 @@ from dhtorch.evaluate import bootstrap
 from dhtorch.evaluate.correlation import spearman
 from dhtorch.studies import protocol
 from dhtorch.studies.cohorts import HeldOut
+from dhtorch.studies.outcome import join
 from dhtorch.studies.paper.gate_ablation import at_gaps, sweep
 from dhtorch.studies.paper.heldout import reach
 from dhtorch.studies.protocol import Answer, Method, Outcome, Pairs, Progress, Settings
@@ -52,7 +53,7 @@ def run(
     """
     split = HeldOut(next(iter(methods.values())), settings.seed)
     parts = sweep(scenes, split, at_gaps(factors, ()), settings, progress, partial(columns, split))
-    outcome = protocol.join(parts)
+    outcome = join(parts)
     for name in dict.fromkeys(r["scene"] for r in outcome.rows):
         trend = _trend([r for r in outcome.rows if r["scene"] == name and r["pair"] is not None])
         for row in outcome.rows:

@@ -18,6 +18,7 @@ from dhtorch.data.scene import Given
 from dhtorch.studies import protocol
 from dhtorch.studies.baselines.sensor_only import sensor_only
 from dhtorch.studies.cohorts import device_fit, has_trajectory
+from dhtorch.studies.outcome import join
 from dhtorch.studies.protocol import Answer, Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
 from dhtorch.studies.rows import Row
 
@@ -72,7 +73,7 @@ def run(
         part = protocol.run(scenes, Protocol({name: Variant(method)}, columns=_truth), pairs, at, progress=progress)
         part.summary = {f"{name}.{k}": v for k, v in part.summary.items()}
         parts.append(part)
-    outcome = protocol.join(parts)
+    outcome = join(parts)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome.summary))
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from dhtorch import archive
-from dhtorch.console import EPILOG, progress, verbosity
+from dhtorch.console import EPILOG, many, progress, verbosity
 from dhtorch.studies.report import jobs, page, text
 from dhtorch.studies.report.advice import advice
 from dhtorch.studies.report.layouts import SHOWN, in_layout
@@ -108,7 +108,7 @@ def main(argv: Sequence[str]) -> int:
     paths = list(_found(options.result))
     results = [archive.read(path) for path in progress(paths, "results", len(paths))]
     if options.html:
-        print(f"wrote {page.write(options.html, results)}: {len(results)} result{'s' * (len(results) != 1)}")
+        print(f"wrote {page.write(options.html, results)}: {many(len(results), 'result')}")
         return 0
     for folder in options.result:
         mine = [r for path, r in zip(paths, results, strict=True) if path != folder and path.is_relative_to(folder)]

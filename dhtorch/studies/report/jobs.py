@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dhtorch import storage
+from dhtorch.console import many
 from dhtorch.studies.report.cells import NOTHING, head, show
 from dhtorch.studies.report.reading import Result, entry, variants
 from dhtorch.studies.report.tables import Table
@@ -79,7 +80,7 @@ def table(results: Sequence[Result]) -> Table | None:
             wanted = max(values.values()) if more else min(values.values())
             best |= {(n, k) for n, v in values.items() if v == wanted and len(set(values.values())) > 1}
     named = {"coverage_at_5": "coverage at 5 %", "ms": "ms"}
-    title = f"{len(results)} jobs"
+    title = many(len(results), "job")
     return Table(title, [*heads, *(named.get(m) or head(m) for m in METRICS)], body, len(heads), best=frozenset(best))
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dhtorch.codes import words
+from dhtorch.console import many
 from dhtorch.studies.report.cells import NOTHING, between, exact, head, show
 from dhtorch.studies.report.published import Published
 from dhtorch.studies.report.reading import (
@@ -208,7 +209,7 @@ def source(result: Result, quoted: Published) -> str:
     """Where the paper's figures are from, and that ours are from elsewhere."""
     data = result["data"]
     n = len(data["scenes"])
-    ours = f"Ours: {data['name']}, {n} scene{'s' * (n != 1)}."
+    ours = f"Ours: {data['name']}, {many(n, 'scene')}."
     return " ".join((f"Published: {quoted.where}, {quoted.data}.", *quoted.notes, ours))
 
 
@@ -252,7 +253,7 @@ def _spread(found: Mapping[str, Any], metric: str) -> str:
 
 def _n_scenes(rows: Sequence[Row]) -> str:
     n, silent = len(rows), sum(bool(row.get("note")) for row in rows)
-    return f"{n - silent} of {n} scenes" if silent else f"{n} scene{'s' * (n != 1)}"
+    return f"{n - silent} of {many(n, 'scene')}" if silent else many(n, "scene")
 
 
 def _cited(
