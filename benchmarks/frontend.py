@@ -5,7 +5,8 @@
 One view of the built-in room with its LiDAR model (depth 192x256 with confidence), the picture resampled to 224x224 and
 1440x1920, three channels uint8, interleaved in memory as decoders leave them. The peer answers the same questions about
 the same pixels in numpy + OpenCV: depth, points, noise, confidence, flags, texture, class. Both sides keep the spiral,
-which depends on the picture's size alone. Mode ``compiled`` is ``torch.compile`` of the three stages, ``native`` reads
+which depends on the picture's size alone. Mode ``compiled`` is ``torch.compile`` of the three stages
+with calls in C++ (``options={"cpp_wrapper": True}``), ``native`` reads
 windows with the compiled code of ``python -m dhtorch.native``.
 
 Errors: median relative difference of the trackability from float64 arithmetic on grey values that were not rounded.
@@ -127,7 +128,7 @@ def exact_trackability(frame: Frame, n: int) -> Tensor:
 def compiled(call: Callable[..., Samples], *args: Any) -> tuple[Callable[[], Samples], float]:
     """The call compiled for its arguments, and the seconds that took."""
     torch.compiler.reset()
-    fast = partial(torch.compile(call), *args)
+    fast = partial(torch.compile(call, options={"cpp_wrapper": True}), *args)
     start = time.perf_counter()
     fast()
     return fast, time.perf_counter() - start

@@ -30,7 +30,7 @@ import recoders  # noqa: E402
 from test_hostile import SAMPLES  # noqa: E402
 
 from dhtorch import storage  # noqa: E402
-from dhtorch.data.files import MAX_MEMORY  # noqa: E402
+from dhtorch.data.doors import MAX_MEMORY  # noqa: E402
 
 SOME, MANY = 150, 1000  # cases of every format
 SECONDS = 20  # of a processor

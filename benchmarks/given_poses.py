@@ -34,9 +34,6 @@ from dhtorch.stages import given
 from dhtorch.synthetic import SyntheticRoom
 from dhtorch.tree import collate
 
-#: Pieces of one room.
-KITCHEN = ("000", "200", "400", "600")
-
 #: Captures whose poses come from a device or a tracker, with cutoff (m), frames between two views, and what they need.
 CAPTURES: tuple[dict[str, Any], ...] = (
     {"path": "holo_a", "near": 2.5, "gap": 3},

@@ -179,11 +179,6 @@ def _xyzw(q: Tensor) -> Tensor:
     return q.roll(-1, -1)
 
 
-def _response_at(x: Tensor, uv: Tensor) -> Tensor:
-    u, v = uv[..., 0].clamp(0, 639), uv[..., 1].clamp(0, 479)
-    return gftt_response(luma(x, 1)).flatten(1).gather(1, (v * 640 + u).long())
-
-
 def _normalised(x: Tensor) -> Tensor:
     mean, std = (x.new_tensor(c).view(3, 1, 1) for c in (dinov2.COLOUR_MEAN, dinov2.COLOUR_STD))
     return (x - mean) / std

@@ -21,7 +21,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from dhtorch import archive, storage
+from dhtorch import archive, older, storage
 from dhtorch.commands.run import config_dir, job_name
 
 HERE = Path(__file__).resolve().parent
@@ -152,7 +152,7 @@ def check(name: str) -> list[str]:
         return [f"no {path.name}; run: {command(name)}"]
     if name in SCRIPTS:
         return []
-    config = archive.today(archive.read(path)["config"])
+    config = older.today(archive.read(path)["config"])
     return [f"{path.name}: {line}; run: {command(name)}" for line in differences(config, settings(name))]
 
 
