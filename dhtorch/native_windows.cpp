@@ -1,6 +1,6 @@
-// A few numbers about the window around each sample: extremes of depth, brightness, texture. Twin of
-// what dhtorch/geometry/lookup.py reads for stages 2 and 3, which is the reference: whole numbers are exact, sums are
-// taken in torch's order. One thread, no gradient. Callers check shapes, types and strides.
+// A few numbers about the window around each sample: extremes of depth, brightness, texture; and what stages 2 and 3 make of
+// them. Twin of dhtorch/geometry/lookup.py, stages/backproject.py and stages/holes.py, which are the reference: whole numbers are exact, textures up to
+// the rounding of their sums. One thread, no gradient. Callers check shapes, types and strides.
 
 #include <torch/csrc/stable/library.h>
 
@@ -13,8 +13,8 @@
 
 namespace {
 
-// Rows of a window, with room for the lanes that are computed beside it; points that are summed together.
-constexpr int64_t WIDE = 16, ROOM = WIDE + 2, POINTS = 16;
+// Rows of a window, with room for the lanes that are computed beside it.
+constexpr int64_t WIDE = 16, ROOM = WIDE + 2;
 
 // Images as one row of numbers, the steps in it, and the samples (B, N, 2) whose windows are asked.
 struct Windows {
@@ -39,22 +39,48 @@ Windows windows(const Tensor& pixel, int64_t image, int64_t channel, int64_t row
   return {image, channel, row, column, channels, height, width, size, data<int32_t>(pixel), pixel.size(0), pixel.size(1)};
 }
 
+inline void extend(float read, float& least, float& most) {
+  const float z = std::isfinite(read) ? read : 0.0f;
+  least = z > 0 ? std::min(least, z) : least;
+  most = std::max(most, z);
+}
+
+constexpr int64_t EIGHT = 8;
+typedef float Eight __attribute__((vector_size(EIGHT * sizeof(float))));
+
+// Of five rows of five returns, which are read with the three beside them.
+inline void five_extremes(const float* at, int64_t row, float& least, float& most) {
+  const Eight none = {};
+  Eight low = none + std::numeric_limits<float>::infinity(), high = none;
+  for (int64_t y = 0; y < 5; ++y) {
+    Eight read;
+    std::memcpy(&read, at + y * row, sizeof(read));
+    const Eight z = (read > none) & (read < std::numeric_limits<float>::infinity() + none) ? read : none;
+    low = (z > none) & (z < low) ? z : low;
+    high = z > high ? z : high;
+  }
+  for (int64_t x = 0; x < 5; ++x) {
+    least = std::min(least, low[x]);
+    most = std::max(most, high[x]);
+  }
+}
+
 // depth (B h w) float32; found (2, B, N): the smallest and the largest return, infinity and 0 where there is none.
 void window_extremes(Tensor depth, Tensor pixel, Tensor found, int64_t image, int64_t channel, int64_t row, int64_t column,
                      int64_t channels, int64_t height, int64_t width, int64_t size) {
   const Windows w = windows(pixel, image, channel, row, column, channels, height, width, size);
-  const float* from = data<float>(depth);
+  const float *from = data<float>(depth), *end = from + w.batch * height * width;
   const int64_t all = w.batch * w.n;
   float *low = data<float>(found), *high = low + all;
   for (int64_t b = 0, i = 0; b < w.batch; ++b) {
     for (int64_t k = 0; k < w.n; ++k, ++i) {
       const float* at = from + w.first(b, k);
       float least = std::numeric_limits<float>::infinity(), most = -least;
-      for (int64_t y = 0; y < size; ++y) {
-        for (int64_t x = 0; x < size; ++x) {
-          const float read = at[y * row + x * column], z = std::isfinite(read) ? read : 0.0f;
-          least = z > 0 ? std::min(least, z) : least;
-          most = std::max(most, z);
+      if (size == 5 && column == 1 && at + 4 * row + EIGHT <= end) {
+        five_extremes(at, row, least, most);
+      } else {
+        for (int64_t y = 0; y < size; ++y) {
+          for (int64_t x = 0; x < size; ++x) extend(at[y * row + x * column], least, most);
         }
       }
       low[i] = least;
@@ -72,6 +98,14 @@ template <int64_t SIZE>
 void sums(const uint8_t* at, const Windows& w, int32_t* sum) {
   const int64_t size = SIZE ? SIZE : w.size;
   std::fill_n(sum, w.channels, 0);
+  if (SIZE == 5 && w.column == 3 && at + 4 * w.row + WIDE <= w.end) {
+    uint16_t all[WIDE] = {};  // of five rows of five pixels, and of the byte beside them
+    for (int64_t y = 0; y < 5; ++y) {
+      for (int64_t x = 0; x < WIDE; ++x) all[x] += at[y * w.row + x];
+    }
+    for (int64_t c = 0; c < 3; ++c) sum[c] = all[c] + all[c + 3] + all[c + 6] + all[c + 9] + all[c + 12];
+    return;
+  }
   if (w.column == 3) {
     int32_t all[3 * WIDE] = {};
     for (int64_t y = 0; y < size; ++y) {
@@ -91,8 +125,9 @@ void sums(const uint8_t* at, const Windows& w, int32_t* sum) {
 // channel, all of them from 0 to 255.
 void window_brightness(Tensor picture, Tensor pixel, Tensor found, int64_t image, int64_t channel, int64_t row,
                        int64_t column, int64_t channels, int64_t height, int64_t width, int64_t size) {
-  const Windows w = windows(pixel, image, channel, row, column, channels, height, width, size);
+  Windows w = windows(pixel, image, channel, row, column, channels, height, width, size);
   const uint8_t* from = data<uint8_t>(picture);
+  w.end = from + w.batch * channels * height * width;
   const int64_t all = w.batch * w.n;
   float* to = data<float>(found);
   for (int64_t b = 0, i = 0; b < w.batch; ++b) {
@@ -179,59 +214,50 @@ inline void grey_row(const uint8_t* at, const Windows& w, bool whole, float* __r
   }
 }
 
-// Squared and mixed gradients of points side by side, summed as torch sums rows: sixteen at a time, these one by one.
-struct Sums {
-  float part[3][POINTS] = {}, whole[3][POINTS] = {};
-  int64_t n = 0;
-
-  void add(const float* __restrict g_x, const float* __restrict g_y) {
-    for (int64_t p = 0; p < POINTS; ++p) {
-      part[0][p] += g_x[p] * g_x[p];
-      part[1][p] += g_x[p] * g_y[p];
-      part[2][p] += g_y[p] * g_y[p];
-    }
-    if (++n % 16) return;
-    for (int64_t s = 0; s < 3; ++s) {
-      for (int64_t p = 0; p < POINTS; ++p) {
-        whole[s][p] += part[s][p];
-        part[s][p] = 0.0f;
-      }
-    }
-  }
-};
-
 // Where rows of grey values lie, and how far apart.
 struct Rows {
   const float* first;
   int64_t step;
 };
 
-// Gradients of one point's window, of its inner pixels in the order in which torch sums them, which of interleaved pixels
-// is column by column.
-template <int64_t SIZE>
-void gradients(const Rows& grey, const Windows& w, bool whole, float* __restrict slopes) {
-  const int64_t size = SIZE ? SIZE : w.size, inner = size - 2;
-  const int64_t down = 2 * POINTS * (whole ? 1 : inner), right = 2 * POINTS * (whole ? inner : 1);
-  for (int64_t y = 0; y < inner; ++y) {
-    const float *a = grey.first + y * grey.step, *b = a + grey.step, *c = b + grey.step;
-    float g_x[WIDE], g_y[WIDE];
-    for (int64_t x = 0; x < WIDE; ++x) {
-      g_x[x] = fused(b[x + 2] - b[x], 2.0f, (a[x + 2] - a[x]) + (c[x + 2] - c[x]));
-      g_y[x] = fused(c[x + 1] - a[x + 1], 2.0f, (c[x] - a[x]) + (c[x + 2] - a[x + 2]));
-    }
-    for (int64_t x = 0; x < inner; ++x) {
-      slopes[y * down + x * right] = g_x[x];
-      slopes[y * down + x * right + POINTS] = g_y[x];
-    }
-  }
+// The smaller eigenvalue of ((a, b), (b, c)), as dhtorch/geometry/small.py finds it.
+inline float smaller(float a, float b, float c) {
+  const float half = (a - c) / 2, middle = (a + c) / 2, square = half * half + b * b;
+  return middle - (square > 0 ? std::sqrt(square) : square);
 }
 
-// Gradients of a window whose pixels are read for it alone.
+// Of the gradient matrix summed over a window's inner pixels: columns side by side, each over all rows. What happens to lie
+// beside the window is computed and left out.
 template <int64_t SIZE>
-void read_gradients(const uint8_t* at, const Windows& w, bool whole, float* slopes) {
-  float grey[WIDE * ROOM] = {};  // what happens to lie beside a window is computed, too, and costs more where it is no number
+inline float least_texture(const Rows& grey, int64_t size) {
+  constexpr int64_t SIDE = SIZE == 9 ? 8 : WIDE;
+  const int64_t inner = (SIZE ? SIZE : size) - 2;
+  float xx[SIDE] = {}, xy[SIDE] = {}, yy[SIDE] = {};
+  for (int64_t y = 0; y < inner; ++y) {
+    const float *a = grey.first + y * grey.step, *b = a + grey.step, *c = b + grey.step;
+    for (int64_t x = 0; x < SIDE; ++x) {
+      const float g_x = fused(b[x + 2] - b[x], 2.0f, (a[x + 2] - a[x]) + (c[x + 2] - c[x]));
+      const float g_y = fused(c[x + 1] - a[x + 1], 2.0f, (c[x] - a[x]) + (c[x + 2] - a[x + 2]));
+      xx[x] += g_x * g_x;
+      xy[x] += g_x * g_y;
+      yy[x] += g_y * g_y;
+    }
+  }
+  float each[3] = {};
+  for (int64_t x = 0; x < inner; ++x) {
+    each[0] += xx[x];
+    each[1] += xy[x];
+    each[2] += yy[x];
+  }
+  return smaller(each[0], each[1], each[2]);
+}
+
+// Of a window whose pixels are read for it alone.
+template <int64_t SIZE>
+float read_texture(const uint8_t* at, const Windows& w, bool whole) {
+  float grey[WIDE * ROOM] = {};  // beside a window as well, where what is no number would cost more
   for (int64_t y = 0; y < (SIZE ? SIZE : w.size); ++y) grey_row<SIZE>(at + y * w.row, w, whole, grey + y * ROOM);
-  gradients<SIZE>({grey, ROOM}, w, whole, slopes);
+  return least_texture<SIZE>({grey, ROOM}, w.size);
 }
 
 // Grey values of an interleaved picture, where its windows have more rows than it has vectors; nothing elsewhere.
@@ -245,12 +271,6 @@ bool grey_picture(const uint8_t* at, const Windows& w, bool whole, std::vector<f
   return true;
 }
 
-// The smaller eigenvalue of ((a, b), (b, c)), as dhtorch/geometry/small.py finds it.
-inline float smaller(float a, float b, float c) {
-  const float half = (a - c) / 2, middle = (a + c) / 2, square = half * half + b * b;
-  return middle - (square > 0 ? std::sqrt(square) : square);
-}
-
 // picture of bytes; found (1, B, N): smaller eigenvalue of the mean gradient matrix, by the Sobel filters over all but the
 // outermost pixels. Windows are at most WIDE pixels wide. With `whole` interleaved pixels become grey as whole numbers.
 void window_texture(Tensor picture, Tensor pixel, Tensor found, int64_t image, int64_t channel, int64_t row, int64_t column,
@@ -258,32 +278,100 @@ void window_texture(Tensor picture, Tensor pixel, Tensor found, int64_t image, i
   Windows w = windows(pixel, image, channel, row, column, channels, height, width, size);
   const uint8_t* from = data<uint8_t>(picture);
   w.end = from + w.batch * channels * height * width;
-  const int64_t inner = size - 2;
-  std::vector<float> slopes(2 * inner * inner * POINTS), grey;
+  std::vector<float> grey;
   float* to = data<float>(found);
-  const float count = 16.0f * inner * inner;
-  for (int64_t b = 0; b < w.batch; ++b, to += w.n) {
+  const float count = 16.0f * (size - 2) * (size - 2);
+  for (int64_t b = 0; b < w.batch; ++b) {
     const bool once = grey_picture(from + b * image, w, whole, grey);
-    for (int64_t k = 0; k < w.n; k += POINTS) {
-      const int64_t several = std::min(POINTS, w.n - k);
-      for (int64_t p = 0; p < several; ++p) {
-        const int64_t first = w.first(b, k + p);
-        float* own = slopes.data() + p;
-        if (once) {
-          const Rows rows = {grey.data() + (first - b * image) / 3, width};
-          (size == 9 ? gradients<9> : gradients<0>)(rows, w, whole, own);
-        } else {
-          (size == 9 ? read_gradients<9> : read_gradients<0>)(from + first, w, whole, own);
-        }
+    for (int64_t k = 0; k < w.n; ++k) {
+      const int64_t first = w.first(b, k);
+      float least;
+      if (once) {
+        const Rows rows = {grey.data() + (first - b * image) / 3, width};
+        least = (size == 9 ? least_texture<9> : least_texture<0>)(rows, size);
+      } else {
+        least = (size == 9 ? read_texture<9> : read_texture<0>)(from + first, w, whole);
       }
-      Sums sums;
-      for (int64_t e = 0; e < inner * inner; ++e) sums.add(slopes.data() + 2 * e * POINTS, slopes.data() + (2 * e + 1) * POINTS);
-      for (int64_t p = 0; p < several; ++p) {
-        float each[3];
-        for (int64_t s = 0; s < 3; ++s) each[s] = sums.part[s][p] + sums.whole[s][p];
-        to[k + p] = smaller(each[0], each[1], each[2]) / count;
-      }
+      *to++ = least / count;
     }
+  }
+}
+
+// Bits of dhtorch/codes.py, Flag.
+constexpr int32_t NO_DEPTH = 1, LOW_CONF = 2, SPECULAR = 4, SATURATED = 8, UNDEREXPOSED = 16, DEPTH_EDGE = 32,
+                  BEYOND_NEAR = 64, BORDER = 128;
+
+// Whether a window around a pixel of a picture lies in it.
+inline bool fits(const int32_t* at, int64_t height, int64_t width, int64_t size) {
+  const int64_t before = size / 2, after = size - before;
+  return at[0] >= before && at[0] <= width - after && at[1] >= before && at[1] <= height - after;
+}
+
+// Stage 2 from what was read: depth (B h w) and levels conf of its size (or of none) at pixels `at` (B, N, 2), extremes of
+// the depth around them, and of the picture (height, width) around pixels (B, N, 2) what window_brightness finds; rays
+// (B, N, 3). Fills depth, sigma and confidence (B, N), xyz (B, N, 3), flags (B, N).
+void samples(Tensor depth, Tensor conf, Tensor at, Tensor low, Tensor high, Tensor pixel, Tensor mean, Tensor centre,
+             Tensor top, Tensor bottom, Tensor ray, Tensor found, Tensor sigma, Tensor confidence, Tensor xyz, Tensor flag,
+             int64_t height, int64_t width, int64_t size, double near, double least_conf, double sigma_m, double sigma_rel,
+             double edge_rel, double dark, double saturated, double highlight) {
+  const int64_t batch = at.size(0), n = at.size(1), h = depth.size(1), w = depth.size(2);
+  const float *map = data<float>(depth), *lowest = data<float>(low), *highest = data<float>(high), *rays = data<float>(ray);
+  const float *means = data<float>(mean), *centres = data<float>(centre), *tops = data<float>(top), *bottoms = data<float>(bottom);
+  const int32_t *places = data<int32_t>(at), *pixels = data<int32_t>(pixel);
+  const uint8_t* levels = conf.numel() > 0 ? data<uint8_t>(conf) : nullptr;
+  float *z_of = data<float>(found), *sigmas = data<float>(sigma), *sures = data<float>(confidence), *points = data<float>(xyz);
+  int32_t* flags = data<int32_t>(flag);
+  const float beyond_near = near, least = least_conf, relative = sigma_rel, fixed = sigma_m * sigma_m, edge = 1.0 + edge_rel;
+  const float dim = dark * 255, white = saturated * 255, bright = highlight * 255;
+  for (int64_t i = 0; i < batch * n; ++i) {
+    const int32_t* place = places + 2 * i;
+    float z = 0.0f, level = 2.0f;
+    const int64_t column = std::clamp<int64_t>(place[0], 0, w - 1), row = std::clamp<int64_t>(place[1], 0, h - 1);
+    const int64_t index = (i / n * h + row) * w + column;
+    if (fits(place, h, w, 1)) {
+      const float read = map[index];
+      z = std::isfinite(read) && read > 0 ? read : 0.0f;
+    }
+    if (levels) level = levels[index];
+    const float grey = means[i], middle = centres[i], most = tops[i];
+    const bool returned = z > 0, beyond = z > beyond_near, unsure = returned && level < least;
+    const bool differs = returned && highest[i] > lowest[i] * edge, clipped = grey >= white;
+    const bool shine = most - bottoms[i] <= 0.15f * most && middle >= bright && middle - grey >= 25.5f;
+    bool usable = returned && !unsure && !beyond;
+    for (int64_t k = 0; k < 3; ++k) usable = usable && std::isfinite(rays[3 * i + k] * z);
+    for (int64_t k = 0; k < 3; ++k) {
+      points[3 * i + k] = usable ? rays[3 * i + k] * z : std::numeric_limits<float>::quiet_NaN();
+    }
+    float sure = std::clamp(level / 2, 0.0f, 1.0f);
+    for (const bool doubt : {differs, shine, clipped}) sure = doubt ? sure / 2 : sure;
+    z_of[i] = z;
+    const float noise = relative * z;
+    sigmas[i] = sigma_m > 0 ? std::sqrt(fixed + noise * noise) : noise;
+    sures[i] = usable ? sure : 0.0f;
+    flags[i] = !returned * NO_DEPTH | unsure * LOW_CONF | beyond * BEYOND_NEAR | differs * DEPTH_EDGE |
+                             !fits(pixels + 2 * i, height, width, size) * BORDER | (grey <= dim) * UNDEREXPOSED |
+                             clipped * SATURATED | shine * SPECULAR;
+  }
+}
+
+// Stage 3 from what was read: of a hole (B, N) the first class of dhtorch/codes.py, Hole, that holds.
+void holes(Tensor xyz, Tensor flag, Tensor trackability, Tensor hole, double min_trackability) {
+  constexpr int32_t NONE = 0, TRACKABLE_NO_LIDAR = 1, LOW_TEXTURE = 2, TOO_BRIGHT = 3, TOO_DARK = 4, HIGHLIGHT = 5,
+                    AT_BORDER = 6;
+  const float *points = data<float>(xyz), *textures = data<float>(trackability), least = min_trackability;
+  const int32_t* flags = data<int32_t>(flag);
+  int32_t* kinds = data<int32_t>(hole);
+  const int64_t all = hole.numel();
+  for (int64_t i = 0; i < all; ++i) {
+    const float* x = points + 3 * i;
+    const int32_t bits = flags[i];
+    int32_t kind = textures[i] < least ? LOW_TEXTURE : TRACKABLE_NO_LIDAR;
+    if (bits & SPECULAR) kind = HIGHLIGHT;
+    if (bits & SATURATED) kind = TOO_BRIGHT;
+    if (bits & UNDEREXPOSED) kind = TOO_DARK;
+    if (bits & BORDER) kind = AT_BORDER;
+    if (std::isfinite(x[0]) && std::isfinite(x[1]) && std::isfinite(x[2])) kind = NONE;
+    kinds[i] = kind;
   }
 }
 
@@ -299,10 +387,18 @@ STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
   m.def(
       "window_texture(Tensor picture, Tensor pixel, Tensor(a!) found, int image, int channel, int row, int column, "
       "int channels, int height, int width, int size, bool whole) -> ()");
+  m.def(
+      "samples(Tensor depth, Tensor conf, Tensor at, Tensor low, Tensor high, Tensor pixel, Tensor mean, Tensor centre, "
+      "Tensor top, Tensor bottom, Tensor ray, Tensor(a!) found, Tensor(b!) sigma, Tensor(c!) confidence, Tensor(d!) xyz, "
+      "Tensor(e!) flag, int height, int width, int size, float near_limit, float min_conf, float sigma_m, float sigma_rel, "
+      "float edge_rel, float dark, float saturated, float highlight) -> ()");
+  m.def("holes(Tensor xyz, Tensor flag, Tensor trackability, Tensor(a!) hole, float min_trackability) -> ()");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) {
   m.impl("window_extremes", TORCH_BOX(&window_extremes));
   m.impl("window_brightness", TORCH_BOX(&window_brightness));
   m.impl("window_texture", TORCH_BOX(&window_texture));
+  m.impl("samples", TORCH_BOX(&samples));
+  m.impl("holes", TORCH_BOX(&holes));
 }

@@ -5,9 +5,12 @@ Fail loud, fail localised: a sample without a usable return is NaN and flagged, 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
+from dhtorch import native
 from dhtorch.codes import Flag, Hole
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.lookup import (
@@ -83,25 +86,46 @@ def backproject(
     if uv.dim() == 2:
         uv = uv.expand(sizes["B"], *uv.shape)
     check("backproject", uv=(uv, "B N 2"), f=(frame.camera.f, "B 2"))
+    limits = _Limits(near_limit, min_conf, sigma_m, sigma_rel, edge_rel, dark, saturated, highlight)
+    found = None if search_px or frame.sparse is not None else _compiled(frame, uv, limits)
+    return _in_torch(frame, uv, search_px, limits) if found is None else found
+
+
+class _Limits(NamedTuple):
+    near_limit: float | None
+    min_conf: int
+    sigma_m: float
+    sigma_rel: float
+    edge_rel: float
+    dark: float
+    saturated: float
+    highlight: float
+
+
+def _in_torch(frame: Frame, uv: Tensor, search_px: int | None, limits: _Limits) -> Samples:
+    """The reference, on any device, with a graph."""
     pixel = pixels(uv)
-    depth, level, edge = _read_depth(frame, uv, pixel, search_px or 0, edge_rel)
+    depth, level, edge = _read_depth(frame, uv, pixel, search_px or 0, limits.edge_rel)
     if search_px is None and frame.sparse is not None:
-        found = zip(_read_depth(frame, uv, pixel, SPARSE_SEARCH_PX, edge_rel), (depth, level, edge), strict=True)
+        found = zip(
+            _read_depth(frame, uv, pixel, SPARSE_SEARCH_PX, limits.edge_rel), (depth, level, edge), strict=True
+        )
         depth, level, edge = (torch.where(frame.sparse[:, None], a, b) for a, b in found)
-    border, dim, white, shine = _appearance(frame.image, pixel, dark, saturated, highlight)
+    border, dim, white, shine = _appearance(frame.image, pixel, limits)
     returned = depth > 0
-    beyond = torch.zeros_like(returned) if near_limit is None else depth > near_limit
-    unsure = returned & (level < min_conf)
+    beyond = torch.zeros_like(returned) if limits.near_limit is None else depth > limits.near_limit
+    unsure = returned & (level < limits.min_conf)
     xyz = cam.unproject(frame.camera, uv.nan_to_num(0.0, 0.0, 0.0), depth)  # no gradient to what is no number
     usable = returned & ~(unsure | beyond)
     usable = usable & (xyz.detach().abs().amax(-1) < torch.inf)  # a pixel outside the lens model has no ray
     confidence = (level.to(depth.dtype) / 2).clamp(0, 1)
     for doubt in (edge, shine, white):
         confidence = torch.where(doubt, confidence / 2, confidence)
+    noise = limits.sigma_rel * depth
     return Samples(
         uv=uv,
         depth=depth,
-        sigma=(sigma_m**2 + (sigma_rel * depth) ** 2).sqrt() if sigma_m > 0 else sigma_rel * depth,
+        sigma=(limits.sigma_m**2 + noise**2).sqrt() if limits.sigma_m > 0 else noise,
         xyz=torch.where(usable[..., None], xyz, torch.nan),
         confidence=torch.where(usable, confidence, 0.0),
         flag=_bits(
@@ -117,6 +141,34 @@ def backproject(
         trackability=torch.zeros_like(depth),
         hole=torch.full_like(depth, Hole.NONE, dtype=torch.int32),
     )
+
+
+def _compiled(frame: Frame, uv: Tensor, limits: _Limits) -> Samples | None:
+    """The same bits of dense maps and pictures of bytes, where compiled code is loaded and serves; else None."""
+    (h, w), n = frame.depth.shape[-2:], uv.shape[1]
+    size, around = min(NEIGHBOURHOOD, *frame.hw), min(NEIGHBOURHOOD, h, w)
+    conf = frame.depth.new_empty(0, dtype=torch.uint8) if frame.conf is None else frame.conf
+    if whole_is_faster(frame.hw, n, size) or whole_is_faster((h, w), n, around) or not 0 <= limits.min_conf <= 255:
+        return None
+    if (frame.image.dtype, conf.dtype, frame.depth.dtype, uv.dtype) != (torch.uint8,) * 2 + (torch.float32,) * 2:
+        return None
+    if not native.serves(frame.depth, conf):
+        return None
+    place = cam.depth_pixels(frame.camera, frame.hw, frame.depth_camera, (h, w), uv)
+    ray = cam.rays(frame.camera, uv.nan_to_num(0.0, 0.0, 0.0))
+    if not native.serves(place.contiguous(), ray) or ray.dtype != torch.float32:
+        return None
+    pixel = pixels(uv).contiguous()
+    at = pixel if place is uv else pixels(place).contiguous()
+    extremes = summarise(frame.depth[:, None], at, around, _extremes, compiled="extremes")
+    seen = summarise(frame.image, pixel, size, _brightness, compiled="brightness")
+    depth, sigma, confidence = (torch.empty_like(extremes[0]) for _ in range(3))
+    xyz, flag = torch.empty_like(ray), torch.empty_like(depth, dtype=torch.int32)
+    told = limits._replace(near_limit=torch.inf if limits.near_limit is None else limits.near_limit)
+    read, filled = (frame.depth, conf, at, *extremes, pixel, *seen, ray), (depth, sigma, confidence, xyz, flag)
+    torch.ops.dhtorch.samples(*read, *filled, *frame.hw, size, *told)
+    hole = torch.zeros_like(flag)
+    return Samples(uv, depth, sigma, xyz, confidence, flag, torch.zeros_like(depth), hole)
 
 
 def _read_depth(
@@ -177,7 +229,7 @@ def _nearest_return(depth: Tensor, place: Tensor, size: int, search_px: int) -> 
     return torch.where(reachable.gather(-1, pick), found.to(place.dtype), place)
 
 
-def _appearance(image: Tensor, pixel: Tensor, dark: float, saturated: float, highlight: float) -> tuple[Tensor, ...]:
+def _appearance(image: Tensor, pixel: Tensor, limits: _Limits) -> tuple[Tensor, ...]:
     """What the picture alone decides, (B, N) each: at the border, too dark, clipped at white, a highlight."""
     hw = (image.shape[-2], image.shape[-1])
     size = min(NEIGHBOURHOOD, *hw)
@@ -189,8 +241,8 @@ def _appearance(image: Tensor, pixel: Tensor, dark: float, saturated: float, hig
     )
     mean, centre, top, bottom = seen
     white = 1 if image.is_floating_point() else 255
-    shine = (top - bottom <= 0.15 * top) & (centre >= highlight * white) & (centre - mean >= 0.1 * white)
-    told = mean <= dark * white, mean >= saturated * white, shine
+    shine = (top - bottom <= 0.15 * top) & (centre >= limits.highlight * white) & (centre - mean >= 0.1 * white)
+    told = mean <= limits.dark * white, mean >= limits.saturated * white, shine
     return ~fits(pixel, hw, size), *((read_whole(x, pixel, size) for x in told) if whole else told)
 
 

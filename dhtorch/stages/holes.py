@@ -10,6 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dhtorch import native
 from dhtorch.codes import ROUTE_OF_HOLE, Flag, Hole, first_reason
 from dhtorch.geometry.lookup import pixels, summarise
 from dhtorch.geometry.shapes import check
@@ -47,7 +48,16 @@ def classify(
     """
     check("classify", image=(frame.image, "B C H W"), uv=(samples.uv, "B N 2"), flag=(samples.flag, "B N"))
     trackability = min_eigenvalue(frame.image, samples.uv, block=block)
-    hole = first_reason(
+    if native.serves(samples.xyz, samples.flag, trackability):
+        hole = torch.empty_like(samples.flag)
+        torch.ops.dhtorch.holes(samples.xyz, samples.flag, trackability, hole, min_trackability)
+    else:
+        hole = _first_class(samples, trackability, min_trackability)
+    return samples.replace(trackability=trackability.to(samples.depth.dtype), hole=hole)
+
+
+def _first_class(samples: Samples, trackability: Tensor, min_trackability: float) -> Tensor:
+    return first_reason(
         (samples.usable, Hole.NONE),
         ((samples.flag & Flag.BORDER).bool(), Hole.AT_BORDER),
         ((samples.flag & Flag.UNDEREXPOSED).bool(), Hole.TOO_DARK),
@@ -56,7 +66,6 @@ def classify(
         (trackability.detach() < min_trackability, Hole.LOW_TEXTURE),
         otherwise=Hole.TRACKABLE_NO_LIDAR,
     )
-    return samples.replace(trackability=trackability.to(samples.depth.dtype), hole=hole)
 
 
 def min_eigenvalue(
