@@ -8,7 +8,8 @@ points, of the registration of their windows and of poses as compiled code, for 
 ``affine`` and ``near_far`` ask here whether tensors may be handed over; where not (nothing was loaded, another device
 or type, under vmap, a compiler or a graph) they do the same in torch, which is the reference. Tokens and the sweep are
 alike bit for bit, its fits up to rounding: no more than one gate in 200 differs, and 99 of 100 depths by less than a
-tenth of their sigma. A pyramid and what is read around samples do up to one rounding of a number. The search and the
+tenth of their sigma. A pyramid, what is read around samples and what is said of them do up to one rounding of a number,
+textures up to the rounding of their sums. The search and the
 registration do up to the rounding of sums over a window: half of the places that were searched for are equal and half
 of those that were registered lie within 1e-4 px, 99 of 100 lie within a tenth of their sigma, and no more than one
 verdict in 200 changes. Of poses, whose costs and equations it sums, 99 of 100 lie within a hundredth of their sigma.
@@ -48,6 +49,9 @@ FLAGS = ("-O3", "-std=c++20", "-fPIC", "-shared", "-ffp-contract=off", "-fno-mat
 
 #: What ATEN_CPU_CAPABILITY may hold torch to → the level of x86-64 that has no wider vectors.
 _LEVELS = {"avx2": "x86-64-v3", "default": "x86-64-v2"}
+
+#: Types of numbers that the compiled code reads.
+_TOLD = frozenset((torch.float32, torch.uint8, torch.bool, torch.int16, torch.int32, torch.int64))
 
 #: The command that makes the file, as errors tell it.
 COMMAND = "python -m dhtorch.native"
@@ -130,9 +134,8 @@ def serves(*tensors: Tensor) -> bool:
 def _plain(x: Tensor) -> bool:
     if type(x) is not Tensor or torch._C._functorch.is_functorch_wrapped_tensor(x):
         return False
-    told = x.dtype == torch.float32 or not (x.is_floating_point() or x.is_complex())
     graph = x.requires_grad and torch.is_grad_enabled()
-    return told and not graph and x.device.type == "cpu" and x.is_contiguous() and not x.is_neg()
+    return x.dtype in _TOLD and not graph and x.is_cpu and x.is_contiguous() and not x.is_neg()
 
 
 def _vectors() -> tuple[str, ...]:

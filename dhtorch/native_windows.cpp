@@ -95,7 +95,7 @@ inline float luma(float red, float green, float blue, int64_t channels) {
 
 // Sums over the window, channel by channel. Rows of interleaved pixels are added as they lie in memory.
 template <int64_t SIZE>
-void sums(const uint8_t* at, const Windows& w, int32_t* sum) {
+inline void sums(const uint8_t* at, const Windows& w, int32_t* sum) {
   const int64_t size = SIZE ? SIZE : w.size;
   std::fill_n(sum, w.channels, 0);
   if (SIZE == 5 && w.column == 3 && at + 4 * w.row + WIDE <= w.end) {
@@ -135,7 +135,11 @@ void window_brightness(Tensor picture, Tensor pixel, Tensor found, int64_t image
       const uint8_t* at = from + w.first(b, k);
       const uint8_t* centre = at + (size / 2) * (row + column);
       int32_t sum[3];
-      (size == 5 ? sums<5> : sums<0>)(at, w, sum);
+      if (size == 5) {
+        sums<5>(at, w, sum);
+      } else {
+        sums<0>(at, w, sum);
+      }
       float mean[3] = {}, middle[3] = {};
       for (int64_t c = 0; c < channels; ++c) {
         mean[c] = static_cast<float>(sum[c]) / static_cast<float>(size * size);
@@ -254,7 +258,7 @@ inline float least_texture(const Rows& grey, int64_t size) {
 
 // Of a window whose pixels are read for it alone.
 template <int64_t SIZE>
-float read_texture(const uint8_t* at, const Windows& w, bool whole) {
+inline float read_texture(const uint8_t* at, const Windows& w, bool whole) {
   float grey[WIDE * ROOM] = {};  // beside a window as well, where what is no number would cost more
   for (int64_t y = 0; y < (SIZE ? SIZE : w.size); ++y) grey_row<SIZE>(at + y * w.row, w, whole, grey + y * ROOM);
   return least_texture<SIZE>({grey, ROOM}, w.size);
@@ -271,6 +275,21 @@ bool grey_picture(const uint8_t* at, const Windows& w, bool whole, std::vector<f
   return true;
 }
 
+template <int64_t SIZE>
+void textures(const uint8_t* from, const Windows& w, bool whole, float* to) {
+  std::vector<float> grey;
+  const float count = 16.0f * (w.size - 2) * (w.size - 2);
+  for (int64_t b = 0; b < w.batch; ++b) {
+    const bool once = grey_picture(from + b * w.image, w, whole, grey);
+    for (int64_t k = 0; k < w.n; ++k) {
+      const int64_t first = w.first(b, k), pixel = (first - b * w.image) / 3;
+      const float least = once ? least_texture<SIZE>({grey.data() + pixel, w.width}, w.size)
+                               : read_texture<SIZE>(from + first, w, whole);
+      *to++ = least / count;
+    }
+  }
+}
+
 // picture of bytes; found (1, B, N): smaller eigenvalue of the mean gradient matrix, by the Sobel filters over all but the
 // outermost pixels. Windows are at most WIDE pixels wide. With `whole` interleaved pixels become grey as whole numbers.
 void window_texture(Tensor picture, Tensor pixel, Tensor found, int64_t image, int64_t channel, int64_t row, int64_t column,
@@ -278,23 +297,7 @@ void window_texture(Tensor picture, Tensor pixel, Tensor found, int64_t image, i
   Windows w = windows(pixel, image, channel, row, column, channels, height, width, size);
   const uint8_t* from = data<uint8_t>(picture);
   w.end = from + w.batch * channels * height * width;
-  std::vector<float> grey;
-  float* to = data<float>(found);
-  const float count = 16.0f * (size - 2) * (size - 2);
-  for (int64_t b = 0; b < w.batch; ++b) {
-    const bool once = grey_picture(from + b * image, w, whole, grey);
-    for (int64_t k = 0; k < w.n; ++k) {
-      const int64_t first = w.first(b, k);
-      float least;
-      if (once) {
-        const Rows rows = {grey.data() + (first - b * image) / 3, width};
-        least = (size == 9 ? least_texture<9> : least_texture<0>)(rows, size);
-      } else {
-        least = (size == 9 ? read_texture<9> : read_texture<0>)(from + first, w, whole);
-      }
-      *to++ = least / count;
-    }
-  }
+  (size == 9 ? textures<9> : textures<0>)(from, w, whole, data<float>(found));
 }
 
 // Bits of dhtorch/codes.py, Flag.
@@ -305,6 +308,36 @@ constexpr int32_t NO_DEPTH = 1, LOW_CONF = 2, SPECULAR = 4, SATURATED = 8, UNDER
 inline bool fits(const int32_t* at, int64_t height, int64_t width, int64_t size) {
   const int64_t before = size / 2, after = size - before;
   return at[0] >= before && at[0] <= width - after && at[1] >= before && at[1] <= height - after;
+}
+
+// The pixel that a place lies in, as dhtorch/geometry/lookup.py, pixels, finds it: one outside of any picture where it is none.
+inline int32_t pixel_of(float at) {
+  const float whole = std::floor((std::isnan(at) ? -1.0f : at) + 0.5f);
+  return whole >= -2147483648.0f && whole < 2147483648.0f ? static_cast<int32_t>(whole) : std::numeric_limits<int32_t>::min();
+}
+
+// Of places uv (B, N, 2) of pictures without distortion, with focal lengths f and centres c (B, 2): the pixels of picture and
+// map (B, N, 2) and rays (B, N, 3). The map has focal lengths and centres of its own, or none (of no size), where its size
+// over the picture's is (across, down).
+void places(Tensor uv, Tensor f, Tensor c, Tensor map_f, Tensor map_c, Tensor pixel, Tensor at, Tensor ray, double across, double down) {
+  const int64_t batch = uv.size(0), n = uv.size(1);
+  const float *from = data<float>(uv), *focal = data<float>(f), *centre = data<float>(c);
+  const float scale[2] = {static_cast<float>(across), static_cast<float>(down)};
+  const bool same = across == 1 && down == 1, own = map_f.numel() > 0;
+  const float *own_focal = own ? data<float>(map_f) : focal, *own_centre = own ? data<float>(map_c) : centre;
+  int32_t *pixels = data<int32_t>(pixel), *map = data<int32_t>(at);
+  float* rays = data<float>(ray);
+  for (int64_t i = 0; i < batch * n; ++i) {
+    for (int64_t k = 0; k < 2; ++k) {
+      const float x = from[2 * i + k];
+      const int64_t of = 2 * (i / n) + k;
+      pixels[2 * i + k] = pixel_of(x);
+      const float scaled = same ? x : (x + 0.5f) * scale[k] - 0.5f;
+      map[2 * i + k] = pixel_of(own ? (x - centre[of]) / focal[of] * own_focal[of] + own_centre[of] : scaled);
+      rays[3 * i + k] = ((std::isfinite(x) ? x : 0.0f) - centre[of]) / focal[of];
+    }
+    rays[3 * i + 2] = 1.0f;
+  }
 }
 
 // Stage 2 from what was read: depth (B h w) and levels conf of its size (or of none) at pixels `at` (B, N, 2), extremes of
@@ -388,6 +421,9 @@ STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
       "window_texture(Tensor picture, Tensor pixel, Tensor(a!) found, int image, int channel, int row, int column, "
       "int channels, int height, int width, int size, bool whole) -> ()");
   m.def(
+      "places(Tensor uv, Tensor f, Tensor c, Tensor map_f, Tensor map_c, Tensor(a!) pixel, Tensor(b!) at, Tensor(c!) ray, "
+      "float across, float down) -> ()");
+  m.def(
       "samples(Tensor depth, Tensor conf, Tensor at, Tensor low, Tensor high, Tensor pixel, Tensor mean, Tensor centre, "
       "Tensor top, Tensor bottom, Tensor ray, Tensor(a!) found, Tensor(b!) sigma, Tensor(c!) confidence, Tensor(d!) xyz, "
       "Tensor(e!) flag, int height, int width, int size, float near_limit, float min_conf, float sigma_m, float sigma_rel, "
@@ -399,6 +435,7 @@ STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) {
   m.impl("window_extremes", TORCH_BOX(&window_extremes));
   m.impl("window_brightness", TORCH_BOX(&window_brightness));
   m.impl("window_texture", TORCH_BOX(&window_texture));
+  m.impl("places", TORCH_BOX(&places));
   m.impl("samples", TORCH_BOX(&samples));
   m.impl("holes", TORCH_BOX(&holes));
 }

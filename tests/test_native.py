@@ -6,6 +6,7 @@ import platform
 import shutil
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 import test_map_pose
@@ -99,18 +100,90 @@ def test_numbers_about_windows_agree_textures_up_to_rounding(loaded, monkeypatch
     uv[0, 0] = torch.nan
     camera = Camera(f=torch.full((2, 2), 50.0), c=torch.full((2, 2), 20.0))
     frame = Frame(image=image, depth=depth, camera=camera, conf=None)
-    calls = []
-    for name in ("extremes", "brightness", "texture"):
-        was = getattr(torch.ops.dhtorch, f"window_{name}")
-        monkeypatch.setattr(
-            torch.ops.dhtorch, f"window_{name}", lambda *a, was=was, **k: (calls.append(1), was(*a, **k))
-        )
+    calls = counted(monkeypatch, "window_extremes", "window_brightness", "window_texture", "places", "samples", "holes")
     ours, torchs = both_ways(lambda: classify(frame, backproject(frame, uv), block=block), monkeypatch)
-    assert len(calls) == 3
+    assert len(calls) == 6
     for name in ("depth", "confidence", "flag", "trackability", "hole"):
         a, b = getattr(ours, name), getattr(torchs, name)
         assert torch.equal(a.nan_to_num(7), b.nan_to_num(7)) or (name == "trackability" and (a - b).abs().max() < 1e-7)
     assert ours.flag.unique().numel() > 3 and ours.trackability.unique().numel() > 100
+
+
+def counted(monkeypatch, *names):
+    """Operations by name, which note in the list that they were called."""
+    calls = []
+    for name in names:
+        was = getattr(torch.ops.dhtorch, name).default
+        noted = SimpleNamespace(default=lambda *a, was=was, name=name: (calls.append(name), was(*a)))
+        monkeypatch.setattr(torch.ops.dhtorch, name, noted)
+    return calls
+
+
+def a_view(*, hw=(61, 83), map_hw=(48, 64), seed=0):
+    """Two views with levels of confidence, returns of every kind, bright and dark places, and cameras of their own."""
+    image = (volume(2, 3, *hw, most=256, seed=seed) // 4 + 120).contiguous(memory_format=torch.channels_last)
+    image[0, :, :20], image[1, :, :, :30], image[:, :, 40, 40:50] = 255, 5, 255
+    depth = 4 * torch.rand(2, *map_hw, generator=torch.Generator().manual_seed(seed)) - 0.4
+    depth[:, ::7, ::5], depth[0, 3], depth[1, :, 9] = torch.nan, torch.inf, -torch.inf
+    camera = Camera(f=torch.tensor([[70.0, 71.0], [64.0, 66.0]]), c=torch.tensor([[40.0, 30.0], [41.5, 29.0]]))
+    return Frame(image=image, depth=depth, camera=camera, conf=volume(2, *map_hw, most=3, seed=seed + 1))
+
+
+@needs_compiler
+@pytest.mark.parametrize("lens", ["none", "of the map", "bent", "bent map"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"near_limit": 1.7, "min_conf": 2, "sigma_m": 0.004},
+        {"min_conf": 0, "edge_rel": 0.6, "dark": 0.5, "saturated": 0.6, "highlight": 0.4, "sigma_rel": 0.03},
+    ],
+)
+def test_samples_and_holes_are_the_same_bits(loaded, monkeypatch, lens, options):
+    frame = a_view(map_hw=(61, 83) if lens == "bent" else (48, 64))
+    own = Camera(f=frame.camera.f * 0.7, c=frame.camera.c * 0.8)
+    bent = torch.tensor([[0.2, -0.1, 0.001, 0.002, 0.0]]).expand(2, 5)
+    if lens == "bent":
+        frame = frame.replace(camera=frame.camera.replace(distortion=bent), conf=None)
+    if lens in ("of the map", "bent map"):
+        frame = frame.replace(depth_camera=own.replace(distortion=bent if lens == "bent map" else None))
+    uv = torch.rand(301, 2, generator=torch.Generator().manual_seed(2)) * torch.tensor([99.0, 75.0]) - 7
+    uv[:5] = torch.tensor([torch.nan, torch.inf, -torch.inf, 3e9, -3e9])[:, None]
+    calls = counted(monkeypatch, "places", "samples", "holes")
+    ours, torchs = both_ways(lambda: classify(frame, backproject(frame, uv, **options)), monkeypatch)
+    assert calls == [*(["places"] if "bent" not in lens else []), "samples", "holes"]
+    assert (ours.sigma - torchs.sigma).abs().le(2.0**-23 * torchs.sigma).all(), "but for the rounding of a root"
+    for name in ("uv", "depth", "xyz", "confidence", "flag", "hole"):
+        a, b = getattr(ours, name), getattr(torchs, name)
+        assert a.dtype == b.dtype and torch.equal(a.nan_to_num(7), b.nan_to_num(7)), name
+        assert torch.equal(a.isnan(), b.isnan()), name
+    assert ours.flag.unique().numel() > 8 and ours.hole.unique().numel() > 4 and ours.usable.any()
+
+
+@needs_compiler
+def test_samples_that_compiled_code_does_not_take_are_torchs(loaded, monkeypatch):
+    calls = counted(monkeypatch, "samples")
+    frame, uv = a_view(), torch.rand(50, 2, generator=torch.Generator().manual_seed(2)) * 50
+    backproject(frame, uv)
+    assert calls.pop() == "samples"
+    backproject(frame, uv, search_px=2)
+    backproject(frame.replace(sparse=torch.tensor([True, False])), uv)
+    backproject(frame, uv, min_conf=-1)
+    backproject(frame.replace(conf=frame.conf.long()), uv)
+    backproject(frame.replace(depth=frame.depth.half()), uv)
+    backproject(frame.replace(image=frame.image.float() / 255), uv)
+    backproject(frame, uv.double())
+    backproject(frame.map(lambda x: x.double() if x.dtype == torch.float32 else x), uv.double())
+    backproject(frame, torch.rand(2, 4096, 2) * 50)  # windows of whole pictures
+    leaf = frame.depth.nan_to_num(1, 1, 1).requires_grad_()
+    found = backproject(frame.replace(depth=leaf), uv)
+    (slope,) = torch.autograd.grad(found.xyz.nan_to_num().sum(), [leaf])
+    assert slope.abs().sum() > 0
+    focal = frame.camera.f.clone().requires_grad_()
+    found = backproject(frame.replace(camera=frame.camera.replace(f=focal)), uv)
+    assert torch.autograd.grad(found.xyz.nan_to_num().sum(), [focal])[0].abs().sum() > 0
+    assert backproject(frame, uv.clone().requires_grad_()).xyz.requires_grad
+    assert not calls
 
 
 @needs_compiler

@@ -100,6 +100,6 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("serves", 'in ("", "0")', 'in ("",)'),
         ("_plain", "not graph and ", ""),
         ("_plain", "and x.is_contiguous()", ""),
-        ("_plain", "x.dtype == torch.float32 or", "x.dtype.is_floating_point or"),
+        ("_plain", "x.dtype in _TOLD", "not x.is_complex()"),
     ],
 }

@@ -68,10 +68,9 @@ def summarise(
         kind, count = COMPILED[compiled]
         if image.dtype == kind:
             found = image.new_empty(count, B, N, dtype=torch.float32)
-            steps = {"image": b, "channel": c, "row": v, "column": u}
-            shape = {"channels": C, "height": H, "width": W, "size": size}
-            exact = {"whole": u == 3 and _product_is_exact(image)} if grey else {}
-            getattr(torch.ops.dhtorch, f"window_{compiled}")(flat, pixel, found, **steps, **shape, **exact)
+            shape = (b, c, v, u, C, H, W, size)
+            exact = (u == 3 and _product_is_exact(image),) if grey else ()
+            getattr(torch.ops.dhtorch, f"window_{compiled}").default(flat, pixel, found, *shape, *exact)
             return found.unbind(0)
     x, y = _moved_inside(pixel if image.numel() < 1 << 31 else pixel.long(), (H, W), size)
     middle = torch.add(x if u == 1 else x * u, y, alpha=v)

@@ -86,7 +86,16 @@ def backproject(
     if uv.dim() == 2:
         uv = uv.expand(sizes["B"], *uv.shape)
     check("backproject", uv=(uv, "B N 2"), f=(frame.camera.f, "B 2"))
-    limits = _Limits(near_limit, min_conf, sigma_m, sigma_rel, edge_rel, dark, saturated, highlight)
+    limits = _Limits(
+        near_limit=near_limit,
+        min_conf=min_conf,
+        sigma_m=sigma_m,
+        sigma_rel=sigma_rel,
+        edge_rel=edge_rel,
+        dark=dark,
+        saturated=saturated,
+        highlight=highlight,
+    )
     found = None if search_px or frame.sparse is not None else _compiled(frame, uv, limits)
     return _in_torch(frame, uv, search_px, limits) if found is None else found
 
@@ -107,9 +116,7 @@ def _in_torch(frame: Frame, uv: Tensor, search_px: int | None, limits: _Limits) 
     pixel = pixels(uv)
     depth, level, edge = _read_depth(frame, uv, pixel, search_px or 0, limits.edge_rel)
     if search_px is None and frame.sparse is not None:
-        found = zip(
-            _read_depth(frame, uv, pixel, SPARSE_SEARCH_PX, limits.edge_rel), (depth, level, edge), strict=True
-        )
+        found = zip(_read_depth(frame, uv, pixel, SPARSE_SEARCH_PX, limits.edge_rel), (depth, level, edge), strict=True)
         depth, level, edge = (torch.where(frame.sparse[:, None], a, b) for a, b in found)
     border, dim, white, shine = _appearance(frame.image, pixel, limits)
     returned = depth > 0
@@ -144,31 +151,50 @@ def _in_torch(frame: Frame, uv: Tensor, search_px: int | None, limits: _Limits) 
 
 
 def _compiled(frame: Frame, uv: Tensor, limits: _Limits) -> Samples | None:
-    """The same bits of dense maps and pictures of bytes, where compiled code is loaded and serves; else None."""
-    (h, w), n = frame.depth.shape[-2:], uv.shape[1]
-    size, around = min(NEIGHBOURHOOD, *frame.hw), min(NEIGHBOURHOOD, h, w)
+    """The same bits (sigma up to the rounding of its root) of dense maps and pictures of bytes; None where compiled
+    code is not loaded or does not serve."""
+    h, w = frame.depth.shape[-2:]
+    size, around = (min(NEIGHBOURHOOD, *hw) for hw in (frame.hw, (h, w)))
     conf = frame.depth.new_empty(0, dtype=torch.uint8) if frame.conf is None else frame.conf
-    if whole_is_faster(frame.hw, n, size) or whole_is_faster((h, w), n, around) or not 0 <= limits.min_conf <= 255:
+    whole = whole_is_faster(frame.hw, uv.shape[1], size) or whole_is_faster((h, w), uv.shape[1], around)
+    bytes_alone = frame.image.dtype == conf.dtype == torch.uint8 and 0 <= limits.min_conf <= 255
+    if whole or not bytes_alone or frame.depth.dtype != uv.dtype or not native.serves(frame.depth, conf):
         return None
-    if (frame.image.dtype, conf.dtype, frame.depth.dtype, uv.dtype) != (torch.uint8,) * 2 + (torch.float32,) * 2:
+    looks = _looks(frame, uv)
+    if looks is None:
         return None
-    if not native.serves(frame.depth, conf):
-        return None
-    place = cam.depth_pixels(frame.camera, frame.hw, frame.depth_camera, (h, w), uv)
-    ray = cam.rays(frame.camera, uv.nan_to_num(0.0, 0.0, 0.0))
-    if not native.serves(place.contiguous(), ray) or ray.dtype != torch.float32:
-        return None
-    pixel = pixels(uv).contiguous()
-    at = pixel if place is uv else pixels(place).contiguous()
+    pixel, at, ray = looks
     extremes = summarise(frame.depth[:, None], at, around, _extremes, compiled="extremes")
     seen = summarise(frame.image, pixel, size, _brightness, compiled="brightness")
     depth, sigma, confidence = (torch.empty_like(extremes[0]) for _ in range(3))
-    xyz, flag = torch.empty_like(ray), torch.empty_like(depth, dtype=torch.int32)
+    flag = torch.empty_like(depth, dtype=torch.int32)
+    xyz = torch.empty_like(ray)
     told = limits._replace(near_limit=torch.inf if limits.near_limit is None else limits.near_limit)
-    read, filled = (frame.depth, conf, at, *extremes, pixel, *seen, ray), (depth, sigma, confidence, xyz, flag)
-    torch.ops.dhtorch.samples(*read, *filled, *frame.hw, size, *told)
-    hole = torch.zeros_like(flag)
-    return Samples(uv, depth, sigma, xyz, confidence, flag, torch.zeros_like(depth), hole)
+    read = (frame.depth, conf, at, *extremes, pixel, *seen, ray)
+    torch.ops.dhtorch.samples.default(*read, depth, sigma, confidence, xyz, flag, *frame.hw, size, *told)
+    none = {"trackability": torch.zeros_like(depth), "hole": torch.zeros_like(flag)}
+    return Samples(uv=uv, depth=depth, sigma=sigma, xyz=xyz, confidence=confidence, flag=flag, **none)
+
+
+def _looks(frame: Frame, uv: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
+    """Pixels of the picture and of the map (B, N, 2), and rays (B, N, 3); None where compiled code does not serve."""
+    camera, own = frame.camera, frame.depth_camera
+    (h, w), (H, W) = frame.depth.shape[-2:], frame.hw
+    if camera.distortion is None and (own is None or own.distortion is None):
+        lens = [camera.f, camera.c]
+        lens += [camera.f.new_empty(0)] * 2 if own is None else [own.f, own.c]
+        start = uv.contiguous()
+        if {x.dtype for x in (start, *lens)} != {torch.float32} or not native.serves(start, *lens):
+            return None
+        pixel, at = (torch.empty_like(start, dtype=torch.int32) for _ in range(2))
+        ray = start.new_empty(*uv.shape[:2], 3)
+        torch.ops.dhtorch.places.default(start, *lens, pixel, at, ray, w / W, h / H)
+        return pixel, at, ray
+    place = cam.depth_pixels(camera, frame.hw, own, (h, w), uv)
+    ray = cam.rays(camera, uv.nan_to_num(0.0, 0.0, 0.0))
+    if ray.dtype != torch.float32 or not native.serves(place.contiguous(), ray):
+        return None
+    return pixels(uv).contiguous(), pixels(place).contiguous(), ray
 
 
 def _read_depth(

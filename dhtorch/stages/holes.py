@@ -50,7 +50,7 @@ def classify(
     trackability = min_eigenvalue(frame.image, samples.uv, block=block)
     if native.serves(samples.xyz, samples.flag, trackability):
         hole = torch.empty_like(samples.flag)
-        torch.ops.dhtorch.holes(samples.xyz, samples.flag, trackability, hole, min_trackability)
+        torch.ops.dhtorch.holes.default(samples.xyz, samples.flag, trackability, hole, min_trackability)
     else:
         hole = _first_class(samples, trackability, min_trackability)
     return samples.replace(trackability=trackability.to(samples.depth.dtype), hole=hole)
