@@ -121,6 +121,33 @@ inline void sums(const uint8_t* at, const Windows& w, int32_t* sum) {
   }
 }
 
+template <int64_t SIZE, int64_t CHANNELS>
+void brightnesses(const uint8_t* from, const Windows& w, float* to) {
+  const int64_t channels = CHANNELS ? CHANNELS : w.channels, all = w.batch * w.n, centre = w.size / 2 * (w.row + w.column);
+  const float count = static_cast<float>(w.size * w.size);
+  for (int64_t b = 0, i = 0; b < w.batch; ++b) {
+    for (int64_t k = 0; k < w.n; ++k, ++i) {
+      const uint8_t* at = from + w.first(b, k);
+      int32_t sum[3];
+      sums<SIZE>(at, w, sum);
+      float mean[3] = {}, middle[3] = {};
+      for (int64_t c = 0; c < channels; ++c) {
+        mean[c] = static_cast<float>(sum[c]) / count;
+        middle[c] = static_cast<float>(at[centre + c * w.channel]);
+      }
+      float most = middle[0], least = middle[0];
+      for (int64_t c = 1; c < channels; ++c) {
+        most = std::max(most, middle[c]);
+        least = std::min(least, middle[c]);
+      }
+      to[i] = luma(mean[0], mean[1], mean[2], channels);
+      to[all + i] = luma(middle[0], middle[1], middle[2], channels);
+      to[2 * all + i] = most;
+      to[3 * all + i] = least;
+    }
+  }
+}
+
 // picture of bytes; found (4, B, N): mean grey of the window, and of the pixel in the middle grey, largest and smallest
 // channel, all of them from 0 to 255.
 void window_brightness(Tensor picture, Tensor pixel, Tensor found, int64_t image, int64_t channel, int64_t row,
@@ -128,29 +155,7 @@ void window_brightness(Tensor picture, Tensor pixel, Tensor found, int64_t image
   Windows w = windows(pixel, image, channel, row, column, channels, height, width, size);
   const uint8_t* from = data<uint8_t>(picture);
   w.end = from + w.batch * channels * height * width;
-  const int64_t all = w.batch * w.n;
-  float* to = data<float>(found);
-  for (int64_t b = 0, i = 0; b < w.batch; ++b) {
-    for (int64_t k = 0; k < w.n; ++k, ++i) {
-      const uint8_t* at = from + w.first(b, k);
-      const uint8_t* centre = at + (size / 2) * (row + column);
-      int32_t sum[3];
-      if (size == 5) {
-        sums<5>(at, w, sum);
-      } else {
-        sums<0>(at, w, sum);
-      }
-      float mean[3] = {}, middle[3] = {};
-      for (int64_t c = 0; c < channels; ++c) {
-        mean[c] = static_cast<float>(sum[c]) / static_cast<float>(size * size);
-        middle[c] = static_cast<float>(centre[c * channel]);
-      }
-      to[i] = luma(mean[0], mean[1], mean[2], channels);
-      to[all + i] = luma(middle[0], middle[1], middle[2], channels);
-      to[2 * all + i] = *std::max_element(middle, middle + channels);
-      to[3 * all + i] = *std::min_element(middle, middle + channels);
-    }
-  }
+  (size == 5 && channels == 3 ? brightnesses<5, 3> : brightnesses<0, 0>)(from, w, data<float>(found));
 }
 
 // A whole number divided, rounded as a division is, which takes longer: right for all bytes over 255 and all whole numbers

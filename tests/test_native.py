@@ -20,7 +20,7 @@ from dhtorch.codes import PoseCode, Source
 from dhtorch.evaluate.holdout import range_split
 from dhtorch.geometry import affine, least_squares, near_far, neighbours, p3p, pyramid, ransac, se3, sweep
 from dhtorch.geometry import lucas_kanade as lk
-from dhtorch.geometry.camera import Camera, project, unproject
+from dhtorch.geometry.camera import Camera, from_matrix, project, unproject
 from dhtorch.geometry.filters import gaussian
 from dhtorch.geometry.near_far import Problem
 from dhtorch.records import NO_HINT, Frame, Map, PoseFit, Samples, Shutter, TrackHint, Tracks
@@ -125,8 +125,8 @@ def a_view(*, hw=(61, 83), map_hw=(48, 64), seed=0):
     image[0, :, :20], image[1, :, :, :30], image[:, :, 40, 40:50] = 255, 5, 255
     depth = 4 * torch.rand(2, *map_hw, generator=torch.Generator().manual_seed(seed)) - 0.4
     depth[:, ::7, ::5], depth[0, 3], depth[1, :, 9] = torch.nan, torch.inf, -torch.inf
-    camera = Camera(f=torch.tensor([[70.0, 71.0], [64.0, 66.0]]), c=torch.tensor([[40.0, 30.0], [41.5, 29.0]]))
-    return Frame(image=image, depth=depth, camera=camera, conf=volume(2, *map_hw, most=3, seed=seed + 1))
+    K = torch.tensor([[[70.0, 0, 40], [0, 71, 30], [0, 0, 1]], [[64, 0, 41.5], [0, 66, 29], [0, 0, 1]]])
+    return Frame(image=image, depth=depth, camera=from_matrix(K), conf=volume(2, *map_hw, most=3, seed=seed + 1))
 
 
 @needs_compiler

@@ -147,6 +147,19 @@ def test_one_view_and_a_padded_pair_say_the_same(sample):
 # ---------------------------------------------------------------------------------------------------- layouts and units
 
 
+@pytest.mark.parametrize("batched", [False, True])
+def test_a_map_with_one_return_where_no_sample_is_has_depth(sample, batched):
+    ask = transform(other_image=None, batched=batched)
+    maps = [np.array(sample["depth"]), 0 * np.array(sample["depth"]), 0 * np.array(sample["depth"])]
+    seen = added(transform(other_image=None)(sample))["uv"].round().long()
+    at = next((v, u) for v in range(SIDE) for u in range(SIDE) if not (seen == torch.tensor([u, v])).all(-1).any())
+    maps[1][at] = 1500
+    said = [SampleProblem.NO_SECOND_VIEW, SampleProblem.NO_SECOND_VIEW, SampleProblem.NO_DEPTH]
+    samples = [sample | {"depth": x} for x in maps]
+    found = added(ask(default_collate(samples)))["problem"] if batched else [added(ask(s))["problem"] for s in samples]
+    assert list(found) == said
+
+
 def as_float_chw(s):
     image = {k: torch.from_numpy(s[k]).permute(2, 0, 1) / 255 for k in ("image", "before")}
     return {**s, **image, "depth": torch.from_numpy(s["depth"].astype(np.int64))[None]}

@@ -183,7 +183,7 @@ def _looks(frame: Frame, uv: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
     if camera.distortion is None and (own is None or own.distortion is None):
         lens = [camera.f, camera.c]
         lens += [camera.f.new_empty(0)] * 2 if own is None else [own.f, own.c]
-        start = uv.contiguous()
+        start, *lens = (x.contiguous() for x in (uv, *lens))
         if {x.dtype for x in (start, *lens)} != {torch.float32} or not native.serves(start, *lens):
             return None
         pixel, at = (torch.empty_like(start, dtype=torch.int32) for _ in range(2))
