@@ -345,6 +345,13 @@ void places(Tensor uv, Tensor f, Tensor c, Tensor map_f, Tensor map_c, Tensor pi
   }
 }
 
+void pixels(Tensor uv, Tensor pixel) {
+  const float* from = data<float>(uv);
+  int32_t* to = data<int32_t>(pixel);
+  const int64_t all = uv.numel();
+  for (int64_t i = 0; i < all; ++i) to[i] = pixel_of(from[i]);
+}
+
 // Stage 2 from what was read: depth (B h w) and levels conf of its size (or of none) at pixels `at` (B, N, 2), extremes of
 // the depth around them, and of the picture (height, width) around pixels (B, N, 2) what window_brightness finds; rays
 // (B, N, 3). Fills depth, sigma and confidence (B, N), xyz (B, N, 3), flags (B, N).
@@ -428,6 +435,7 @@ STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
   m.def(
       "places(Tensor uv, Tensor f, Tensor c, Tensor map_f, Tensor map_c, Tensor(a!) pixel, Tensor(b!) at, Tensor(c!) ray, "
       "float across, float down) -> ()");
+  m.def("pixels(Tensor uv, Tensor(a!) pixel) -> ()");
   m.def(
       "samples(Tensor depth, Tensor conf, Tensor at, Tensor low, Tensor high, Tensor pixel, Tensor mean, Tensor centre, "
       "Tensor top, Tensor bottom, Tensor ray, Tensor(a!) found, Tensor(b!) sigma, Tensor(c!) confidence, Tensor(d!) xyz, "
@@ -441,6 +449,7 @@ STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) {
   m.impl("window_brightness", TORCH_BOX(&window_brightness));
   m.impl("window_texture", TORCH_BOX(&window_texture));
   m.impl("places", TORCH_BOX(&places));
+  m.impl("pixels", TORCH_BOX(&pixels));
   m.impl("samples", TORCH_BOX(&samples));
   m.impl("holes", TORCH_BOX(&holes));
 }

@@ -18,7 +18,7 @@ from torch.utils._pytree import tree_leaves
 from dhtorch import WINDOW, dense, native, stereo
 from dhtorch.codes import PoseCode, Source
 from dhtorch.evaluate.holdout import range_split
-from dhtorch.geometry import affine, least_squares, near_far, neighbours, p3p, pyramid, ransac, se3, sweep
+from dhtorch.geometry import affine, least_squares, lookup, near_far, neighbours, p3p, pyramid, ransac, se3, sweep
 from dhtorch.geometry import lucas_kanade as lk
 from dhtorch.geometry.camera import Camera, from_matrix, project, unproject
 from dhtorch.geometry.filters import gaussian
@@ -127,6 +127,16 @@ def a_view(*, hw=(61, 83), map_hw=(48, 64), seed=0):
     depth[:, ::7, ::5], depth[0, 3], depth[1, :, 9] = torch.nan, torch.inf, -torch.inf
     K = torch.tensor([[[70.0, 0, 40], [0, 71, 30], [0, 0, 1]], [[64, 0, 41.5], [0, 66, 29], [0, 0, 1]]])
     return Frame(image=image, depth=depth, camera=from_matrix(K), conf=volume(2, *map_hw, most=3, seed=seed + 1))
+
+
+@needs_compiler
+def test_pixels_are_the_same(loaded, monkeypatch):
+    uv = torch.rand(2, 50, 2, generator=torch.Generator().manual_seed(3)) * 40 - 5
+    uv[0, :8, 0] = torch.tensor([torch.nan, torch.inf, -torch.inf, 3e9, -3e9, 0.5, -0.5, 1.5])
+    calls = counted(monkeypatch, "pixels")
+    ours, torchs = both_ways(lambda: lookup.pixels(uv), monkeypatch)
+    assert calls == ["pixels"] and ours.dtype == torchs.dtype and torch.equal(ours, torchs)
+    assert lookup.pixels(uv.double()).dtype == torch.int32 and len(calls) == 1
 
 
 @needs_compiler

@@ -256,6 +256,10 @@ def nearest_index(hw: tuple[int, int], pixel: Tensor) -> tuple[Tensor, Tensor]:
 
 def pixels(uv: Tensor) -> Tensor:
     """The pixel that each ``uv`` lies in, int32; one outside of any image where it is no place at all."""
+    if native.serves(uv) and uv.dtype == torch.float32:
+        pixel = torch.empty_like(uv, dtype=torch.int32)
+        torch.ops.dhtorch.pixels.default(uv, pixel)
+        return pixel
     return round_half_up(uv.nan_to_num(-1.0)).int()
 
 
