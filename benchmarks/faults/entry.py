@@ -153,8 +153,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("ExtendDepth.left_out", "self.tally.add(torch.tensor([SampleProblem.UNREADABLE]))", "pass"),
         ("ExtendDepth._asked", "torch.where(read.paired[:, None], estimate.gate, Gate.NO_TRACK)", "estimate.gate"),
         ("ExtendDepth._answer", "tokens_hw=self.tokens_hw, fit=self.fit", "tokens_hw=self.tokens_hw"),
-        ("_has_returns", "frame.depth.amax((1, 2)) > 0", "frame.depth.amin((1, 2)) > 0"),
-        ("_has_returns", "min(seen.tolist(), default=0) > 0", "max(seen.tolist(), default=0) > 0"),
+        ("ExtendDepth._answer", "frame.depth.amax((1, 2)) > 0", "frame.depth.amin((1, 2)) > 0"),
         ("ExtendDepth._answer", '"score": found.score', '"score": found.sigma'),
         ("ExtendDepth._answer", '"hole": samples.hole', '"hole": samples.flag'),
         (

@@ -15,12 +15,12 @@ from dhtorch.geometry import camera as cam
 from dhtorch.method import Method, networks
 from dhtorch.methods import chosen
 from dhtorch.pair import merge
-from dhtorch.records import NO_HINT, DepthMap, Estimate, Frame, PoseFit, Samples, TrackHint
+from dhtorch.records import NO_HINT, DepthMap, Estimate, PoseFit, Samples, TrackHint
 from dhtorch.transform import given, maps
 from dhtorch.transform.leaves import SampleError, check_sample, find, to_tensor
 from dhtorch.transform.problems import SampleProblem, Tally
 from dhtorch.transform.tokens import CHANNELS, FITS, grid, patch_tokens
-from dhtorch.transform.views import Read, Views, told_at_once
+from dhtorch.transform.views import Read, Views
 
 ON_ERROR = ("raise", "skip", "flag")
 
@@ -167,7 +167,7 @@ class ExtendDepth(torch.nn.Module):
         valid = found.source != Source.NONE
         xyz = samples.xyz if estimate is None else cam.unproject(frame.camera, found.uv, found.depth)
         problem = (~paired).int() * SampleProblem.NO_SECOND_VIEW
-        problem = torch.where(_has_returns(frame, samples), problem, SampleProblem.NO_DEPTH)
+        problem = torch.where(frame.depth.amax((1, 2)) > 0, problem, SampleProblem.NO_DEPTH)
         added = {
             "uv": found.uv,
             "xyz": torch.where(valid[..., None], xyz, 0.0),
@@ -243,12 +243,6 @@ class ExtendDepth(torch.nn.Module):
         # Copies of their own: a row of a shared table would be sent to the main process with the whole table.
         mine = {self.prefix + key: x if self.batched else x[0].contiguous() for key, x in added.items()}
         return {**sample, **mine}
-
-
-def _has_returns(frame: Frame, samples: Samples) -> Tensor:
-    """Whether there is a return anywhere in each map (B,); whole maps are looked through where no sample tells."""
-    seen = samples.depth.detach().amax(1) if samples.depth.shape[1] else samples.depth.new_zeros(len(frame.depth))
-    return seen > 0 if told_at_once(seen) and min(seen.tolist(), default=0) > 0 else frame.depth.amax((1, 2)) > 0
 
 
 def _pose(fit: PoseFit | None, paired: Tensor, like: Tensor) -> dict[str, Tensor]:

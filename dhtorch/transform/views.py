@@ -252,7 +252,7 @@ class Views:
         flat = flat[:, :: max(1, flat.shape[1] // PROBES)]
         median = torch.where(flat > 0, flat, torch.nan).nanmedian(1).values
         low, high = self.min_depth * (1 + _ROUNDING), self.max_depth * (1 - _ROUNDING)
-        if told_at_once(median) and all(low < m < high or math.isnan(m) for m in median.tolist()):
+        if _told_at_once(median) and all(low < m < high or math.isnan(m) for m in median.tolist()):
             return []
         said = f"{self.depth}: the median return is {{:.4g}} m with the unit {self.depth_unit!r}, expected"
         return [
@@ -281,7 +281,7 @@ class Views:
 
     def _fits_surely(self, camera: Camera, hw: tuple[int, int]) -> bool:
         """Whether no rounding can make the intrinsics suspect; for few numbers operations of torch are dear."""
-        if not (told_at_once(camera.c) and camera.f.dtype == camera.c.dtype):
+        if not (_told_at_once(camera.c) and camera.f.dtype == camera.c.dtype):
             return False
         off = (abs((c + 0.5) / n - 0.5) for row in camera.c.tolist() for c, n in zip(row, (hw[1], hw[0]), strict=True))
         return all(x < self.max_offset - _ROUNDING for x in off) and all(x > 0 for x in camera.f.flatten().tolist())
@@ -307,7 +307,7 @@ def _place(at: int, T: int, key: str) -> int:
     return at % T
 
 
-def told_at_once(x: Tensor) -> bool:
+def _told_at_once(x: Tensor) -> bool:
     """Whether numbers may be looked at without waiting for a device, and have the digits for it."""
     return x.device.type == "cpu" and x.dtype.itemsize >= 4 and not is_transformed()
 
