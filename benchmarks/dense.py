@@ -51,11 +51,7 @@ def measure(hw: tuple[int, int], threads: int, options: Any) -> list[dict[str, A
         views = (small[0], cameras[0]), (small[1], cameras[1])
         stereo.matched(stereo.rectify(*views, trace["fit"].T_1_from_0, nearest_m=0.7 * NEAR).pictures)
 
-    def compiled() -> None:
-        with harness.natively():
-            ours()
-
-    a, b, c = harness.in_turn([ours, peer, compiled], repeats=options.repeats, clock=options.clock)
+    a, b, c = harness.in_turn([ours, peer, harness.natively()(ours)], repeats=options.repeats, clock=options.clock)
     more: dict[str, Any] = {"n": size[0] * size[1], "bar": True}
     name, other_side = f"sweep_{hw[1]}x{hw[0]}", "rectify + SGBM"
     return [

@@ -5,9 +5,8 @@
 One view of the built-in room with its LiDAR model (depth 192x256 with confidence), the picture resampled to 224x224 and
 1440x1920, three channels uint8, interleaved in memory as decoders leave them. The peer answers the same questions about
 the same pixels in numpy + OpenCV: depth, points, noise, confidence, flags, texture, class. Both sides keep the spiral,
-which depends on the picture's size alone. Mode ``compiled`` is ``torch.compile`` of the three stages
-with calls in C++ (``options={"cpp_wrapper": True}``), ``native`` reads
-windows with the compiled code of ``python -m dhtorch.native``.
+which depends on the picture's size alone. Mode ``compiled`` is ``torch.compile`` of the three stages with calls in C++
+(``options={"cpp_wrapper": True}``), ``native`` the stages with the compiled code of ``python -m dhtorch.native``.
 
 Errors: median relative difference of the trackability from float64 arithmetic on grey values that were not rounded.
 """
@@ -54,12 +53,6 @@ def front_end(frame: Frame, n: int) -> Samples:
     """Stages 1 to 3."""
     uv = spiral(frame.hw, n, device=frame.image.device)
     return classify(frame, backproject(frame, uv))
-
-
-def natively(frame: Frame, n: int) -> Samples:
-    """Stages 1 to 3, whose windows compiled code reads."""
-    with harness.natively():
-        return front_end(frame, n)
 
 
 class OpenCVFrontEnd:
@@ -147,7 +140,11 @@ def measure(size: str, n: int, batch: int, options: Any, compile_too: bool) -> l
     """Rows of one size: eager and compiled against OpenCV."""
     frame = view(SIZES[size], batch)
     peer = OpenCVFrontEnd(frame, n)
-    calls: list[Callable[[], Any]] = [peer, partial(front_end, frame, n), partial(natively, frame, n)]
+    calls: list[Callable[[], Any]] = [
+        peer,
+        partial(front_end, frame, n),
+        partial(harness.natively()(front_end), frame, n),
+    ]
     seconds = 0.0
     if compile_too:
         fast, seconds = compiled(front_end, frame, n)

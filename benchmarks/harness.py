@@ -84,7 +84,7 @@ def _time(call: Callable[[], Any], count: int, clock: str, device: str) -> float
 
 @contextmanager
 def natively() -> Iterator[None]:
-    """Compiled code is used in this block, and in processes forked from it."""
+    """Compiled code is used in this block, and in processes forked from it; as a decorator, in each call."""
     before, native._loaded = native._loaded, [_library()]  # no mock, which takes longer than a small call
     try:
         yield

@@ -89,12 +89,6 @@ def forward_compiled(image_0: Tensor, image_1: Tensor, uv: Tensor, window: int):
         return forward(image_0, image_1, uv, window)
 
 
-def natively(call: Callable[..., Any], *args: Any, **options: Any) -> Any:
-    """A call that may use compiled code."""
-    with harness.natively():
-        return call(*args, **options)
-
-
 def forward_opencv(image_0: Tensor, image_1: Tensor, uv: Tensor, window: int):
     """The same by OpenCV, pair after pair."""
     options: Any = {"winSize": (window, window), "maxLevel": LEVELS - 1, "criteria": (3, 30, 0.01)}
@@ -151,8 +145,8 @@ def measure(n: int, batch: int, window: int, repeats: int) -> list[dict[str, Any
         partial(track.lucas_kanade, *views, **options),
         partial(track.lucas_kanade, *views, hint=TrackHint(pyramid=kept), **options),
         partial(opencv.lucas_kanade, *views, **options),
-        partial(natively, forward, *views, window),
-        partial(natively, track.lucas_kanade, *views, **options),
+        partial(harness.natively()(forward), *views, window),
+        partial(harness.natively()(track.lucas_kanade), *views, **options),
         partial(forward_compiled, *views, window),
     ]
     begin = time.perf_counter()

@@ -32,7 +32,7 @@ from torch import Tensor
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.pair import uniform_draws
-from dhtorch.records import Camera, Pose, PoseFit, Samples, Tracks
+from dhtorch.records import Camera, Pose, Samples, Tracks
 from dhtorch.stages.pose import pnp_ransac
 
 HW, FOCAL, THRESHOLD_PX, HYPOTHESES = (480, 640), 525.0, 3.0, 64
@@ -130,18 +130,12 @@ def errors(found: Pose, truth: Pose) -> Iterator[tuple[float, float]]:
     yield from zip((turn * 180 / np.pi).tolist(), (shift * 1e3).tolist(), strict=True)
 
 
-def natively(call: Callable[[], PoseFit]) -> PoseFit:
-    """What a call answers with compiled code."""
-    with harness.natively():
-        return call()
-
-
 def measure(batch: int, n: int, outliers: float, options: Any, compile_too: bool) -> list[dict[str, Any]]:
     """Rows of one size: eager, native and compiled against every peer."""
     draws = uniform_draws(torch.arange(batch), batch, HYPOTHESES)
     samples, tracks, camera, _ = scene(batch, n, outliers, seed=1)
     seat = partial(pnp_ransac, samples, tracks, camera, camera, draws)
-    calls: dict[str, Callable[[], Any]] = {"eager": seat, "native": partial(natively, seat)}
+    calls: dict[str, Callable[[], Any]] = {"eager": seat, "native": harness.natively()(seat)}
     seconds = 0.0
     if compile_too:
         torch.compiler.reset()
@@ -159,7 +153,7 @@ def measure(batch: int, n: int, outliers: float, options: Any, compile_too: bool
         samples, tracks, camera, T = scene(batch, n, outliers, seed=100 + seed)
         ask = partial(pnp_ransac, samples, tracks, camera, camera, draws)
         wrong["eager"] += errors(ask().T_1_from_0, T)
-        wrong["native"] += errors(natively(ask).T_1_from_0, T)
+        wrong["native"] += errors(harness.natively()(ask)().T_1_from_0, T)
         for name, peer in PEERS.items():
             wrong[name] += errors(each(peer, arrays(samples, tracks)), T)
     middle = {name: np.nanmedian(np.array(w), 0) for name, w in wrong.items()}

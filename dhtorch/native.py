@@ -4,17 +4,17 @@ points, of the registration of their windows and of poses as compiled code, for 
     python -m dhtorch.native            compile ``native*.cpp``, with the system's C++ compiler, into the user's cache
     DHTORCH_NATIVE=1 python …           use it, in loader workers as well; or dhtorch.native.load() in a program
 
-``dhtorch.dense``, ``dhtorch.stages.pose``, ``dhtorch.geometry.sweep``, ``pyramid``, ``lookup``, ``lucas_kanade``,
-``affine`` and ``near_far`` ask here whether tensors may be handed over; where not (nothing was loaded, another device
-or type, under vmap, a compiler or a graph) they do the same in torch, which is the reference. Tokens and the sweep are
-alike bit for bit, its fits up to rounding: no more than one gate in 200 differs, and 99 of 100 depths by less than a
-tenth of their sigma. A pyramid, what is read around samples and what is said of them do up to one rounding of a number,
-textures up to the rounding of their sums. The search and the
-registration do up to the rounding of sums over a window: half of the places that were searched for are equal and half
-of those that were registered lie within 1e-4 px, 99 of 100 lie within a tenth of their sigma, and no more than one
-verdict in 200 changes. Of poses, whose costs and equations it sums, 99 of 100 lie within a hundredth of their sigma.
-Nothing is ever compiled or downloaded without the command above. The file in the cache is named after its sources,
-torch's version and the processor, whose widest vectors it uses.
+``dhtorch.stereo``, ``dhtorch.stages.backproject``, ``holes`` and ``pose``, ``dhtorch.geometry.sweep``, ``pyramid``,
+``lookup``, ``neighbours``, ``lucas_kanade``, ``affine`` and ``near_far`` and ``dhtorch.transform.tokens`` ask here
+whether tensors may be handed over; where not (nothing was loaded, another device or type, under vmap, a compiler or a
+graph) they do the same in torch, which is the reference. Tokens and the sweep are alike bit for bit, its fits up to
+rounding: no more than one gate in 200 differs, and 99 of 100 depths by less than a tenth of their sigma. A pyramid,
+what is read around samples and what is said of them do up to one rounding of a number, textures up to the rounding of
+their sums. The search and the registration do up to the rounding of sums over a window: half of the places that were
+searched for are equal and half of those that were registered lie within 1e-4 px, 99 of 100 lie within a tenth of their
+sigma, and no more than one verdict in 200 changes. Of poses, whose costs and equations it sums, 99 of 100 lie within a
+hundredth of their sigma. Nothing is ever compiled or downloaded without the command above. The file in the cache is
+named after its sources, torch's version and the processor, whose widest vectors it uses.
 """
 
 from __future__ import annotations

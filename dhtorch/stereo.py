@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dhtorch import native
 from dhtorch.geometry import neighbours, sweep
-from dhtorch.geometry.shapes import is_static
+from dhtorch.geometry.shapes import perhaps_any
 from dhtorch.records import PoseFit
 
 #: A pixel's own noise of grey values (a step of eight bits is 0.004), and how many of a window's pixels err by
@@ -89,15 +89,10 @@ def best_planes(base: sweep.Base, partners: list[Partner], q: Tensor) -> Found:
 
 def _idle(partners: list[Partner], like: Tensor) -> Tensor:
     """What a surface costs (B,) by views that are read for others of the batch alone: the same at all its planes."""
-    unused = [~partner.use for partner in partners if _is_read(partner.use)]
+    unused = [~partner.use for partner in partners if perhaps_any(partner.use)]
     if not unused:
         return torch.zeros_like(partners[0].use, dtype=like.dtype)
     return sweep.PATHS * sweep.UNSEEN * torch.stack(unused).sum(0).to(like.dtype)
-
-
-def _is_read(use: Tensor) -> bool:
-    """Whether a view is of use to some of a batch; all are where values are not known yet."""
-    return is_static(use) or bool(use.any())
 
 
 def _costs(base: sweep.Base, partners: list[Partner], q: Tensor) -> Tensor:
@@ -109,7 +104,7 @@ def _costs(base: sweep.Base, partners: list[Partner], q: Tensor) -> Tensor:
         C = torch.empty(len(q), planes, *shape, dtype=torch.uint8, device=q.device)
     fresh = True
     for view, _, _, use in partners:
-        if _is_read(use):
+        if perhaps_any(use):
             sweep.add_costs(C, base, view, q, use, fresh=fresh)
             fresh = False
     if fresh:

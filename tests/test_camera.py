@@ -9,7 +9,7 @@ from kornia.geometry.camera import PinholeCamera
 
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.camera import Camera
-from dhtorch.geometry.shapes import check, is_static
+from dhtorch.geometry.shapes import check, is_static, perhaps_any, surely_all
 
 HW = (480, 640)
 
@@ -351,3 +351,12 @@ def test_shapes_are_static_in_graphs_and_transforms_only():
     torch._dynamo.reset()
     captured = torch.compile(lambda v: v + 1 if is_static(v) else v - 1, fullgraph=True, backend="eager")
     assert torch.equal(captured(x), x + 1)
+
+
+def test_masks_are_looked_at_where_they_have_values_alone():
+    all_, some, none = torch.tensor([True, True]), torch.tensor([True, False]), torch.tensor([False, False])
+    assert [surely_all(x) for x in (all_, some, none)] == [True, False, False]
+    assert [perhaps_any(x) for x in (all_, some, none)] == [True, True, False]
+    told = []
+    torch.vmap(lambda x: (told.append((surely_all(x), perhaps_any(x))), x)[1])(none[None])
+    assert told == [(False, True)]

@@ -515,7 +515,10 @@ ELSEWHERE = {
     "dhtorch.geometry.near_far.squares_at",
     "dhtorch.geometry.p3p.p3p_of_planes",
     *(f"dhtorch.stages.sample.{name}" for name in ("spiral", "vogel", "grid")),
-    *(f"dhtorch.geometry.shapes.{name}" for name in ("check", "is_static", "is_transformed")),
+    *(
+        f"dhtorch.geometry.shapes.{name}"
+        for name in ("check", "is_static", "is_transformed", "perhaps_any", "surely_all")
+    ),
     *(f"dhtorch.geometry.reference.{name}" for name in ("patch", "nearest", "luma", "offsets", "levels")),
     *(
         f"dhtorch.geometry.reference.{name}"

@@ -236,6 +236,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_bound", "sizes.setdefault(axis, size) == size", "sizes.setdefault(axis, size) > 0"),
         ("_bound", "{tuple(x.shape)}", "{shape}"),
         ("_bound", "if x is None:\n            continue", "if x is None:\n            break"),
+        ("surely_all", "mask.all()", "mask.any()"),
+        ("perhaps_any", "mask.any()", "mask.all()"),
         ("is_static", "torch.compiler.is_compiling() or ", ""),
         ("is_static", " or torch._C._functorch.is_functorch_wrapped_tensor(x)", ""),
     ],

@@ -68,7 +68,6 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     "stereo": [
         ("best_planes", "(best.plane + best.shift) * step", "best.plane * step"),
         ("best_planes", ">= RIVAL * each", ">= 0 * each"),
-        ("_is_read", "bool(use.any())", "bool(use.all())"),
         ("_idle", "sweep.PATHS * sweep.UNSEEN", "sweep.UNSEEN"),
         ("_elsewhere", "torch.stack(moved).amax(0)", "torch.stack(moved).amin(0)"),
         ("fitted", "(start.misfit / MISFIT).square()", "(MISFIT / start.misfit).square()"),

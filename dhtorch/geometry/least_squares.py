@@ -19,7 +19,7 @@ from torch.autograd.forward_ad import unpack_dual
 from torch.utils import _pytree as pytree
 
 from dhtorch.geometry.se3 import Pose
-from dhtorch.geometry.shapes import check, is_static
+from dhtorch.geometry.shapes import check, surely_all
 from dhtorch.geometry.small import product
 
 #: Points nearer to the camera plane than this (m), or behind it, are not in front.
@@ -218,7 +218,7 @@ def solve_spd(
         pivot = L.diagonal(dim1=-2, dim2=-1).amin(-1)  # NaN for a NaN matrix, and so not above the limit
         ok = (info == 0) & (pivot > MIN_PIVOT) & (rhs * 0 == 0).flatten(1).all(1)
         bad = ~ok[:, None, None]
-    if not _all(ok):
+    if not surely_all(ok):
         L, A = torch.where(bad, eye, L), torch.where(bad, eye, A)
         rhs = rhs.masked_fill(bad, 0.0)
     start = torch.cholesky_solve(rhs.detach(), L)
@@ -333,12 +333,12 @@ def minimise(
         if k == steps - 1:
             found = evaluate(proposal).cost if cost is None else cost(proposal)
             better = ok & (found < best.cost)
-            if _all(better):
+            if surely_all(better):
                 return proposal, found
             return choose(better, proposal, T), torch.where(better, found, best.cost)
         there = evaluate(proposal)
         better = ok & (there.cost < best.cost)
-        if _all(better):
+        if surely_all(better):
             T, best = proposal, there
             factor = factor * 0.1
             continue
@@ -346,11 +346,6 @@ def minimise(
         best = Normal(*(_where(better, a, b) for a, b in zip(there, best, strict=True)))
         factor = torch.where(better, factor * 0.1, factor * 10)
     return T, best.cost
-
-
-def _all(mask: Tensor) -> bool:
-    """Whether a mask holds everywhere, where values may be looked at: then nothing need be chosen."""
-    return not is_static(mask) and bool(mask.all())
 
 
 def choose(mask: Tensor, new: S, old: S) -> S:

@@ -34,7 +34,7 @@ from dhtorch.geometry.near_far import (
     trial_step,
 )
 from dhtorch.geometry.se3 import Pose
-from dhtorch.geometry.shapes import is_static
+from dhtorch.geometry.shapes import is_static, surely_all
 from dhtorch.geometry.small import product
 
 #: Standard deviations of a residual coordinate, px, that are believed.
@@ -171,7 +171,7 @@ def _translates(problem: Problem, at: Unknowns, noise: Tensor, far: Tensor, prec
     still = Unknowns(Pose(at.T.R, torch.zeros_like(at.T.t)), at.turn)
     turned, rotation = minimise(evaluate, still, o.steps, cost=judge, step=trial_step)
     shown = rotation - judge(at) > o.translation_gain * rotation + SLACK
-    if not is_static(shown) and bool(shown.all()):
+    if surely_all(shown):
         return shown
     costs = [_costs(problem, x, noise, o) for x in (turned, at)]
     for part in NEAREST:

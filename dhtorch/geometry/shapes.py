@@ -70,6 +70,16 @@ def is_static(x: Tensor) -> bool:
     return torch.compiler.is_compiling() or torch._C._functorch.is_functorch_wrapped_tensor(x)
 
 
+def surely_all(mask: Tensor) -> bool:
+    """Whether a mask holds everywhere, where values may be looked at: then nothing need be chosen."""
+    return not is_static(mask) and bool(mask.all())
+
+
+def perhaps_any(mask: Tensor) -> bool:
+    """Whether a mask holds anywhere; it may where values are not known yet."""
+    return is_static(mask) or bool(mask.any())
+
+
 def is_transformed() -> bool:
     """Whether this runs inside ``torch.compile`` or a transform of ``torch.func``, whatever it is given."""
     return torch.compiler.is_compiling() or torch._C._functorch.maybe_current_level() is not None

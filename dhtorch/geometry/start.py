@@ -24,7 +24,7 @@ from torch import Tensor
 
 from dhtorch.geometry import small as closed
 from dhtorch.geometry.filters import grey
-from dhtorch.geometry.shapes import check, is_static
+from dhtorch.geometry.shapes import check, perhaps_any
 from dhtorch.tree import Record, record
 
 #: Longest side of the small pictures, px, and of those on which turn and zoom are found.
@@ -119,7 +119,7 @@ def coarse_flow(
     if linear is None:
         found = _turn(image_0, image_1, reach, turns_deg, zooms)
         plain = torch.eye(2, device=a.device).expand_as(found)
-        some = is_static(found) or bool(is_turned(found).any())
+        some = perhaps_any(is_turned(found))
         rivals = torch.stack([plain, found], 1) if some else plain[:, None]
     else:
         rivals = linear.to(a)[:, None] / larger
@@ -172,7 +172,7 @@ def upright(
     check("upright", image=(image, "B C H W"), linear=(linear, "B 2 2"), gain=(gain, "B"))
     picture = _grey(image)
     H, W = picture.shape[-2:]
-    if is_static(linear) or bool(is_turned(linear).any()):
+    if perhaps_any(is_turned(linear)):
         rows, columns = (torch.arange(n, device=image.device, dtype=picture.dtype) for n in (H, W))
         v, u = torch.meshgrid(rows, columns, indexing="ij")
         uv = turned(linear, torch.stack([u, v], -1).reshape(1, H * W, 2).expand(len(picture), -1, -1), (H, W))

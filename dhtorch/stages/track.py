@@ -19,7 +19,7 @@ from dhtorch.geometry import lucas_kanade as lk
 from dhtorch.geometry.exact import filled
 from dhtorch.geometry.graphless import spared
 from dhtorch.geometry.pyramid import Pyramid, Pyramids, build_pyramid
-from dhtorch.geometry.shapes import check, is_static
+from dhtorch.geometry.shapes import check, perhaps_any
 from dhtorch.geometry.small import product
 from dhtorch.geometry.start import Flow, inverse, is_turned, turned, upright
 from dhtorch.records import NO_HINT, TrackHint, Tracks
@@ -194,7 +194,7 @@ class _Upright:
         self.turned = is_turned(self.linear)
         self.changed = self.turned | (flows[0].gain != 1)
         # Under a compiler, which sees no values, everything is undone, if it be nothing.
-        undo = is_static(self.changed) or bool(self.changed.any())
+        undo = perhaps_any(self.changed)
         self.image = upright(image, self.linear, flows[0].gain) if undo else image
 
     def begin(self, uv_0: Tensor, known: Tensor | None) -> Tensor:
