@@ -406,7 +406,7 @@ def test_the_principal_point_lies_near_the_centre_of_the_picture():
 def test_numbers_that_are_looked_at_are_judged_as_by_operations(monkeypatch):
     def judged(given):
         with monkeypatch.context() as patched:
-            patched.setattr(views, "told_at_once", lambda _: False)
+            patched.setattr(views, "_told_at_once", lambda _: False)
             return read(given).bad
 
     near = [limit * (1 + step * 2**-23) for limit in (0.01, 100.0) for step in (-100, -2, -1, 0, 1, 2, 100)]
