@@ -66,8 +66,26 @@ FOCALS = (0.8, 0.87, 0.93, 0.95, 1.05, 1.07, 1.15, 1.25)
 #: beside its place.
 FIELDS, BESIDE = (0.55, 0.62, 0.7, 0.78, 0.87, 1.15, 1.28, 1.43, 1.6, 1.8), (-0.08, -0.04, 0.04, 0.08)
 
-#: Factors that take a depth in another unit to metres.
-UNITS = {"mm read as m": 1e-3, "m read as mm": 1e3, "inch read as m": 0.0254, "m read as inch": 1 / 0.0254}
+#: Factors that take a depth in another unit to metres; 1/256 m and 1/5000 m are the steps of KITTI's and TUM's files.
+UNITS = {
+    "mm read as m": 1e-3,
+    "m read as mm": 1e3,
+    "inch read as m": 0.0254,
+    "m read as inch": 1 / 0.0254,
+    "cm read as m": 1e-2,
+    "dm read as mm, or m as cm": 1e2,
+    "cm read as mm, or m as dm": 10.0,
+    "mm read as cm, or tenths of mm as mm": 0.1,
+    "foot read as m": 0.3048,
+    "m read as foot": 1 / 0.3048,
+    "1/5000 m read as mm": 0.2,
+    "mm read as 1/5000 m": 5.0,
+    "1/256 m read as mm": 1000 / 256,
+    "mm read as 1/256 m": 256 / 1000,
+}
+
+#: Factor by which a unit may fail to bring a map to its near returns, else it is not tried.
+NEAR_UNIT = 2.0
 
 #: Pairs of a window, fewest that may name a cause, frames from one of a pair to the other, the widest first in which
 #: such a share of the textured samples is found again.
@@ -108,6 +126,12 @@ def ray_lengths(camera: cam.Camera, hw: tuple[int, int]) -> Tensor:
     uv = torch.stack((u, v), -1).view(1, -1, 2).expand(len(camera.f), -1, -1).to(camera.f)
     with torch.no_grad():
         return cam.rays(camera, uv).norm(dim=-1).unflatten(1, hw)
+
+
+def _may_be(cause: Cause, ratio: float) -> bool:
+    """Whether it can be a cause where near returns stand at so many times what the maps say; 0 = not known."""
+    factor = UNITS.get(cause.name)
+    return factor is None or ratio == 0 or abs(math.log(ratio / factor)) < math.log(NEAR_UNIT)
 
 
 def _mirrored(depth: Tensor, axis: int) -> Tensor:
@@ -332,7 +356,18 @@ class Window:
         swallowed: set[str] = {"inverse"} if self.maps is None else set()
         if self.anchors.T_world_from_cam is None or self.others.T_world_from_cam is None:
             swallowed |= {"focal length", "unit"} if self.maps is None else {"focal length"}
-        return (NONE, *(cause for cause in CAUSES if cause.kind not in swallowed))
+        asked = [NONE, *(cause for cause in CAUSES if cause.kind not in swallowed)]
+        ratio = 0.0 if self.maps is None else self._returned_over(self.maps)
+        return [each for each in asked if _may_be(each, ratio)]
+
+    def _returned_over(self, maps: Sequence[Tensor]) -> float:
+        """Median ratio of near returns to what maps say there; 0 without one."""
+        samples = self.method.backproject(self.anchors, self.samples.uv)
+        depth = torch.cat([maps[i] for i, _ in self.pairs]).to(samples.depth)
+        at = cam.resize_pixels(self.samples.uv, self.anchors.hw, (depth.shape[-2], depth.shape[-1]))
+        depth = nearest(depth, at)[0].nan_to_num(0.0, 0.0, 0.0)
+        found = _ratio(torch.where(samples.usable, samples.depth, 0.0), depth)
+        return float(found[found > 0].median()) if bool((found > 0).any()) else 0.0
 
     def explains(self, cause: Cause) -> bool:
         """Whether maps with that fault undone come near to the sensor's returns, where there are any: an explanation

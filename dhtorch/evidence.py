@@ -78,6 +78,46 @@ def references(samples: Samples, estimate: Estimate, *, near: bool) -> Reference
     return References(samples.uv, depth, sigma / depth, shared / depth, used, returned)
 
 
+def extent(depth: Tensor, hw: tuple[int, int]) -> Tensor:
+    """Standard deviation (B, h, w) of log depth by which a map coarser than the grid ``hw`` may be off at its pixels
+    and not be wrong; 0 where it is as fine.
+
+    A coarse map knows the depths of its pixels' centres. An outline between two centres lies anywhere as likely: at a
+    pixel of the grid that is a share o of the way from one to the other it is the other's depth that is true with
+    probability o. Gradient: none.
+    """
+    check("extent", depth_map=(depth, "B y x"))
+    log = torch.where(depth > 0, depth.detach(), torch.nan).log()
+    total = log.new_zeros(len(log), *hw)
+    index, beside, off = zip(*(_between(n, m, log) for n, m in zip(log.shape[-2:], hw, strict=True)), strict=True)
+    (row, column), (row_beside, column_beside), (off_row, off_column) = index, beside, off
+    here = log[:, row[:, None], column]
+    for other, share in (
+        (log[:, row_beside[:, None], column], off_row[:, None]),
+        (log[:, row[:, None], column_beside], off_column),
+    ):
+        total = total + share * (other - here).square().nan_to_num(0.0)
+    return total.sqrt()
+
+
+def _between(n: int, m: int, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Of ``m`` pixels along a side of which a map has ``n``: the map's pixel each is in, that on its other side, and
+    which share of the way to that one it stands."""
+    place = (torch.arange(m).to(like) + 0.5) * n / m - 0.5
+    index = (place + 0.5).floor().clamp(0, n - 1)
+    off = place - index
+    beside = (index + off.sign()).clamp(0, n - 1)
+    return index.long(), beside.long(), off.abs() * (n < m)
+
+
+def loosened(found: References, loose: Tensor, hw: tuple[int, int]) -> References:
+    """Depths to hold a map against whose pixels (B, h, w) stand for depths that differ by so much (log); ``hw`` of the
+    picture. Gradient: none."""
+    check("loosened", loose=(loose, "B h w"), uv=(found.uv, "B N 2"))
+    at = nearest(loose, resize_pixels(found.uv, hw, (loose.shape[-2], loose.shape[-1])))[0]
+    return found._replace(sigma=(found.sigma.square() + at.square()).sqrt())
+
+
 def silent(like: Tensor) -> Said:
     """Nothing is said of any pixel of a grid."""
     nowhere = torch.full_like(like, -2, dtype=torch.int32)
@@ -88,7 +128,7 @@ def by_answers(
     depth: Tensor,  # (B, h, w) m, 0 = the map says nothing
     hw: tuple[int, int],  # of the picture
     found: References,
-    tolerance: float,
+    tolerance: float | Tensor,  # (B, h, w) or one for all
     returns: Samples | None = None,  # (B, h, w) each: near returns at every pixel of the grid
 ) -> Said:
     """Near returns at the pixel itself, else answers around it that lie on the same surface of the map.
@@ -124,7 +164,7 @@ def by_views(
     depth: Tensor,  # (B, h, w) m, 0 = the map says nothing
     base: sweep.Base,
     partners: list[stereo.Partner],
-    tolerance: float,
+    tolerance: float | Tensor,  # (B, h, w) or one for all
 ) -> Said:
     """How the map fits the pictures of other views, whatever their exposure, beside other depths along the same rays.
 
@@ -151,7 +191,7 @@ def by_maps(
     base: sweep.Base,
     partners: list[stereo.Partner],
     maps: list[Tensor],  # (B, h', w') m of each partner, 0 = says nothing
-    tolerance: float,
+    tolerance: float | Tensor,  # (B, h, w) or one for all
 ) -> Said:
     """What lies in front of a surface that another view's map shows: one of the two maps is wrong.
 
@@ -183,7 +223,7 @@ def by_maps(
     return said
 
 
-def _by_view(q: Tensor, base: sweep.Base, partner: stereo.Partner, tolerance: float) -> tuple[Tensor, Tensor]:
+def _by_view(q: Tensor, base: sweep.Base, partner: stereo.Partner, tolerance: float | Tensor) -> tuple[Tensor, Tensor]:
     """Evidence (B, h, w) of one view in sigmas, NaN where it says nothing, and whether it would have told an error."""
     view, picture, fit, _ = partner
     here = sweep.fit_windows(base, view, picture, q, radius=RADIUS)
@@ -199,7 +239,7 @@ def _by_view(q: Tensor, base: sweep.Base, partner: stereo.Partner, tolerance: fl
     # A window's log-likelihood goes by its unexplained share of variance.
     better = (INDEPENDENT * ((1 - ours.square().where(ours > 0, 0.0)) / (1 - best.square())).log()).clamp_min(0).sqrt()
     alone = (INDEPENDENT * ((1 - beside.square()) / (1 - ours.square())).log()).clamp_min(0).sqrt() >= 1.5
-    far = ~fits & (best >= RIVAL) & (better >= 1.0)
+    far = ~fits & (best >= RIVAL) & (better >= 1.0) & (factor.log().abs() > SIGMAS * tolerance)
     misfit = torch.where(fits & alone, step.clamp(-0.5, 0.5) / sigma, torch.nan)
     misfit = torch.where(far, factor.log().sign() * better * SIGMAS / 2, misfit)
     misfit = torch.where(seen, misfit, torch.nan)

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch import dense, evidence, tree
@@ -144,13 +145,16 @@ def judged(
     samples = method.look(anchor) if asked is None else asked.samples
     joined = Estimate.silent(samples, Gate.NO_TRACK, n_views=0) if asked is None else asked.joined
     found = evidence.references(samples, joined, near=not own)
-    answers = evidence.by_answers(grid, anchor.hw, found, tolerance, None if own else returns)
+    loose = torch.zeros_like(grid) if depth_map is None else evidence.extent(depth_map.to(grid), hw)
+    found = evidence.loosened(found, loose, anchor.hw)
+    allowed = (loose.square() + tolerance**2).sqrt()
+    answers = evidence.by_answers(grid, anchor.hw, found, allowed, None if own else returns)
     kinds = [answers]
     if asked is not None and views:
         number = offered if offered is not None else torch.arange(len(asked.fits.code))[:, None].expand(-1, len(grid))
         source = None if own else other_maps
         of = _Judged(grid, anchor, asked, number.to(grid.device), own)
-        kinds += _asked_views(of, source, partners, tolerance)
+        kinds += _asked_views(of, source, partners, allowed)
     none = torch.full((len(grid), 3), torch.nan).to(grid)
     ruler = none if asked is None else _ruler(anchor, asked)
     return _joined(grid, kinds, _of_frame(grid, anchor, found, own), ruler, own)
@@ -175,7 +179,7 @@ def _asked(method: Method, anchor: Frame, others: Frame | Sequence[Frame], trace
     return dense.views_asked(joined, others, trace)
 
 
-def _asked_views(of: _Judged, other_maps: Tensor | None, partners: int, tolerance: float) -> tuple[Said, Said]:
+def _asked_views(of: _Judged, other_maps: Tensor | None, partners: int, tolerance: Tensor) -> tuple[Said, Said]:
     """What pictures and maps of the views say that are worth most; a view's number is its place among those offered."""
     grid, asked = of.grid, of.asked
     base = sweep.base(*dense.resized(of.anchor, max(grid.shape[-2:])))
@@ -191,7 +195,7 @@ def _asked_views(of: _Judged, other_maps: Tensor | None, partners: int, toleranc
             depths = [_of_sensor(asked.frames[k, batch], base.hw) for k in index]
         else:
             assert other_maps is not None
-            depths = [_resized(other_maps.to(grid)[n, batch], base.hw) for n in number]
+            depths = [_surfaces(other_maps.to(grid)[n, batch], base.hw) for n in number]
         maps = evidence.by_maps(grid, base, chosen, [_usable(depth) for depth in depths], tolerance)
     return _numbered(pictures, number), _numbered(maps, number)
 
@@ -232,6 +236,17 @@ def _resized(depth_map: Tensor, hw: tuple[int, int]) -> Tensor:
         for n, m in zip(hw, depth_map.shape[-2:], strict=True)
     )
     return depth_map[..., rows[:, None], columns]
+
+
+def _surfaces(depth_map: Tensor, hw: tuple[int, int]) -> Tensor:
+    """What a map shows on a grid: where it is coarser, the nearest of its pixels around,
+    since an outline lies anywhere between two."""
+    if min(n / m for n, m in zip(depth_map.shape[-2:], hw, strict=True)) < 1:
+        known = _usable(depth_map)
+        nearness = torch.where(known > 0, 1 / known.clamp_min(1e-6), 0.0)
+        nearness = F.max_pool2d(nearness[:, None], 3, 1, 1)[:, 0]
+        depth_map = torch.where(known > 0, 1 / nearness.clamp_min(1e-6), 0.0)
+    return _resized(depth_map, hw)
 
 
 def _of_sensor(frame: Frame, hw: tuple[int, int]) -> Tensor:

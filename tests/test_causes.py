@@ -5,7 +5,18 @@ import re
 import pytest
 import torch
 
-from dhtorch.causes import CAUSES, NONE, TRACKING, Watched, decided, name_cause, ray_lengths, turned, watch
+from dhtorch.causes import (
+    CAUSES,
+    NONE,
+    TRACKING,
+    UNITS,
+    Watched,
+    decided,
+    name_cause,
+    ray_lengths,
+    turned,
+    watch,
+)
 from dhtorch.evaluate.holdout import range_split
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.lookup import magnified
@@ -58,6 +69,23 @@ def test_a_planted_fault_is_named(name, own, frames, watched):
     found = name_cause(shown, maps, method=METHOD, watched=watched)
     assert found.kind == kind
     assert found.n_pairs >= 4
+
+
+@pytest.mark.parametrize("own", [True, False])
+@pytest.mark.parametrize("name", UNITS)
+def test_a_unit_is_named(name, own, frames, watched):
+    spoilt = [frame.depth / UNITS[name] for frame in frames]
+    if own:
+        shown, maps = [f.replace(depth=d) for f, d in zip(frames, spoilt, strict=True)], None
+    else:
+        shown, maps = [range_split(f, 2.0).replace(T_world_from_cam=None) for f in frames], spoilt
+    assert name_cause(shown, maps, method=METHOD, watched=watched).cause == name
+
+
+def test_a_scale_that_is_no_unit_is_not_named(frames, watched):
+    shown = [range_split(f, 2.0).replace(T_world_from_cam=None) for f in frames]
+    for factor in (1.6, 0.5, 7.0):
+        assert name_cause(shown, [factor * f.depth for f in frames], method=METHOD, watched=watched).cause is None
 
 
 def test_a_fault_that_is_no_known_one_is_not_named_after_the_nearest(frames, watched):

@@ -70,6 +70,9 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     "evidence": [
         ("references", "samples.usable & ((samples.flag", "samples.usable | ((samples.flag"),
         ("references", "& ~returned", ""),
+        ("extent", "share * (other - here).square()", "(other - here).square()"),
+        ("_between", "off.abs() * (n < m)", "off.abs()"),
+        ("loosened", "+ at.square()", ""),
         ("by_answers", "own + (square - mean.square()).clamp_min(0)", "own"),
         ("by_answers", "there & (SIGMAS * sigma <= TELLS)", "there"),
         ("by_views", "misfit.abs() < said.misfit.abs()", "misfit.abs() > said.misfit.abs()"),
@@ -109,6 +112,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_ruler", "+ TRAJECTORY_METRE**2", ""),
         ("_numbered", "torch.where(said.view >= 0, place, said.view)", "place"),
         ("_resized", "+ 0.5) * m / n", ") * m / n"),
+        ("_surfaces", "strict=True)) < 1:", "strict=True)) < 0:"),
+        ("judged", "(loose.square() + tolerance**2).sqrt()", "torch.full_like(loose, tolerance)"),
     ],
     "evaluate.detection": [("auroc", "0.5 * (count - 1).double()", "0")],
     "transform.judge_depth": [

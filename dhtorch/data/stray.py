@@ -77,7 +77,9 @@ def read(
     rows, report = _odometry(root / "odometry.csv")
     video = root / "rgb.mp4" if images else None
     if video is not None and not video.is_file():
-        raise FormatError(video, "file", "no such file", "the pictures, or option images=False to read depth alone")
+        raise FormatError(
+            video, "file", "no such file", "the pictures (images=False reads depth alone, for what needs none)"
+        )
     hw = video_header(video, all_frames=True).hw if video is not None else _size(K_hw, root) or _HW
     shots, missing = _shots(root, rows, poses)
     report += missing
