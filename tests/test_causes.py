@@ -215,3 +215,19 @@ def test_a_roll_is_undone(quarters):
     depth = torch.arange(48.0).reshape(1, 6, 8).repeat_interleave(8, 1).repeat_interleave(8, 2)
     back = turned(turned(depth, quarters), 4 - quarters)
     assert (back == depth).float().mean() > 0.8
+
+
+def test_a_quarter_turn_is_counter_clockwise():
+    depth = torch.zeros(1, 4, 4)
+    depth[0, 0, 3] = 1  # the upper right corner
+    assert turned(depth, 1)[0, 0, 0] == 1
+    assert turned(depth, 3)[0, 3, 3] == 1
+
+
+def test_what_a_motion_swallows_is_not_asked(frames, watched):
+    """Inverse depths of the sensor's own have no returns that tell their scale."""
+    own = name_cause(frames, method=METHOD, watched=watched)
+    beside = name_cause(frames, [f.depth for f in frames], method=METHOD, watched=watched)
+    inverse = next(cause.name for cause in CAUSES if cause.kind == "inverse")
+    assert inverse not in own.loss
+    assert inverse in beside.loss

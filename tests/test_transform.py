@@ -27,6 +27,7 @@ from dhtorch.transform import (
     Views,
     collate_kept,
     one_thread,
+    views,
 )
 
 extend_window = PAPER.replace(views=5)
@@ -479,3 +480,11 @@ def test_no_sample_is_skipped_but_cannot_be_flagged():
 def test_a_transform_without_a_unit_says_which_there_are(transform):
     with pytest.raises(ValueError, match=r"depth_unit is '', expected one of \['m', 'mm'\] or metres per unit"):
         transform()
+
+
+def test_one_return_that_no_probe_meets_is_a_return():
+    depth = torch.zeros(2, 60, 80)
+    depth[1, 31, 17] = 1.5
+    assert 2 * views.PROBES < 60 * 80
+    assert views.any_return(depth).tolist() == [False, True]
+    assert views.any_return(depth[1:] + 1).tolist() == [True]

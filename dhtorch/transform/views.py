@@ -19,7 +19,7 @@ from torch import Tensor
 
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import conventions
-from dhtorch.geometry.shapes import is_transformed
+from dhtorch.geometry.shapes import is_transformed, surely_all
 from dhtorch.records import Camera, Frame, GivenPose
 from dhtorch.transform import given
 from dhtorch.transform.leaves import Leaves, Numbers, SampleError
@@ -248,8 +248,7 @@ class Views:
         return z if low <= 0 and high == float("inf") else torch.where((z > low) & (z <= high), z, 0.0)
 
     def _depth_checks(self, depth: Tensor) -> list[tuple[Tensor, Tensor, str]]:
-        flat = depth.detach().flatten(1)
-        flat = flat[:, :: max(1, flat.shape[1] // PROBES)]
+        flat = _probes(depth.detach())
         median = torch.where(flat > 0, flat, torch.nan).nanmedian(1).values
         low, high = self.min_depth * (1 + _ROUNDING), self.max_depth * (1 - _ROUNDING)
         if _told_at_once(median) and all(low < m < high or math.isnan(m) for m in median.tolist()):
@@ -296,6 +295,18 @@ class Views:
                 "transposed? A map with a field of its own needs depth_intrinsics"
             )
         return None
+
+
+def _probes(depth: Tensor) -> Tensor:
+    """Some of the numbers of each map, evenly spread."""
+    flat = depth.flatten(1)
+    return flat[:, :: max(1, flat.shape[1] // PROBES)]
+
+
+def any_return(depth: Tensor) -> Tensor:
+    """Whether maps (B, h, w) have a return, (B,) bool: a pass over all of them only where a few numbers do not tell."""
+    some = (_probes(depth) > 0).any(1)
+    return some if depth.is_cpu and surely_all(some) else depth.amax((1, 2)) > 0
 
 
 def _place(at: int, T: int, key: str) -> int:
