@@ -29,7 +29,7 @@ from dhtorch import data, storage
 from dhtorch.data.recording import Recording
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
-from dhtorch.integrate.level import GRAVITY, mean_upwards
+from dhtorch.integrate.level import GRAVITY, directions, mean_upwards
 from dhtorch.records import Frame
 
 #: Frames that are looked at, and columns of a depth map that are kept.
@@ -72,17 +72,9 @@ def normals(frame: Frame) -> tuple[Tensor, Tensor]:
     return (n[good] / area[good, None]) @ R.T, area[good] / 4
 
 
-def sphere(count: int = 4000) -> Tensor:
-    """Directions (count, 3) spread evenly."""
-    k = torch.arange(count, dtype=torch.float64) + 0.5
-    z, turn = 1 - 2 * k / count, k * math.pi * (3 - math.sqrt(5))
-    r = (1 - z * z).sqrt()
-    return torch.stack((r * turn.cos(), r * turn.sin(), z), -1)
-
-
 def mode(n: Tensor, area: Tensor, guess: Tensor, within_deg: float) -> tuple[Tensor, float]:
     """The direction that most of the area shares, within an angle of ``guess``; and that share."""
-    axes = sphere()
+    axes = directions(4000)
     axes = axes[axes @ guess > math.cos(math.radians(within_deg))]
     kernel = math.cos(math.radians(BIN_DEG))
     mass = torch.zeros(len(axes), dtype=torch.float64)

@@ -123,7 +123,7 @@ def standing(normal: Tensor, guess: Tensor) -> Tensor | None:
         return None
     draw = torch.Generator().manual_seed(0)
     some = torch.nn.functional.normalize(normal[torch.randint(len(normal), (min(len(normal), 5000),), generator=draw)])
-    axes = _sphere(DIRECTIONS)
+    axes = directions(DIRECTIONS)
     axes = axes[axes @ guess > WITHIN]
     upright = torch.asin((some @ axes.T).abs().clamp(max=1))  # angle from the plane at right angles to the axis
     level = torch.pi / 2 - upright
@@ -132,8 +132,8 @@ def standing(normal: Tensor, guess: Tensor) -> Tensor | None:
     return axes[best] if float(score[best]) >= LEAST_SCORE else None
 
 
-def _sphere(count: int) -> Tensor:
-    """Directions (count, 3) spread evenly, along a spiral."""
+def directions(count: int) -> Tensor:
+    """Unit vectors (count, 3) spread evenly over the sphere, along a spiral."""
     k = torch.arange(count, dtype=torch.float64) + 0.5
     z, turn = 1 - 2 * k / count, k * math.pi * (3 - math.sqrt(5))
     r = (1 - z * z).sqrt()

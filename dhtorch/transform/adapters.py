@@ -24,7 +24,18 @@ from dhtorch.transform.leaves import SampleError, find, has, to_tensor, without
 _NEIGHBOURS = 16
 
 
-class ExtendedDataset(Dataset[Any]):
+class _Wrapped:
+    """What a wrapper does not know itself, its data set does."""
+
+    dataset: Any
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or name == "dataset":
+            raise AttributeError(name)
+        return getattr(self.dataset, name)
+
+
+class ExtendedDataset(_Wrapped, Dataset[Any]):
     """A map-style data set whose items went through the transform; everything else is the data set's own.
 
     With ``gap`` the other view is the item so many places before, of the same episode; it is put under the
@@ -108,11 +119,6 @@ class ExtendedDataset(Dataset[Any]):
         gone = self.consumed if self.gap is None else (*self.consumed, *self._lent)
         return without(out, gone) if out is not None and gone else out
 
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__") or name == "dataset":
-            raise AttributeError(name)
-        return getattr(self.dataset, name)
-
     def _loaded(self, i: int) -> dict[str, Any]:
         """The item, with the other view where it comes from another item."""
         sample = self.dataset[i]
@@ -141,7 +147,7 @@ class ExtendedDataset(Dataset[Any]):
         raise SampleError(f"neither item {i} nor its neighbours can be loaded: {error}") from error
 
 
-class ExtendedStream(IterableDataset[Any]):
+class ExtendedStream(_Wrapped, IterableDataset[Any]):
     """An iterable data set whose samples went through the transform; skipped ones are left out of the stream."""
 
     def __init__(self, dataset: Iterable[Any], transform: Callable[[Any], dict[str, Any] | None]) -> None:
@@ -152,11 +158,6 @@ class ExtendedStream(IterableDataset[Any]):
             out = self.transform(sample)
             if out is not None:
                 yield out
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__") or name == "dataset":
-            raise AttributeError(name)
-        return getattr(self.dataset, name)
 
 
 class NumpyTransform:
