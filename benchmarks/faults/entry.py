@@ -52,7 +52,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("Views._metres", "x * float(self.depth_unit)", "x / float(self.depth_unit)"),
         ("Views._metres", "(z > low) & (z <= high)", "(z >= low) & (z <= high)"),
         ("Views._metres", "(z > low) & (z <= high)", "(z > low) & (z < high)"),
-        ("Views._depth_checks", "flat[:, :: max(1, flat.shape[1] // PROBES)]", "flat[:, :PROBES]"),
+        ("_probes", "flat[:, :: max(1, flat.shape[1] // PROBES)]", "flat[:, :PROBES]"),
+        ("any_return", "depth.amax((1, 2)) > 0", "depth.amin((1, 2)) > 0"),
         ("Views._depth_checks", "flat > 0", "flat >= 0"),
         ("Views._depth_checks", "median > self.max_depth", "median >= self.max_depth"),
         ("Views._depth_checks", "median < self.min_depth", "median < 0"),
@@ -153,7 +154,6 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("ExtendDepth.left_out", "self.tally.add(torch.tensor([SampleProblem.UNREADABLE]))", "pass"),
         ("ExtendDepth._asked", "torch.where(read.paired[:, None], estimate.gate, Gate.NO_TRACK)", "estimate.gate"),
         ("ExtendDepth._answer", "tokens_hw=self.tokens_hw, fit=self.fit", "tokens_hw=self.tokens_hw"),
-        ("ExtendDepth._answer", "frame.depth.amax((1, 2)) > 0", "frame.depth.amin((1, 2)) > 0"),
         ("ExtendDepth._answer", '"score": found.score', '"score": found.sigma'),
         ("ExtendDepth._answer", '"hole": samples.hole', '"hole": samples.flag'),
         (
