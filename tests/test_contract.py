@@ -536,7 +536,7 @@ ELSEWHERE = {
     "dhtorch.integrate.from_maps.join",
     *(f"dhtorch.integrate.scales.{name}" for name in ("coarse", "union")),
     *(f"dhtorch.integrate.mapping.{name}" for name in ("make", "run", "voxel_of", "meshed", "write", "write_surface")),
-    *(f"dhtorch.integrate.level.{name}" for name in ("upwards", "mean_upwards", "floor", "standing")),
+    *(f"dhtorch.integrate.level.{name}" for name in ("upwards", "mean_upwards", "floor", "standing", "directions")),
     "dhtorch.geometry.se3.turn_between",
     *(
         f"dhtorch.integrate.recording.{name}"

@@ -9,7 +9,7 @@ import torch
 from dhtorch import MAP, data
 from dhtorch.data.recording import Recording
 from dhtorch.geometry import se3
-from dhtorch.integrate.level import WITHIN, floor, standing, upwards
+from dhtorch.integrate.level import WITHIN, directions, floor, standing, upwards
 from dhtorch.records import Pose
 
 GUESSES = torch.nn.functional.normalize(torch.randn(12, 3, dtype=torch.float64, generator=torch.manual_seed(0)), dim=-1)
@@ -80,3 +80,11 @@ def test_a_trajectory_that_begins_in_its_first_camera_is_not_taken_for_level():
     assert held("tum", (0.2, 0, 0)) == pytest.approx([0, 1, 0], abs=0.01), (
         "z is up by the format; the floor knows better"
     )
+
+
+def test_directions_are_spread_evenly():
+    found = directions(2000)
+    torch.testing.assert_close(found.norm(dim=-1), torch.ones(2000, dtype=torch.float64))
+    torch.testing.assert_close(found.T @ found / 2000, torch.eye(3).double() / 3, atol=2e-3, rtol=0)
+    nearest = (found @ found.T).fill_diagonal_(-1).amax(1).clamp(-1, 1).acos()
+    assert nearest.max() < 1.6 * nearest.median()
