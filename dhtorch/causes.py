@@ -294,9 +294,7 @@ def _off(told: tuple[Tensor, Tensor], depth: Tensor, cause: Cause, frame: Frame)
     """Mean loss of a map (1, h, w) with a fault undone at near returns; NaN where it meets too few."""
     uv, returned = told
     depth = _undone(depth.to(returned), cause, frame.replace(depth_camera=None))
-    at = nearest(depth, cam.resize_pixels(uv, frame.hw, (depth.shape[-2], depth.shape[-1])))[0].nan_to_num(
-        0.0, 0.0, 0.0
-    )
+    at = _said(depth, uv, frame.hw)
     at = at * _ratio(returned, at) if cause.scaled else at
     both = (returned > 0) & (at > 0)
     miss = torch.where(both, at / torch.where(both, returned, 1.0), 1.0).log() / math.log(HALF_RATIO)
@@ -364,9 +362,8 @@ class Window:
         """Median ratio of near returns to what maps say there; 0 without one."""
         samples = self.method.backproject(self.anchors, self.samples.uv)
         depth = torch.cat([maps[i] for i, _ in self.pairs]).to(samples.depth)
-        at = cam.resize_pixels(self.samples.uv, self.anchors.hw, (depth.shape[-2], depth.shape[-1]))
-        depth = nearest(depth, at)[0].nan_to_num(0.0, 0.0, 0.0)
-        found = _ratio(torch.where(samples.usable, samples.depth, 0.0), depth)
+        told = torch.where(samples.usable, samples.depth, 0.0)
+        found = _ratio(told, _said(depth, self.samples.uv, self.anchors.hw))
         return float(found[found > 0].median()) if bool((found > 0).any()) else 0.0
 
     def explains(self, cause: Cause) -> bool:
@@ -406,8 +403,7 @@ class Window:
         if self.maps is not None and not sensor:
             picture = scaled[0].replace(depth_camera=None)
             depth = _undone(torch.cat([self.maps[i] for i in place]).to(told), cause, picture)
-            at = cam.resize_pixels(self.samples.uv, view.hw, (depth.shape[-2], depth.shape[-1]))
-            depth = nearest(depth, at)[0].nan_to_num(0.0, 0.0, 0.0)
+            depth = _said(depth, self.samples.uv, view.hw)
             depth = depth * _ratio(told, depth) if cause.scaled else depth
             depth = torch.where(samples.usable, depth, 0.0) if near else depth
         found = self._under_fit(samples, depth, scaled)
@@ -469,6 +465,12 @@ def _undone(depth: Tensor, cause: Cause, view: Frame) -> Tensor:
         return depth
     hw = (depth.shape[-2], depth.shape[-1])
     return depth / ray_lengths(view.depth_camera or cam.resize(view.camera, view.hw, hw), hw)
+
+
+def _said(depth: Tensor, uv: Tensor, hw: tuple[int, int]) -> Tensor:
+    """What maps (P, h, w) say at pixels (P, N, 2) of pictures of size ``hw``; 0 where nothing finite."""
+    at = cam.resize_pixels(uv, hw, (depth.shape[-2], depth.shape[-1]))
+    return nearest(depth, at)[0].nan_to_num(0.0, 0.0, 0.0)
 
 
 def _ratio(told: Tensor, depth: Tensor) -> Tensor:

@@ -87,25 +87,33 @@ def extent(depth: Tensor, hw: tuple[int, int]) -> Tensor:
     probability o. Gradient: none.
     """
     check("extent", depth_map=(depth, "B y x"))
+    if not coarser(depth, hw):
+        return depth.new_zeros(len(depth), *hw)
     log = torch.where(depth > 0, depth.detach(), torch.nan).log()
-    total = log.new_zeros(len(log), *hw)
-    index, beside, off = zip(*(_between(n, m, log) for n, m in zip(log.shape[-2:], hw, strict=True)), strict=True)
-    (row, column), (row_beside, column_beside), (off_row, off_column) = index, beside, off
+    sides = zip(log.shape[-2:], hw, strict=True)
+    (row, row_beside, off_row), (column, column_beside, off_column) = (_between(n, m, log.device) for n, m in sides)
     here = log[:, row[:, None], column]
-    for other, share in (
-        (log[:, row_beside[:, None], column], off_row[:, None]),
-        (log[:, row[:, None], column_beside], off_column),
-    ):
-        total = total + share * (other - here).square().nan_to_num(0.0)
-    return total.sqrt()
+    down, across = log[:, row_beside[:, None], column], log[:, row[:, None], column_beside]
+    down, across = ((beside - here).square().nan_to_num(0.0) for beside in (down, across))
+    return (off_row[:, None] * down + off_column * across).sqrt()
 
 
-def _between(n: int, m: int, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def coarser(depth: Tensor, hw: tuple[int, int]) -> bool:
+    """Whether a map (..., h, w) has fewer pixels along a side than a grid over the same field."""
+    return any(n < m for n, m in zip(depth.shape[-2:], hw, strict=True))
+
+
+def centres(n: int, m: int, device: torch.device) -> Tensor:
+    """Where the centres (m,) of ``m`` pixels along a side lie, from its edge on, in pixels of ``n`` along that side."""
+    return (torch.arange(m, device=device) + 0.5) * n / m
+
+
+def _between(n: int, m: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     """Of ``m`` pixels along a side of which a map has ``n``: the map's pixel each is in, that on its other side, and
     which share of the way to that one it stands."""
-    place = (torch.arange(m).to(like) + 0.5) * n / m - 0.5
-    index = (place + 0.5).floor().clamp(0, n - 1)
-    off = place - index
+    place = centres(n, m, device)
+    index = place.floor().clamp_max(n - 1)
+    off = place - index - 0.5
     beside = (index + off.sign()).clamp(0, n - 1)
     return index.long(), beside.long(), off.abs() * (n < m)
 
@@ -206,9 +214,7 @@ def by_maps(
         z = (se3.rotate(view.T_1_from_0.R, base.ray)[..., 2] + q.flatten(1) * view.T_1_from_0.t[:, None, 2]) / (
             q.flatten(1).clamp_min(1e-6)
         )
-        known = torch.where(there > 0, there, torch.inf)
-        around = -F.max_pool2d(-known[:, None], 3, 1, 1)[:, 0]  # the nearest surface beside it
-        at, inside = nearest(around, uv)
+        at, inside = nearest(nearest_surface(there), uv)
         fine = front & inside & at.isfinite() & (z > 0) & partner.use[:, None]
         r = torch.where(fine, z / torch.where(fine, at, 1.0), 1.0).clamp_min(1e-9).log().unflatten(-1, base.hw)
         wide = _moves(base, view, q) >= 1.5
@@ -221,6 +227,12 @@ def by_maps(
             torch.where(worse, torch.full_like(said.view, k), said.view),
         )
     return said
+
+
+def nearest_surface(depth: Tensor) -> Tensor:
+    """The nearest depth of each pixel (B, h, w) of a map and of those beside it; infinite where none has one."""
+    known = torch.where(depth > 0, depth, torch.inf)
+    return -F.max_pool2d(-known[:, None], 3, 1, 1)[:, 0]
 
 
 def _by_view(q: Tensor, base: sweep.Base, partner: stereo.Partner, tolerance: float | Tensor) -> tuple[Tensor, Tensor]:
@@ -239,9 +251,10 @@ def _by_view(q: Tensor, base: sweep.Base, partner: stereo.Partner, tolerance: fl
     # A window's log-likelihood goes by its unexplained share of variance.
     better = (INDEPENDENT * ((1 - ours.square().where(ours > 0, 0.0)) / (1 - best.square())).log()).clamp_min(0).sqrt()
     alone = (INDEPENDENT * ((1 - beside.square()) / (1 - ours.square())).log()).clamp_min(0).sqrt() >= 1.5
-    far = ~fits & (best >= RIVAL) & (better >= 1.0) & (factor.log().abs() > SIGMAS * tolerance)
+    away = factor.log()
+    far = ~fits & (best >= RIVAL) & (better >= 1.0) & (away.abs() > SIGMAS * tolerance)
     misfit = torch.where(fits & alone, step.clamp(-0.5, 0.5) / sigma, torch.nan)
-    misfit = torch.where(far, factor.log().sign() * better * SIGMAS / 2, misfit)
+    misfit = torch.where(far, away.sign() * better * SIGMAS / 2, misfit)
     misfit = torch.where(seen, misfit, torch.nan)
     return misfit, fits & alone & (SIGMAS * sigma <= TELLS) & seen
 

@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch import dense, evidence, tree
@@ -232,20 +231,18 @@ def _must_be_metres(name: str, maps: Tensor | None) -> None:
 
 def _resized(depth_map: Tensor, hw: tuple[int, int]) -> Tensor:
     rows, columns = (
-        ((torch.arange(n, device=depth_map.device) + 0.5) * m / n).floor().long().clamp_max(m - 1)
-        for n, m in zip(hw, depth_map.shape[-2:], strict=True)
+        evidence.centres(n, m, depth_map.device).floor().long().clamp_max(n - 1)
+        for n, m in zip(depth_map.shape[-2:], hw, strict=True)
     )
     return depth_map[..., rows[:, None], columns]
 
 
 def _surfaces(depth_map: Tensor, hw: tuple[int, int]) -> Tensor:
-    """What a map shows on a grid: where it is coarser, the nearest of its pixels around,
-    since an outline lies anywhere between two."""
-    if min(n / m for n, m in zip(depth_map.shape[-2:], hw, strict=True)) < 1:
+    """What a map shows on a grid: where it is coarser, the nearest of its pixels around, since an outline lies anywhere
+    between two."""
+    if evidence.coarser(depth_map, hw):
         known = _usable(depth_map)
-        nearness = torch.where(known > 0, 1 / known.clamp_min(1e-6), 0.0)
-        nearness = F.max_pool2d(nearness[:, None], 3, 1, 1)[:, 0]
-        depth_map = torch.where(known > 0, 1 / nearness.clamp_min(1e-6), 0.0)
+        depth_map = torch.where(known > 0, evidence.nearest_surface(known), 0.0)
     return _resized(depth_map, hw)
 
 

@@ -56,16 +56,20 @@ FAULTS = {
 }
 
 
+def planted(frames, spoilt, own):
+    """Frames and maps: spoilt depths as the sensor's own, or beside a sensor that sees 2 m, without a trajectory."""
+    if own:
+        return [f.replace(depth=d) for f, d in zip(frames, spoilt, strict=True)], None
+    return [range_split(f, 2.0).replace(T_world_from_cam=None) for f in frames], spoilt
+
+
 @pytest.mark.parametrize(
     ("name", "own"), [(name, own) for name in FAULTS for own in (True, False) if (name, own) != ("inverse", True)]
 )
 def test_a_planted_fault_is_named(name, own, frames, watched):
     kind, plant = FAULTS[name]
     spoilt = [plant(frame.depth) for frame in frames]
-    if own:
-        shown, maps = [f.replace(depth=d) for f, d in zip(frames, spoilt, strict=True)], None
-    else:
-        shown, maps = [range_split(f, 2.0).replace(T_world_from_cam=None) for f in frames], spoilt
+    shown, maps = planted(frames, spoilt, own)
     found = name_cause(shown, maps, method=METHOD, watched=watched)
     assert found.kind == kind
     assert found.n_pairs >= 4
@@ -75,10 +79,7 @@ def test_a_planted_fault_is_named(name, own, frames, watched):
 @pytest.mark.parametrize("name", UNITS)
 def test_a_unit_is_named(name, own, frames, watched):
     spoilt = [frame.depth / UNITS[name] for frame in frames]
-    if own:
-        shown, maps = [f.replace(depth=d) for f, d in zip(frames, spoilt, strict=True)], None
-    else:
-        shown, maps = [range_split(f, 2.0).replace(T_world_from_cam=None) for f in frames], spoilt
+    shown, maps = planted(frames, spoilt, own)
     assert name_cause(shown, maps, method=METHOD, watched=watched).cause == name
 
 

@@ -573,10 +573,8 @@ ELSEWHERE = {
     "dhtorch.dense.partner_of",
     *(f"dhtorch.stereo.{name}" for name in ("best_planes", "fitted", "pose_variance")),
     *(f"dhtorch.verdict.{name}" for name in ("judge", "judged", "decided", "cut", "share")),
-    *(
-        f"dhtorch.evidence.{name}"
-        for name in ("references", "extent", "loosened", "silent", "by_answers", "by_views", "by_maps")
-    ),
+    *(f"dhtorch.evidence.{name}" for name in ("references", "extent", "coarser", "centres", "loosened", "silent")),
+    *(f"dhtorch.evidence.{name}" for name in ("by_answers", "by_views", "by_maps", "nearest_surface")),
     *(f"dhtorch.causes.{name}" for name in ("turned", "name_cause", "decided", "watch", "ray_lengths")),
     "dhtorch.evaluate.detection.auroc",
     "dhtorch.metric.anchor",

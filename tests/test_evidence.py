@@ -76,6 +76,19 @@ def test_a_map_as_fine_as_its_grid_has_no_extent():
     assert extent(step, (2, 8)).any()
 
 
+def test_the_extent_of_a_pixel_is_how_far_the_next_one_may_be_true():
+    near, far = 1.0, 3.0
+    step = torch.tensor([[[near, near, far, far]]]).expand(1, 2, 4)
+    assert not extent(step, (2, 4)).any()
+    assert not extent(step, (1, 2)).any()  # finer than the grid
+    found = extent(step, (4, 8))
+    by_hand = math.log(far / near) * torch.tensor([0, 0, 0, 0.25, 0.25, 0, 0, 0]).sqrt()
+    torch.testing.assert_close(found, by_hand.expand(1, 4, 8))
+    hole = step.clone()
+    hole[..., 2] = 0
+    assert not extent(hole, (4, 8)).any()  # a step to no value is none
+
+
 def test_of_several_views_the_mildest_counts(monkeypatch):
     said = {0: 5.0, 1: -2.0, 2: 4.0}
     base, partner = a_view((0.1, 0, 0))

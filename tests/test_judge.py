@@ -11,7 +11,7 @@ from dhtorch import AUTO, judge
 from dhtorch.codes import State
 from dhtorch.evaluate.detection import auroc
 from dhtorch.evaluate.holdout import range_split
-from dhtorch.evidence import Said, extent
+from dhtorch.evidence import Said
 from dhtorch.synthetic import SyntheticRoom
 from dhtorch.tree import collate, stack
 from dhtorch.verdict import QUICK, cut, decided, share
@@ -223,19 +223,6 @@ def test_a_sound_map_of_few_pixels_is_not_wrong_at_its_outlines(fewer, room, tru
     assert found.known.float().mean() > 0.6 * sound.known.float().mean()
     off = judge(1.1 * coarse(true), anchor, others, **SMALL, views=False)
     assert not off.scale[0, 1] <= 1 <= off.scale[0, 2]
-
-
-def test_the_extent_of_a_pixel_is_how_far_the_next_one_may_be_true():
-    near, far = 1.0, 3.0
-    step = torch.tensor([[[near, near, far, far]]]).expand(1, 2, 4)
-    assert not extent(step, (2, 4)).any()
-    assert not extent(step, (1, 2)).any()  # finer than the grid
-    found = extent(step, (4, 8))
-    by_hand = math.log(far / near) * torch.tensor([0, 0, 0, 0.25, 0.25, 0, 0, 0]).sqrt()
-    torch.testing.assert_close(found, by_hand.expand(1, 4, 8))
-    hole = step.clone()
-    hole[..., 2] = 0
-    assert not extent(hole, (4, 8)).any()  # a step to no value is none
 
 
 def test_no_depth_is_never_right_or_wrong(true, anchor, others):
