@@ -74,6 +74,8 @@ def test_a_map_as_fine_as_its_grid_has_no_extent():
     assert not extent(step, (2, 4)).any()
     assert not extent(step, (1, 2)).any()
     assert extent(step, (2, 8)).any()
+    finer_down = torch.tensor([1.0, 3.0, 3.0, 1.0])[:, None].expand(1, 4, 2)  # and coarser across, without a step there
+    assert not extent(finer_down, (2, 4)).any()
 
 
 def test_the_extent_of_a_pixel_is_how_far_the_next_one_may_be_true():
@@ -140,6 +142,27 @@ def test_what_another_view_does_not_see_it_says_nothing_of():
     misfit, sure = evidence._by_view(torch.full((1, *HW), 1.0), base, partner._replace(fit=pose), 0.02)
     assert misfit[0, :, -10:].isnan().all()
     assert not sure[0, :, -10:].any()
+
+
+def test_windows_that_fit_say_nothing_where_the_lens_knows_no_ray(monkeypatch):
+    base, partner = a_view((0.1, 0, 0))
+    pose = SimpleNamespace(
+        cov=1e-8 * torch.eye(6)[None], shutter=None, ok=torch.tensor([True]), T_1_from_0=partner.view.T_1_from_0
+    )
+    like = torch.full((1, *HW), 0.5)
+    window = SimpleNamespace(
+        seen=like > 0, correlation=like * 0 + 0.99, noise=like * 1e-6, contrast=like, step=like * 0.1,
+        motion=torch.full((1, *HW, 2), 4.0),
+    )  # fmt: skip
+    monkeypatch.setattr(sweep, "fit_windows", lambda *args, **options: window)
+    monkeypatch.setattr(evidence, "_rivals", lambda *args: (like * 0 + 0.1, like * 0 + 1.14, like * 0 + 0.1))
+    known = torch.ones(1, *HW, dtype=torch.bool)
+    known[0, :, :5] = False
+    misfit, sure = evidence._by_view(like, base.replace(known=known.flatten(1)), partner._replace(fit=pose), 0.02)
+    assert misfit[known].isfinite().all()
+    assert sure[known].all()
+    assert misfit[~known].isnan().all()
+    assert not sure[~known].any()
 
 
 def test_maps_speak_only_between_views_that_stand_apart():
