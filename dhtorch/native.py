@@ -1,20 +1,22 @@
-"""Inner loops of the sweep and its fits, of pyramids, of tokens, of what is read around samples, of the search for
-points, of the registration of their windows and of poses as compiled code, for those who ask for it; nothing needs it.
+"""Inner loops of the sweep and its fits, of pyramids, of what a loader does beside the stages, of what is read around
+samples, of the search for points, of the registration of their windows and of poses as compiled code, for those who ask
+for it; nothing needs it.
 
     python -m dhtorch.native            compile ``native*.cpp``, with the system's C++ compiler, into the user's cache
     DHTORCH_NATIVE=1 python …           use it, in loader workers as well; or dhtorch.native.load() in a program
 
-``dhtorch.stereo``, ``dhtorch.stages.backproject``, ``holes`` and ``pose``, ``dhtorch.geometry.sweep``, ``pyramid``,
-``lookup``, ``neighbours``, ``lucas_kanade``, ``affine`` and ``near_far`` and ``dhtorch.transform.tokens`` ask here
-whether tensors may be handed over; where not (nothing was loaded, another device or type, under vmap, a compiler or a
-graph) they do the same in torch, which is the reference. Tokens and the sweep are alike bit for bit, its fits up to
-rounding: no more than one gate in 200 differs, and 99 of 100 depths by less than a tenth of their sigma. A pyramid,
-what is read around samples and what is said of them do up to one rounding of a number, textures up to the rounding of
-their sums. The search and the registration do up to the rounding of sums over a window: half of the places that were
-searched for are equal and half of those that were registered lie within 1e-4 px, 99 of 100 lie within a tenth of their
-sigma, and no more than one verdict in 200 changes. Of poses, whose costs and equations it sums, 99 of 100 lie within a
-hundredth of their sigma. Nothing is ever compiled or downloaded without the command above. The file in the cache is
-named after its sources, torch's version and the processor, whose widest vectors it uses.
+``dhtorch.stereo`` and ``pair``, ``dhtorch.stages.backproject``, ``holes`` and ``pose``, ``dhtorch.geometry.sweep``,
+``pyramid``, ``lookup``, ``neighbours``, ``lucas_kanade``, ``affine`` and ``near_far``, ``dhtorch.transform.tokens`` and
+``views`` ask here whether tensors may be handed over; where not (nothing was loaded, another device or type, under
+vmap, a compiler or a graph) they do the same in torch, which is the reference. Tokens, depths in metres, the sensor's
+own map and the sweep are alike bit for bit, the fits of the sweep up to rounding: no more than one gate in 200 differs,
+and 99 of 100 depths by less than a tenth of their sigma. A pyramid, what is read around samples and what is said of
+them do up to one rounding of a number, textures up to the rounding of their sums. The search and the registration do up
+to the rounding of sums over a window: half of the places that were searched for are equal and half of those that were
+registered lie within 1e-4 px, 99 of 100 lie within a tenth of their sigma, and no more than one verdict in 200 changes.
+Of poses, whose costs and equations it sums, 99 of 100 lie within a hundredth of their sigma. Nothing is ever compiled
+or downloaded without the command above. The file in the cache is named after its sources, torch's version and the
+processor, whose widest vectors it uses.
 """
 
 from __future__ import annotations
@@ -128,14 +130,13 @@ def serves(*tensors: Tensor) -> bool:
         if os.environ.get("DHTORCH_NATIVE", "") in ("", "0"):
             return False
         load()
-    return all(_plain(x) for x in tensors)
-
-
-def _plain(x: Tensor) -> bool:
-    if type(x) is not Tensor or torch._C._functorch.is_functorch_wrapped_tensor(x):
-        return False
-    graph = x.requires_grad and torch.is_grad_enabled()
-    return x.dtype in _TOLD and not graph and x.is_cpu and x.is_contiguous() and not x.is_neg()
+    graph = torch.is_grad_enabled()
+    for x in tensors:  # in as few steps as there are: some stages ask a dozen times
+        if type(x) is not Tensor or x.dtype not in _TOLD or not x.is_cpu or not x.is_contiguous():
+            return False
+        if (graph and x.requires_grad) or x.is_neg() or torch._C._functorch.is_functorch_wrapped_tensor(x):
+            return False
+    return True
 
 
 def _vectors() -> tuple[str, ...]:

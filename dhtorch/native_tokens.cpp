@@ -1,8 +1,11 @@
-// Depth tokens of samples. Twin of dhtorch/transform/tokens.py, which is the reference: the same sums in the same order in
-// double precision, bit for bit. One thread, no gradient. Callers check shapes, types and strides.
+// What a loader's transform does beside the stages: depth maps in metres, what some of their numbers say, the sensor's own
+// returns as a map, depth tokens of samples. Twin of dhtorch/transform/views.py and tokens.py and of dhtorch/pair.py, merge, which
+// are the reference: bit for bit, sums in double precision in the same order. One thread, no gradient. Callers check shapes, types
+// and strides.
 
 #include <torch/csrc/stable/library.h>
 
+#include <algorithm>
 #include <cmath>
 #include <vector>
 
@@ -65,12 +68,68 @@ void patch_tokens(Tensor uv, Tensor depth, Tensor sigma, Tensor source, Tensor h
   }
 }
 
+template <typename Word>
+void over_unit(const Word* raw, float* __restrict z, int64_t n, float unit) {
+  if (unit == 1000.0f) {
+    for (int64_t k = 0; k < n; ++k) z[k] = over<1000>(std::max(static_cast<float>(raw[k]), 0.0f));
+  } else {
+    for (int64_t k = 0; k < n; ++k) z[k] = std::max(static_cast<float>(raw[k]), 0.0f) / unit;
+  }
+}
+
+// raw: numbers of two bytes, int16 or (without a sign) uint16; z: as many float32, filled: what is positive over `unit`, else 0.
+void metres(Tensor raw, Tensor z, double unit, bool sign) {
+  const float per_metre = unit;
+  if (sign) {
+    over_unit(data<int16_t>(raw), data<float>(z), z.numel(), per_metre);
+  } else {
+    over_unit(data<uint16_t>(raw), data<float>(z), z.numel(), per_metre);
+  }
+}
+
+// depth (B h w); counts (2, B), filled: of every `step`-th number how many are positive, and between both bounds.
+void probe(Tensor depth, Tensor counts, int64_t step, double low, double high) {
+  const int64_t batch = depth.size(0), all = depth.size(1) * depth.size(2);
+  const float least = low, most = high, *z = data<float>(depth);
+  int64_t *some = data<int64_t>(counts), *sound = some + batch;
+  for (int64_t b = 0; b < batch; ++b, z += all) {
+    some[b] = sound[b] = 0;
+    for (int64_t k = 0; k < all; k += step) {
+      some[b] += z[k] > 0;
+      sound[b] += z[k] > least && z[k] < most;
+    }
+  }
+}
+
+// Samples as stage 2 says them: depth, sigma, confidence (B, N), xyz (B, N, 3). Fills z, noise, score and source (B, N) of those
+// with a point, 0 elsewhere.
+void sensed(Tensor depth, Tensor sigma, Tensor confidence, Tensor xyz, Tensor z, Tensor noise, Tensor score, Tensor source) {
+  const float *point = data<float>(xyz), *from[] = {data<float>(depth), data<float>(sigma), data<float>(confidence)};
+  float* to[] = {data<float>(z), data<float>(noise), data<float>(score)};
+  int32_t* sources = data<int32_t>(source);
+  for (int64_t i = 0; i < depth.numel(); ++i, point += 3) {
+    const bool usable = std::isfinite(point[0]) && std::isfinite(point[1]) && std::isfinite(point[2]);
+    for (int64_t k = 0; k < 3; ++k) to[k][i] = usable ? from[k][i] : 0.0f;
+    sources[i] = usable;
+  }
+}
+
 }  // namespace
 
 STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
+  m.def("probe(Tensor depth, Tensor(a!) counts, int step, float low, float high) -> ()");
+  m.def(
+      "sensed(Tensor depth, Tensor sigma, Tensor confidence, Tensor xyz, Tensor(a!) z, Tensor(b!) noise, Tensor(c!) score, "
+      "Tensor(d!) source) -> ()");
+  m.def("metres(Tensor raw, Tensor(a!) z, float unit, bool sign) -> ()");
   m.def(
       "patch_tokens(Tensor uv, Tensor depth, Tensor sigma, Tensor source, Tensor hole, Tensor(a!) tokens, Tensor(b!) known, int "
       "patch, int rows, int columns, float scale_x, float scale_y, float margin_x, float margin_y) -> ()");
 }
 
-STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) { m.impl("patch_tokens", TORCH_BOX(&patch_tokens)); }
+STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) {
+  m.impl("probe", TORCH_BOX(&probe));
+  m.impl("sensed", TORCH_BOX(&sensed));
+  m.impl("metres", TORCH_BOX(&metres));
+  m.impl("patch_tokens", TORCH_BOX(&patch_tokens));
+}

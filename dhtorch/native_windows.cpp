@@ -7,9 +7,16 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
-#include <vector>
+#include <memory>
+#include <numeric>
 
 #include "native_vectors.h"
+
+#if defined(__has_builtin)
+#if __has_builtin(__builtin_shufflevector)
+#define DHTORCH_SHUFFLES
+#endif
+#endif
 
 namespace {
 
@@ -39,30 +46,61 @@ Windows windows(const Tensor& pixel, int64_t image, int64_t channel, int64_t row
   return {image, channel, row, column, channels, height, width, size, data<int32_t>(pixel), pixel.size(0), pixel.size(1)};
 }
 
-inline void extend(float read, float& least, float& most) {
+struct Extremes {
+  float least = std::numeric_limits<float>::infinity(), most = 0.0f;  // as where there is no return
+};
+
+inline void extend(float read, Extremes& found) {
   const float z = std::isfinite(read) ? read : 0.0f;
-  least = z > 0 ? std::min(least, z) : least;
-  most = std::max(most, z);
+  found.least = z > 0 ? std::min(found.least, z) : found.least;
+  found.most = std::max(found.most, z);
 }
 
 constexpr int64_t EIGHT = 8;
 typedef float Eight __attribute__((vector_size(EIGHT * sizeof(float))));
 
+// What `join` makes of the first few of eight numbers, two by two.
+template <int64_t FEW, typename Join>
+inline float joined(Eight x, float none, const Join& join) {
+  for (int64_t k = FEW; k < EIGHT; ++k) x[k] = none;
+#ifdef DHTORCH_SHUFFLES
+  x = join(x, __builtin_shufflevector(x, x, 4, 5, 6, 7, 4, 5, 6, 7));
+  x = join(x, __builtin_shufflevector(x, x, 2, 3, 2, 3, 2, 3, 2, 3));
+  return join(x, __builtin_shufflevector(x, x, 1, 1, 1, 1, 1, 1, 1, 1))[0];
+#else
+  for (int64_t half = EIGHT / 2; half; half /= 2) {
+    for (int64_t k = 0; k < half; ++k) x[k] = join(Eight{} + x[k], Eight{} + x[k + half])[0];
+  }
+  return x[0];
+#endif
+}
+
 // Of five rows of five returns, which are read with the three beside them.
-inline void five_extremes(const float* at, int64_t row, float& least, float& most) {
+inline Extremes five_extremes(const float* at, int64_t row) {
   const Eight none = {};
-  Eight low = none + std::numeric_limits<float>::infinity(), high = none;
+  const Eight infinity = none + std::numeric_limits<float>::infinity();
+  Eight low = infinity, high = none;
   for (int64_t y = 0; y < 5; ++y) {
     Eight read;
     std::memcpy(&read, at + y * row, sizeof(read));
-    const Eight z = (read > none) & (read < std::numeric_limits<float>::infinity() + none) ? read : none;
-    low = (z > none) & (z < low) ? z : low;
-    high = z > high ? z : high;
+    const auto some = (read > none) & (read < infinity);
+    const Eight least = some ? read : infinity, most = some ? read : none;
+    low = least < low ? least : low;
+    high = most > high ? most : high;
   }
-  for (int64_t x = 0; x < 5; ++x) {
-    least = std::min(least, low[x]);
-    most = std::max(most, high[x]);
+  const auto less = [](Eight a, Eight b) { return a < b ? a : b; };
+  const auto more = [](Eight a, Eight b) { return a > b ? a : b; };
+  return {joined<5>(low, std::numeric_limits<float>::infinity(), less), joined<5>(high, 0.0f, more)};
+}
+
+// Of the window that begins at a return; `end` is behind the last one.
+inline Extremes extremes_at(const float* at, const Windows& w, const float* end) {
+  if (w.size == 5 && w.column == 1 && at + 4 * w.row + EIGHT <= end) return five_extremes(at, w.row);
+  Extremes found;
+  for (int64_t y = 0; y < w.size; ++y) {
+    for (int64_t x = 0; x < w.size; ++x) extend(at[y * w.row + x * w.column], found);
   }
+  return found;
 }
 
 // depth (B h w) float32; found (2, B, N): the smallest and the largest return, infinity and 0 where there is none.
@@ -70,21 +108,12 @@ void window_extremes(Tensor depth, Tensor pixel, Tensor found, int64_t image, in
                      int64_t channels, int64_t height, int64_t width, int64_t size) {
   const Windows w = windows(pixel, image, channel, row, column, channels, height, width, size);
   const float *from = data<float>(depth), *end = from + w.batch * height * width;
-  const int64_t all = w.batch * w.n;
-  float *low = data<float>(found), *high = low + all;
-  for (int64_t b = 0, i = 0; b < w.batch; ++b) {
-    for (int64_t k = 0; k < w.n; ++k, ++i) {
-      const float* at = from + w.first(b, k);
-      float least = std::numeric_limits<float>::infinity(), most = -least;
-      if (size == 5 && column == 1 && at + 4 * row + EIGHT <= end) {
-        five_extremes(at, row, least, most);
-      } else {
-        for (int64_t y = 0; y < size; ++y) {
-          for (int64_t x = 0; x < size; ++x) extend(at[y * row + x * column], least, most);
-        }
-      }
-      low[i] = least;
-      high[i] = most;
+  float *low = data<float>(found), *high = low + w.batch * w.n;
+  for (int64_t b = 0; b < w.batch; ++b) {
+    for (int64_t k = 0; k < w.n; ++k) {
+      const Extremes seen = extremes_at(from + w.first(b, k), w, end);
+      *low++ = seen.least;
+      *high++ = seen.most;
     }
   }
 }
@@ -93,15 +122,20 @@ inline float luma(float red, float green, float blue, int64_t channels) {
   return channels == 1 ? red : fused(blue, 0.114f, fused(green, 0.587f, red * 0.299f));
 }
 
+typedef uint8_t Bytes __attribute__((vector_size(WIDE)));
+typedef uint16_t Words __attribute__((vector_size(2 * WIDE)));
+
 // Sums over the window, channel by channel. Rows of interleaved pixels are added as they lie in memory.
 template <int64_t SIZE>
 inline void sums(const uint8_t* at, const Windows& w, int32_t* sum) {
   const int64_t size = SIZE ? SIZE : w.size;
   std::fill_n(sum, w.channels, 0);
   if (SIZE == 5 && w.column == 3 && at + 4 * w.row + WIDE <= w.end) {
-    uint16_t all[WIDE] = {};  // of five rows of five pixels, and of the byte beside them
+    Words all = {};  // of five rows of five pixels, and of the byte beside them
     for (int64_t y = 0; y < 5; ++y) {
-      for (int64_t x = 0; x < WIDE; ++x) all[x] += at[y * w.row + x];
+      Bytes read;
+      std::memcpy(&read, at + y * w.row, sizeof(read));
+      all += __builtin_convertvector(read, Words);
     }
     for (int64_t c = 0; c < 3; ++c) sum[c] = all[c] + all[c + 3] + all[c + 6] + all[c + 9] + all[c + 12];
     return;
@@ -121,90 +155,65 @@ inline void sums(const uint8_t* at, const Windows& w, int32_t* sum) {
   }
 }
 
+struct Brightness {
+  float mean, centre, most, least;  // grey of the window; of the pixel in the middle grey, largest and smallest channel
+};
+
+template <int64_t SIZE, int64_t CHANNELS>
+inline Brightness brightness_at(const uint8_t* at, const Windows& w) {
+  const int64_t channels = CHANNELS ? CHANNELS : w.channels, centre = w.size / 2 * (w.row + w.column);
+  const float count = static_cast<float>(w.size * w.size);
+  int32_t sum[3];
+  sums<SIZE>(at, w, sum);
+  float mean[3] = {}, middle[3] = {};
+  for (int64_t c = 0; c < channels; ++c) {
+    mean[c] = SIZE == 5 ? over<25>(sum[c]) : static_cast<float>(sum[c]) / count;
+    middle[c] = static_cast<float>(at[centre + c * w.channel]);
+  }
+  float most = middle[0], least = middle[0];
+  for (int64_t c = 1; c < channels; ++c) {
+    most = std::max(most, middle[c]);
+    least = std::min(least, middle[c]);
+  }
+  return {luma(mean[0], mean[1], mean[2], channels), luma(middle[0], middle[1], middle[2], channels), most, least};
+}
+
 template <int64_t SIZE, int64_t CHANNELS>
 void brightnesses(const uint8_t* from, const Windows& w, float* to) {
-  const int64_t channels = CHANNELS ? CHANNELS : w.channels, all = w.batch * w.n, centre = w.size / 2 * (w.row + w.column);
-  const float count = static_cast<float>(w.size * w.size);
+  const int64_t all = w.batch * w.n;
   for (int64_t b = 0, i = 0; b < w.batch; ++b) {
     for (int64_t k = 0; k < w.n; ++k, ++i) {
-      const uint8_t* at = from + w.first(b, k);
-      int32_t sum[3];
-      sums<SIZE>(at, w, sum);
-      float mean[3] = {}, middle[3] = {};
-      for (int64_t c = 0; c < channels; ++c) {
-        mean[c] = static_cast<float>(sum[c]) / count;
-        middle[c] = static_cast<float>(at[centre + c * w.channel]);
-      }
-      float most = middle[0], least = middle[0];
-      for (int64_t c = 1; c < channels; ++c) {
-        most = std::max(most, middle[c]);
-        least = std::min(least, middle[c]);
-      }
-      to[i] = luma(mean[0], mean[1], mean[2], channels);
-      to[all + i] = luma(middle[0], middle[1], middle[2], channels);
-      to[2 * all + i] = most;
-      to[3 * all + i] = least;
+      const Brightness seen = brightness_at<SIZE, CHANNELS>(from + w.first(b, k), w);
+      to[i] = seen.mean;
+      to[all + i] = seen.centre;
+      to[2 * all + i] = seen.most;
+      to[3 * all + i] = seen.least;
     }
   }
 }
+
+// Pictures of bytes, whose windows are usually of five pixels in three channels.
+Windows of_picture(Windows w, const uint8_t* from) {
+  w.end = from + w.batch * w.channels * w.height * w.width;
+  return w;
+}
+
+inline bool usual(const Windows& w) { return w.size == 5 && w.channels == 3; }
 
 // picture of bytes; found (4, B, N): mean grey of the window, and of the pixel in the middle grey, largest and smallest
 // channel, all of them from 0 to 255.
 void window_brightness(Tensor picture, Tensor pixel, Tensor found, int64_t image, int64_t channel, int64_t row,
                        int64_t column, int64_t channels, int64_t height, int64_t width, int64_t size) {
-  Windows w = windows(pixel, image, channel, row, column, channels, height, width, size);
   const uint8_t* from = data<uint8_t>(picture);
-  w.end = from + w.batch * channels * height * width;
-  (size == 5 && channels == 3 ? brightnesses<5, 3> : brightnesses<0, 0>)(from, w, data<float>(found));
-}
-
-// A whole number divided, rounded as a division is, which takes longer: right for all bytes over 255 and all whole numbers
-// up to 255000 over that.
-template <int DIVISOR>
-inline float over(float x) {
-#ifdef __FMA__
-  constexpr float part = 1.0f / DIVISOR;
-  const float near = x * part;
-  return fused(fused(-static_cast<float>(DIVISOR), near, x), part, near);
-#else
-  return x / DIVISOR;
-#endif
+  const Windows w = of_picture(windows(pixel, image, channel, row, column, channels, height, width, size), from);
+  (usual(w) ? brightnesses<5, 3> : brightnesses<0, 0>)(from, w, data<float>(found));
 }
 
 // Grey values of a row of a window, and of what happens to lie beside it: of pixels that are interleaved as one division
 // of whole numbers, else as of a picture's channels.
-#if defined(__has_builtin)
-#if __has_builtin(__builtin_shufflevector)
-#define DHTORCH_SHUFFLES
-#endif
-#endif
-
-#ifdef DHTORCH_SHUFFLES
-typedef uint8_t Bytes __attribute__((vector_size(16)));
-typedef int32_t Whole __attribute__((vector_size(16 * sizeof(int32_t))));
-
-// Of nine interleaved pixels, of which the last eight bytes are read twice over.
-inline void nine_greys(const uint8_t* at, float* to) {
-  Bytes a, b;
-  std::memcpy(&a, at, 16);
-  std::memcpy(&b, at + 11, 16);
-  const Bytes red = __builtin_shufflevector(a, b, 0, 3, 6, 9, 12, 15, 23, 26, 29, 0, 0, 0, 0, 0, 0, 0);
-  const Bytes green = __builtin_shufflevector(a, b, 1, 4, 7, 10, 13, 21, 24, 27, 30, 0, 0, 0, 0, 0, 0, 0);
-  const Bytes blue = __builtin_shufflevector(a, b, 2, 5, 8, 11, 14, 22, 25, 28, 31, 0, 0, 0, 0, 0, 0, 0);
-  const Whole sum = 299 * __builtin_convertvector(red, Whole) + 587 * __builtin_convertvector(green, Whole) +
-                    114 * __builtin_convertvector(blue, Whole);
-  for (int64_t x = 0; x < WIDE; ++x) to[x] = over<255000>(static_cast<float>(sum[x]));
-}
-#endif
-
-template <int64_t SIZE>
 inline void grey_row(const uint8_t* at, const Windows& w, bool whole, float* __restrict to) {
-  const int64_t size = SIZE ? SIZE : w.size;
-#ifdef DHTORCH_SHUFFLES
-  if (whole && SIZE == 9) return nine_greys(at, to);
-#endif
   if (whole) {
-    for (int64_t x = 0; x < size; ++x) {
+    for (int64_t x = 0; x < w.size; ++x) {
       to[x] = over<255000>(static_cast<float>(299 * at[3 * x] + 587 * at[3 * x + 1] + 114 * at[3 * x + 2]));
     }
     return;
@@ -218,16 +227,10 @@ inline void grey_row(const uint8_t* at, const Windows& w, bool whole, float* __r
     for (int64_t x = 0; x < WIDE; ++x) to[x] = luma(r[x], g[x], b[x], w.channels);
     return;
   }
-  for (int64_t x = 0; x < size; ++x) {
+  for (int64_t x = 0; x < w.size; ++x) {
     to[x] = luma(over<255>(red[x * w.column]), over<255>(green[x * w.column]), over<255>(blue[x * w.column]), w.channels);
   }
 }
-
-// Where rows of grey values lie, and how far apart.
-struct Rows {
-  const float* first;
-  int64_t step;
-};
 
 // The smaller eigenvalue of ((a, b), (b, c)), as dhtorch/geometry/small.py finds it.
 inline float smaller(float a, float b, float c) {
@@ -235,16 +238,27 @@ inline float smaller(float a, float b, float c) {
   return middle - (square > 0 ? std::sqrt(square) : square);
 }
 
-// Of the gradient matrix summed over a window's inner pixels: columns side by side, each over all rows. What happens to lie
-// beside the window is computed and left out.
-template <int64_t SIZE>
-inline float least_texture(const Rows& grey, int64_t size) {
-  constexpr int64_t SIDE = SIZE == 9 ? 8 : WIDE;
-  const int64_t inner = (SIZE ? SIZE : size) - 2;
-  float xx[SIDE] = {}, xy[SIDE] = {}, yy[SIDE] = {};
-  for (int64_t y = 0; y < inner; ++y) {
-    const float *a = grey.first + y * grey.step, *b = a + grey.step, *c = b + grey.step;
-    for (int64_t x = 0; x < SIDE; ++x) {
+// Where gradient matrices of many windows are kept, so that their eigenvalues are found side by side.
+struct Matrices {
+  static constexpr int64_t ROOM = 64;
+  float xx[ROOM], xy[ROOM], yy[ROOM];
+
+  void keep(int64_t at, float of_xx, float of_xy, float of_yy) {
+    xx[at] = of_xx;
+    xy[at] = of_xy;
+    yy[at] = of_yy;
+  }
+};
+
+// Of the gradient matrix of a window, summed over its inner pixels. What happens to lie beside the window is computed and
+// left out.
+inline void gradients(const uint8_t* at, const Windows& w, bool whole, Matrices& into, int64_t k) {
+  float grey[WIDE * ROOM] = {};  // beside a window as well, where what is no number would cost more
+  for (int64_t y = 0; y < w.size; ++y) grey_row(at + y * w.row, w, whole, grey + y * ROOM);
+  float xx[WIDE] = {}, xy[WIDE] = {}, yy[WIDE] = {};
+  for (int64_t y = 0; y < w.size - 2; ++y) {
+    const float *a = grey + y * ROOM, *b = a + ROOM, *c = b + ROOM;
+    for (int64_t x = 0; x < WIDE; ++x) {
       const float g_x = fused(b[x + 2] - b[x], 2.0f, (a[x + 2] - a[x]) + (c[x + 2] - c[x]));
       const float g_y = fused(c[x + 1] - a[x + 1], 2.0f, (c[x] - a[x]) + (c[x + 2] - a[x + 2]));
       xx[x] += g_x * g_x;
@@ -252,46 +266,100 @@ inline float least_texture(const Rows& grey, int64_t size) {
       yy[x] += g_y * g_y;
     }
   }
-  float each[3] = {};
-  for (int64_t x = 0; x < inner; ++x) {
-    each[0] += xx[x];
-    each[1] += xy[x];
-    each[2] += yy[x];
+  const auto sum = [&](const float* x) { return std::accumulate(x, x + w.size - 2, 0.0f); };
+  into.keep(k, sum(xx), sum(xy), sum(yy));
+}
+
+#ifdef DHTORCH_SHUFFLES
+typedef uint16_t EightWords __attribute__((vector_size(2 * EIGHT)));
+typedef int32_t EightWhole __attribute__((vector_size(4 * EIGHT)));
+
+// Grey values of interleaved pixels are 255000 times as large here: whole numbers, exact however they are summed.
+constexpr float UNIT = 255000.0f;
+
+inline float grey_of(const uint8_t* at) { return static_cast<float>(299 * at[0] + 587 * at[1] + 114 * at[2]); }
+
+// Every other byte.
+inline Eight numbers(Bytes from) {
+  EightWords words;
+  std::memcpy(&words, &from, sizeof(words));
+  return __builtin_convertvector(__builtin_convertvector(words & 255, EightWhole), Eight);
+}
+
+inline Eight eight_greys(const uint8_t* at) {
+  Bytes a, b;
+  std::memcpy(&a, at, WIDE);
+  std::memcpy(&b, at + 8, WIDE);
+  const Bytes red = __builtin_shufflevector(a, b, 0, 16, 3, 16, 6, 16, 9, 16, 12, 16, 15, 16, 26, 16, 29, 16);
+  const Bytes green = __builtin_shufflevector(a, b, 1, 16, 4, 16, 7, 16, 10, 16, 13, 16, 24, 16, 27, 16, 30, 16);
+  const Bytes blue = __builtin_shufflevector(a, b, 2, 16, 5, 16, 8, 16, 11, 16, 14, 16, 25, 16, 28, 16, 31, 16);
+  return 299.0f * numbers(red) + 587.0f * numbers(green) + 114.0f * numbers(blue);
+}
+
+// A row of nine pixels, as what the Sobel filters make of it: differences and weighted sums of neighbours in the row, seven
+// that count.
+struct Row {
+  Eight across, along;
+
+  explicit Row(const uint8_t* at) {
+    const Eight left = eight_greys(at), last = Eight{} + grey_of(at + 24);
+    *this = {left, __builtin_shufflevector(left, last, 1, 2, 3, 4, 5, 6, 7, 8),
+             __builtin_shufflevector(left, last, 2, 3, 4, 5, 6, 7, 8, 8)};
   }
-  return smaller(each[0], each[1], each[2]);
+
+  // What lies beside the nine is read with them.
+  explicit Row(const float* at) {
+    Eight of[3];
+    for (int64_t k = 0; k < 3; ++k) std::memcpy(of + k, at + k, sizeof(Eight));
+    *this = {of[0], of[1], of[2]};
+  }
+
+  Row(Eight left, Eight middle, Eight right) : across(right - left), along(left + middle + (middle + right)) {}
+};
+
+// Of nine rows of nine pixels, in registers from bytes or grey values on; gradients are exact.
+template <typename Pixel>
+inline void nine_gradients(const Pixel* at, int64_t row, Matrices& into, int64_t k) {
+  Row above(at), middle(at + row);
+  Eight xx = {}, xy = {}, yy = {};
+  for (int64_t y = 2; y < 9; ++y) {
+    const Row below(at + y * row);
+    const Eight g_x = above.across + middle.across + (middle.across + below.across), g_y = below.along - above.along;
+    xx += g_x * g_x;
+    xy += g_x * g_y;
+    yy += g_y * g_y;
+    above = middle;
+    middle = below;
+  }
+  const auto sum = [](Eight x) { return joined<7>(x, 0.0f, [](Eight a, Eight b) { return a + b; }); };
+  into.keep(k, sum(xx), sum(xy), sum(yy));
 }
 
-// Of a window whose pixels are read for it alone.
-template <int64_t SIZE>
-inline float read_texture(const uint8_t* at, const Windows& w, bool whole) {
-  float grey[WIDE * ROOM] = {};  // beside a window as well, where what is no number would cost more
-  for (int64_t y = 0; y < (SIZE ? SIZE : w.size); ++y) grey_row<SIZE>(at + y * w.row, w, whole, grey + y * ROOM);
-  return least_texture<SIZE>({grey, ROOM}, w.size);
-}
-
-// Grey values of an interleaved picture, where its windows have more rows than it has vectors; nothing elsewhere.
-bool grey_picture(const uint8_t* at, const Windows& w, bool whole, std::vector<float>& grey) {
+// A whole interleaved picture, where its windows have more pixels than it has; else nothing.
+std::unique_ptr<float[]> grey_picture(const uint8_t* at, const Windows& w) {
   const int64_t all = w.height * w.width;
-  if (!whole || w.n * w.size * WIDE < all) return false;
-  grey.resize(all + ROOM);
-  for (int64_t k = 0; k < all; ++k) {
-    grey[k] = over<255000>(static_cast<float>(299 * at[3 * k] + 587 * at[3 * k + 1] + 114 * at[3 * k + 2]));
+  if (w.n * w.size * w.size < all) return {};
+  std::unique_ptr<float[]> grey(new float[all + WIDE]);
+  int64_t k = 0;
+  for (; k + EIGHT <= all; k += EIGHT) {
+    const Eight some = eight_greys(at + 3 * k);
+    std::memcpy(&grey[k], &some, sizeof(some));
   }
-  return true;
+  for (; k < all; ++k) grey[k] = grey_of(at + 3 * k);
+  std::fill_n(&grey[all], WIDE, 0.0f);  // beside the last windows
+  return grey;
 }
+#endif
 
-template <int64_t SIZE>
-void textures(const uint8_t* from, const Windows& w, bool whole, float* to) {
-  std::vector<float> grey;
+// Calls `each` with every window and a place in `kept`, and writes the textures (B, N) of as many as that holds at once.
+template <typename Each>
+void textures(const Windows& w, float unit, float* to, const Each& each) {
   const float count = 16.0f * (w.size - 2) * (w.size - 2);
-  for (int64_t b = 0; b < w.batch; ++b) {
-    const bool once = grey_picture(from + b * w.image, w, whole, grey);
-    for (int64_t k = 0; k < w.n; ++k) {
-      const int64_t first = w.first(b, k), pixel = (first - b * w.image) / 3;
-      const float least = once ? least_texture<SIZE>({grey.data() + pixel, w.width}, w.size)
-                               : read_texture<SIZE>(from + first, w, whole);
-      *to++ = least / count;
-    }
+  Matrices kept;
+  for (int64_t begin = 0; begin < w.n; begin += Matrices::ROOM) {
+    const int64_t some = std::min(Matrices::ROOM, w.n - begin);
+    for (int64_t k = 0; k < some; ++k) each(begin + k, kept, k);
+    for (int64_t k = 0; k < some; ++k) *to++ = smaller(kept.xx[k], kept.xy[k], kept.yy[k]) / unit / unit / count;
   }
 }
 
@@ -299,10 +367,26 @@ void textures(const uint8_t* from, const Windows& w, bool whole, float* to) {
 // outermost pixels. Windows are at most WIDE pixels wide. With `whole` interleaved pixels become grey as whole numbers.
 void window_texture(Tensor picture, Tensor pixel, Tensor found, int64_t image, int64_t channel, int64_t row, int64_t column,
                     int64_t channels, int64_t height, int64_t width, int64_t size, bool whole) {
-  Windows w = windows(pixel, image, channel, row, column, channels, height, width, size);
   const uint8_t* from = data<uint8_t>(picture);
-  w.end = from + w.batch * channels * height * width;
-  (size == 9 ? textures<9> : textures<0>)(from, w, whole, data<float>(found));
+  const Windows w = of_picture(windows(pixel, image, channel, row, column, channels, height, width, size), from);
+  for (int64_t b = 0; b < w.batch; ++b) {
+    float* to = data<float>(found) + b * w.n;
+#ifdef DHTORCH_SHUFFLES
+    if (whole && size == 9) {
+      const std::unique_ptr<float[]> grey = grey_picture(from + b * image, w);
+      textures(w, UNIT, to, [&](int64_t i, Matrices& kept, int64_t k) {
+        const int64_t first = w.first(b, i);
+        if (grey) {
+          nine_gradients(&grey[(first - b * image) / 3], width, kept, k);
+        } else {
+          nine_gradients(from + first, row, kept, k);
+        }
+      });
+      continue;
+    }
+#endif
+    textures(w, 1.0f, to, [&](int64_t i, Matrices& kept, int64_t k) { gradients(from + w.first(b, i), w, whole, kept, k); });
+  }
 }
 
 // Bits of dhtorch/codes.py, Flag.
@@ -352,51 +436,81 @@ void pixels(Tensor uv, Tensor pixel) {
   for (int64_t i = 0; i < all; ++i) to[i] = pixel_of(from[i]);
 }
 
-// Stage 2 from what was read: depth (B h w) and levels conf of its size (or of none) at pixels `at` (B, N, 2), extremes of
-// the depth around them, and of the picture (height, width) around pixels (B, N, 2) what window_brightness finds; rays
-// (B, N, 3). Fills depth, sigma and confidence (B, N), xyz (B, N, 3), flags (B, N).
-void samples(Tensor depth, Tensor conf, Tensor at, Tensor low, Tensor high, Tensor pixel, Tensor mean, Tensor centre,
-             Tensor top, Tensor bottom, Tensor ray, Tensor found, Tensor sigma, Tensor confidence, Tensor xyz, Tensor flag,
-             int64_t height, int64_t width, int64_t size, double near, double least_conf, double sigma_m, double sigma_rel,
-             double edge_rel, double dark, double saturated, double highlight) {
-  const int64_t batch = at.size(0), n = at.size(1), h = depth.size(1), w = depth.size(2);
-  const float *map = data<float>(depth), *lowest = data<float>(low), *highest = data<float>(high), *rays = data<float>(ray);
-  const float *means = data<float>(mean), *centres = data<float>(centre), *tops = data<float>(top), *bottoms = data<float>(bottom);
-  const int32_t *places = data<int32_t>(at), *pixels = data<int32_t>(pixel);
-  const uint8_t* levels = conf.numel() > 0 ? data<uint8_t>(conf) : nullptr;
-  float *z_of = data<float>(found), *sigmas = data<float>(sigma), *sures = data<float>(confidence), *points = data<float>(xyz);
-  int32_t* flags = data<int32_t>(flag);
-  const float beyond_near = near, least = least_conf, relative = sigma_rel, fixed = sigma_m * sigma_m, edge = 1.0 + edge_rel;
-  const float dim = dark * 255, white = saturated * 255, bright = highlight * 255;
-  for (int64_t i = 0; i < batch * n; ++i) {
-    const int32_t* place = places + 2 * i;
-    float z = 0.0f, level = 2.0f;
-    const int64_t column = std::clamp<int64_t>(place[0], 0, w - 1), row = std::clamp<int64_t>(place[1], 0, h - 1);
-    const int64_t index = (i / n * h + row) * w + column;
-    if (fits(place, h, w, 1)) {
-      const float read = map[index];
-      z = std::isfinite(read) && read > 0 ? read : 0.0f;
-    }
-    if (levels) level = levels[index];
-    const float grey = means[i], middle = centres[i], most = tops[i];
-    const bool returned = z > 0, beyond = z > beyond_near, unsure = returned && level < least;
-    const bool differs = returned && highest[i] > lowest[i] * edge, clipped = grey >= white;
-    const bool shine = most - bottoms[i] <= 0.15f * most && middle >= bright && middle - grey >= 25.5f;
+// What stage 2 takes for a return, and says of it.
+struct Limits {
+  float near, conf, fixed, relative, edge, dim, white, bright;
+};
+
+// What is read around a sample, and its ray.
+struct Look {
+  float z, level;
+  Extremes around;
+  Brightness seen;
+  const float* ray;
+  bool border;
+};
+
+// Where stage 2 writes what it says of samples: depth, sigma and confidence (B, N), xyz (B, N, 3), flags (B, N).
+struct Said {
+  float *depth, *sigma, *confidence, *xyz;
+  int32_t* flag;
+
+  void write(int64_t i, const Look& x, const Limits& limits) const {
+    const bool returned = x.z > 0, beyond = x.z > limits.near, unsure = returned && x.level < limits.conf;
+    const bool differs = returned && x.around.most > x.around.least * limits.edge, clipped = x.seen.mean >= limits.white;
+    const bool shine = x.seen.most - x.seen.least <= 0.15f * x.seen.most && x.seen.centre >= limits.bright &&
+                       x.seen.centre - x.seen.mean >= 25.5f;
     bool usable = returned && !unsure && !beyond;
-    for (int64_t k = 0; k < 3; ++k) usable = usable && std::isfinite(rays[3 * i + k] * z);
-    for (int64_t k = 0; k < 3; ++k) {
-      points[3 * i + k] = usable ? rays[3 * i + k] * z : std::numeric_limits<float>::quiet_NaN();
-    }
-    float sure = std::clamp(level / 2, 0.0f, 1.0f);
+    for (int64_t k = 0; k < 3; ++k) usable = usable && std::isfinite(x.ray[k] * x.z);
+    for (int64_t k = 0; k < 3; ++k) xyz[3 * i + k] = usable ? x.ray[k] * x.z : std::numeric_limits<float>::quiet_NaN();
+    float sure = std::clamp(x.level / 2, 0.0f, 1.0f);
     for (const bool doubt : {differs, shine, clipped}) sure = doubt ? sure / 2 : sure;
-    z_of[i] = z;
-    const float noise = relative * z;
-    sigmas[i] = sigma_m > 0 ? std::sqrt(fixed + noise * noise) : noise;
-    sures[i] = usable ? sure : 0.0f;
-    flags[i] = !returned * NO_DEPTH | unsure * LOW_CONF | beyond * BEYOND_NEAR | differs * DEPTH_EDGE |
-                             !fits(pixels + 2 * i, height, width, size) * BORDER | (grey <= dim) * UNDEREXPOSED |
-                             clipped * SATURATED | shine * SPECULAR;
+    const float noise = limits.relative * x.z;
+    depth[i] = x.z;
+    sigma[i] = limits.fixed > 0 ? std::sqrt(limits.fixed + noise * noise) : noise;
+    confidence[i] = usable ? sure : 0.0f;
+    flag[i] = !returned * NO_DEPTH | unsure * LOW_CONF | beyond * BEYOND_NEAR | differs * DEPTH_EDGE | x.border * BORDER |
+              (x.seen.mean <= limits.dim) * UNDEREXPOSED | clipped * SATURATED | shine * SPECULAR;
   }
+};
+
+template <int64_t SIZE, int64_t CHANNELS>
+void say(const float* map, const uint8_t* levels, const Windows& returns, const uint8_t* picture, const Windows& seen,
+         const float* rays, const Said& said, const Limits& limits) {
+  const int64_t h = returns.height, w = returns.width;
+  const float* end = map + returns.batch * h * w;
+  for (int64_t b = returns.batch; b-- > 0;) {  // the last picture was collated just now, the first one's textures are next
+    for (int64_t k = 0; k < returns.n; ++k) {
+      const int64_t i = b * returns.n + k;
+      const int32_t* place = returns.pixel + 2 * i;
+      const int64_t x = std::clamp<int64_t>(place[0], 0, w - 1), y = std::clamp<int64_t>(place[1], 0, h - 1);
+      const int64_t index = (b * h + y) * w + x;
+      const float read = fits(place, h, w, 1) ? map[index] : 0.0f;
+      said.write(i,
+                 {std::isfinite(read) && read > 0 ? read : 0.0f, levels ? levels[index] : 2.0f,
+                  extremes_at(map + returns.first(b, k), returns, end),
+                  brightness_at<SIZE, CHANNELS>(picture + seen.first(b, k), seen), rays + 3 * i,
+                  !fits(seen.pixel + 2 * i, seen.height, seen.width, seen.size)},
+                 limits);
+    }
+  }
+}
+
+// Stage 2: depth (B h w) and levels conf of its size (or of none) at pixels `at` (B, N, 2), returns around them as far as
+// `reach`; a picture of bytes, as window_brightness takes it, at pixels (B, N, 2); rays (B, N, 3). Fills what it says.
+void samples(Tensor depth, Tensor conf, Tensor at, Tensor picture, Tensor pixel, Tensor ray, Tensor found, Tensor sigma,
+             Tensor confidence, Tensor xyz, Tensor flag, int64_t reach, int64_t image, int64_t channel, int64_t row,
+             int64_t column, int64_t channels, int64_t height, int64_t width, int64_t size, double near, double least_conf,
+             double sigma_m, double sigma_rel, double edge_rel, double dark, double saturated, double highlight) {
+  const int64_t h = depth.size(1), w = depth.size(2);
+  const uint8_t *from = data<uint8_t>(picture), *levels = conf.numel() > 0 ? data<uint8_t>(conf) : nullptr;
+  const Windows returns = windows(at, h * w, 0, w, 1, 1, h, w, reach);
+  const Windows seen = of_picture(windows(pixel, image, channel, row, column, channels, height, width, size), from);
+  const Said said = {data<float>(found), data<float>(sigma), data<float>(confidence), data<float>(xyz), data<int32_t>(flag)};
+  const auto single = [](double x) { return static_cast<float>(x); };
+  const Limits limits = {single(near),           single(least_conf), single(sigma_m * sigma_m), single(sigma_rel),
+                         single(1.0 + edge_rel), single(dark * 255), single(saturated * 255),   single(highlight * 255)};
+  (usual(seen) ? say<5, 3> : say<0, 0>)(data<float>(depth), levels, returns, from, seen, data<float>(ray), said, limits);
 }
 
 // Stage 3 from what was read: of a hole (B, N) the first class of dhtorch/codes.py, Hole, that holds.
@@ -437,10 +551,10 @@ STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
       "float across, float down) -> ()");
   m.def("pixels(Tensor uv, Tensor(a!) pixel) -> ()");
   m.def(
-      "samples(Tensor depth, Tensor conf, Tensor at, Tensor low, Tensor high, Tensor pixel, Tensor mean, Tensor centre, "
-      "Tensor top, Tensor bottom, Tensor ray, Tensor(a!) found, Tensor(b!) sigma, Tensor(c!) confidence, Tensor(d!) xyz, "
-      "Tensor(e!) flag, int height, int width, int size, float near_limit, float min_conf, float sigma_m, float sigma_rel, "
-      "float edge_rel, float dark, float saturated, float highlight) -> ()");
+      "samples(Tensor depth, Tensor conf, Tensor at, Tensor picture, Tensor pixel, Tensor ray, Tensor(a!) found, "
+      "Tensor(b!) sigma, Tensor(c!) confidence, Tensor(d!) xyz, Tensor(e!) flag, int reach, int image, int channel, int row, "
+      "int column, int channels, int height, int width, int size, float near_limit, float min_conf, float sigma_m, "
+      "float sigma_rel, float edge_rel, float dark, float saturated, float highlight) -> ()");
   m.def("holes(Tensor xyz, Tensor flag, Tensor trackability, Tensor(a!) hole, float min_trackability) -> ()");
 }
 

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dhtorch import native
 from dhtorch.codes import Gate, PoseCode, Source
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.shapes import check, is_transformed
@@ -148,9 +149,15 @@ def merge(samples: Samples, estimate: Estimate | None) -> Map:
 
     Gradient: to both sources.
     """
+    told = (samples.depth, samples.sigma, samples.confidence)
+    if estimate is None and native.serves(*told, samples.xyz) and {x.dtype for x in told} == {torch.float32}:
+        depth, sigma, score = (torch.empty_like(x) for x in told)
+        source = torch.empty_like(depth, dtype=torch.int32)
+        torch.ops.dhtorch.sensed.default(*told, samples.xyz, depth, sigma, score, source)
+        return Map(samples.uv, depth, sigma, score, source)
     sensed = samples.usable
     if estimate is None:
-        depth, sigma, score = (torch.where(sensed, x, 0.0) for x in (samples.depth, samples.sigma, samples.confidence))
+        depth, sigma, score = (torch.where(sensed, x, 0.0) for x in told)
         return Map(samples.uv, depth, sigma, score, sensed.int() * Source.SENSOR)
     recovered = estimate.keep & ~sensed
     zero = torch.zeros_like(samples.depth)

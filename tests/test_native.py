@@ -23,6 +23,7 @@ from dhtorch.geometry import lucas_kanade as lk
 from dhtorch.geometry.camera import Camera, from_matrix, project, unproject
 from dhtorch.geometry.filters import gaussian
 from dhtorch.geometry.near_far import Problem
+from dhtorch.pair import merge
 from dhtorch.records import NO_HINT, Frame, Map, PoseFit, Samples, Shutter, TrackHint, Tracks
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.holes import classify, min_eigenvalue
@@ -30,6 +31,8 @@ from dhtorch.stages.pose import SEARCH_POINTS, map_pose, pnp_ransac
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 from dhtorch.synthetic import SyntheticRoom
 from dhtorch.transform import patch_tokens
+from dhtorch.transform.leaves import SampleError
+from dhtorch.transform.views import UNITS, Views
 
 COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
 needs_compiler = pytest.mark.skipif(COMPILER is None or sys.platform == "win32", reason="no C++ compiler here")
@@ -100,13 +103,18 @@ def test_numbers_about_windows_agree_textures_up_to_rounding(loaded, monkeypatch
     uv[0, 0] = torch.nan
     camera = Camera(f=torch.full((2, 2), 50.0), c=torch.full((2, 2), 20.0))
     frame = Frame(image=image, depth=depth, camera=camera, conf=None)
-    calls = counted(monkeypatch, "window_extremes", "window_brightness", "window_texture", "places", "samples", "holes")
-    ours, torchs = both_ways(lambda: classify(frame, backproject(frame, uv), block=block), monkeypatch)
-    assert len(calls) == 6
-    for name in ("depth", "confidence", "flag", "trackability", "hole"):
-        a, b = getattr(ours, name), getattr(torchs, name)
-        assert torch.equal(a.nan_to_num(7), b.nan_to_num(7)) or (name == "trackability" and (a - b).abs().max() < 1e-7)
-    assert ours.flag.unique().numel() > 3 and ours.trackability.unique().numel() > 100
+    at_once, alone = ["places", "samples"], ["window_extremes", "window_brightness"]
+    for options, reads in ({}, at_once), ({"search_px": 1}, alone):  # a search for returns is torch's
+        calls = counted(monkeypatch, *at_once, *alone, "window_texture", "holes")
+        ours, torchs = both_ways(
+            lambda options=options: classify(frame, backproject(frame, uv, **options), block=block), monkeypatch
+        )
+        assert calls == [*reads, "window_texture", "holes"]
+        for name in ("depth", "confidence", "flag", "trackability", "hole"):
+            a, b = getattr(ours, name), getattr(torchs, name)
+            rounds = name == "trackability" and (a - b).abs().max() < 1e-7
+            assert torch.equal(a.nan_to_num(7), b.nan_to_num(7)) or rounds, name
+        assert ours.flag.unique().numel() > (3 if reads is at_once else 2) and ours.trackability.unique().numel() > 100
 
 
 def counted(monkeypatch, *names):
@@ -220,6 +228,71 @@ def test_pyramids_that_compiled_code_cannot_build_are_torchs(loaded, monkeypatch
     assert not calls and slope.abs().sum() > 0
     pyramid.build_pyramid(image.detach(), 2, 11)
     assert len(calls) == 2
+
+
+@needs_compiler
+@pytest.mark.parametrize("kind", [torch.uint16, torch.int16])
+@pytest.mark.parametrize(("unit", "bounds"), [("mm", (0.0, torch.inf)), ("m", (0.0, torch.inf)), ("mm", (0.4, 9.0))])
+def test_whole_depths_in_metres_are_the_same_bits(loaded, monkeypatch, kind, unit, bounds):
+    every = torch.arange(-(1 << 15), 1 << 15, dtype=torch.int32).to(torch.int16).view(kind).view(2, 128, 256)
+    calls = counted(monkeypatch, "metres")
+    views = Views(depth_unit="mm", depth_range=bounds)
+    if unit == "m":  # another divisor than the one that is written for
+        monkeypatch.setitem(UNITS, "mm", 5000.0)
+    ours, torchs = both_ways(lambda: views.metres(list(every)), monkeypatch)
+    assert len(calls) == 2 and ours.dtype == torchs.dtype == torch.float32
+    assert torch.equal(ours, torchs) and ours.unique().numel() > 8000 and ours.amin() == 0
+
+
+@needs_compiler
+def test_depths_that_compiled_code_does_not_take_are_torchs(loaded, monkeypatch):
+    calls = counted(monkeypatch, "metres", "probe")
+    whole = torch.arange(6000).view(1, 60, 100)
+    for x in (whole.int(), whole.float(), whole.double(), whole.to(torch.uint8)):
+        assert (Views(depth_unit="mm").metres([x])[0] - x / 1000.0).abs().max() < 1e-6
+    assert Views(depth_unit=0.002).metres([whole.to(torch.int16)])[0, 0, 59, 99] == 5999 * 0.002
+    with pytest.raises(SampleError, match="is the unit mm"):
+        Views(depth_unit="m").metres([whole.to(torch.int16)])
+    Views(depth_unit="m")._probed(whole.double())
+    assert not calls
+
+
+@needs_compiler
+def test_what_some_depths_say_is_what_torch_says(loaded, monkeypatch):
+    views, random = Views(depth_unit="m"), torch.Generator().manual_seed(5)
+    depth = 3 * torch.rand(6, 60, 80, generator=random)
+    depth[0, ::2], depth[1], depth[2], depth[3, :40] = 0, 0, 0, 300.0
+    depth[2, 31, 17], depth[4] = 1.5, 0.004
+    depth[5, :, ::3] = torch.nan
+    calls = counted(monkeypatch, "probe")
+    for some in ([0, 5], [0, 1], [2], [3], [4], [5], [0, 3, 4]):
+        ours, torchs = both_ways(lambda some=some: views._probed(depth[some]), monkeypatch)
+        assert torch.equal(ours[0], torchs[0]) and ours[0].dtype == torchs[0].dtype
+        assert ours[0].tolist() == [k != 1 for k in some]
+        bad = [
+            torch.stack([b for b, _, _ in said]).any(0).tolist() if said else [False] * len(some)
+            for _, said in (ours, torchs)
+        ]
+        assert bad[0] == bad[1] == [k in (3, 4) for k in some]
+    assert len(calls) == 7
+
+
+@needs_compiler
+def test_the_sensors_own_map_is_the_same_bits(loaded, monkeypatch):
+    frame = a_view()
+    uv = torch.rand(301, 2, generator=torch.Generator().manual_seed(2)) * torch.tensor([99.0, 75.0]) - 7
+    samples = classify(frame, backproject(frame, uv, near_limit=2.5, min_conf=1))
+    samples = samples.replace(xyz=torch.where(samples.depth[..., None] < 0.5, torch.inf, samples.xyz))
+    calls = counted(monkeypatch, "sensed")
+    ours, torchs = both_ways(lambda: merge(samples, None), monkeypatch)
+    assert calls == ["sensed"] and 0 < (ours.source == Source.SENSOR).sum() < ours.source.numel()
+    for name in ("uv", "depth", "sigma", "score", "source"):
+        a, b = getattr(ours, name), getattr(torchs, name)
+        assert a.dtype == b.dtype and torch.equal(a.nan_to_num(7), b.nan_to_num(7)), name
+    leaf = samples.depth.clone().requires_grad_()
+    assert merge(samples.replace(depth=leaf), None).depth.requires_grad
+    assert merge(samples.map(lambda x: x.double() if x.is_floating_point() else x), None).depth.dtype == torch.float64
+    assert calls == ["sensed"]
 
 
 def sparse(batch, n, seed=0):

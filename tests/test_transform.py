@@ -486,5 +486,5 @@ def test_one_return_that_no_probe_meets_is_a_return():
     depth = torch.zeros(2, 60, 80)
     depth[1, 31, 17] = 1.5
     assert 2 * views.PROBES < 60 * 80
-    assert views.any_return(depth).tolist() == [False, True]
-    assert views.any_return(depth[1:] + 1).tolist() == [True]
+    assert views.any_return(depth, views._probes(depth)).tolist() == [False, True]
+    assert views.any_return(depth[1:] + 1, views._probes(depth[1:] + 1)).tolist() == [True]

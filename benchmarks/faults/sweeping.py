@@ -97,8 +97,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("load", "if not path.is_file():", "if False:"),
         ("serves", "torch.compiler.is_compiling() or forward_ad._current_level >= 0", "torch.compiler.is_compiling()"),
         ("serves", 'in ("", "0")', 'in ("",)'),
-        ("_plain", "not graph and ", ""),
-        ("_plain", "and x.is_contiguous()", ""),
-        ("_plain", "x.dtype in _TOLD", "not x.is_complex()"),
+        ("serves", "(graph and x.requires_grad) or ", ""),
+        ("serves", " or not x.is_contiguous()", ""),
+        ("serves", "x.dtype not in _TOLD", "x.is_complex()"),
     ],
 }

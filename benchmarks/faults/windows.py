@@ -97,7 +97,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_must_fit", "size > min(H, W)", "size >= min(H, W)"),
         ("_must_fit", "size > min(H, W)", "size > max(H, W)"),
         (
-            "_flat",
+            "in_a_row",
             "image.stride(1) == 1 and image.stride(3) == C",
             "image.stride(1) == 1",
             "both orders hold the same numbers, the wrong one costs a copy",

@@ -63,7 +63,7 @@ def summarise(
     sizes = check("lookup.summarise", image=(image, "B C H W"), pixel=(pixel, "B N 2"))
     B, N, C, H, W = (sizes[k] for k in "BNCHW")
     _must_fit("summarise", size, H, W)
-    flat, (b, c, v, u) = _flat(image)
+    flat, (b, c, v, u) = in_a_row(image)
     if compiled is not None and size <= WIDEST and native.serves(flat, pixel):
         kind, count = COMPILED[compiled]
         if image.dtype == kind:
@@ -169,7 +169,7 @@ def fits(pixel: Tensor, hw: tuple[int, int], size: int) -> Tensor:
     return (x == pixel[..., 0]) & (y == pixel[..., 1])
 
 
-def _flat(image: Tensor) -> tuple[Tensor, tuple[int, int, int, int]]:
+def in_a_row(image: Tensor) -> tuple[Tensor, tuple[int, int, int, int]]:
     """All images as one row of numbers, and the steps in it from image to image, channel, row and column."""
     C, H, W = image.shape[1:]
     if C > 1 and image.stride(1) == 1 and image.stride(3) == C:
@@ -256,9 +256,10 @@ def nearest_index(hw: tuple[int, int], pixel: Tensor) -> tuple[Tensor, Tensor]:
 
 def pixels(uv: Tensor) -> Tensor:
     """The pixel that each ``uv`` lies in, int32; one outside of any image where it is no place at all."""
-    if native.serves(uv) and uv.dtype == torch.float32:
-        pixel = torch.empty_like(uv, dtype=torch.int32)
-        torch.ops.dhtorch.pixels.default(uv, pixel)
+    near = uv.contiguous()  # samples that a batch shares are a view
+    if native.serves(near) and near.dtype == torch.float32:
+        pixel = torch.empty_like(near, dtype=torch.int32)
+        torch.ops.dhtorch.pixels.default(near, pixel)
         return pixel
     return round_half_up(uv.nan_to_num(-1.0)).int()
 

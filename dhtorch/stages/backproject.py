@@ -15,6 +15,7 @@ from dhtorch.codes import Flag, Hole
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.lookup import (
     fits,
+    in_a_row,
     luma,
     nearest_index,
     patches,
@@ -164,14 +165,14 @@ def _compiled(frame: Frame, uv: Tensor, limits: _Limits) -> Samples | None:
     if looks is None:
         return None
     pixel, at, ray = looks
-    extremes = summarise(frame.depth[:, None], at, around, _extremes, compiled="extremes")
-    seen = summarise(frame.image, pixel, size, _brightness, compiled="brightness")
-    depth, sigma, confidence = (torch.empty_like(extremes[0]) for _ in range(3))
+    picture, steps = in_a_row(frame.image)
+    depth, sigma, confidence = (ray.new_empty(ray.shape[:2]) for _ in range(3))
     flag = torch.empty_like(depth, dtype=torch.int32)
     xyz = torch.empty_like(ray)
     told = limits._replace(near_limit=torch.inf if limits.near_limit is None else limits.near_limit)
-    read = (frame.depth, conf, at, *extremes, pixel, *seen, ray)
-    torch.ops.dhtorch.samples.default(*read, depth, sigma, confidence, xyz, flag, *frame.hw, size, *told)
+    said = (depth, sigma, confidence, xyz, flag)
+    shape = (around, *steps, *frame.image.shape[1:], size)
+    torch.ops.dhtorch.samples.default(frame.depth, conf, at, picture, pixel, ray, *said, *shape, *told)
     none = {"trackability": torch.zeros_like(depth), "hole": torch.zeros_like(flag)}
     return Samples(uv=uv, depth=depth, sigma=sigma, xyz=xyz, confidence=confidence, flag=flag, **none)
 

@@ -110,13 +110,18 @@ class ExtendedDataset(_Wrapped, Dataset[Any]):
     def collate(self, samples: Sequence[Any]) -> dict[str, Any]:
         """One batch, collated as torch does and then extended as a whole; with ``by_batch``."""
         # In a worker torch collates into memory that it shares: page by page a new one, several times as slow.
-        own = {key: _stacked(samples, key) for key in self.consumed if has(samples[0], key)}
-        batch = default_collate([without(sample, own) for sample in samples] if own else list(samples))
+        gone = {key: _each(samples, key) for key in self.consumed if has(samples[0], key)}
+        views = self.transform.views
+        own = {key: torch.stack(found) for key, found in gone.items() if key != views.depth}
+        if views.depth in gone:
+            own[views.in_metres] = views.metres(gone[views.depth])
+        batch = default_collate([without(sample, gone) for sample in samples] if gone else list(samples))
         return self._returned(self.transform({**batch, **own} if own else batch)) or {}
 
     def _returned(self, out: dict[str, Any] | None) -> dict[str, Any] | None:
         """Without what a gap lent, and what was consumed."""
-        gone = self.consumed if self.gap is None else (*self.consumed, *self._lent)
+        gone = (*self.consumed, self.transform.views.in_metres) if self.consumed else ()
+        gone = gone if self.gap is None else (*gone, *self._lent)
         return without(out, gone) if out is not None and gone else out
 
     def _loaded(self, i: int) -> dict[str, Any]:
@@ -219,9 +224,9 @@ def one_thread(worker: int = 0) -> None:
         opencv.setNumThreads(0)  # 1 would wait for the threads of the pool, which a forked worker does not have
 
 
-def _stacked(samples: Sequence[Any], key: str) -> torch.Tensor:
-    """What lies under a key of each sample, in memory of this process alone."""
-    return torch.stack([to_tensor(find(sample, key), key, signed=False) for sample in samples])
+def _each(samples: Sequence[Any], key: str) -> list[torch.Tensor]:
+    """What lies under a key of each sample."""
+    return [to_tensor(find(sample, key), key, signed=False) for sample in samples]
 
 
 def _zero(value: Any) -> Any:

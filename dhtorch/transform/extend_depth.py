@@ -20,7 +20,7 @@ from dhtorch.transform import given, maps
 from dhtorch.transform.leaves import SampleError, check_sample, find, to_tensor
 from dhtorch.transform.problems import SampleProblem, Tally
 from dhtorch.transform.tokens import CHANNELS, FITS, grid, patch_tokens
-from dhtorch.transform.views import Read, Views, any_return
+from dhtorch.transform.views import Read, Views
 
 ON_ERROR = ("raise", "skip", "flag")
 
@@ -167,7 +167,7 @@ class ExtendDepth(torch.nn.Module):
         valid = found.source != Source.NONE
         xyz = samples.xyz if estimate is None else cam.unproject(frame.camera, found.uv, found.depth)
         problem = (~paired).int() * SampleProblem.NO_SECOND_VIEW
-        problem = torch.where(any_return(frame.depth), problem, SampleProblem.NO_DEPTH)
+        problem = torch.where(read.sensed, problem, SampleProblem.NO_DEPTH)
         added = {
             "uv": found.uv,
             "xyz": torch.where(valid[..., None], xyz, 0.0),

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dhtorch.geometry import camera as cam
 from dhtorch.records import Camera
 
 #: Where the numbers are: a key of the sample, or the numbers themselves, the same for every sample.
@@ -208,7 +207,7 @@ class Leaves:
         if x.shape[1] != 9:
             name = numbers if isinstance(numbers, str) else "intrinsics"
             raise SampleError(f"{name}: found {x.shape[1]} numbers, expected 3x3, or fx fy cx cy")
-        return cam.from_matrix(x.unflatten(1, (3, 3)), distortion)
+        return Camera(x[:, 0:5:4].contiguous(), x[:, 2:6:3].contiguous(), distortion)
 
     def pad(self, key: str, T: int) -> Tensor:
         """(B, T) whether a frame only pads the start or end of an episode: LeRobot's ``<key>_is_pad``."""

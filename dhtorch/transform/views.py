@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from dhtorch import native
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import conventions
 from dhtorch.geometry.shapes import is_transformed, surely_all
@@ -51,6 +52,7 @@ class Read(NamedTuple):
     other: Frame | None  # with a leading dimension where several were asked for; None = there is none
     paired: Tensor  # (B,) bool: the other view is a view of its own, no copy that pads the start of an episode
     bad: Tensor  # (B,) bool: values contradict what was stated
+    sensed: Tensor  # (B,) bool: the anchor's map has a return
     complaints: tuple[tuple[Tensor, Tensor, str], ...]  # mask (B,), value (B,) and what to say about it
     given: GivenPose | None = None  # the motion to the other view, where samples state it; leading dims as of other
 
@@ -124,9 +126,12 @@ class Views:
         at = _place(self.at, T, self.image)
         image = images[:, at]
         checks = _unit_range_checks(image, self.image)
-        depths = self._metres(leaves.planes(self.depth, T, signed=False))
+        ready = self.in_metres in sample
+        planes = leaves.planes(self.in_metres if ready else self.depth, T, signed=False)
+        depths = planes if ready else self.metres([planes])[0]
         depth = depths[:, at if depths.shape[1] > 1 else 0].contiguous()
-        checks += self._depth_checks(depth)
+        sensed, doubts = self._probed(depth)
+        checks += doubts
         conf = None if self.confidence is None else leaves.planes(self.confidence, T)
         if conf is not None:
             conf = conf[:, at if conf.shape[1] > 1 else 0]
@@ -143,7 +148,32 @@ class Views:
         if other is not None:  # tracking reads all pixels, the front end alone a few where they lie
             anchor = anchor.replace(image=anchor.image.contiguous())
         bad = torch.stack([c[0] for c in checks]).any(0) if checks else paired.new_zeros(len(depth))
-        return Read(anchor, other, paired, bad, tuple(checks), motion)
+        return Read(anchor, other, paired, bad, sensed, tuple(checks), motion)
+
+    @property
+    def in_metres(self) -> str:
+        """Key of depth maps that went through :meth:`metres` when they were collated, in place of the stated one."""
+        return f"{self.depth} in metres"
+
+    def metres(self, maps: Sequence[Tensor]) -> Tensor:
+        """Depth maps of one shape as they are in files, stacked and in metres, 0 = no return.
+
+        They are converted one after the other, while each is in the cache.
+
+        Raises:
+            SampleError: numbers that cannot be metres.
+        """
+        if self.depth_unit == "m" and not maps[0].is_floating_point():
+            raise SampleError(f"{self.depth}: found whole numbers ({maps[0].dtype}), expected metres; is the unit mm?")
+        words = [x.view(torch.int16) for x in maps if x.dtype in (torch.int16, torch.uint16)]
+        if len(words) == len(maps) and isinstance(self.depth_unit, str) and native.serves(*words):
+            z = torch.empty(len(maps), *maps[0].shape)
+            for into, read, x in zip(z, words, maps, strict=True):
+                torch.ops.dhtorch.metres.default(read, into, UNITS[self.depth_unit], x.dtype.is_signed)
+        else:
+            z = self._scaled(torch.stack(list(maps)) if len(maps) > 1 else maps[0][None])
+        low, high = self.depth_range
+        return z if low <= 0 and high == float("inf") else torch.where((z > low) & (z <= high), z, 0.0)
 
     def keys(self) -> tuple[str, ...]:
         """The keys of a sample that are read, but for those that say what only pads."""
@@ -229,28 +259,32 @@ class Views:
             raise ValueError("found pose and other_image, expected other_pose: the other view's pose")
         given.sigmas(self.pose_cov)
 
-    def _metres(self, x: Tensor) -> Tensor:
-        """Depth in metres, 0 = no return."""
-        if self.depth_unit == "m" and not x.is_floating_point():
-            raise SampleError(f"{self.depth}: found whole numbers ({x.dtype}), expected metres; is the unit mm?")
+    def _scaled(self, x: Tensor) -> Tensor:
+        """Positive numbers in metres, 0 for all others."""
         # Every pass over a whole map costs as much as the front end: no more of them than the numbers ask for.
         if x.is_floating_point():
             x = x.nan_to_num(0.0, 0.0, 0.0).relu()
         else:
             x = x.float().relu_() if x.dtype.is_signed else x.float()
         if not isinstance(self.depth_unit, str):
-            z = x * float(self.depth_unit)
-        elif self.depth_unit == "m":
-            z = x
-        else:
-            z = x / UNITS[self.depth_unit] if x.requires_grad else x.div_(UNITS[self.depth_unit])
-        low, high = self.depth_range
-        return z if low <= 0 and high == float("inf") else torch.where((z > low) & (z <= high), z, 0.0)
+            return x * float(self.depth_unit)
+        if self.depth_unit == "m":
+            return x
+        return x / UNITS[self.depth_unit] if x.requires_grad else x.div_(UNITS[self.depth_unit])
 
-    def _depth_checks(self, depth: Tensor) -> list[tuple[Tensor, Tensor, str]]:
-        flat = _probes(depth.detach())
-        median = torch.where(flat > 0, flat, torch.nan).nanmedian(1).values
+    def _probed(self, depth: Tensor) -> tuple[Tensor, list[tuple[Tensor, Tensor, str]]]:
+        """Which maps (B,) have a return, and what speaks against the unit."""
         low, high = self.min_depth * (1 + _ROUNDING), self.max_depth * (1 - _ROUNDING)
+        if native.serves(depth):
+            counts = depth.new_empty(2, len(depth), dtype=torch.int64)
+            torch.ops.dhtorch.probe.default(depth, counts, _step(depth), low, high)
+            if all(0 < some < 2 * sound for some, sound in zip(*counts.tolist(), strict=True)):  # so is the median
+                return torch.ones(len(depth), dtype=torch.bool), []
+        probes = _probes(depth.detach())
+        return any_return(depth, probes), self._depth_checks(probes, low, high)
+
+    def _depth_checks(self, probes: Tensor, low: float, high: float) -> list[tuple[Tensor, Tensor, str]]:
+        median = torch.where(probes > 0, probes, torch.nan).nanmedian(1).values
         if _told_at_once(median) and all(low < m < high or math.isnan(m) for m in median.tolist()):
             return []
         said = f"{self.depth}: the median return is {{:.4g}} m with the unit {self.depth_unit!r}, expected"
@@ -298,14 +332,17 @@ class Views:
 
 
 def _probes(depth: Tensor) -> Tensor:
-    """Some of the numbers of each map, evenly spread."""
-    flat = depth.flatten(1)
-    return flat[:, :: max(1, flat.shape[1] // PROBES)]
+    """Some of the numbers (B, k) of each map, evenly spread; far from each other, they are read once for all."""
+    return depth.flatten(1)[:, :: _step(depth)].contiguous()
 
 
-def any_return(depth: Tensor) -> Tensor:
-    """Whether maps (B, h, w) have a return, (B,) bool: a pass over all of them only where a few numbers do not tell."""
-    some = (_probes(depth) > 0).any(1)
+def _step(depth: Tensor) -> int:
+    return max(1, depth.shape[1] * depth.shape[2] // PROBES)
+
+
+def any_return(depth: Tensor, probes: Tensor) -> Tensor:
+    """Whether maps (B, h, w) have a return, (B,) bool: a pass over all of them only where some numbers do not tell."""
+    some = (probes > 0).any(1)
     return some if depth.is_cpu and surely_all(some) else depth.amax((1, 2)) > 0
 
 
