@@ -58,10 +58,17 @@ UNLIKELY: Final = 3.0
 STEPS, MANY = 10, 40
 
 
+class Head(NamedTuple):
+    """What is free in ``y = s x + t``."""
+
+    scale: bool
+    shift: bool
+
+
 class Model(NamedTuple):
     """What is taken to be wrong with a map; standard deviations of log depth, 0 = nothing."""
 
-    head: int  # place in HEADS
+    head: str  # of HEADS
     tilt: float  # from the middle to a side
     field: float  # smooth, over the picture
     curve: float  # smooth, over log depth
@@ -70,10 +77,16 @@ class Model(NamedTuple):
     @property
     def prior(self) -> float:
         """Log probability, up to a constant: every kind of freedom is less likely than none."""
-        return -UNLIKELY * (self.head + (self.tilt > 0) + (self.field > 0))
+        return -UNLIKELY * (sum(HEADS[self.head]) + (self.tilt > 0) + (self.field > 0))
 
 
-HEADS: Final = ("raw", "scale", "affine")
+#: The simplest first: of two with as many freedoms the one that many maps lack, a metre, and not a shift.
+HEADS: Final = {
+    "raw": Head(scale=False, shift=False),
+    "scale": Head(scale=True, shift=False),
+    "shift": Head(scale=False, shift=True),
+    "affine": Head(scale=True, shift=True),
+}
 
 #: What may be wrong beside the head.
 _DRIFTS: Final = {
@@ -85,7 +98,7 @@ _DRIFTS: Final = {
     "_short_4": (0.04, 0.04, 0.01, True),
 }
 
-MODELS: Final = {head + drift: Model(k, *rest) for k, head in enumerate(HEADS) for drift, rest in _DRIFTS.items()}
+MODELS: Final = {head + drift: Model(head, *rest) for head in HEADS for drift, rest in _DRIFTS.items()}
 
 
 class Basis(NamedTuple):
@@ -105,7 +118,7 @@ class Task(NamedTuple):
 
     points: Anchors
     basis: Basis
-    start: Tensor  # (B, 3, 2) heads from which fits start, as HEADS
+    start: Tensor  # (B, H, 2) heads from which fits start, as HEADS
     level: Tensor  # (B, 1) a usual value of y
 
 
@@ -334,12 +347,13 @@ def _problem(task: Task, model: Tensor, used: Tensor) -> _Problem:
         return t[:, None].expand(B, K, *t.shape[1:]).flatten(0, 1)
 
     of = list(MODELS.values())
-    head = torch.tensor([m.head for m in of], device=model.device)[model]
+    place = torch.tensor([list(HEADS).index(m.head) for m in of], device=model.device)[model]
+    free = points.x.new_tensor([HEADS[m.head] for m in of])[model]
     short = torch.tensor([m.short for m in of], device=model.device)[model]
     rest = torch.cat((curves(basis, points.x), leans(points)), -1)[:, None].expand(B, K, -1, -1)
     sd = points.x.new_tensor([_deviations(m) for m in of])[model.flatten()]
-    start = task.start.gather(1, head[..., None].expand(-1, -1, 2))
-    believed = torch.stack((OF_SCALE * start[..., 0] * (head > 0), OF_SHIFT * task.level * (head > 1)), -1)
+    start = task.start.gather(1, place[..., None].expand(-1, -1, 2))
+    believed = free * torch.stack((OF_SCALE * start[..., 0], (OF_SHIFT * task.level).expand_as(place)), -1)
     weight = [points.weight(one) for one in used.unbind(1)] if used.dim() == 3 else [points.weight(used)] * K
     return _Problem(
         x=each(points.x),

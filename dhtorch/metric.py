@@ -1,8 +1,8 @@
 """Anybody's depth in metres: a map tied to near returns and far answers, with a sigma for every pixel.
 
-    map ─┐                ┌─ right as it is ──────┐
-         ├─ robust fits ──┼─ scale, scale + shift ┼─ the one under which the anchors are most probable ─ DepthMap
-    anchors ┘             └─ and a smooth field ──┘        └─ its rivals, and anchors left out: sigma
+    map ─┐                ┌─ right as it is ───────┐
+         ├─ robust fits ──┼─ scale, shift, or both ┼─ the one under which the anchors are most probable ─ DepthMap
+    anchors ┘             └─ and a smooth field ───┘        └─ its rivals, and anchors left out: sigma
 
 What a map lacks is a metre, then a shift, then a slow drift over picture and depth (:mod:`dhtorch.distortion`). More is
 believed only as far as it makes the anchors more probable than its freedom costs, and tells those that were left out
@@ -33,12 +33,13 @@ from dhtorch.records import DepthMap, Estimate, Samples
 #: any rising function of depth.
 KINDS: Final = ("metric", "scale", "affine", "inverse", "ordinal")
 
-#: Kind → models that make sense of it. What has an order alone is not bent across the picture.
+#: Kind → models that make sense of it: those that are free where it is. What has an order alone is not bent across the
+#: picture.
 _OF_KIND: Final = {
     "metric": tuple(MODELS),
-    "scale": tuple(name for name in MODELS if not name.startswith("raw")),
-    **dict.fromkeys(("affine", "inverse"), tuple(name for name in MODELS if name.startswith("affine"))),
-    "ordinal": HEADS,
+    "scale": tuple(name for name, model in MODELS.items() if HEADS[model.head].scale),
+    **dict.fromkeys(("affine", "inverse"), tuple(name for name, model in MODELS.items() if all(HEADS[model.head]))),
+    "ordinal": tuple(HEADS),
 }
 
 #: Fewest anchors of a fit, and most models that share in sigma.
@@ -95,8 +96,8 @@ def anchor(
 ) -> DepthMap:
     """A map of anybody's, in metres, with a sigma for every pixel.
 
-    Robust fits (Student's t) tie the map to the anchors: nothing, a scale, a scale and a shift; on top a tilt or a
-    field over the picture and a correction over depth, both Gaussian processes, so that they are zero away from
+    Robust fits (Student's t) tie the map to the anchors: nothing, a scale, a shift, both; on top a tilt or a field
+    over the picture and a correction over depth, both Gaussian processes, so that they are zero away from
     anchors. How far anchors are off by themselves is found with each fit, and how heavy the tails of near returns are
     with the answer's. How probable the anchors are under a fit (its evidence) says which may be taken; it is, in place
     of a plain head, only where anchors that were left out bear it out. Its two nearest rivals are part of sigma. An
@@ -172,7 +173,8 @@ def _task(x: Tensor, known: Tensor, points: Anchors, *, of_depth: bool) -> Task:
 
 
 def _starts(x: Tensor, y: Tensor, points: Anchors) -> Tensor:
-    """Heads (B, 3, 2): none, the median ratio, the line of least absolute relative error."""
+    """Heads (B, H, 2) as HEADS: none, the median ratio, the median difference, the line of least absolute relative
+    error."""
     ratio = median(y / torch.where(x == 0, torch.nan, x), points.used)[:, 0]
     scale = torch.stack((ratio.abs(), torch.zeros_like(ratio)), -1)
     A = torch.stack((x, torch.ones_like(x)), -1) / y[..., None]
@@ -184,8 +186,9 @@ def _starts(x: Tensor, y: Tensor, points: Anchors) -> Tensor:
         line, ok = solve_spd(W.mT @ A + eye, W.sum(1)[..., None])
         w = weight / (((A @ line)[..., 0] - 1).square() + BEND**2).sqrt()
     line = torch.where((ok & (line[:, 0, 0] > 0))[:, None], line[..., 0], scale)
-    none = torch.stack((torch.ones_like(ratio), torch.zeros_like(ratio)), -1)
-    return torch.stack((none, scale, line), 1)
+    one = torch.ones_like(ratio)
+    none, shift = (torch.stack((one, t), -1) for t in (torch.zeros_like(ratio), median(y - x, points.used)[:, 0]))
+    return torch.stack((none, scale, shift, line), 1)
 
 
 class _Left(NamedTuple):
@@ -204,14 +207,14 @@ def _chosen(task: Task, names: tuple[str, ...]) -> tuple[Fit, Chosen]:
         some = every.evidence.isfinite().any(-1) & (points.used.sum(-1) >= FEWEST)
         prior = every.evidence.new_tensor([MODELS[name].prior for name in names])
         weight = torch.softmax(torch.where(some[:, None], every.evidence + prior, 0.0), -1)
-        simple = torch.tensor([names.index(head) for head in HEADS if head in names], device=place.device)
+        heads = [head for head in HEADS if head in names]
+        simple = torch.tensor([names.index(head) for head in heads], device=place.device)
         asked = torch.cat((simple.expand(len(weight), -1), weight.argmax(-1, keepdim=True)), -1)
         left = _left_out(task, place[asked])
         fitted = every.evidence.gather(1, asked).isfinite()
         left = left._replace(r=torch.where(fitted[..., None, None], left.r, torch.nan))
-        drifts = [list(MODELS.values())[k].head for k in place.tolist()]
-        head = torch.tensor(drifts, device=place.device)[asked[:, -1]] - drifts[0]
-        taken = _simplest(points, left, head)[:, None]
+        head = torch.tensor([heads.index(MODELS[name].head) for name in names], device=place.device)[asked[:, -1]]
+        taken = _simplest(points, left, heads, head)[:, None]
         factor = _stretch(points, left, taken)
         best = asked.gather(1, taken)
         # What the anchors left out do not tell from the most probable model shares alike with it.
@@ -242,23 +245,24 @@ def _left_out(task: Task, model: Tensor) -> _Left:
     return _Left(*(part.unflatten(1, (model.shape[1], len(turns))) for part in (r, var)))
 
 
-def _simplest(points: Anchors, left: _Left, head: Tensor) -> Tensor:
+def _simplest(points: Anchors, left: _Left, heads: Sequence[str], head: Tensor) -> Tensor:
     """Place (B,) of the first model whose loss is within one standard error of the least, blocks of the picture being
-    the unit (Breiman's rule): one error bar in favour of what changes the map less. The last one has the head at the
-    places ``head`` (B,) and perhaps a drift. The metre is the near returns'; where there are far answers, they must
-    not refute a shift (lose more by it than one standard error), and bear a drift out: what near returns alone ask for
-    in their part of the picture is no evidence of the far part."""
+    the unit (Breiman's rule): one error bar in favour of what changes the map less. The first ones are the plain
+    ``heads``; the last one has the head at the places ``head`` (B,) among them and perhaps a drift. The metre is the
+    near returns'; where there are far answers, they must not refute a shift (lose more by it than one standard error),
+    and bear a drift out: what near returns alone ask for in their part of the picture is no evidence of the far
+    part."""
     block = _lost(points, left)
     n = block.mean.shape[1]
     of_far = block.mass * (torch.arange(block.mass.shape[-1], device=block.mass.device) % 2 == 0)
     far = (of_far * block.mean).sum(-1)
-    below = torch.arange(n, device=far.device) - 1
-    below = torch.cat((below[:-1].expand(len(far), -1), head[:, None]), -1).clamp_min(0)
+    place = torch.arange(n, device=far.device)
+    below = torch.cat(((place[:-1] - 1).expand(len(far), -1), head[:, None]), -1).clamp_min(0)
     simpler = far.cummin(-1).indices.gather(1, below)
     worse, error = _against(block.mean, simpler, of_far)
-    place = torch.arange(n, device=far.device)
     told = (points.used & ~points.near).sum(-1, keepdim=True) >= FEWEST
-    bent = (place == max(1, n - 2)) & (worse > torch.where(block.met <= EXACT, SURE, 1.0) * error)
+    shifts = torch.tensor([*(HEADS[name].shift for name in heads), False], device=far.device)
+    bent = shifts & (worse > torch.where(block.met <= EXACT, SURE, 1.0) * error)
     drifts = (place == n - 1) & (worse >= 0)
     refused = told & (bent | drifts)
     mean = (block.mass * block.mean).sum(-1).masked_fill(refused, torch.inf)

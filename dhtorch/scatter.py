@@ -1,9 +1,10 @@
 """How far a map in metres is off from pixel to pixel, as its near returns show it: what no model holds of sigma.
 
 Four things are told apart. A return stands somewhere in its pixel and so does the value of the map, so that on a slope
-both differ though neither is wrong. What returns have by themselves is not the map's. What is left goes with how rough
-the map is around: two levels, of the flatter and the rougher half of the returns. And where returns are off by far more
-than that, so are the pixels around them on the same surface.
+both differ though neither is wrong. What returns have by themselves is not the map's: it goes neither with how the map
+stands out of its surroundings nor with what returns a little way off have. What is left goes with how rough the map is
+around: two levels, of the flatter and the rougher half of the returns. And where returns are off by far more than that,
+so are the pixels around them on the same surface.
 
 Alphabet: ``r`` residual of log depth at anchors; ``read`` its variance by where in the pixel they stand; ``h`` how
 rough the map is; ``G`` candidates of a level.
@@ -53,8 +54,15 @@ BEYOND: Final = 2.0
 #: Returns off by more of these levels are no witnesses of what returns have by themselves.
 OUTSIDE: Final = 3.0
 
-#: Neighbours that a return is held against.
-AROUND: Final = 4
+#: Unevenness of a map, as a share of the scatter of returns, below which it is as good as even.
+EVEN: Final = 0.1
+
+#: How far apart returns are that a map is wrong at alike and a sensor is not, whose noise is smooth over a few of its
+#: pixels: shares of the longer side.
+ASIDE: Final = (0.035, 0.12)
+
+#: Pairs of returns for which the belief counts that all of the scatter is the map's.
+BELIEVED: Final = 10
 
 
 def variance(
@@ -83,44 +91,52 @@ def variance(
         excess = (r.square() - BEYOND**2 * (flat.square() + (slope * h).square() + read)).clamp_min(0)
         level = at_anchors(log, points.share)[0]
         off = _in_places(points.share, level, (excess, near), log, known)
-        calm = near & (h <= median(h, near)) & (r.abs() <= OUTSIDE * flat)
-        least = flat.square() * (2 / calm.sum(-1, keepdim=True).clamp_min(2)).sqrt()  # what a variance is known to
-        of_map = (flat.square() - _of_returns(points, r, level, calm)).maximum(least)
+        calm = near & (r.abs() <= OUTSIDE * flat)
+        stands = at_anchors(_standing_out(log, known), points.share)[0]
+        fast = _fast(r, stands, calm / (h.square() + (EVEN * flat).square()).clamp_min(1e-18))
+        slow = _slow(r, points.share * points.share.new_tensor(_sides(log)), calm, flat.square())
+        stated = (median(points.var, calm) - FLOOR**2).clamp_min(0)
+        of_map = (fast + slow).maximum(flat.square() - stated).minimum(flat.square())
         return of_map[..., None] + (slope[..., None] * rough).square() + off
 
 
-def _of_returns(points: Anchors, r: Tensor, level: Tensor, among: Tensor) -> Tensor:
-    """Variance (B, 1) that returns have by themselves, less its standard error and at most what they state.
+def _fast(r: Tensor, stands: Tensor, weight: Tensor) -> Tensor:
+    """Variance (B, 1) of what a map is off by from pixel to pixel: that makes it uneven, and residuals go with how it
+    ``stands`` out of its surroundings, against it. Where they go along with it the map is too smooth, and what of them
+    is told by it is the map's. Where it is even this is known best, whatever returns have by themselves."""
+    both, alone, whole = ((weight * v).sum(-1, keepdim=True) for v in (stands * r, stands.square(), torch.ones_like(r)))
+    mean = both / whole.clamp_min(1e-18)
+    return torch.where(mean < 0, -mean, mean * both / alone.clamp_min(1e-18))
 
-    Map and returns are two instruments on one surface. Residuals go with how a return differs from its neighbours as
-    far as they are the return's, and not as far as they are the map's.
 
-    Source: F. Grubbs, "On estimating precision of measuring instruments and product variability", 1948.
-    """
-    pair = among[:, None] & among[:, :, None] & ~torch.eye(r.shape[1], dtype=torch.bool, device=r.device)
-    apart = torch.cdist(points.share, points.share, compute_mode="donot_use_mm_for_euclid_dist")
-    apart = torch.where(pair, apart, torch.inf)
-    apart, other = apart.topk(min(AROUND, r.shape[1]), largest=False)
-    some = apart.isfinite().all(-1)
-
-    def beside(value: Tensor) -> Tensor:
-        """By how much (B, N) it differs from the mean of its neighbours."""
-        around = value[:, None].expand(-1, value.shape[1], -1).gather(2, other)
-        return torch.where(some, value - around.mean(-1), 0.0)
-
-    d_r, d_map = beside(r), beside(level)
-    product = (d_r + d_map) * d_r / (1 + 1 / AROUND)
-    n = some.sum(-1, keepdim=True).clamp_min(1)
-    mean = product.sum(-1, keepdim=True) / n
-    error = torch.where(some, product - mean, 0.0).square().sum(-1, keepdim=True).sqrt() / n
-    stated = median(points.var - FLOOR**2, among).clamp_min(0)
-    return (mean - error).clamp_min(0).minimum(torch.where(some.any(-1, keepdim=True), stated, 0.0))
+def _slow(r: Tensor, place: Tensor, among: Tensor, whole: Tensor) -> Tensor:
+    """Variance (B, 1) of what a map is off by over more than a few pixels of a sensor: returns that stand apart at
+    ``place`` (B, N, 2) are off alike by it, and not by what they have by themselves. Without many pairs it is as likely
+    the ``whole`` (B, 1) of the scatter."""
+    apart = torch.cdist(place, place, compute_mode="donot_use_mm_for_euclid_dist")
+    pair = among[:, None] & among[:, :, None] & (apart > ASIDE[0]) & (apart <= ASIDE[1])
+    alike = torch.where(pair, r[:, None] * r[:, :, None], 0.0).sum((1, 2))[:, None].clamp_min(0)
+    return (alike + BELIEVED * whole) / (pair.sum((1, 2))[:, None] + BELIEVED)
 
 
 def _roughness(x: Tensor, known: Tensor) -> Tensor:
     """How far (B, h, w) pixels stand from the mean of those around them, root mean square over the same window."""
-    side = max(3, 2 * round(0.5 * WINDOW * max(x.shape[-2:])) + 1)
-    return _around((x - _around(x, known, side)).square(), known, side).sqrt()
+    return _around(_standing_out(x, known).square(), known, _side(x)).sqrt()
+
+
+def _standing_out(x: Tensor, known: Tensor) -> Tensor:
+    """By how much (B, h, w) pixels differ from the mean of those around them."""
+    return x - _around(x, known, _side(x))
+
+
+def _sides(x: Tensor) -> tuple[float, float]:
+    """Width and height of a map in longer sides."""
+    return x.shape[-1] / max(x.shape[-2:]), x.shape[-2] / max(x.shape[-2:])
+
+
+def _side(x: Tensor) -> int:
+    """Pixels along the window in which a map is rough."""
+    return max(3, 2 * round(0.5 * WINDOW * max(x.shape[-2:])) + 1)
 
 
 def _around(x: Tensor, known: Tensor, side: int) -> Tensor:
@@ -142,7 +158,8 @@ def _levels(r: Tensor, read: Tensor, h: Tensor, near: Tensor) -> tuple[Tensor, T
     flat = _held(r.abs(), _read_there(r, levels, read, near & ~steep))
     slopes = torch.cat((torch.zeros_like(slopes[:1]), slopes))
     levels = (flat.square() / WITHIN**2).clamp_min(1e-10)[..., None] + (slopes[:, None] * h[:, None]).square()
-    beyond = (r.square() - flat.square()).clamp_min(0).sqrt() / h
+    known_to = (8 / near.sum(-1, keepdim=True).clamp_min(8)).sqrt()  # the difference of two variances, of half each
+    beyond = (r.square() - flat.square() * (1 + known_to)).clamp_min(0).sqrt() / h
     return flat, _held(beyond, _read_there(r, levels, read, steep)).clamp_max(10.0 ** SLOPES[1])
 
 
@@ -175,7 +192,7 @@ def _in_places(
     """Mean (B, h, w) of what anchors are off by, of those around each pixel and about as deep: a bilateral grid."""
     excess, used = found
     rows, columns = log.shape[-2:]
-    sides = [columns / max(rows, columns), rows / max(rows, columns)]
+    sides = _sides(log)
     low = torch.where(known, log, torch.inf).flatten(1).amin(-1, keepdim=True)
     high = torch.where(known, log, -torch.inf).flatten(1).amax(-1, keepdim=True)
     width = torch.where(low < high, high - low, 1.0)

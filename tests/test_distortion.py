@@ -53,6 +53,7 @@ def test_short_fields_are_those_of_near_neighbours():
 
 def test_freedom_is_less_likely_than_none():
     prior = {name: model.prior for name, model in MODELS.items()}
+    assert prior["shift"] == prior["scale"] and prior["shift_tilt"] == prior["scale_tilt"] == prior["affine"]
     assert prior["raw"] == 0 > prior["scale"] > prior["affine"] > prior["affine_tilt"] > prior["affine_long_4"]
     assert prior["raw"] > prior["raw_tilt"]
 

@@ -4,9 +4,10 @@ import pytest
 import torch
 
 from dhtorch.anchors import BLOCKS, Anchors
+from dhtorch.distortion import HEADS
 from dhtorch.metric import _Left, _simplest
 
-RAW, SCALE, AFFINE, DRIFT = range(4)
+RAW, SCALE, SHIFT, AFFINE, DRIFT = range(5)
 PER_BLOCK = 4
 
 
@@ -31,17 +32,18 @@ def taken(points, near, far, seed=0):
     noise = torch.randn(points.x.shape[1], generator=draw, dtype=torch.float64)  # an anchor's own, to all models
     size = [torch.where(points.near[0], a or torch.nan, b or torch.nan) for a, b in zip(near, far, strict=True)]
     r = (torch.stack(size) * noise)[None, :, None]
-    return int(_simplest(points, _Left(r, torch.full_like(r, 1e-4)), torch.tensor([AFFINE])))
+    return int(_simplest(points, _Left(r, torch.full_like(r, 1e-4)), list(HEADS), torch.tensor([AFFINE])))
 
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize(
     ("near", "far", "expected"),
     [
-        ((0.01, 0.01, 0.01, 0.01), (0.02, 0.02, 0.02, 0.02), RAW),
-        ((0.1, 0.01, 0.01, 0.01), (0.1, 0.02, 0.02, 0.02), SCALE),
-        ((0.1, 0.1, 0.01, 0.01), (0.1, 0.1, 0.02, 0.02), AFFINE),
-        ((0.1, 0.1, 0.1, 0.01), (0.2, 0.2, 0.2, 0.02), DRIFT),
+        ((0.01, 0.01, 0.01, 0.01, 0.01), (0.02, 0.02, 0.02, 0.02, 0.02), RAW),
+        ((0.1, 0.01, 0.01, 0.01, 0.01), (0.1, 0.02, 0.02, 0.02, 0.02), SCALE),
+        ((0.1, 0.1, 0.01, 0.01, 0.01), (0.1, 0.1, 0.02, 0.02, 0.02), SHIFT),
+        ((0.1, 0.1, 0.1, 0.01, 0.01), (0.1, 0.1, 0.1, 0.02, 0.02), AFFINE),
+        ((0.1, 0.1, 0.1, 0.1, 0.01), (0.2, 0.2, 0.2, 0.2, 0.02), DRIFT),
     ],
 )
 def test_the_simplest_model_that_does_is_taken(points, near, far, expected, seed):
@@ -51,9 +53,18 @@ def test_the_simplest_model_that_does_is_taken(points, near, far, expected, seed
 @pytest.mark.parametrize("seed", range(4))
 def test_what_bends_a_map_far_answers_must_bear_out(points, seed):
     """An affine head and a drift that near returns alone ask for would be wrong farther away."""
-    near = (0.03, 0.03, 0.01, 0.008)
-    assert taken(points, near, (0.02, 0.02, 0.1, 0.1), seed) == RAW
-    assert taken(points, near, (0.1, 0.1, 0.02, 0.1), seed) == AFFINE
+    near = (0.03, 0.03, 0.03, 0.01, 0.008)
+    assert taken(points, near, (0.02, 0.02, 0.02, 0.1, 0.1), seed) == RAW
+    assert taken(points, near, (0.1, 0.1, 0.1, 0.02, 0.1), seed) == AFFINE
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_far_answers_refute_a_shift_and_not_a_scale(points, seed):
+    """The metre is the near returns'. A shift tells the far part otherwise than the near one, alone or with a scale."""
+    far = (0.02, 0.03, 0.1, 0.1, 0.1)
+    assert taken(points, (0.1, 0.1, 0.01, 0.1, 0.1), far, seed) != SHIFT
+    assert taken(points, (0.1, 0.1, 0.01, 0.1, 0.1), (0.1, 0.1, 0.02, 0.1, 0.1), seed) == SHIFT
+    assert taken(points, (0.1, 0.01, 0.01, 0.1, 0.1), far, seed) == SCALE
 
 
 def test_a_shift_that_near_returns_meet_exactly_is_not_refuted_by_one_standard_error(points):
@@ -63,15 +74,15 @@ def test_a_shift_that_near_returns_meet_exactly_is_not_refuted_by_one_standard_e
     for met in (0.0005, 0.01):
         kept[met] = 0
         for _ in range(40):
-            noise = torch.randn(4, points.x.shape[1], generator=draw, dtype=torch.float64)
-            far = torch.tensor([0.020, 0.020, 0.023, 0.1])[:, None] * noise
-            near = torch.tensor([0.1, 0.1, met, 0.1])[:, None] * noise[:1]
+            noise = torch.randn(5, points.x.shape[1], generator=draw, dtype=torch.float64)
+            far = torch.tensor([0.020, 0.020, 0.1, 0.023, 0.1])[:, None] * noise
+            near = torch.tensor([0.1, 0.1, 0.1, met, 0.1])[:, None] * noise[:1]
             r = torch.where(points.near, near, far)[None, :, None]
-            place = _simplest(points, _Left(r, torch.full_like(r, 1e-4)), torch.tensor([AFFINE]))
+            place = _simplest(points, _Left(r, torch.full_like(r, 1e-4)), list(HEADS), torch.tensor([AFFINE]))
             kept[met] += int(place) == AFFINE
     assert kept[0.0005] > kept[0.01] + 5
 
 
 def test_a_model_that_cannot_be_fitted_is_not_taken(points):
-    assert taken(points, (None, 0.01, 0.01, 0.01), (None, 0.02, 0.02, 0.02)) == SCALE
-    assert taken(points, (0.1, 0.1, 0.1, None), (0.1, 0.1, 0.1, None)) == RAW
+    assert taken(points, (None, 0.01, 0.01, 0.01, 0.01), (None, 0.02, 0.02, 0.02, 0.02)) == SCALE
+    assert taken(points, (0.1, 0.1, 0.1, 0.1, None), (0.1, 0.1, 0.1, 0.1, None)) == RAW

@@ -1,20 +1,22 @@
 """How far an anchored map is off from pixel to pixel: only as far as near returns show it, and where they do."""
 
+import pytest
 import torch
 
-from dhtorch.anchors import Anchors, at_anchors, spread_within
+from dhtorch.anchors import FLOOR, Anchors, at_anchors, spread_within
 from dhtorch.scatter import SCATTER, variance
 
 HW = (60, 80)
 
 
-def seen(log, truth, n=500, seed=0):
+def seen(log, truth, n=500, seed=0, noise=0.0, stated=0.0):
     """Near returns of a map: residuals, and what the map differs by within a pixel."""
     g = torch.Generator().manual_seed(seed)
     share = torch.rand(len(log), n, 2, generator=g, dtype=torch.float64)
     r = at_anchors(truth, share)[0] - at_anchors(log, share)[0]
+    r = r + noise * torch.randn(r.shape, generator=g, dtype=torch.float64)
     one = torch.ones_like(r)
-    points = Anchors(share, one, 0 * one, one, 1e-4 * one, 0 * one, one > 0, one > 0)
+    points = Anchors(share, one, 0 * one, one, (stated**2 + FLOOR**2) * one, 0 * one, one > 0, one > 0)
     return points, r, (at_anchors(spread_within(log), share)[0].square(), 0 * one)
 
 
@@ -23,6 +25,12 @@ def room():
     v, u = torch.meshgrid(*(torch.linspace(0, 1, k, dtype=torch.float64) for k in HW), indexing="ij")
     box = (u > 0.3) & (u < 0.6) & (v > 0.3) & (v < 0.7)
     return torch.where(box, 0.2, 1.2 - 0.5 * v)[None], box[None]
+
+
+def wall():
+    """Log depth (1, h, w) of a wall that is a little bent, so that it hardly matters where in its pixel a return is."""
+    v, u = torch.meshgrid(*(torch.linspace(0, 1, k, dtype=torch.float64) for k in HW), indexing="ij")
+    return 0.5 + 0.02 * (u + 0.5 * (3 * v).sin())[None]
 
 
 def sigma(log, truth, **options):
@@ -41,6 +49,39 @@ def test_noise_of_the_map_is_found():
         found = sigma(truth + noise, truth)
         within = (noise.abs() <= found).double().mean()
         assert 0.6 < within < 0.85
+
+
+@pytest.mark.parametrize(
+    ("of_return", "of_map", "smooth", "stated", "expected"),
+    [
+        (0.005, 0.0, False, 0.01, 0.0),
+        (0.005, 0.005, False, 0.01, 0.005),
+        (0.005, 0.003, False, 0.01, 0.003),
+        (0.0, 0.005, False, 0.01, 0.005),
+        (0.005, 0.005, True, 0.01, 0.005),
+        (0.005, 0.003, True, 0.01, 0.003),
+        (0.005, 0.0, False, 0.002, (0.005**2 - 0.002**2) ** 0.5),
+    ],
+)
+def test_noise_that_returns_have_by_themselves_is_told_from_the_maps(of_return, of_map, smooth, stated, expected):
+    """Residuals of noisy returns and of a wrong map are alike: what is wrong with a map makes it uneven from pixel to
+    pixel, or is the same a little way off. Returns are not believed to be worse than they say."""
+    v, u = torch.meshgrid(*(torch.linspace(0, 1, k, dtype=torch.float64) for k in HW), indexing="ij")
+    truth = wall()
+    for seed in range(4):
+        draw = torch.Generator().manual_seed(10 + seed)
+        off = torch.randn(truth.shape, generator=draw, dtype=torch.float64)
+        if smooth:
+            off = 2 * torch.sin(6 * u + seed) * torch.sin(6 * v)[None]
+        found = sigma(truth + of_map * off, truth, seed=seed, noise=of_return, stated=stated)
+        assert abs(float(found.median()) - expected) < 0.0015
+
+
+def test_few_returns_do_not_show_that_a_map_is_exact():
+    truth = wall()
+    few = sigma(truth, truth, n=12, noise=0.005, stated=0.01)
+    many = sigma(truth, truth, n=500, noise=0.005, stated=0.01)
+    assert few.median() > 3 * many.median()
 
 
 def test_an_object_that_was_moved_is_in_doubt_and_not_what_is_around_it():
