@@ -445,7 +445,12 @@ def anchored(*results: str) -> str:
         [words, *(f"{result['summary'][f'anchor.{name}']['value']:.3f}" for result in found), bar]
         for name, (words, bar) in ANCHORED.items()
     ]
-    return table(["number", *(f"`{result['data']['name']}`" for result in found), "bar"], rows)
+    seeds = [result["config"]["data"].get("seed") for result in found]
+    names = [
+        f"`{result['data']['name']}`" + (f", seeds {seed[0]} to {seed[-1]}" if seed else "")
+        for result, seed in zip(found, seeds, strict=True)
+    ]
+    return table(["number", *names, "bar"], rows)
 
 
 def questions() -> str:
@@ -492,7 +497,7 @@ TABLES |= {
     "judge": judge,
     "judge real": judged_real,
     "clients": clients,
-    "anchor": partial(anchored, "anchor_study", "anchor_study_streams", "anchor_study_rooms"),
+    "anchor": partial(anchored, "anchor_study", "anchor_study_streams", "anchor_study_rooms", "anchor_study_unseen"),
 }
 TABLES |= {"every pixel": partial(every_pixel, "dense", "dense_streams")}
 TABLES |= {"pixels by scene": partial(pixels_by_scene, "dense")}

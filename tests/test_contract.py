@@ -364,6 +364,7 @@ ROWS = [
     Row(conventions.relative_covariance, lambda b, n, d: (poses(b, d), positive(b, n, d), positive(b, n, d)), POINTLESS + " raises", grad=(0, 1, 2), bad=wrong_last_axis(1)),
     Row(se3.retract, lambda b, n, d: (poses(b, d), uniform(b, 6, dtype=d, low=-1)), POINTLESS + " raises", grad=(0, 1), bad=wrong_last_axis(1)),
     Row(se3.rotation_angle, lambda b, n, d: (poses(b, d).R,), POINTLESS, grad=(0,)),
+    Row(lookup.in_a_row, lambda b, n, d: (frames(b, n, d)[0].image,), "dtype capture gradcheck", grad=(0,)),
     Row(lookup.patches, lambda b, n, d: (frames(b, n, d)[0].image, pixels(b, n, d).long(), 5), "dtype batch vmap capture gradcheck empty shuffle padding raises", (1,), (0,), bad=wrong_last_axis(1)),
     Row(lookup.windows, lambda b, n, d: (frames(b, n, d)[0].depth, torch.arange(b)[:, None] * HW[0] * HW[1] + torch.arange(n) % 900, 5), "dtype capture gradcheck empty", grad=(0,)),
     Row(lookup.summarise, lambda b, n, d: (frames(b, n, d)[0].image, pixels(b, n, d).int(), 5, mean_and_corner), "dtype batch vmap capture gradcheck empty shuffle padding raises", (1,), (0,), bad=wrong_last_axis(1)),

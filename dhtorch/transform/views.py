@@ -148,7 +148,7 @@ class Views:
         if other is not None:  # tracking reads all pixels, the front end alone a few where they lie
             anchor = anchor.replace(image=anchor.image.contiguous())
         bad = torch.stack([c[0] for c in checks]).any(0) if checks else paired.new_zeros(len(depth))
-        return Read(anchor, other, paired, bad, sensed, tuple(checks), motion)
+        return Read(anchor, other, paired, bad, sensed=sensed, complaints=tuple(checks), given=motion)
 
     @property
     def in_metres(self) -> str:
