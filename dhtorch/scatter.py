@@ -83,7 +83,8 @@ def variance(
     with torch.no_grad():
         near = points.used & points.near
         r = r - median(r, near).maximum(-of_fit).minimum(of_fit)
-        rough = _roughness(log, known)
+        out = _standing_out(log, known)
+        rough = _roughness(out, known)
         h = at_anchors(rough, points.share)[0].clamp_min(1e-9)
         flat, slope = _levels(r, read, h, near)
         some = near.any(-1, keepdim=True)
@@ -92,7 +93,7 @@ def variance(
         level = at_anchors(log, points.share)[0]
         off = _in_places(points.share, level, (excess, near), log, known)
         calm = near & (r.abs() <= OUTSIDE * flat)
-        stands = at_anchors(_standing_out(log, known), points.share)[0]
+        stands = at_anchors(out, points.share)[0]
         fast = _fast(r, stands, calm / (h.square() + (EVEN * flat).square()).clamp_min(1e-18))
         slow = _slow(r, points.share * points.share.new_tensor(_sides(log)), calm, flat.square())
         stated = (median(points.var, calm) - FLOOR**2).clamp_min(0)
@@ -119,9 +120,9 @@ def _slow(r: Tensor, place: Tensor, among: Tensor, whole: Tensor) -> Tensor:
     return (alike + BELIEVED * whole) / (pair.sum((1, 2))[:, None] + BELIEVED)
 
 
-def _roughness(x: Tensor, known: Tensor) -> Tensor:
-    """How far (B, h, w) pixels stand from the mean of those around them, root mean square over the same window."""
-    return _around(_standing_out(x, known).square(), known, _side(x)).sqrt()
+def _roughness(out: Tensor, known: Tensor) -> Tensor:
+    """How far (B, h, w) pixels stand ``out`` of those around them, root mean square over the same window."""
+    return _around(out.square(), known, _side(out)).sqrt()
 
 
 def _standing_out(x: Tensor, known: Tensor) -> Tensor:
