@@ -17,6 +17,7 @@ namespace {
 constexpr int64_t STEPS = 8, LEAP = 6, MARGIN = 4;
 constexpr float RATIO = 0.9f, LEAST_GAIN = 0.2f, MOST_GAIN = 5.0f;
 constexpr int64_t MOST_NODES = 6;  // along a side of a map of radius 2
+static_assert(MOST_NODES * MOST_NODES <= 64);  // a bit each
 enum Normalise : int64_t { NONE, BIAS, GAIN_BIAS };
 
 inline Vector between(Vector a, Vector b, float weight) {  // as torch.lerp
@@ -49,33 +50,37 @@ struct Level {
 // its level has more padding below it.
 struct Window {
   int64_t size, wide, count;
-  std::vector<float> planes, rows, inside;  // inside: 1, and 0 in what is filled up
+  std::vector<float> planes, inside;  // inside: 1, and 0 in what is filled up
   Bits last;                                // the bits of a row's last vector that belong to the window
   float moments[6];
 
   explicit Window(int64_t size)
-      : size(size), wide((size + LANES - 1) / LANES * LANES), count(size * wide), planes(3 * count), rows(count + wide),
-        inside(count) {
+      : size(size), wide((size + LANES - 1) / LANES * LANES), count(size * wide), planes(3 * count), inside(count) {
     for (int64_t i = 0; i < size; ++i) std::fill_n(inside.data() + i * wide, size, 1.0f);
     for (int64_t i = 0; i < LANES; ++i) last[i] = wide - LANES + i < size ? -1 : 0;
   }
 
   float* plane(int64_t k) { return planes.data() + k * count; }
+  const float* plane(int64_t k) const { return planes.data() + k * count; }
 
   void read(const Level& level, float x, float y, int64_t batch, bool exactly) {
     const float u = level.corner(x, 0), v = level.corner(y, 1), right = x - u, down = y - v;
     for (int64_t k = 0; k < 3; ++k) {
       const float* from = level.at(batch, (k + 1) % 3, u, v, size / 2);
-      float* to = plane(k);
-      for (int64_t i = 0; i <= size; ++i) {
-        for (int64_t j = 0; j < wide; j += LANES) {
+      for (int64_t j = 0; j < wide; j += LANES) {
+        const Bits kept = j + LANES < wide ? ~Bits{} : last;
+        const auto row = [&](int64_t i) {
           const float* pixel = from + i * level.width + j;
-          const Vector here = exactly ? between(load(pixel), load(pixel + 1), right) : load(pixel);
-          store(j + LANES < wide ? here : reinterpret_cast<Vector>(reinterpret_cast<Bits>(here) & last), &rows[i * wide + j]);
+          return exactly ? between(load(pixel), load(pixel + 1), right) : load(pixel);
+        };
+        float* to = plane(k) + j;
+        Vector above = row(0);
+        for (int64_t i = 0; i < size; ++i) {
+          const Vector below = row(exactly ? i + 1 : i);
+          const Vector here = exactly ? between(above, below, down) : below;
+          store(reinterpret_cast<Vector>(reinterpret_cast<Bits>(here) & kept), to + i * wide);
+          above = below;
         }
-      }
-      for (int64_t i = 0; i < count; i += LANES) {
-        store(exactly ? between(load(&rows[i]), load(&rows[i + wide]), down) : load(&rows[i]), to + i);
       }
     }
   }
@@ -107,44 +112,82 @@ struct Window {
   }
 };
 
-// Map C (K, N, N): the window's K planes correlated with J (rows of `stride` pixels) at N x N offsets.
-template <int K, int N>
-void correlate(const float* const* kernel, int64_t size, int64_t wide, const float* J, int64_t stride, float* C) {
-  for (int64_t v = 0; v < N; ++v) {
-    Vector sums[K][N] = {};
-    for (int64_t i = 0; i < size; ++i) {
-      for (int64_t j = 0; j < wide; j += LANES) {
+// A map of one point: the window's K planes correlated with J (rows of `stride` pixels from `J` on) at n x n offsets, and
+// what a step makes of it. Steps pass by a few of its nodes, so each is found when a step first asks for it.
+template <int K>
+struct Map {
+  const Window& window;
+  const float *inverse, *moments, *J;
+  int64_t stride, n;
+  uint64_t known = 0;  // a bit per node
+  float field[K * MOST_NODES * MOST_NODES];
+
+  // R x M nodes whose first is at row v and column u.
+  template <int R, int M>
+  void correlate(int64_t v, int64_t u) {
+    Vector sums[K][R][M] = {};
+    for (int64_t i = 0; i < window.size; ++i) {
+      for (int64_t j = 0; j < window.wide; j += LANES) {
         Vector own[K];
-        for (int k = 0; k < K; ++k) own[k] = load(kernel[k] + i * wide + j);
-        for (int u = 0; u < N; ++u) {
-          const Vector there = load(J + (i + v) * stride + j + u);
-          for (int k = 0; k < K; ++k) sums[k][u] += own[k] * there;
+        for (int k = 0; k < K; ++k) own[k] = load(window.plane(k) + i * window.wide + j);
+        for (int r = 0; r < R; ++r) {
+          for (int m = 0; m < M; ++m) {
+            const Vector there = load(J + (i + v + r) * stride + j + u + m);
+            for (int k = 0; k < K; ++k) sums[k][r][m] += own[k] * there;
+          }
         }
       }
     }
-    for (int k = 0; k < K; ++k) {
-      for (int u = 0; u < N; ++u) C[(k * N + v) * N + u] = total(sums[k][u]);
-    }
-  }
-}
-
-// A field (K, n, n) between its nodes; beyond its border it fades to zero.
-template <int K>
-void look(const float* field, int64_t n, const float* p, float* found) {
-  const float u = std::floor(p[0]), v = std::floor(p[1]);
-  std::fill_n(found, K, 0.0f);
-  if (!(u >= -1.0f && v >= -1.0f && u < static_cast<float>(n) && v < static_cast<float>(n))) return;
-  const int64_t column = static_cast<int64_t>(u), row = static_cast<int64_t>(v);
-  for (int k = 0; k < K; ++k) {
-    for (int64_t i = std::max<int64_t>(row, 0); i <= std::min(row + 1, n - 1); ++i) {
-      float along = 0.0f;
-      for (int64_t j = std::max<int64_t>(column, 0); j <= std::min(column + 1, n - 1); ++j) {
-        along += field[(k * n + i) * n + j] * (1.0f - std::abs(p[0] - static_cast<float>(j)));
+    for (int r = 0; r < R; ++r) {
+      for (int m = 0; m < M; ++m) {
+        float C[K];
+        for (int k = 0; k < K; ++k) C[k] = total(sums[k][r][m]);
+        put((v + r) * n + u + m, C);
       }
-      found[k] += along * (1.0f - std::abs(p[1] - static_cast<float>(i)));
     }
   }
-}
+
+  void put(int64_t node, const float* C) {
+    const float a = C[0] - moments[0], b = C[1] - moments[1];
+    field[node] = inverse[0] * a + inverse[1] * b;
+    field[n * n + node] = inverse[1] * a + inverse[2] * b;
+    if constexpr (K == 3) field[2 * n * n + node] = moments[5] > 0.0f ? C[2] / moments[5] : 1.0f;
+    known |= uint64_t{1} << node;
+  }
+
+  // Nodes of two rows and columns, or of one at a border.
+  void find(int64_t v, int64_t last_v, int64_t u, int64_t last_u) {
+    const bool square = last_v > v && last_u > u;
+    const uint64_t two = uint64_t{3} << (v * n + u), four = two | two << n;
+    if (square && !(known & four)) return correlate<2, 2>(v, u);
+    if (square && (known & four) == four) return;
+    for (int64_t i = v; i <= last_v; ++i) {
+      for (int64_t j = u; j <= last_u; ++j) {
+        if (!(known >> (i * n + j) & 1)) correlate<1, 1>(i, j);
+      }
+    }
+  }
+
+  // The field between its nodes; beyond its border it fades to zero.
+  void look(const float* p, float* found) {
+    const float u = std::floor(p[0]), v = std::floor(p[1]);
+    std::fill_n(found, K, 0.0f);
+    if (!(u >= -1.0f && v >= -1.0f && u < static_cast<float>(n) && v < static_cast<float>(n))) return;
+    const int64_t column = static_cast<int64_t>(u), row = static_cast<int64_t>(v);
+    const int64_t first[2] = {std::max<int64_t>(column, 0), std::max<int64_t>(row, 0)};
+    const int64_t last[2] = {std::min(column + 1, n - 1), std::min(row + 1, n - 1)};
+    find(first[1], last[1], first[0], last[0]);
+    for (int k = 0; k < K; ++k) {
+      for (int64_t i = first[1]; i <= last[1]; ++i) {
+        float along = 0.0f;
+        for (int64_t j = first[0]; j <= last[0]; ++j) {
+          along += field[(k * n + i) * n + j] * (1.0f - std::abs(p[0] - static_cast<float>(j)));
+        }
+        found[k] += along * (1.0f - std::abs(p[1] - static_cast<float>(i)));
+      }
+    }
+  }
+};
 
 struct Options {
   int64_t iterations, level, window;
@@ -176,13 +219,13 @@ struct State {
 
 // Gauss-Newton steps of one point on one map that begins at the target's pixel `corner`.
 template <int K>
-void walk(const float* field, int64_t n, const float* corner, const float* x, int64_t steps, const Options& o, State& s) {
+void walk(Map<K>& map, const float* corner, const float* x, int64_t steps, const Options& o, State& s) {
   const float start[2] = {x[0] + s.d[0] - corner[0], x[1] + s.d[1] - corner[1]};
   float p[2] = {start[0], start[1]}, step[2] = {0.0f, 0.0f}, square = 0.0f;
   for (int64_t k = 1; k <= steps; ++k) {
     const float last[2] = {step[0], step[1]};
     float found[K];
-    look<K>(field, n, p, found);
+    map.look(p, found);
     const float gain = K == 3 ? std::clamp(found[K - 1], LEAST_GAIN, MOST_GAIN) : 1.0f;
     step[0] = found[0] / gain;
     step[1] = found[1] / gain;
@@ -197,41 +240,42 @@ void walk(const float* field, int64_t n, const float* corner, const float* x, in
     p[1] -= step[1];
   }
   if (!s.live || !std::isfinite(p[0]) || !std::isfinite(p[1])) std::copy_n(start, 2, p);
-  const float side = static_cast<float>(n - 1);
+  const float side = static_cast<float>(map.n - 1);
   s.held = p[0] >= 0.0f && p[0] <= side && p[1] >= 0.0f && p[1] <= side;
   const float place[2] = {p[0] + corner[0], p[1] + corner[1]};
   s.live = s.live && (!s.held || square > o.epsilon * o.epsilon) && o.within(place);
   for (int axis = 0; axis < 2; ++axis) s.d[axis] = place[axis] - x[axis];
 }
 
-// One map of radius (N - 2) / 2 around where a point is, and the steps on it.
-template <int K, int N>
-void on_map(Window& window, const float* inverse, const Level& target, int64_t batch, std::vector<float>& patch,
-            const float* x, int64_t steps, const Options& o, State& s) {
-  constexpr float radius = (N - 2) / 2;
-  const float corner[2] = {target.corner(x[0] + s.d[0], 0) - radius, target.corner(x[1] + s.d[1], 1) - radius};
-  const int64_t side = window.size + N - 1, stride = window.wide + LANES;
-  const float* from = target.at(batch, 0, corner[0], corner[1], window.size / 2);
+// Whether rows of numbers are finite, as far as whole vectors reach.
+bool finite(const float* from, int64_t stride, int64_t rows, int64_t columns) {
   Vector nothing = {};
-  for (int64_t i = 0; i < side; ++i) {
-    for (int64_t j = 0; j < stride; j += LANES) {
-      store(load(from + i * target.width + j), &patch[i * stride + j]);
+  for (int64_t i = 0; i < rows; ++i) {
+    for (int64_t j = 0; j < columns; j += LANES) nothing += 0.0f * load(from + i * stride + j);
+  }
+  return total(nothing) == 0.0f;
+}
+
+// One map of radius (n - 2) / 2 around where a point is, and the steps on it.
+template <int K>
+void on_map(Window& window, const float* inverse, const Level& target, int64_t batch, std::vector<float>& patch, int64_t n,
+            const float* x, int64_t steps, const Options& o, State& s) {
+  const float radius = static_cast<float>((n - 2) / 2);
+  const float corner[2] = {target.corner(x[0] + s.d[0], 0) - radius, target.corner(x[1] + s.d[1], 1) - radius};
+  const int64_t side = window.size + n - 1, stride = window.wide + LANES;
+  Map<K> map{window, inverse, window.moments, target.at(batch, 0, corner[0], corner[1], window.size / 2), target.width, n};
+  if (!finite(map.J, map.stride, side, stride)) {  // perhaps beside the patch alone
+    for (int64_t i = 0; i < side; ++i) {
+      std::fill_n(std::copy_n(map.J + i * map.stride, side, &patch[i * stride]), stride - side, 0.0f);
     }
-    for (int64_t j = side; j < stride; ++j) patch[i * stride + j] = 0.0f;
-    for (int64_t j = 0; j < stride; j += LANES) nothing += 0.0f * load(&patch[i * stride + j]);
+    map.J = patch.data();
+    map.stride = stride;
+    if (!finite(map.J, map.stride, side, stride)) {  // no step across what is no number, as in torch
+      std::fill_n(map.field, K * n * n, NAN);
+      map.known = ~uint64_t{0};
+    }
   }
-  const float* kernel[3] = {window.plane(0), window.plane(1), window.plane(2)};
-  float C[K * N * N];
-  correlate<K, N>(kernel, window.size, window.wide, patch.data(), stride, C);
-  if (total(nothing) != 0.0f) std::fill_n(C, K * N * N, NAN);  // no step across what is no number, as in torch
-  const float* sums = window.moments;
-  for (int i = 0; i < N * N; ++i) {
-    const float a = C[i] - sums[0], b = C[N * N + i] - sums[1];
-    C[i] = inverse[0] * a + inverse[1] * b;
-    C[N * N + i] = inverse[1] * a + inverse[2] * b;
-    if constexpr (K == 3) C[2 * N * N + i] = sums[5] > 0.0f ? C[2 * N * N + i] / sums[5] : 1.0f;
-  }
-  walk<K>(C, N, corner, x, steps, o, s);
+  walk<K>(map, corner, x, steps, o, s);
 }
 
 template <int K>
@@ -240,11 +284,7 @@ void descend_point(Window& window, const float* inverse, const Level& target, in
   for (int64_t k = 0; k < radii.size(0); ++k) {
     const int64_t steps = std::min(STEPS, o.iterations - k * STEPS);
     if (k && (steps <= 0 || !s.live)) return;
-    if (data<int64_t>(radii)[k] == 1) {
-      on_map<K, 4>(window, inverse, target, batch, patch, x, steps, o, s);
-    } else {
-      on_map<K, 6>(window, inverse, target, batch, patch, x, steps, o, s);
-    }
+    on_map<K>(window, inverse, target, batch, patch, 2 * data<int64_t>(radii)[k] + 2, x, steps, o, s);
   }
 }
 
