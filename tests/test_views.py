@@ -6,7 +6,7 @@ import torch
 from torch.utils.data import default_collate
 
 from dhtorch.transform import SampleError, Views, views
-from dhtorch.transform.leaves import to_tensor
+from dhtorch.transform.leaves import Leaves, to_tensor
 
 H, W = 6, 8
 K = [20.0, 22.0, 3.6, 2.4]  # fx fy cx cy
@@ -371,6 +371,50 @@ def test_numbers_along_time_are_those_of_the_frame():
     once = read(sample(image=images, intrinsics=np.array([K])), at=2, other_at=1)
     assert torch.equal(numbers(once.anchor.camera), torch.tensor([K])), "given once it holds for all"
     assert torch.equal(numbers(once.other.camera), torch.tensor([K]))
+
+
+def test_the_same_numbers_are_read_once_and_others_never_taken_for_them():
+    views = Views(depth_unit="m")
+    given = [matrix(*K), matrix(*K), matrix(21, 22, 3.5, 2.5), matrix(*K).astype(np.float64), torch.tensor(matrix(*K))]
+    given += [
+        [*K],
+        np.array(K, np.int64),
+        torch.tensor(K, dtype=torch.bfloat16),
+        matrix(*K)[::-1],
+        matrix(*K)[::-1].copy(),
+    ]
+    for value in (*given, *given):
+        found = views.read(sample(intrinsics=value))
+        alone = read(sample(intrinsics=value))
+        assert torch.equal(numbers(found.anchor.camera), numbers(alone.anchor.camera))
+        assert torch.equal(found.bad, alone.bad)
+    first, again = (views.read(sample()).anchor.camera for _ in range(2))
+    assert first is again
+    for k in range(200):  # one for each frame: never more than some are kept
+        views.read(sample(intrinsics=matrix(20 + k / 100, *K[1:])))
+    assert len(views._cameras) <= 64 and Views(depth_unit="m") == views
+    small = views.read(sample(image=picture(shape=(2 * H, 2 * W, 3)))).anchor.camera
+    assert torch.equal(small.c, first.c) and views.read(sample(image=picture(shape=(6 * H, 6 * W, 3)))).bad
+    leaf = torch.tensor(matrix(*K), requires_grad=True)
+    views.read(sample(intrinsics=leaf)).anchor.camera.f.sum().backward()
+    assert leaf.grad.sum() == 2
+    flat, views = np.array(K, np.float32), Views(depth_unit="m")
+    views.read(sample(intrinsics=flat))
+    with pytest.raises(SampleError, match="expected"):
+        views.read(sample(intrinsics=flat.reshape(2, 1, 2)))
+    leaves = Leaves(sample(intrinsics=np.array(K, object)), batched=False, dtype=torch.float32)
+    leaves.images("image", None)
+    assert leaves.stated("intrinsics") is None, "bytes of objects are addresses"
+    assert leaves.stated((20.0, 22.0, 3.6, 2.4)) is not None
+
+
+@pytest.mark.parametrize("place", [(0, 1), (33, 47), (63, 95)])
+def test_one_return_that_no_probe_meets_is_a_return(place):
+    depth = np.zeros((64, 96), np.float32)
+    given = sample(image=picture(shape=(64, 96, 3)), depth=depth, intrinsics=[50, 50, 47.5, 31.5])
+    assert not read(given).sensed
+    depth[place] = 1.5
+    assert read(given).sensed
 
 
 def test_intrinsics_of_another_size_are_scaled_about_the_corner():

@@ -166,8 +166,6 @@ class ExtendDepth(torch.nn.Module):
         tokens, known = patch_tokens(*pooled, frame.hw, patch=self.patch, tokens_hw=self.tokens_hw, fit=self.fit)
         valid = found.source != Source.NONE
         xyz = samples.xyz if estimate is None else cam.unproject(frame.camera, found.uv, found.depth)
-        problem = (~paired).int() * SampleProblem.NO_SECOND_VIEW
-        problem = torch.where(read.sensed, problem, SampleProblem.NO_DEPTH)
         added = {
             "uv": found.uv,
             "xyz": torch.where(valid[..., None], xyz, 0.0),
@@ -187,7 +185,7 @@ class ExtendDepth(torch.nn.Module):
         }
         if flagged:
             added = {key: x.masked_fill(bad.view(-1, *[1] * (x.ndim - 1)), 0) for key, x in added.items()}
-            problem = torch.where(bad, SampleProblem.UNREADABLE, problem)
+        problem = torch.tensor(_problems(read, flagged), dtype=torch.int32, device=valid.device)
         return {**added, "problem": problem}
 
     def _asked(self, read: Read, seed: int | Tensor) -> tuple[Samples, Estimate | None, list[PoseFit], DepthMap | None]:
@@ -243,6 +241,20 @@ class ExtendDepth(torch.nn.Module):
         # Copies of their own: a row of a shared table would be sent to the main process with the whole table.
         mine = {self.prefix + key: x if self.batched else x[0].contiguous() for key, x in added.items()}
         return {**sample, **mine}
+
+
+def _problems(read: Read, flagged: bool) -> list[int]:
+    """The code of each sample; few numbers, of which torch would make several operations."""
+    bad = read.bad.tolist() if flagged else [False] * len(read.bad)
+
+    def code(bad: bool, sensed: bool, paired: bool) -> int:
+        if bad:
+            return SampleProblem.UNREADABLE
+        if not sensed:
+            return SampleProblem.NO_DEPTH
+        return SampleProblem.NONE if paired else SampleProblem.NO_SECOND_VIEW
+
+    return list(map(code, bad, read.sensed.tolist(), read.paired.tolist()))
 
 
 def _pose(fit: PoseFit | None, paired: Tensor, like: Tensor) -> dict[str, Tensor]:

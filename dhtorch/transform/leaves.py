@@ -5,13 +5,14 @@ Alphabet: B samples, T frames of a sample along time, C × H × W image, h × w 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from dhtorch.geometry.shapes import is_transformed
 from dhtorch.records import Camera
 
 #: Where the numbers are: a key of the sample, or the numbers themselves, the same for every sample.
@@ -161,7 +162,7 @@ class Leaves:
         hwc = last if layout is None else layout == "hwc"
         if not (last if hwc else first):
             raise SampleError(f"{key}: found shape {tuple(x.shape[2:])}, expected layout {layout} with 1 or 3 channels")
-        x = x.movedim(-1, 2) if hwc else x
+        x = x.permute(0, 1, 4, 2, 3) if hwc else x
         return x if x.dtype == torch.uint8 else x.to(self.dtype)
 
     def planes(self, key: str, T: int, *, signed: bool = True) -> Tensor:
@@ -197,6 +198,17 @@ class Leaves:
                 f"{name}: found shape {tuple(x.shape[1:])}, expected one row of numbers, or one per frame"
             )
         return x.to(self.dtype)
+
+    def stated(self, numbers: Numbers) -> Hashable | None:
+        """What tells numbers from others, so that the same ones need not be read again; None where a graph, a device or
+        a type that numpy does not know has them."""
+        value = find(self.sample, numbers) if isinstance(numbers, str) else np.asarray(numbers)
+        if isinstance(value, Tensor) and value.dtype in (torch.float32, torch.float64) and not is_transformed():
+            value = value.numpy() if value.is_cpu and not value.requires_grad else value
+        if not isinstance(value, np.ndarray) or value.dtype.kind not in "buif" or self.like is None:
+            return None
+        kind = value.dtype.str, value.shape, self.dtype, self.like.device
+        return value.tobytes(), *kind, self.batched, len(self.like)
 
     def camera(self, numbers: Numbers, T: int, at: int, distortion: Tensor | None) -> Camera:
         """Camera of the frame at a place along time."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import torch
@@ -31,6 +31,9 @@ UNITS = {"m": 1.0, "mm": 1000.0}
 
 #: Pixels at most by which the median depth of a frame is judged.
 PROBES = 1024
+
+#: Cameras that are kept; a recording has one, or one for each frame.
+CAMERAS = 64
 
 #: Relative distance from a limit beyond which single precision cannot change a verdict.
 _ROUNDING = 1e-5
@@ -102,6 +105,7 @@ class Views:
     max_depth: float = 100.0  # m, a median depth beyond is taken for a wrong unit
     min_depth: float = 0.01  # m, one below likewise
     max_offset: float = 0.2  # share of the image size by which the principal point may lie off the centre
+    _cameras: dict[Any, Camera] = field(default_factory=dict, init=False, repr=False, compare=False)  # by their numbers
 
     def __post_init__(self) -> None:
         unit = self.depth_unit
@@ -296,10 +300,16 @@ class Views:
     def _camera(
         self, leaves: Leaves, numbers: Numbers, hw: tuple[int, int], T: int, at: int, checks: list[Any]
     ) -> Camera:
+        stated = None if self.distortion is not None else leaves.stated(numbers)
+        known = (stated, hw, T, at)
+        if stated is not None and known in self._cameras:
+            return self._cameras[known]
         camera = leaves.camera(numbers, T, at, leaves.numbers(self.distortion, T, at))
         if self.intrinsics_hw is not None and self.intrinsics_hw != hw:
             camera = cam.resize(camera, self.intrinsics_hw, hw)
         if self._fits_surely(camera, hw):
+            if stated is not None and len(self._cameras) < CAMERAS:
+                self._cameras[known] = camera
             return camera
         name = numbers if isinstance(numbers, str) else "intrinsics"
         size = torch.tensor([hw[1], hw[0]], dtype=camera.c.dtype, device=camera.c.device)
