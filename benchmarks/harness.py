@@ -1,6 +1,6 @@
 """Timing both sides in turn, in one process, and one row format for every script.
 
-Rows: ``{name, mode, n, batch, threads, processor, device, ours_ms, ours_iqr, peer, peer_ms, ratio, ours_error,
+Rows: ``{name, mode, n, batch, threads, processor, git, device, ours_ms, ours_iqr, peer, peer_ms, ratio, ours_error,
 peer_error, bar}``; ``ratio`` is ours / peer of medians, below 1 = ours is faster.
 """
 
@@ -100,6 +100,12 @@ def _library() -> Path:
     return path
 
 
+@cache
+def _code() -> str | None:
+    """The commit whose code is measured."""
+    return archive.revision(Path(archive.__file__).parent)
+
+
 def iqr(values: Sequence[float]) -> float:
     """Interquartile range."""
     quarters = statistics.quantiles(values, n=4)
@@ -119,8 +125,12 @@ def row(name: str, ours: Sequence[float], peer: str, theirs: Sequence[float], **
         "bar": False,
     }
     timing = {"ours_ms": a, "ours_iqr": iqr(ours), "peer": peer, "peer_ms": b, "ratio": a / b}
-    place = {"threads": torch.get_num_threads(), "processor": archive.processor()}
-    return {"name": name, **base, **place, **timing, **more}
+    return {"name": name, **base, "threads": torch.get_num_threads(), **place(), **timing, **more}
+
+
+def place() -> dict[str, str | None]:
+    """Where a row is measured: the processor, and the commit whose code it is."""
+    return {"processor": archive.processor(), "git": _code()}
 
 
 def set_threads(threads: int) -> None:

@@ -17,7 +17,7 @@ from typing import Any
 
 import harness
 
-from dhtorch import MAP, archive, storage
+from dhtorch import MAP, storage
 from dhtorch.commands.stream import streamed
 from dhtorch.data.scene import Scene
 from dhtorch.synthetic import SyntheticRoom
@@ -52,7 +52,7 @@ def measure(frames: int) -> dict[str, Any]:
         "first_mib": peaks[0],
         "above_mib": peak_mib() - peaks[0],
         "held_mib": told["mib"],
-        "processor": archive.processor(),
+        **harness.place(),
     }
 
 

@@ -78,9 +78,17 @@ def errors(row: dict[str, Any]) -> str:
 
 
 def on(file: str, shown: str) -> str:
-    """A table, and under it the processor that its file was measured on, where the file says it."""
+    """A table, and under it the processor that its file was measured on and the commit whose code it was, where the
+    file says them."""
     names = {r.get("processor") for r in timings(file)} - {None}
-    return f"{shown}\n\nMeasured on: {', '.join(sorted(names))}." if names else shown
+    return f"{shown}\n\nMeasured on: {', '.join(sorted(names))}{code(timings(file))}." if names else shown
+
+
+def code(rows: list[dict[str, Any]]) -> str:
+    """In words, which commit's code was measured."""
+    commits = {r.get("git") for r in rows}
+    said = [f"code of {commit}" for commit in sorted(commit for commit in commits if commit)]
+    return "; " + " and ".join(said + ["code of an earlier commit, not noted"] * (None in commits))
 
 
 def _barred(file: str, name: str, mode: str) -> dict[str, Any] | None:
@@ -100,10 +108,10 @@ def bars() -> str:
             continue
         cells = [called, f"{r['ours_ms']:.2f}", f"{r['peer_ms']:.2f}"]
         verdict = "met" if r["ratio"] <= bar else "missed"
-        maker = r["processor"].partition("(")[0].partition(",")[0]
+        maker = f"{r['processor'].partition('(')[0].partition(',')[0]}, {r.get('git') or 'earlier code'}"
         narrow = "–" if slower is None else ratio(slower["ratio"])
         rows.append([*cells, ratio(r["ratio"]), f"≤ {bar:g}", verdict, errors(r), maker, narrow])
-    head = ["", "ours, ms", "peer, ms", "ratio", "bar", "", "errors, ours / peer", "on", "ratio held to AVX2"]
+    head = ["", "ours, ms", "peer, ms", "ratio", "bar", "", "errors, ours / peer", "on, code of", "ratio held to AVX2"]
     return text.grid(Table("", head, rows))
 
 

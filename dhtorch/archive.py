@@ -253,7 +253,7 @@ def meta(*, device: str, dtype: str, threads: int, seed: int) -> dict[str, Any]:
     versions = {"python": platform.python_version(), **{name: _version(name) for name in _PACKAGES}}
     return {
         "utc": datetime.now(UTC).isoformat(timespec="seconds"),
-        "git": _git(Path(__file__).parent),
+        "git": revision(Path(__file__).parent),
         "versions": versions,
         "processor": processor(),
         "device": str(device),
@@ -400,7 +400,7 @@ def _version(package: str) -> str | None:
         return None
 
 
-def _git(folder: Path) -> str | None:
+def revision(folder: Path) -> str | None:
     """What ``git describe`` calls the code in ``folder``, None where it is not under version control."""
 
     def ask(*words: str) -> str | None:
