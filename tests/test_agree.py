@@ -210,6 +210,18 @@ def test_a_small_frame_sees_the_same_rays(room):
     uv = torch.tensor([[[10.0, 20.0], [63.0, 5.0]]])
     torch.testing.assert_close(cam.rays(little.camera, uv), cam.rays(frame.camera, uv * k + (k - 1) / 2))
     assert shrunk(frame, 400)[1] == 1
+    frame = frame.replace(depth_camera=None)
+    own = cam.resize(frame.camera, frame.hw, (frame.depth.shape[-2], frame.depth.shape[-1]))
+    torch.testing.assert_close(shrunk(frame, 80)[0].depth_camera, own)
+    turned = own.replace(c=own.c + 3)
+    assert shrunk(frame.replace(depth_camera=turned), 80)[0].depth_camera is turned
+
+
+def test_a_small_picture_is_no_reason_to_be_less_sure(room):
+    frames = [room[k] for k in (0, 2, 4, 6)]
+    large, little = (by_probes(frames[0], stack(frames[1:]), 3, long=n, good_sigma_rel=1e-4) for n in (400, 160))
+    ratio = little.worth / large.worth
+    assert bool((ratio > 1 / 3).all() and (ratio < 3).all()), ratio
 
 
 def test_key_views_takes_what_adds_most():

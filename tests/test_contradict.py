@@ -83,6 +83,8 @@ def test_holes_between_returns_and_a_sparse_sensor_say_nothing():
     v, u = torch.meshgrid(torch.arange(H), torch.arange(W), indexing="ij")
     samples, fit = scene((u + v) % 5 > 0)
     assert share(samples, fit, 1.5) == 0.0, "every cell has returns"
+    few = fit.replace(inlier=fit.inlier & (torch.arange(N) % 8 == 0))
+    assert share(samples, few, 1.5) == 0.0, "also where few hold the pose"
     samples, fit = scene(left(20) & ((u + 2 * v) % 5 == 0))
     assert share(samples, fit, 1.5) == 0.0, "a sensor that leaves four of five out where it sees"
 

@@ -246,6 +246,21 @@ def test_key_views_are_added_one_by_one_each_the_one_that_adds_most(good):
             weighed(views, bad)
 
 
+def test_what_a_view_adds_stands_beside_it():
+    views = views_of(V=4, B=3, N=6, silent=0.0, seed=1)
+    choice = weighed(views, 3)
+    worth = (0.1 * views.depth / views.sigma).square()
+    for b in range(3):
+        known, left, added = torch.zeros(6).double(), list(range(4)), {}
+        for _ in range(3):
+            gains = {v: float(((1 + known + worth[v, b]).log() - (1 + known).log()).sum()) for v in left}
+            best = max(left, key=gains.__getitem__)
+            added[best], known = gains[best], known + worth[best, b]
+            left.remove(best)
+        assert choice.index[:, b].tolist() == sorted(added)
+        assert choice.worth[:, b].tolist() == pytest.approx([added[v] for v in sorted(added)])
+
+
 def test_answers_without_a_sigma_add_nothing():
     views = views_of(V=3, B=1, N=4, silent=0.0)
     sigma = views.sigma.clone()

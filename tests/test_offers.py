@@ -107,6 +107,13 @@ def test_why_is_said_in_one_line(caplog):
     assert picked(0, (1,), {}) == Picked(0, (1,), 1) and str(picked(0, (1,), {})).endswith("1, all that were offered")
 
 
+def test_each_anchor_of_a_batch_is_told_of_its_own():
+    index, worth = torch.tensor([[0, 1], [3, 2]]), torch.tensor([[1.0, 2.0], [3.0, 4.0]])
+    mute = torch.tensor([[False, True]] * 4)
+    found = picked(7, (4, 9, 20, 31), {"choice": Choice(index, worth, mute)}, b=1)
+    assert found == Picked(7, (9, 20), 4, (2.0, 4.0), 4)
+
+
 def test_what_a_view_adds_and_which_say_nothing(room):
     choice = by_probes(room[0], stack([room[k] for k in (0, 1, 2, 4)]), 3)  # the anchor itself has no baseline
     assert choice.mute[0, 0] and not choice.mute[3, 0] and choice.index[:, 0].tolist() == [1, 2, 3]

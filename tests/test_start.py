@@ -128,6 +128,16 @@ def test_neighbours_tell_what_a_repeated_pattern_cannot() -> None:
     assert _share_near(flow, there, 10.0) > 0.9
 
 
+def test_cells_hear_from_above_and_below_as_from_left_and_right() -> None:
+    V = torch.randint(0, 1 << 14, (1, 2, 4, 5, 7, 7), generator=torch.Generator().manual_seed(0)).float()
+    told, turned = start._told(V), start._told(V.transpose(2, 3)).transpose(2, 3)
+    assert torch.equal(told, turned)
+    for quiet in ((slice(1, None), slice(None)), (slice(None), slice(1, None))):  # one row, one column alone speaks
+        alone = V.clone()
+        alone[:, :, quiet[0], quiet[1]] = 0
+        assert bool((start._told(alone)[:, :, -1, -1] != 0).any())
+
+
 def test_what_is_upright_was_read_where_its_pixels_lie() -> None:
     v, u = torch.meshgrid(torch.arange(float(H)), torch.arange(float(W)), indexing="ij")
     a = math.radians(20.0)
