@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dhtorch import distortion
+from dhtorch import distortion, metric
 from dhtorch.anchors import Anchors
 from dhtorch.distortion import HEADS, MODELS, Fit, Task
 
@@ -93,3 +93,23 @@ def test_what_lies_between_nodes_is_part_of_what_is_believed_of_a_field():
     assert found[3, : len(of.node)].sqrt().max() < 2e-4 and found[3, len(of.node) :].sqrt().mean() > 2e-3
     held = 0.04**2 * field[0, 3, :, distortion.SLOPES :].square().sum(-1)
     torch.testing.assert_close(held + found[3], torch.full_like(held, 0.04**2), rtol=1e-4, atol=0)
+
+
+def test_a_fit_that_knows_all_its_nodes_is_unsure_between_them():
+    """At the anchors and at every pixel, of the map whose anchors they are."""
+    anchors, of = points(), basis()
+    size = distortion.SLOPES + len(of.node) + distortion.KNOTS
+    head = torch.tensor([[[1.0, 0.0]]], dtype=torch.float64)
+    x = torch.ones(1, 120, 160, dtype=torch.float64)
+    task = Task(anchors, of, head.expand(1, len(HEADS), 2), anchors.x[:, :1])
+    for name, low in (("raw", 0.0), ("raw_tilt", 0.0), ("raw_short_1", 6e-4), ("raw_short_4", 2.4e-3)):
+        fit = Fit(
+            model=torch.tensor([[list(MODELS).index(name)]]),
+            head=head,
+            beta=torch.zeros(1, 1, size, dtype=torch.float64),
+            spread=torch.zeros(1, 1, 2 + size, 2 + size, dtype=torch.float64),
+            noise=torch.ones(1, 1, 2, dtype=torch.float64),
+            evidence=torch.zeros(1, 1, dtype=torch.float64),
+        )
+        for var in (distortion.predicted(fit, task)[1], metric._everywhere(task, fit, x)[1]):
+            assert low <= float(var.mean().sqrt()) <= 1.5 * low
