@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from dhtorch.anchors import FLOOR, Anchors, at_anchors, spread_within
-from dhtorch.scatter import SCATTER, variance
+from dhtorch.scatter import SCATTER, _at_edges, variance
 
 HW = (60, 80)
 
@@ -115,6 +115,23 @@ def test_returns_that_are_noisier_at_edges_are_not_the_maps():
     off = (blurred - truth).abs() > 0.1
     wrong = [sigma(blurred, truth, seed=seed, noise=noise, stated=0.01)[off].median() for seed in range(6)]
     assert sorted(right)[3] < 0.003 and min(wrong) > 0.05
+
+
+@pytest.mark.parametrize(("goes_with", "kept"), [(1.0, 0.5), (-1.0, 0.5), (0.0, 0.0)])
+def test_less_than_returns_state_is_the_maps_where_it_goes_with_its_edges(goes_with, kept):
+    """Along with how the map stands out of its surroundings, or against it; what goes with neither is the returns', in
+    most draws. Exact returns have nothing by themselves."""
+    found = []
+    for seed in range(12):
+        g = torch.Generator().manual_seed(seed)
+        stands, noise = 0.01 * torch.randn(2, 1, 300, generator=g, dtype=torch.float64)
+        one = torch.ones_like(stands)
+        points, *_ = seen(wall(), wall(), n=300, seed=seed)
+        r = goes_with * stands + (1 - abs(goes_with)) * noise
+        of_map, levels = (stands, 0.01 * one, points.block), (0.001 * one[:, :1], 0.5 * one[:, :1])
+        found.append(float(_at_edges(r, of_map, levels, one > 0, 0.01**2 * one[:, :1])))
+        assert float(_at_edges(r, of_map, levels, one > 0, 0 * one[:, :1])) == pytest.approx(0.5)
+    assert sorted(found)[6] == pytest.approx(kept, abs=0.02)
 
 
 def test_an_object_that_was_moved_is_in_doubt_and_not_what_is_around_it():
