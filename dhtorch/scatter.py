@@ -20,7 +20,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch.anchors import BLOCKS, FLOOR, Anchors, at_anchors
-from dhtorch.distortion import LENGTHS
 from dhtorch.geometry.covariance import median
 
 #: Relative scatter of a map without near returns.
@@ -60,9 +59,9 @@ OUTSIDE: Final = 3.0
 EVEN: Final = 0.1
 
 #: How far apart returns are at least that a map is wrong at alike and a sensor is not, whose noise is smooth over a few
-#: of its pixels; and the correlation length of what the map is wrong by there, that of the shortest field of a model.
-#: Shares of the longer side.
-ASIDE, SMOOTH = 0.035, LENGTHS[1]
+#: of its pixels; and the correlation length of what the map is wrong by there, that of the shortest field of a model
+#: (:data:`dhtorch.distortion.LENGTHS`). Shares of the longer side.
+ASIDE, SMOOTH = 0.035, 0.13
 
 #: Least share of what returns have by themselves that differs from each to the next.
 OWN: Final = 0.5

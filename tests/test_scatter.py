@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from dhtorch.anchors import FLOOR, Anchors, at_anchors, spread_within
-from dhtorch.scatter import SCATTER, _at_edges, variance
+from dhtorch.distortion import LENGTHS
+from dhtorch.scatter import SCATTER, SMOOTH, _at_edges, variance
 
 HW = (60, 80)
 
@@ -92,6 +93,10 @@ def test_chance_is_no_error_of_a_map():
     truth = wall()
     found = [float(sigma(truth, truth, n=250, seed=seed, noise=0.006, stated=0.01).median()) for seed in range(20)]
     assert sum(found) / len(found) < 0.0009 and sum(level < 0.00055 for level in found) >= 9
+
+
+def test_slow_errors_are_as_smooth_as_the_shortest_field():
+    assert min(LENGTHS) == SMOOTH
 
 
 @pytest.mark.parametrize("seed", range(4))
