@@ -497,7 +497,10 @@ TABLES |= {
     "judge": judge,
     "judge real": judged_real,
     "clients": clients,
-    "anchor": partial(anchored, "anchor_study", "anchor_study_streams", "anchor_study_rooms", "anchor_study_unseen"),
+    "anchor": partial(
+        anchored,
+        *("anchor_study", "anchor_study_streams", "anchor_study_rooms", "anchor_study_unseen", "anchor_study_unseen_2"),
+    ),
 }
 TABLES |= {"every pixel": partial(every_pixel, "dense", "dense_streams")}
 TABLES |= {"pixels by scene": partial(pixels_by_scene, "dense")}

@@ -193,6 +193,13 @@ def fields(basis: Basis, share: Tensor, short: Tensor) -> Tensor:
     return torch.where(short[..., None, None], near_by, long)
 
 
+def between_nodes(model: Tensor, field: Tensor) -> Tensor:
+    """Variance (B, K, N) of the field of models (B, K) that its nodes do not hold, at places whose functions of
+    :func:`fields` are ``field`` (B, K, N, SLOPES + F)."""
+    sd = field.new_tensor([m.field for m in MODELS.values()])[model]
+    return sd.square()[..., None] * (1 - field[..., SLOPES:].square().sum(-1)).clamp_min(0)
+
+
 def curves(basis: Basis, x: Tensor) -> Tensor:
     """The correction's functions (B, N, KNOTS) at values (B, N)."""
     along = ((_level(x) - basis.low) / basis.width).clamp(-0.2, 1.2)
@@ -213,9 +220,11 @@ def predicted(fit: Fit, task: Task) -> tuple[Tensor, Tensor]:
     x = points.x[:, None].expand(-1, fit.head.shape[1], -1)
     log, slope = log_depth(fit.head, x, basis)
     curve = curves(basis, points.x)[:, None].expand(-1, x.shape[1], -1, -1)
-    phi = torch.cat((fields(basis, points.share, fit.short), curve), -1)
+    field = fields(basis, points.share, fit.short)
+    phi = torch.cat((field, curve), -1)
     mean = log + (phi @ fit.beta[..., None])[..., 0]
-    return mean, (torch.cat((slope, phi), -1) @ fit.spread).square().sum(-1)
+    var = (torch.cat((slope, phi), -1) @ fit.spread).square().sum(-1)
+    return mean, var + between_nodes(fit.model, field)
 
 
 def reading(head: Tensor, points: Anchors) -> Tensor:

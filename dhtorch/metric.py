@@ -396,7 +396,8 @@ def _everywhere(task: Task, fit: Fit, x: Tensor) -> tuple[Tensor, Tensor]:
     field = distortion.fields(basis, share, fit.short)[:, 0]
     of_place, of_value = spread[:, 2 : 2 + n], torch.cat((spread[:, :2], spread[:, 2 + n :]), 1)
     spread_field = field @ of_place
-    parts = field @ beta[:, :n, None], spread_field.square().sum(-1, keepdim=True), spread_field @ of_value.mT
+    of_field = spread_field.square().sum(-1) + distortion.between_nodes(fit.model, field[:, None])[:, 0]
+    parts = field @ beta[:, :n, None], of_field[..., None], spread_field @ of_value.mT
     maps = torch.cat(parts, -1).mT.unflatten(-1, coarse)
     maps = F.interpolate(maps, size, mode="bicubic", align_corners=True).flatten(2)
     curve = distortion.curves(basis, flat)

@@ -2,9 +2,10 @@
 
 Four things are told apart. A return stands somewhere in its pixel and so does the value of the map, so that on a slope
 both differ though neither is wrong. What returns have by themselves is not the map's: it goes neither with how the map
-stands out of its surroundings nor with what returns a little way off have. What is left goes with how rough the map is
-around: two levels, of the flatter and the rougher half of the returns. And where returns are off by far more than that,
-so are the pixels around them on the same surface.
+stands out of its surroundings nor with what returns a little way off have, and differs from each to the next. What is
+left goes with how rough the map is around: two levels, of the flatter and the rougher half of the returns. And where
+returns are off by far more than that, so are the pixels around them on the same surface. What chance alone may have
+made is nobody's error: both kinds of going together count as far as they exceed their standard error.
 
 Alphabet: ``r`` residual of log depth at anchors; ``read`` its variance by where in the pixel they stand; ``h`` how
 rough the map is; ``G`` candidates of a level.
@@ -18,7 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dhtorch.anchors import FLOOR, Anchors, at_anchors
+from dhtorch.anchors import BLOCKS, FLOOR, Anchors, at_anchors
 from dhtorch.geometry.covariance import median
 
 #: Relative scatter of a map without near returns.
@@ -57,9 +58,13 @@ OUTSIDE: Final = 3.0
 #: Unevenness of a map, as a share of the scatter of returns, below which it is as good as even.
 EVEN: Final = 0.1
 
-#: How far apart returns are that a map is wrong at alike and a sensor is not, whose noise is smooth over a few of its
-#: pixels: shares of the longer side.
-ASIDE: Final = (0.035, 0.12)
+#: How far apart returns are at least that a map is wrong at alike and a sensor is not, whose noise is smooth over a few
+#: of its pixels; and the correlation length of what the map is wrong by there, that of the shortest field of a model
+#: (:data:`dhtorch.distortion.LENGTHS`). Shares of the longer side.
+ASIDE, SMOOTH = 0.035, 0.13
+
+#: Least share of what returns have by themselves that differs from each to the next.
+OWN: Final = 0.5
 
 #: Pairs of returns for which the belief counts that all of the scatter is the map's.
 BELIEVED: Final = 10
@@ -94,10 +99,14 @@ def variance(
         off = _in_places(points.share, level, (excess, near), log, known)
         calm = near & (r.abs() <= OUTSIDE * flat)
         stands = at_anchors(out, points.share)[0]
-        fast = _fast(r, stands, calm / (h.square() + (EVEN * flat).square()).clamp_min(1e-18))
-        slow = _slow(r, points.share * points.share.new_tensor(_sides(log)), calm, flat.square())
         stated = (median(points.var, calm) - FLOOR**2).clamp_min(0)
-        of_map = (fast + slow).maximum(flat.square() - stated).minimum(flat.square())
+        place = points.share * points.share.new_tensor(_sides(log))
+        apart = torch.cdist(place, place, compute_mode="donot_use_mm_for_euclid_dist")
+        fast = _fast(r, stands, calm / (h.square() + (EVEN * flat).square()).clamp_min(1e-18))
+        slow = _slow(r, apart, points.block, calm, flat.square())
+        alone = stated.minimum(_alone(r, apart, calm, flat.square()))
+        of_map = (fast + slow).maximum(flat.square() - alone).minimum(flat.square())
+        slope = _at_edges(r, (stands, h, points.block), (flat, slope), near, stated)
         return of_map[..., None] + (slope[..., None] * rough).square() + off
 
 
@@ -110,14 +119,52 @@ def _fast(r: Tensor, stands: Tensor, weight: Tensor) -> Tensor:
     return torch.where(mean < 0, -mean, mean * both / alone.clamp_min(1e-18))
 
 
-def _slow(r: Tensor, place: Tensor, among: Tensor, whole: Tensor) -> Tensor:
-    """Variance (B, 1) of what a map is off by over more than a few pixels of a sensor: returns that stand apart at
-    ``place`` (B, N, 2) are off alike by it, and not by what they have by themselves. Without many pairs it is as likely
-    the ``whole`` (B, 1) of the scatter."""
-    apart = torch.cdist(place, place, compute_mode="donot_use_mm_for_euclid_dist")
-    pair = among[:, None] & among[:, :, None] & (apart > ASIDE[0]) & (apart <= ASIDE[1])
-    alike = torch.where(pair, r[:, None] * r[:, :, None], 0.0).sum((1, 2))[:, None].clamp_min(0)
-    return (alike + BELIEVED * whole) / (pair.sum((1, 2))[:, None] + BELIEVED)
+def _slow(r: Tensor, apart: Tensor, block: Tensor, among: Tensor, whole: Tensor) -> Tensor:
+    """Variance (B, 1) of what a map is off by over more than a few pixels of a sensor: returns that stand ``apart``
+    (B, N, N) are off alike by it, and not by what they have by themselves. It is that of a field of correlation
+    ``SMOOTH``: products of residuals are regressed on it. Without many pairs it is as likely the ``whole`` (B, 1) of
+    the scatter."""
+    pair = among[:, None] & among[..., None] & (apart > ASIDE)
+    alike = torch.where(pair, (-0.5 * (apart / SMOOTH).square()).exp(), 0.0)
+    of_block = F.one_hot(block, 2 * BLOCKS[0] * BLOCKS[1]).to(r)
+    both = of_block.mT @ (alike * r[:, None] * r[..., None]) @ of_block  # every pair of blocks is there twice
+    error = 2 * both.square().sum((1, 2)) - both.diagonal(dim1=1, dim2=2).square().sum(-1)
+    more = _beyond_chance(both.sum((1, 2))[:, None], error[:, None])
+    return (more + BELIEVED * whole) / (alike.square().sum((1, 2))[:, None] + BELIEVED)
+
+
+def _alone(r: Tensor, apart: Tensor, among: Tensor, whole: Tensor) -> Tensor:
+    """Most variance (B, 1) that returns have by themselves: ``OWN`` of it differs from each to the next, so that what
+    neighbours are off by alike is more than that. Without many pairs it is as likely the ``whole`` (B, 1) of the
+    scatter."""
+    itself = torch.eye(r.shape[1], dtype=torch.bool, device=r.device)
+    pair = among[:, None] & among[..., None] & (apart <= ASIDE) & ~itself
+    differ = torch.where(pair, 0.5 * (r[:, None] - r[..., None]).square(), 0.0).sum((1, 2))[:, None]
+    return (differ / OWN + BELIEVED * whole) / (pair.sum((1, 2))[:, None] + BELIEVED)
+
+
+def _at_edges(
+    r: Tensor, of_map: tuple[Tensor, Tensor, Tensor], levels: tuple[Tensor, Tensor], near: Tensor, stated: Tensor
+) -> Tensor:
+    """Level (B, 1) of error by roughness, less what returns have by themselves where a map is rough, at most what is
+    ``stated`` (B, 1): sensors are noisier on slanted and dark surfaces and at edges. It is the map's as far as
+    residuals go with how it stands out of its surroundings, along or against it: what blurs or moves an edge does."""
+    stands, h, block = of_map
+    flat, slope = levels
+    level = flat.square() + (slope * h).square()
+    steep = near & (h >= median(h, near))
+    weight = (steep & (r.square() <= OUTSIDE**2 * level)) / level.clamp_min(1e-18)
+    both = (weight * stands * r)[:, None] @ F.one_hot(block, 2 * BLOCKS[0] * BLOCKS[1]).to(r)
+    along = both.sum(-1).abs()
+    sure = _beyond_chance(along, both.square().sum(-1)) / along.clamp_min(1e-18)
+    alone = (1 - sure) * stated / median(h.square(), steep).clamp_min(1e-18)
+    return (slope.square() - alone).maximum(sure * slope.square()).sqrt()
+
+
+def _beyond_chance(total: Tensor, square: Tensor) -> Tensor:
+    """What is left of a sum whose standard error is known, squared: none below one error, nearly all beyond several
+    (the positive part of James and Stein's estimate)."""
+    return (total - square / total.clamp_min(1e-18)).clamp_min(0)
 
 
 def _roughness(out: Tensor, known: Tensor) -> Tensor:

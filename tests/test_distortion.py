@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dhtorch import distortion
+from dhtorch import distortion, metric
 from dhtorch.anchors import Anchors
 from dhtorch.distortion import HEADS, MODELS, Fit, Task
 
@@ -77,3 +77,39 @@ def test_what_a_fit_does_not_know_is_carried_to_the_anchors():
     torch.testing.assert_close(mean[0], y.log())
     torch.testing.assert_close(var[0], ((0.03 * anchors.x) ** 2 + 0.05**2) / y**2)
     torch.testing.assert_close(distortion.reading(head, anchors)[0], (0.1 * 1.5 / y) ** 2)
+
+
+def test_what_lies_between_nodes_is_part_of_what_is_believed_of_a_field():
+    """Nodes and what they do not hold make up the variance that a model states, at nodes and between them."""
+    of = basis()
+    g = torch.Generator().manual_seed(0)
+    where = torch.cat((of.node / of.aspect, torch.rand(60, 2, generator=g, dtype=torch.float64)))[None]
+    names = ["raw", "raw_tilt", "scale_long_4", "raw_short_4"]
+    model = torch.tensor([[list(MODELS).index(name) for name in names]])
+    short = torch.tensor([[MODELS[name].short for name in names]])
+    field = distortion.fields(of, where, short)
+    found = distortion.between_nodes(model, field)[0]
+    assert (found[:2] == 0).all() and found[2].sqrt().max() < 2e-4
+    assert found[3, : len(of.node)].sqrt().max() < 2e-4 and found[3, len(of.node) :].sqrt().mean() > 2e-3
+    held = 0.04**2 * field[0, 3, :, distortion.SLOPES :].square().sum(-1)
+    torch.testing.assert_close(held + found[3], torch.full_like(held, 0.04**2), rtol=1e-4, atol=0)
+
+
+def test_a_fit_that_knows_all_its_nodes_is_unsure_between_them():
+    """At the anchors and at every pixel, of the map whose anchors they are."""
+    anchors, of = points(), basis()
+    size = distortion.SLOPES + len(of.node) + distortion.KNOTS
+    head = torch.tensor([[[1.0, 0.0]]], dtype=torch.float64)
+    x = torch.ones(1, 120, 160, dtype=torch.float64)
+    task = Task(anchors, of, head.expand(1, len(HEADS), 2), anchors.x[:, :1])
+    for name, low in (("raw", 0.0), ("raw_tilt", 0.0), ("raw_short_1", 6e-4), ("raw_short_4", 2.4e-3)):
+        fit = Fit(
+            model=torch.tensor([[list(MODELS).index(name)]]),
+            head=head,
+            beta=torch.zeros(1, 1, size, dtype=torch.float64),
+            spread=torch.zeros(1, 1, 2 + size, 2 + size, dtype=torch.float64),
+            noise=torch.ones(1, 1, 2, dtype=torch.float64),
+            evidence=torch.zeros(1, 1, dtype=torch.float64),
+        )
+        for var in (distortion.predicted(fit, task)[1], metric._everywhere(task, fit, x)[1]):
+            assert low <= float(var.mean().sqrt()) <= 1.5 * low

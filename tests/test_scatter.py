@@ -4,16 +4,20 @@ import pytest
 import torch
 
 from dhtorch.anchors import FLOOR, Anchors, at_anchors, spread_within
-from dhtorch.scatter import SCATTER, variance
+from dhtorch.distortion import LENGTHS
+from dhtorch.scatter import SCATTER, SMOOTH, _at_edges, variance
 
 HW = (60, 80)
 
 
 def seen(log, truth, n=500, seed=0, noise=0.0, stated=0.0):
-    """Near returns of a map: residuals, and what the map differs by within a pixel."""
+    """Near returns of a map: residuals, and what the map differs by within a pixel; noise is a number, or that of each
+    pixel (1, h, w)."""
     g = torch.Generator().manual_seed(seed)
     share = torch.rand(len(log), n, 2, generator=g, dtype=torch.float64)
     r = at_anchors(truth, share)[0] - at_anchors(log, share)[0]
+    if isinstance(noise, torch.Tensor):
+        noise = at_anchors(noise, share)[0]
     r = r + noise * torch.randn(r.shape, generator=g, dtype=torch.float64)
     one = torch.ones_like(r)
     points = Anchors(share, one, 0 * one, one, (stated**2 + FLOOR**2) * one, 0 * one, one > 0, one > 0)
@@ -82,6 +86,57 @@ def test_few_returns_do_not_show_that_a_map_is_exact():
     few = sigma(truth, truth, n=12, noise=0.005, stated=0.01)
     many = sigma(truth, truth, n=500, noise=0.005, stated=0.01)
     assert few.median() > 3 * many.median()
+
+
+def test_chance_is_no_error_of_a_map():
+    """Products of independent residuals do not sum to zero; what chance makes of them is no error."""
+    truth = wall()
+    found = [float(sigma(truth, truth, n=250, seed=seed, noise=0.006, stated=0.01).median()) for seed in range(20)]
+    assert sum(found) / len(found) < 0.0009 and sum(level < 0.00055 for level in found) >= 9
+
+
+def test_slow_errors_are_as_smooth_as_the_shortest_field():
+    assert min(LENGTHS) == SMOOTH
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_the_nearest_returns_are_off_by_alike_is_the_maps(seed):
+    """An error that turns sign within an eighth of the picture is alike at neighbours alone."""
+    truth = wall()
+    u = torch.linspace(0, 1, HW[1], dtype=torch.float64)
+    off = 0.005 * 2**0.5 * torch.sin(25 * u).expand_as(truth)
+    found = sigma(truth + off, truth, seed=seed, stated=0.01)
+    assert 0.0035 < float(found.median()) < 0.006
+
+
+def test_returns_that_are_noisier_at_edges_are_not_the_maps():
+    """A map that is right is right at its edges, whatever a sensor makes of them; one that is blurred there is not."""
+    truth, box = room()
+    edge = torch.nn.functional.max_pool2d(box[:, None].double(), 5, 1, 2)[:, 0]
+    edge = (edge + torch.nn.functional.max_pool2d(-box[:, None].double(), 5, 1, 2)[:, 0]) > 0.5
+    noise = torch.where(edge, 0.01, 0.003).double()
+    right = [sigma(truth, truth, seed=seed, noise=noise, stated=0.01)[edge].median() for seed in range(6)]
+    blurred = torch.nn.functional.avg_pool2d(truth[:, None], 9, 1, 4, count_include_pad=False)[:, 0]
+    off = (blurred - truth).abs() > 0.1
+    wrong = [sigma(blurred, truth, seed=seed, noise=noise, stated=0.01)[off].median() for seed in range(6)]
+    assert sorted(right)[3] < 0.003 and min(wrong) > 0.05
+
+
+@pytest.mark.parametrize(("goes_with", "kept"), [(1.0, 0.5), (-1.0, 0.5), (0.0, 0.0)])
+def test_less_than_returns_state_is_the_maps_where_it_goes_with_its_edges(goes_with, kept):
+    """Along with how the map stands out of its surroundings, or against it; what goes with neither is the returns', in
+    most draws. Exact returns have nothing by themselves."""
+    found = []
+    for seed in range(12):
+        g = torch.Generator().manual_seed(seed)
+        stands, noise = 0.01 * torch.randn(2, 1, 300, generator=g, dtype=torch.float64)
+        one = torch.ones_like(stands)
+        points, *_ = seen(wall(), wall(), n=300, seed=seed)
+        r = goes_with * stands + (1 - abs(goes_with)) * noise
+        of_map, levels = (stands, 0.01 * one, points.block), (0.001 * one[:, :1], 0.5 * one[:, :1])
+        found.append(float(_at_edges(r, of_map, levels, one > 0, 0.01**2 * one[:, :1])))
+        assert float(_at_edges(r, of_map, levels, one > 0, 0 * one[:, :1])) == pytest.approx(0.5)
+    assert sorted(found)[6] == pytest.approx(kept, abs=0.02)
 
 
 def test_an_object_that_was_moved_is_in_doubt_and_not_what_is_around_it():
