@@ -113,3 +113,53 @@ def test_a_fit_that_knows_all_its_nodes_is_unsure_between_them():
         )
         for var in (distortion.predicted(fit, task)[1], metric._everywhere(task, fit, x)[1]):
             assert low <= float(var.mean().sqrt()) <= 1.5 * low
+
+
+def test_anchors_of_which_there_are_none_are_as_good_as_they_would_have_said():
+    anchors = points()
+    task = Task(anchors, basis(), torch.tensor([[[1.0, 0.0]]]).double().expand(1, len(HEADS), 2), anchors.x[:, :1])
+    raw = torch.tensor([[list(MODELS).index("raw")]])
+    for near in (True, False):
+        alone = anchors._replace(near=torch.full_like(anchors.near, near))
+        noise = distortion.fit(task._replace(points=alone), raw, alone.used).noise[0, 0]
+        assert noise[int(near)] == 1, "near answers, far ones"
+
+
+def test_far_answers_lean_together_and_near_returns_do_not():
+    anchors = points()
+    far = torch.arange(40)[None] % 2 == 0
+    anchors = anchors._replace(near=~far, shared=torch.where(far, 0.05, 0.0).double())
+    lean = distortion.leans(anchors)
+    assert lean.shape == (1, 40, distortion.LEANS) and (lean[~far] == 0).all()
+    torch.testing.assert_close(lean[far][:, 0], torch.full((20,), 0.05).double())
+    assert (lean[far].abs().amax(0) > 0.02).all() and lean.abs().max() <= 3 * 0.05
+
+
+def worth_of_a_scale(scale):
+    """What a model of a scale says that anchors are worth, and the integral over all scales that it believed possible."""
+    anchors = points(n=12)
+    noise = 0.05 * torch.randn(1, 12, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    anchors = anchors._replace(depth=scale * anchors.x * noise.exp(), var=torch.full_like(anchors.var, 0.05**2))
+    task = Task(anchors, basis(), torch.tensor([[[1.0, 0.0]]]).double().expand(1, len(HEADS), 2), anchors.x[:, :1])
+    model = torch.tensor([[list(MODELS).index("scale")]])
+    found = distortion.fit(task, model, anchors.used, distortion.MANY)
+    problem = distortion._problem(task, model, anchors.used)
+    spread = problem.square(found.noise[0]).sqrt()
+    tails = torch.distributions.StudentT(problem.freedom)
+    xi = torch.zeros(1, problem.phi.shape[-1] + 2, dtype=torch.float64)
+    at, told = torch.linspace(-0.5, 4.0, 2001, dtype=torch.float64), []
+    for x in at:
+        xi[0, 0] = x
+        r, _ = problem.missed(xi)
+        each = tails.log_prob(r / spread) - tails.log_prob(torch.zeros_like(r)) - spread.log()
+        told.append((problem.weight * each).sum() - 0.5 * x.square())
+    whole = torch.stack(told).logsumexp(0) + (at[1] - at[0]).log() - 0.5 * torch.log(torch.tensor(2 * torch.pi))
+    return float(found.evidence), float(whole)
+
+
+def test_evidence_is_an_integral_over_what_was_believed_possible():
+    """Laplace's: off by how much a tail bends, alike wherever the scale lies; far from what was believed it is worth
+    less."""
+    (near, near_whole), (far, far_whole) = (worth_of_a_scale(scale) for scale in (1.1, 3.0))
+    assert near - near_whole == pytest.approx(far - far_whole, abs=0.05) and abs(near - near_whole) < 0.7
+    assert near - far > 0.7

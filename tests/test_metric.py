@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from dhtorch import anchor, metric
-from dhtorch.anchors import gathered
+from dhtorch import anchor, distortion, metric
+from dhtorch.anchors import Anchors, gathered
 from dhtorch.codes import Gate, Source
 from dhtorch.distortion import freedom_of
 from dhtorch.records import DepthMap, Estimate, Samples
@@ -312,3 +312,75 @@ def test_disparity_may_have_zeros_and_holes():
     found = anchor(x, [near, far], kind="inverse")
     assert (found.gate[:, :, :3] == Gate.NO_TRACK).all() and (x == 0).any()
     assert found.keep[:, :, 3:].double().mean() > 0.99 and error(found, truth) < 0.01
+
+
+@pytest.mark.parametrize("kind", ["metric", "scale"])
+def test_what_is_not_positive_is_no_depth(kind):
+    depth, samples, _ = world()
+    given = depth.clone()
+    given[0, :5, :7], given[0, 5, :7] = 0.0, -1.0
+    found = anchor(given, [samples], kind=kind, hw=tuple(depth.shape[-2:]))
+    assert (found.gate[0, :6, :7] == Gate.NO_TRACK).all() and (found.gate[0, 6:] != Gate.NO_TRACK).all()
+
+
+def near_points(n, seed=0):
+    """Anchors at random places of a map of values from 1 to 4, with a hundredth of noise."""
+    g = torch.Generator().manual_seed(seed)
+    share, x = torch.rand(1, n, 2, generator=g).double(), 1 + 3 * torch.rand(1, n, generator=g).double()
+    one = torch.ones_like(x)
+    return Anchors(share, x, 0 * one, x, 1e-4 * one, 0 * one, one > 0, one > 0)
+
+
+def test_fits_start_from_what_most_anchors_say():
+    points = near_points(200)
+    y = 2 * points.x + 1
+    wrong = torch.arange(200)[None] % 10 < 3
+    none, scale, shift, line = metric._starts(points.x, torch.where(wrong, 5 * y, y), points)[0]
+    assert none.tolist() == [1, 0] and scale[1] == 0 and shift[0] == 1
+    torch.testing.assert_close(line, torch.tensor([2.0, 1.0]).double(), rtol=0.03, atol=0.03)
+
+
+def test_anchors_that_are_left_out_are_not_fitted(monkeypatch):
+    points = near_points(150)
+    values = torch.linspace(1, 4, 48, dtype=torch.float64).view(1, 6, 8)
+    task = metric._task(values, values > 0, points, of_depth=True)
+    seen = []
+    fit = distortion.fit
+    monkeypatch.setattr(distortion, "fit", lambda task, model, used: seen.append(used) or fit(task, model, used))
+    left = metric._left_out(task, torch.tensor([[0, 1]]))
+    out = left.r.isfinite()
+    used = seen[0].unflatten(1, out.shape[1:3])
+    assert not (out & used).any() and (out | used).all() and (out.sum(2) == 2).all(), "in a block and in a quarter"
+
+
+def test_few_anchors_that_were_left_out_move_sigma_little():
+    sixfold = []
+    for n in (8, 4000):
+        points = near_points(n)
+        r = 6 * 0.01 * torch.randn(1, 1, 1, n, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        left = metric._Left(r, torch.full_like(r, 1e-4))
+        sixfold.append(float(metric._stretch(points, left, torch.zeros(1, 1, dtype=torch.int64))))
+    few, many = sixfold
+    assert 1 < few < 0.6 * many, sixfold
+    assert many == pytest.approx(min(6, metric.STRETCH[1]), rel=0.05)
+
+
+def test_a_rising_line_through_what_rises_is_what_it_goes_through():
+    points = near_points(240)
+    points = points._replace(depth=1 + points.x**2)
+    x = torch.linspace(1.2, 3.8, 60, dtype=torch.float64).view(1, 6, 10)
+    torch.testing.assert_close(metric._ordered(x, points), 1 + x**2, rtol=0.05, atol=0)
+    wavy = points._replace(depth=points.depth * (1 + 0.3 * (9 * points.x).sin()))
+    found = metric._ordered(x, wavy).flatten()
+    assert (found.diff() >= -1e-12).all() and ((found / (1 + x.flatten() ** 2)).log().abs() < 0.35).all()
+
+
+def test_a_pixel_that_is_not_sure_enough_is_silent():
+    truth, near, far = world()
+    x, _ = depth_faults.spoil("simulated", truth)
+    plain = anchor(x, [near, far])
+    rel = plain.sigma / plain.depth
+    limit = float(rel.quantile(0.5)) * (1 + 1e-6)
+    found = anchor(x, [near, far], max_sigma_rel=limit)
+    assert torch.equal(found.gate == Gate.UNCERTAIN, rel > limit) and 0.3 < (rel > limit).double().mean() < 0.7
+    assert ((found.gate == Gate.UNCERTAIN) | found.keep).all() and found.depth[~found.keep].isnan().all()

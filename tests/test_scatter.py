@@ -5,7 +5,7 @@ import torch
 
 from dhtorch.anchors import FLOOR, Anchors, at_anchors, spread_within
 from dhtorch.distortion import LENGTHS
-from dhtorch.scatter import SCATTER, SMOOTH, _at_edges, variance
+from dhtorch.scatter import SCATTER, SMOOTH, _at_edges, _in_places, _standing_out, variance
 
 HW = (60, 80)
 
@@ -173,3 +173,20 @@ def test_alone_as_in_a_batch():
         told_one = (told[0][k : k + 1], told[1][k : k + 1])
         alone = variance(one, r[k : k + 1], told_one, log[k : k + 1], torch.ones_like(log[:1], dtype=torch.bool))
         assert torch.allclose(alone.sqrt(), both[k : k + 1], rtol=1e-9)
+
+
+def test_a_flat_map_stands_out_nowhere_not_even_beside_its_holes_and_borders():
+    flat = torch.full((1, *HW), 2.0, dtype=torch.float64)
+    known = torch.ones_like(flat, dtype=torch.bool)
+    known[:, 20:30, :40], known[:, ::7, ::5] = False, False
+    out = _standing_out(torch.where(known, flat, torch.nan), known)
+    assert out[known].abs().max() < 1e-12
+
+
+def test_what_is_off_in_one_place_is_no_doubt_in_another():
+    log, _ = room()
+    flat = torch.zeros_like(log)
+    share = 0.1 * torch.rand(1, 50, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    one = torch.ones(1, 50, dtype=torch.float64)
+    found = _in_places(share, 0 * one, (one, one > 0), flat, torch.ones_like(flat, dtype=torch.bool))[0]
+    assert found[2, 3] > 0.9 and found[:3, 22:].max() < 0.01 and found[-10:].max() < 0.01
