@@ -581,7 +581,7 @@ ELSEWHERE = {
     "dhtorch.metric.anchor",
     *(f"dhtorch.anchors.{name}" for name in ("gathered", "at_anchors", "spread_within")),
     *(f"dhtorch.distortion.{name}" for name in ("basis_of", "fields", "curves", "log_depth", "predicted", "fit")),
-    *(f"dhtorch.distortion.{name}" for name in ("reading", "freedom_of", "leans")),
+    *(f"dhtorch.distortion.{name}" for name in ("reading", "freedom_of", "leans", "between_nodes")),
     "dhtorch.scatter.variance",
     "dhtorch.geometry.exact.filled",
     "dhtorch.geometry.least_squares.minimise",

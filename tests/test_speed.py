@@ -93,6 +93,7 @@ def test_rows_of_benchmarks_are_strict_json(tmp_path, capsys):
         "batch",
         "threads",
         "processor",
+        "git",
         "device",
         "ours_ms",
         "ours_iqr",

@@ -227,8 +227,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_add", 'total.update(len(part).to_bytes(8, "big"))', "pass"),
         ("_keyed", "str(k) not in UNKEYED", "True"),
         ("_shorter", "place != home and", ""),
-        ("_git", '"--dirty", ', ""),
-        ("_git", 'if ask("ls-files", "--error-unmatch", "__init__.py") is None:\n        return None\n', ""),
+        ("revision", '"--dirty", ', ""),
+        ("revision", 'if ask("ls-files", "--error-unmatch", "__init__.py") is None:\n        return None\n', ""),
         (
             "difference",
             "{theirs.get(name)} there, {ours.get(name)} here",
