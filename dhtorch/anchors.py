@@ -55,6 +55,11 @@ class Anchors(NamedTuple):
         column, row = cell[..., 0].clamp(0, columns - 1), cell[..., 1].clamp(0, rows - 1)
         return 2 * (row * columns + column) + self.near.long()
 
+    @property
+    def of_block(self) -> Tensor:
+        """Which anchors are in which block (B, N, blocks): 1, else 0."""
+        return F.one_hot(self.block, 2 * BLOCKS[0] * BLOCKS[1]).to(self.x)
+
     def weight(self, used: Tensor) -> Tensor:
         """How many anchors each of those ``used`` (B, N) counts as among its block's, 0 of the others."""
         count = self.x.new_zeros(len(used), 2 * BLOCKS[0] * BLOCKS[1])

@@ -51,7 +51,7 @@ struct Level {
 struct Window {
   int64_t size, wide, count;
   std::vector<float> planes, inside;  // inside: 1, and 0 in what is filled up
-  Bits last;                                // the bits of a row's last vector that belong to the window
+  Bits last;                          // the bits of a row's last vector that belong to the window
   float moments[6];
 
   explicit Window(int64_t size)

@@ -8,6 +8,12 @@
 #include <cstdint>
 #include <cstring>
 
+#if defined(__has_builtin)
+#if __has_builtin(__builtin_shufflevector)
+#define DHTORCH_SHUFFLES
+#endif
+#endif
+
 using torch::stable::Tensor;
 
 namespace {
@@ -57,7 +63,7 @@ inline float over(float x) {
 
 // The sum of a vector's numbers, halves added to halves.
 inline float total(Vector x) {
-#if __has_builtin(__builtin_shufflevector)  // without it g++ 12 goes through memory
+#ifdef DHTORCH_SHUFFLES  // without them g++ 12 goes through memory
 #ifdef __AVX512F__
   const auto eight = __builtin_shufflevector(x, x, 0, 1, 2, 3, 4, 5, 6, 7) +
                      __builtin_shufflevector(x, x, 8, 9, 10, 11, 12, 13, 14, 15);

@@ -12,12 +12,6 @@
 
 #include "native_vectors.h"
 
-#if defined(__has_builtin)
-#if __has_builtin(__builtin_shufflevector)
-#define DHTORCH_SHUFFLES
-#endif
-#endif
-
 namespace {
 
 // Rows of a window, with room for the lanes that are computed beside it.

@@ -19,7 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dhtorch.anchors import BLOCKS, FLOOR, Anchors, at_anchors
+from dhtorch.anchors import FLOOR, Anchors, at_anchors
 from dhtorch.geometry.covariance import median
 
 #: Relative scatter of a map without near returns.
@@ -91,7 +91,8 @@ def variance(
         out = _standing_out(log, known)
         rough = _roughness(out, known)
         h = at_anchors(rough, points.share)[0].clamp_min(1e-9)
-        flat, slope = _levels(r, read, h, near)
+        steep = near & (h >= median(h, near))
+        flat, slope = _levels(r, read, h, (near, steep))
         some = near.any(-1, keepdim=True)
         flat, slope = torch.where(some, flat, SCATTER), torch.where(some, slope, OF_ROUGH)
         excess = (r.square() - BEYOND**2 * (flat.square() + (slope * h).square() + read)).clamp_min(0)
@@ -103,10 +104,10 @@ def variance(
         place = points.share * points.share.new_tensor(_sides(log))
         apart = torch.cdist(place, place, compute_mode="donot_use_mm_for_euclid_dist")
         fast = _fast(r, stands, calm / (h.square() + (EVEN * flat).square()).clamp_min(1e-18))
-        slow = _slow(r, apart, points.block, calm, flat.square())
+        slow = _slow(r, apart, points.of_block, calm, flat.square())
         alone = stated.minimum(_alone(r, apart, calm, flat.square()))
         of_map = (fast + slow).maximum(flat.square() - alone).minimum(flat.square())
-        slope = _at_edges(r, (stands, h, points.block), (flat, slope), near, stated)
+        slope = _at_edges(r, (stands, h, points.of_block), (flat, slope), steep, stated)
         return of_map[..., None] + (slope[..., None] * rough).square() + off
 
 
@@ -119,14 +120,14 @@ def _fast(r: Tensor, stands: Tensor, weight: Tensor) -> Tensor:
     return torch.where(mean < 0, -mean, mean * both / alone.clamp_min(1e-18))
 
 
-def _slow(r: Tensor, apart: Tensor, block: Tensor, among: Tensor, whole: Tensor) -> Tensor:
+def _slow(r: Tensor, apart: Tensor, of_block: Tensor, among: Tensor, whole: Tensor) -> Tensor:
     """Variance (B, 1) of what a map is off by over more than a few pixels of a sensor: returns that stand ``apart``
     (B, N, N) are off alike by it, and not by what they have by themselves. It is that of a field of correlation
-    ``SMOOTH``: products of residuals are regressed on it. Without many pairs it is as likely the ``whole`` (B, 1) of
+    ``SMOOTH``: products of residuals are regressed on it, pairs of blocks (``of_block`` (B, N, blocks), one of them 1)
+    being the unit of chance. Without many pairs it is as likely the ``whole`` (B, 1) of
     the scatter."""
     pair = among[:, None] & among[..., None] & (apart > ASIDE)
     alike = torch.where(pair, (-0.5 * (apart / SMOOTH).square()).exp(), 0.0)
-    of_block = F.one_hot(block, 2 * BLOCKS[0] * BLOCKS[1]).to(r)
     both = of_block.mT @ (alike * r[:, None] * r[..., None]) @ of_block  # every pair of blocks is there twice
     error = 2 * both.square().sum((1, 2)) - both.diagonal(dim1=1, dim2=2).square().sum(-1)
     more = _beyond_chance(both.sum((1, 2))[:, None], error[:, None])
@@ -144,17 +145,16 @@ def _alone(r: Tensor, apart: Tensor, among: Tensor, whole: Tensor) -> Tensor:
 
 
 def _at_edges(
-    r: Tensor, of_map: tuple[Tensor, Tensor, Tensor], levels: tuple[Tensor, Tensor], near: Tensor, stated: Tensor
+    r: Tensor, of_map: tuple[Tensor, Tensor, Tensor], levels: tuple[Tensor, Tensor], steep: Tensor, stated: Tensor
 ) -> Tensor:
     """Level (B, 1) of error by roughness, less what returns have by themselves where a map is rough, at most what is
     ``stated`` (B, 1): sensors are noisier on slanted and dark surfaces and at edges. It is the map's as far as
     residuals go with how it stands out of its surroundings, along or against it: what blurs or moves an edge does."""
-    stands, h, block = of_map
+    stands, h, of_block = of_map
     flat, slope = levels
     level = flat.square() + (slope * h).square()
-    steep = near & (h >= median(h, near))
     weight = (steep & (r.square() <= OUTSIDE**2 * level)) / level.clamp_min(1e-18)
-    both = (weight * stands * r)[:, None] @ F.one_hot(block, 2 * BLOCKS[0] * BLOCKS[1]).to(r)
+    both = (weight * stands * r)[:, None] @ of_block
     along = both.sum(-1).abs()
     sure = _beyond_chance(along, both.square().sum(-1)) / along.clamp_min(1e-18)
     alone = (1 - sure) * stated / median(h.square(), steep).clamp_min(1e-18)
@@ -194,13 +194,14 @@ def _around(x: Tensor, known: Tensor, side: int) -> Tensor:
     return torch.where(known, (total / count.clamp_min(1e-6))[:, 0], 0.0)
 
 
-def _levels(r: Tensor, read: Tensor, h: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
-    """Level (B, 1) within which 68 % of the errors of the flatter half lie, and by roughness ``h`` of the rougher half.
+def _levels(r: Tensor, read: Tensor, h: Tensor, among: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """Level (B, 1) within which 68 % of the errors of the flatter half lie, and by roughness ``h`` of the rougher half,
+    ``among`` near returns and the rougher of them (B, N).
 
     A return either stands where the map's value was taken or beside it: each is as likely, errors are Cauchy's. Their
     likeliest level says how much each return counts as one that is read where it stands.
     """
-    steep = near & (h >= median(h, near))
+    near, steep = among
     levels, slopes = (torch.logspace(*of).to(r) for of in (LEVELS, SLOPES))
     levels = levels.square()[None, :, None].expand(len(r), -1, r.shape[1])
     flat = _held(r.abs(), _read_there(r, levels, read, near & ~steep))

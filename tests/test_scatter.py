@@ -133,7 +133,7 @@ def test_less_than_returns_state_is_the_maps_where_it_goes_with_its_edges(goes_w
         one = torch.ones_like(stands)
         points, *_ = seen(wall(), wall(), n=300, seed=seed)
         r = goes_with * stands + (1 - abs(goes_with)) * noise
-        of_map, levels = (stands, 0.01 * one, points.block), (0.001 * one[:, :1], 0.5 * one[:, :1])
+        of_map, levels = (stands, 0.01 * one, points.of_block), (0.001 * one[:, :1], 0.5 * one[:, :1])
         found.append(float(_at_edges(r, of_map, levels, one > 0, 0.01**2 * one[:, :1])))
         assert float(_at_edges(r, of_map, levels, one > 0, 0 * one[:, :1])) == pytest.approx(0.5)
     assert sorted(found)[6] == pytest.approx(kept, abs=0.02)

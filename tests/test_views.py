@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from torch.autograd import forward_ad
 from torch.utils.data import default_collate
 
 from dhtorch.transform import SampleError, Views, views
@@ -398,6 +399,13 @@ def test_the_same_numbers_are_read_once_and_others_never_taken_for_them():
     leaf = torch.tensor(matrix(*K), requires_grad=True)
     views.read(sample(intrinsics=leaf)).anchor.camera.f.sum().backward()
     assert leaf.grad.sum() == 2
+    views = Views(depth_unit="m")
+    with torch.inference_mode():
+        views.read(sample())
+    assert not views.read(sample()).anchor.camera.f.is_inference(), "a graph could not go through it"
+    with forward_ad.dual_level():
+        tangent = forward_ad.make_dual(torch.tensor(matrix(*K)), torch.ones(3, 3))
+        assert forward_ad.unpack_dual(views.read(sample(intrinsics=tangent)).anchor.camera.f).tangent is not None
     flat, views = np.array(K, np.float32), Views(depth_unit="m")
     views.read(sample(intrinsics=flat))
     with pytest.raises(SampleError, match="expected"):

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dhtorch.geometry.least_squares import has_graph
 from dhtorch.geometry.shapes import is_transformed
 from dhtorch.records import Camera
 
@@ -201,10 +202,12 @@ class Leaves:
 
     def stated(self, numbers: Numbers) -> Hashable | None:
         """What tells numbers from others, so that the same ones need not be read again; None where a graph, a device or
-        a type that numpy does not know has them."""
+        a type that numpy does not know has them, and in inference mode, whose tensors are of no use outside it."""
+        if torch.is_inference_mode_enabled():
+            return None
         value = find(self.sample, numbers) if isinstance(numbers, str) else np.asarray(numbers)
         if isinstance(value, Tensor) and value.dtype in (torch.float32, torch.float64) and not is_transformed():
-            value = value.numpy() if value.is_cpu and not value.requires_grad else value
+            value = value.numpy() if value.is_cpu and not has_graph(value) else value
         if not isinstance(value, np.ndarray) or value.dtype.kind not in "buif" or self.like is None:
             return None
         kind = value.dtype.str, value.shape, self.dtype, self.like.device
