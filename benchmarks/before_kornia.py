@@ -19,8 +19,9 @@ _GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 def distort(camera: Camera, uv: Tensor) -> Tensor:
     """``geometry.camera.distort``: the value beside the Jacobian that Newton's method asks for."""
     assert camera.distortion is not None
-    xy = cam._distort(camera.distortion, (uv - camera.c[:, None]) / camera.f[:, None])[0]
-    return xy * camera.f[:, None] + camera.c[:, None]
+    xy = (uv - camera.c[:, None]) / camera.f[:, None]
+    seen = cam._distort(camera.distortion, xy.movedim(-1, 0))[0].movedim(0, -1)
+    return seen * camera.f[:, None] + camera.c[:, None]
 
 
 def to_matrix(T: Pose) -> Tensor:

@@ -203,6 +203,8 @@ def test_default_steps_suffice_close_to_the_fold():
     camera = Camera(double([300.0, 300.0]), double([0.0, 0.0]), double([-0.3, 0.0, 0.0, 0.0]))
     ideal = double([[0.999 * 300 / 0.9**0.5, 0.0]])  # the fold is at 1 / √0.9
     close(cam.undistort(camera, cam.distort(camera, ideal)), ideal, atol=1e-6)
+    across, along = 1 / (1 - 0.3 * 0.999**2 / 0.9), 1 / (1 - 0.999**2)  # of r (1 − 0.3 r²)
+    close(cam.undistort_jacobian(camera, ideal)[0, 0], torch.diag(double(along, across)))
 
 
 def test_a_pixel_is_solved_when_it_returns_to_within_a_hundredth_of_a_pixel():

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from dhtorch.geometry import se3
 from dhtorch.geometry.se3 import Pose
-from dhtorch.geometry.shapes import check
+from dhtorch.geometry.shapes import check, surely_all
 from dhtorch.geometry.small import inverse
 from dhtorch.tree import Record, record
 
@@ -158,18 +158,16 @@ def undistort(camera: Camera, uv: Tensor, *, iterations: int = 12) -> Tensor:
     check("camera.undistort", f=(camera.f, "B 2"), uv=(uv, "B N 2"))
     if camera.distortion is None:
         return uv
-    target = _normalised(camera, uv)
-    xy = target.detach()
+    target = _planes(_normalised(camera, uv))
     with torch.no_grad():
-        for _ in range(iterations):
-            xy = _newton_step(camera.distortion, xy, target)
-        miss = (_bent(camera.distortion, xy) - target).abs().amax(-1, keepdim=True)
+        xy = _solved(camera.distortion, target.detach(), iterations)
+        miss = (_bent(camera.distortion, xy.movedim(0, -1)) - target.movedim(0, -1)).abs().amax(-1)
         # A pixel counts as solved when it returns to itself within a hundredth of a pixel, at any focal length.
-        solved = miss * camera.f.amax(-1)[:, None, None] < 0.01
-        start = torch.where(solved, xy, torch.zeros_like(xy))
-    xy = _newton_step(camera.distortion, start, torch.where(solved, target, torch.zeros_like(target)))
-    uv = xy * camera.f[:, None] + camera.c[:, None]
-    return torch.where(solved, uv, torch.full_like(uv, torch.nan))
+        solved = miss * camera.f.amax(-1)[:, None] < 0.01
+        start = torch.where(solved, xy, 0.0)
+    xy = start + _newton_step(camera.distortion, start, torch.where(solved, target, 0.0))
+    uv = xy.movedim(0, -1) * camera.f[:, None] + camera.c[:, None]
+    return torch.where(solved[..., None], uv, torch.nan)
 
 
 def depth_pixels(
@@ -197,9 +195,10 @@ def undistort_jacobian(camera: Camera, uv_ideal: Tensor) -> Tensor:
     if camera.distortion is None:
         eye = torch.eye(2, dtype=uv_ideal.dtype, device=uv_ideal.device)
         return eye.expand(*uv_ideal.shape, 2)
-    jacobian = _distort(camera.distortion, _normalised(camera, uv_ideal))[1]
+    a, b, c = _distort(camera.distortion, _planes(_normalised(camera, uv_ideal)))[1]
     f = camera.f[:, None]
-    return f[..., :, None] * _inverse_2x2(jacobian) / f[..., None, :]
+    turned = inverse(a, b, b, c, least=1e-12).movedim(0, -1).unflatten(-1, (2, 2))
+    return f[..., :, None] * turned / f[..., None, :]
 
 
 def _normalised(camera: Camera, uv: Tensor) -> Tensor:
@@ -222,40 +221,53 @@ def _bent(distortion: Tensor, xy: Tensor) -> Tensor:
     return distort_points(xy, one, distortion)
 
 
+def _planes(xy: Tensor) -> Tensor:
+    """(B, N, 2) as (2, B, N), each coordinate in a row."""
+    return xy.movedim(-1, 0).contiguous()
+
+
+def _solved(distortion: Tensor, target: Tensor, iterations: int) -> Tensor:
+    """Newton's method for the ideal planes (2, B, N) that are bent to ``target``.
+
+    A point stops after a step whose square is lost in rounding, as the error that is left then is: so that its answer
+    does not depend on how long others of its batch take.
+    """
+    xy, moving = target, torch.ones_like(target[0], dtype=torch.bool)
+    for _ in range(iterations):
+        step = _newton_step(distortion, xy, target)
+        xy = torch.where(moving, xy + step, xy)
+        moving = moving & ((step * step).sum(0) > torch.finfo(xy.dtype).eps)
+        if surely_all(~moving):
+            break
+    return xy
+
+
 def _newton_step(distortion: Tensor, xy: Tensor, target: Tensor) -> Tensor:
-    value, jacobian = _distort(distortion, xy)
-    step = _inverse_2x2(jacobian.detach()) @ (target - value)[..., None]
-    return xy + step[..., 0]
+    """What is to be added to the planes ``xy`` (2, B, N)."""
+    value, (a, b, c) = _distort(distortion, xy)
+    left = target - value
+    a, b, _, c = inverse(*(x.detach() for x in (a, b, b, c)), least=1e-12)
+    return torch.stack((a * left[0] + b * left[1], b * left[0] + c * left[1]))
 
 
-def _distort(distortion: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
-    """Brown's rational model and its Jacobian: ideal xy (B, N, 2) → distorted xy (B, N, 2), (B, N, 2, 2)."""
+def _distort(distortion: Tensor, xy: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
+    """Brown's rational model: where ideal points x (2, B, N) are seen, s x + r² q with q = (p₂, p₁) and
+    s = radial(r²) + 2 q·x; and the entries a, b, c (B, N) of its Jacobian s I + 2 (radial' x xᵀ + x qᵀ + q xᵀ)."""
     count = _check_count(distortion)
     k1, k2, p1, p2, k3, k4, k5, k6 = torch.nn.functional.pad(distortion, (0, 8 - count))[:, None].unbind(-1)
-    x, y = xy.unbind(-1)
+    x, y = xy
     r2 = x * x + y * y
-    top = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    bottom = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-    radial = top / bottom
-    slope = (k1 + r2 * (2 * k2 + 3 * r2 * k3) - radial * (k4 + r2 * (2 * k5 + 3 * r2 * k6))) / bottom  # d radial / d r²
-    value = torch.stack(
-        (
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        ),
-        -1,
-    )
-    cross = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
-    jacobian = torch.stack(
-        (
-            radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x,
-            cross,
-            cross,
-            radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x,
-        ),
-        -1,
-    )
-    return value, jacobian.unflatten(-1, (2, 2))
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = k1 + r2 * (2 * k2 + r2 * (3 * k3))  # d radial / d r²
+    if count > 5:
+        bottom = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        radial = radial / bottom
+        slope = (slope - radial * (k4 + r2 * (2 * k5 + r2 * (3 * k6)))) / bottom
+    s = radial + 2 * (p1 * y + p2 * x)
+    value = torch.stack((x * s + p2 * r2, y * s + p1 * r2))
+    along = slope * x
+    a, c = s + 2 * x * (along + 2 * p2), s + 2 * y * (slope * y + 2 * p1)
+    return value, (a, 2 * (y * (along + p2) + x * p1), c)
 
 
 def _check_count(distortion: Tensor) -> int:
@@ -263,7 +275,3 @@ def _check_count(distortion: Tensor) -> int:
     if count not in COEFFICIENTS:  # more would be OpenCV's thin prism and tilted sensor
         raise ValueError(f"camera: distortion has {count} coefficients, expected one of {COEFFICIENTS}")
     return count
-
-
-def _inverse_2x2(m: Tensor) -> Tensor:
-    return inverse(*m.flatten(-2).unbind(-1), least=1e-12).movedim(0, -1).unflatten(-1, (2, 2))

@@ -345,7 +345,7 @@ def _map(pair: _Pair, radius: int, x: Tensor, corner: Tensor, batch: Tensor, mom
         if moments is None:
             sums.append(_moments(G, o.normalise))
         kernel = _kernels(G, o.normalise).reshape(-1, 1, w, w)
-        J = pair.target.read(pair.level, j.repeat(1, len(kernel) // len(f[0])), side).view(1, len(kernel), side, side)
+        J = pair.target.read(pair.level, j, side).repeat(1, len(kernel) // len(f[0]), 1).view(1, -1, side, side)
         maps.append(F.conv2d(J, kernel, groups=len(kernel)).unflatten(1, (-1, len(f[0])))[0])
     C = torch.cat(maps, 1).permute(0, 2, 3, 1).contiguous()
     return C, torch.cat(sums, -1) if moments is None else moments

@@ -8,6 +8,7 @@ windows are to be searched for and not only searched in, its gradients along x a
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import torch
@@ -54,8 +55,7 @@ class Pyramid(NamedTuple):
 
     def corner(self, level: int, x: Tensor) -> Tensor:
         """The pixel (2, M) left of and above ``x`` (2, M), on a level or in the margin around it."""
-        H, W = self.hw(level)
-        return torch.minimum(x.detach().floor().clamp_min(-MARGIN), x.new_tensor([[W - 1], [H - 1]]) + MARGIN)
+        return torch.clamp(x.detach().floor(), *_margins(self.hw(level), device=x.device, dtype=x.dtype))
 
     def locate(self, level: int, x: Tensor, batch: Tensor, before: int, planes: tuple[int, ...]):
         """Where windows begin that reach ``before`` pixels left of and above floor(x), and the fraction of x.
@@ -64,9 +64,9 @@ class Pyramid(NamedTuple):
         """
         count, rows, width = self.levels[level].shape[1:]
         whole = self.corner(level, x)
-        u, v = whole.long() + (self.pad - before)
-        plane = count * batch + torch.tensor(planes, device=x.device)[:, None]
-        return (plane * rows + v) * width + u, x - whole
+        u, v = whole.long()
+        first = _first(planes, rows * width, (self.pad - before) * (width + 1), device=x.device)
+        return torch.add(first, batch, alpha=count * rows * width) + torch.add(u, v, alpha=width), x - whole
 
     def read(self, level: int, first: Tensor, size: int, fraction: Tensor | None = None) -> Tensor:
         """Windows (P, M, size²) that begin at ``first`` (P, M), or (bilinear) ``fraction`` (2, M) right and below."""
@@ -83,6 +83,20 @@ class Pyramid(NamedTuple):
         """Windows (P, M, size²) around ``x`` (2, M), between pixels."""
         first, fraction = self.locate(level, x, batch, size // 2, planes)
         return self.read(level, first, size, fraction)
+
+
+@lru_cache(maxsize=64)
+def _margins(hw: tuple[int, int], *, device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """First and last pixel (2, 1) of an image and the margin around it."""
+    H, W = hw
+    last = torch.tensor([[W - 1 + MARGIN], [H - 1 + MARGIN]], device=device, dtype=dtype)
+    return torch.full_like(last, -MARGIN), last
+
+
+@lru_cache(maxsize=256)
+def _first(planes: tuple[int, ...], size: int, shift: int, *, device: torch.device) -> Tensor:
+    """Flat indices (P, 1) of pixel ``shift`` of some planes of ``size`` pixels."""
+    return torch.tensor(planes, device=device)[:, None] * size + shift
 
 
 class Pyramids:

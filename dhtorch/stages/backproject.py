@@ -5,6 +5,7 @@ Fail loud, fail localised: a sample without a usable return is NaN and flagged, 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -30,6 +31,9 @@ from dhtorch.records import Frame, Samples
 
 #: Search radius in a sparse depth map, px: the truth test reads sparse returns in 7×7 windows, so do the samples.
 SPARSE_SEARCH_PX = 3
+
+#: Rows of a picture that are looked at together where all of its pixels are.
+ROWS = 64
 
 #: Side of the neighbourhood that appearance and depth edges are judged on, px.
 NEIGHBOURHOOD = 5
@@ -260,17 +264,18 @@ def _appearance(image: Tensor, pixel: Tensor, limits: _Limits) -> tuple[Tensor, 
     """What the picture alone decides, (B, N) each: at the border, too dark, clipped at white, a highlight."""
     hw = (image.shape[-2], image.shape[-1])
     size = min(NEIGHBOURHOOD, *hw)
-    whole = whole_is_faster(hw, pixel.shape[1], size) and image.dtype == torch.uint8
-    seen = (
-        _whole_brightness(image, size)
-        if whole
-        else summarise(image.detach(), pixel, size, _brightness, compiled="brightness")
-    )
-    mean, centre, top, bottom = seen
     white = 1 if image.is_floating_point() else 255
-    shine = (top - bottom <= 0.15 * top) & (centre >= limits.highlight * white) & (centre - mean >= 0.1 * white)
-    told = mean <= limits.dark * white, mean >= limits.saturated * white, shine
-    return ~fits(pixel, hw, size), *((read_whole(x, pixel, size) for x in told) if whole else told)
+
+    def told(mean: Tensor, centre: Tensor, top: Tensor, bottom: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        shine = (top - bottom <= 0.15 * top) & (centre >= limits.highlight * white) & (centre - mean >= 0.1 * white)
+        return mean <= limits.dark * white, mean >= limits.saturated * white, shine
+
+    if whole_is_faster(hw, pixel.shape[1], size) and image.dtype == torch.uint8:
+        found = zip(*(told(*seen) for seen in _whole_brightness(image, size)), strict=True)
+        doubts = tuple(read_whole(torch.cat(rows, 1), pixel, size) for rows in found)
+    else:
+        doubts = told(*summarise(image.detach(), pixel, size, _brightness, compiled="brightness"))
+    return ~fits(pixel, hw, size), *doubts
 
 
 def _brightness(patch: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -281,13 +286,18 @@ def _brightness(patch: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return mean, centre, middle.amax(0), middle.amin(0)
 
 
-def _whole_brightness(image: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _whole_brightness(image: Tensor, size: int) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
     """What :func:`_brightness` finds around every pixel (B, H, W) of pictures of bytes, whose sums are exact in
-    whatever order they are taken."""
-    planes = image.contiguous()
-    total = window_sum(planes.flatten(0, 1).to(torch.int16), size // 2).view_as(planes)
-    mean, centre = (luma(x, 1)[:, 0] for x in (total.float() / size**2, planes.float()))
-    return mean, centre, planes.amax(1).float(), planes.amin(1).float()
+    whatever order they are taken; some rows after the other, which need no fresh memory."""
+    radius, H = size // 2, image.shape[-2]
+    for first in range(0, H, ROWS):
+        last = min(first + ROWS, H)
+        top = max(first - radius, 0)
+        around = image[..., top : last + radius, :].to(torch.int16).flatten(0, 1)
+        total = window_sum(around, radius)[:, first - top : last - top].unflatten(0, image.shape[:2])
+        planes = image[..., first:last, :].contiguous()
+        mean, centre = (luma(x, 1)[:, 0] for x in (total.float() / size**2, planes.float()))
+        yield mean, centre, planes.amax(1).float(), planes.amin(1).float()
 
 
 def _bits(*masks: tuple[Tensor, int]) -> Tensor:
