@@ -162,10 +162,12 @@ def test_what_is_no_return_is_zero():
         found = read(sample(depth=given), depth_unit=unit).anchor.depth[0].numpy()
         np.testing.assert_allclose(found, wanted, rtol=1e-6)
         assert np.array_equal(given, before, equal_nan=True), "the sample is left as it was"
-    whole = np.full((H, W), -7, np.int32)
-    whole[1, 1] = 500
-    found = read(sample(depth=whole), depth_unit="mm").anchor.depth
-    assert found.sum() == found[0, 1, 1] == 0.5 and whole[0, 0] == -7 and whole[1, 1] == 500
+    for kind in (np.int32, np.int16):
+        whole = np.full((H, W), -7, kind)
+        whole[1, 1] = 500
+        for unit in ("mm", 0.001):
+            found = read(sample(depth=whole), depth_unit=unit).anchor.depth
+            assert found.sum() == found[0, 1, 1] == 0.5 and whole[0, 0] == -7 and whole[1, 1] == 500
 
 
 def test_the_depth_range_is_open_below_and_closed_above():

@@ -211,13 +211,19 @@ def windows(image: Tensor, first: Tensor, size: int) -> Tensor:
     """
     W = image.shape[-1]
     image = image.contiguous()
-    steps = torch.arange(size, device=image.device)
+    rows = _rows(size, W, device=image.device)
     if _view_is_safe(image):
         # Row by row: a contiguous slice is copied as a block of memory, which is several times faster.
         view = image.as_strided((max(image.numel() - size + 1, 0), size), (1, 1))
-        return view.index_select(0, (first.reshape(-1, 1) + steps * W).flatten()).view(*first.shape, size, size)
-    index = first[..., None, None] + steps[:, None] * W + steps
+        return view.index_select(0, (first.reshape(-1, 1) + rows).flatten()).view(*first.shape, size, size)
+    index = first[..., None, None] + rows[:, None] + torch.arange(size, device=image.device)
     return image.flatten()[index]
+
+
+@lru_cache(maxsize=64)
+def _rows(size: int, width: int, *, device: torch.device) -> Tensor:
+    """Flat indices (size,) of the rows of a window, less that of its first; asked for again and again."""
+    return torch.arange(0, size * width, width, device=device)
 
 
 def luma(rgb: Tensor, dim: int) -> Tensor:

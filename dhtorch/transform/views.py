@@ -170,12 +170,17 @@ class Views:
         if self.depth_unit == "m" and not maps[0].is_floating_point():
             raise SampleError(f"{self.depth}: found whole numbers ({maps[0].dtype}), expected metres; is the unit mm?")
         words = [x.view(torch.int16) for x in maps if x.dtype in (torch.int16, torch.uint16)]
-        if len(words) == len(maps) and isinstance(self.depth_unit, str) and native.serves(*words):
-            z = torch.empty(len(maps), *maps[0].shape)
-            for into, read, x in zip(z, words, maps, strict=True):
-                torch.ops.dhtorch.metres.default(read, into, UNITS[self.depth_unit], x.dtype.is_signed)
-        else:
+        if len(words) < len(maps):
             z = self._scaled(torch.stack(list(maps)) if len(maps) > 1 else maps[0][None])
+        else:
+            z = torch.empty(len(maps), *maps[0].shape, device=maps[0].device)
+            unit = UNITS[self.depth_unit] if isinstance(self.depth_unit, str) else 0.0
+            compiled = unit > 0 and native.serves(*words)
+            for into, read, x in zip(z, words, maps, strict=True):
+                if compiled:
+                    torch.ops.dhtorch.metres.default(read, into, unit, x.dtype.is_signed)
+                else:
+                    self._scale(into.copy_(x), signed=x.dtype.is_signed)
         low, high = self.depth_range
         return z if low <= 0 and high == float("inf") else torch.where((z > low) & (z <= high), z, 0.0)
 
@@ -265,16 +270,19 @@ class Views:
 
     def _scaled(self, x: Tensor) -> Tensor:
         """Positive numbers in metres, 0 for all others."""
-        # Every pass over a whole map costs as much as the front end: no more of them than the numbers ask for.
-        if x.is_floating_point():
-            x = x.nan_to_num(0.0, 0.0, 0.0).relu()
-        else:
-            x = x.float().relu_() if x.dtype.is_signed else x.float()
+        if not x.is_floating_point():
+            return self._scale(x.float(), signed=x.dtype.is_signed)
+        x = x.nan_to_num(0.0, 0.0, 0.0).relu()
         if not isinstance(self.depth_unit, str):
             return x * float(self.depth_unit)
-        if self.depth_unit == "m":
-            return x
-        return x / UNITS[self.depth_unit] if x.requires_grad else x.div_(UNITS[self.depth_unit])
+        return x if self.depth_unit == "m" else x / UNITS[self.depth_unit]
+
+    def _scale(self, x: Tensor, *, signed: bool) -> Tensor:
+        """The same of whole numbers, in place."""
+        # Every pass over a whole map costs as much as the front end: no more of them than the numbers ask for.
+        x = x.relu_() if signed else x
+        unit = self.depth_unit
+        return x.div_(UNITS[unit]) if isinstance(unit, str) else x.mul_(float(unit))
 
     def _probed(self, depth: Tensor) -> tuple[Tensor, list[tuple[Tensor, Tensor, str]]]:
         """Which maps (B,) have a return, and what speaks against the unit."""
