@@ -127,6 +127,20 @@ def test_a_changed_source_is_another_set(robot, whole, tmp_path, capsys):
     assert "another enriched set" in said and "data" in said and said.count("\n") == 1
 
 
+def test_splits_are_in_the_new_numbers(tmp_path):
+    source = tmp_path / "source"
+    source.mkdir()
+    writers.write_lerobot(source, [shots(2), shots(2, 2), shots(2, 4)], depth="tiff")
+    info = source / "meta" / "info.json"
+    info.write_text(json.dumps(json.loads(info.read_text()) | {"splits": {"train": "0:2", "val": "2:3"}}))
+
+    def splits(out, *more):
+        return json.loads((enrich(source, out, *more) / "meta" / "info.json").read_text())["splits"]
+
+    assert splits(tmp_path / "all") == {"train": "0:2", "val": "2:3"}
+    assert splits(tmp_path / "one", "data=lerobot", "data.episode=2") == {"val": "0:1"}
+
+
 def test_two_writers_do_not_share_a_folder(robot, whole, tmp_path, capsys):
     with lock.held(tmp_path / ".set.lock", "out"):
         assert main(["enrich", str(robot), str(tmp_path / "set"), *ASKED]) == 2
