@@ -22,6 +22,7 @@ from dhtorch.geometry import camera as cam
 from dhtorch.geometry.lookup import magnified
 from dhtorch.synthetic import SyntheticRoom
 from dhtorch.synthetic.depth_faults import mirrored
+from dhtorch.synthetic.paths import hand_held
 
 N, FIRST = 16, 4
 METHOD = TRACKING.replace(n=256)
@@ -73,6 +74,39 @@ def test_a_planted_fault_is_named(name, own, frames, watched):
     found = name_cause(shown, maps, method=METHOD, watched=watched)
     assert found.kind == kind
     assert found.n_pairs >= 4
+
+
+@pytest.fixture(scope="module")
+def panned():
+    """A camera that walks and looks 3 degrees farther to the left each frame, so that maps of other frames differ."""
+    poses = hand_held("walk", N, step_m=0.06, rate_hz=30.0, seed=1, pan=(24.0, -3.0))
+    room = SyntheticRoom(n_frames=N, hw=(180, 240), depth_hw=(90, 120), supersample=1, seed=1, true_poses=poses)
+    shown = [room[k] for k in range(N)]
+    return shown, watch(shown, METHOD)
+
+
+@pytest.mark.parametrize("own", [True, False])
+@pytest.mark.parametrize(("late", "name"), [(3, "3 frames late"), (-3, "3 frames early")])
+def test_maps_that_come_late_or_early_are_named_by_how_much(late, name, own, panned):
+    frames, watched = panned
+    spoilt = [frames[min(max(k - late, 0), N - 1)].depth for k in range(N)]
+    shown, maps = planted(frames, spoilt, own)
+    assert name_cause(shown, maps, method=METHOD, watched=watched).cause == name
+
+
+def test_a_lag_as_long_as_the_window_cannot_be_told(frames):
+    """No pair has a map so much earlier or later: those at the ends say nothing in its place."""
+    found = name_cause(frames[:5], method=METHOD)
+    assert found.n_pairs == 4
+    assert {"none", "4 frames late", "1 frames early"} < set(found.loss)
+    assert not {"5 frames late", "5 frames early"} & set(found.loss)
+
+
+def test_pairs_are_as_wide_as_tracks_hold(frames):
+    """Two takes of four frames, the second upside down: a pair across the cut shows no point twice."""
+    upside_down = [frame.replace(image=frame.image.flip(-2)) for frame in frames[4:8]]
+    assert list(watch(frames[:4], METHOD).pairs) == [(0, 2), (1, 3), (2, 3)]
+    assert list(watch(frames[:4] + upside_down, METHOD).pairs) == [(0, 2), (1, 3), (2, 3), (4, 6), (5, 7), (6, 7)]
 
 
 @pytest.mark.parametrize("own", [True, False])

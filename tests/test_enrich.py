@@ -89,14 +89,31 @@ def test_what_the_source_had_is_there_value_for_value(robot, enriched):
     assert {k: after[k] for k in before} == before
 
 
+def test_an_episode_begins_and_ends_in_its_video_where_it_did(robot, enriched):
+    before, after = (parquet.read_table(next((r / "meta" / "episodes").rglob("*.parquet"))) for r in (robot, enriched))
+    for end in ("from_timestamp", "to_timestamp"):
+        name = f"videos/{CAMERA}/{end}"
+        assert after[name].to_pylist() == pytest.approx(before[name].to_pylist()), end
+
+
 def test_depth_is_in_steps_and_the_sensor_is_within_half_of_one(enriched, shots):
     for row, frame in zip(rows(enriched), shots, strict=True):
         depth, sigma, source = (map_of(row, k) for k in (DEPTH, f"{DEPTH}_sigma", f"{CAMERA}_dhtorch_source"))
         assert depth.dtype == np.float32 and np.array_equal(np.round(depth / STEP) * STEP, depth)
+        assert np.array_equal(np.round(sigma / (STEP / 8)) * (STEP / 8), sigma) and (sigma % STEP).any()
         assert np.array_equal(depth > 0, source > 0) and np.array_equal(sigma > 0, source > 0)
         sensor = source == 1
         assert sensor.any()
         assert np.abs(depth - frame.depth[0].numpy())[sensor].max() <= STEP / 2 + 1e-6
+
+
+def test_what_is_known_to_less_than_half_a_step_is_known_to_one(robot, tmp_path):
+    """Depth in whole metres: nothing that has a depth is said to have none, or to be known exactly."""
+    assert main(["enrich", str(robot), str(tmp_path / "set"), *ASKED, "step=1"]) == 0
+    for row in rows(tmp_path / "set"):
+        depth, sigma, source = (map_of(row, k) for k in (DEPTH, f"{DEPTH}_sigma", f"{CAMERA}_dhtorch_source"))
+        assert set(np.unique(depth)) <= set(range(8)) and np.array_equal(depth > 0, source > 0)
+        assert sigma[depth > 0].min() == 1 / 8
 
 
 def test_statistics_are_of_what_is_known(enriched):
@@ -246,7 +263,7 @@ def test_a_table_without_frame_index_counts_its_rows(shots, tmp_path):
         read = parquet.read_table(table).drop_columns(["frame_index"])
         stamps = np.asarray(read.column("timestamp")) + np.float32(0.05)
         place = read.column_names.index("timestamp")
-        parquet.write_table(read.set_column(place, "timestamp", [stamps]), table)
+        parquet.write_table(read.set_column(place, "timestamp", [stamps]), table, row_group_size=3)
     recording = data.open_all(source)[0]
     assert recording.number.tolist() == list(range(LENGTHS[0])) and float(recording.times[0]) == 0
     assert recording[2].hw == HW  # its video frame is found
@@ -255,6 +272,8 @@ def test_a_table_without_frame_index_counts_its_rows(shots, tmp_path):
     assert main(["enrich", str(source), str(out), *ASKED]) == 0
     found = rows(out)
     assert found[0]["timestamp"] == 0 and found[0]["source.timestamp"] == pytest.approx(0.05)
+    assert [row["frame_index"] for row in found] == [*range(LENGTHS[0]), *range(LENGTHS[1])]
+    assert all((map_of(row, DEPTH) > 0).any() for row in found)
 
 
 def test_a_write_that_failed_at_the_first_file_is_no_other_set(robot, enriched, tmp_path):

@@ -10,6 +10,7 @@ import sys
 import tracemalloc
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -27,10 +28,16 @@ from dhtorch import testing as writers
 from dhtorch.commands.run import main
 from dhtorch.data.codecs import tfrecord
 from dhtorch.data.recording import Recording
+from dhtorch.data.rlds import Described
 from dhtorch.data.scene import Scene
 from dhtorch.extract import cut, plan
-from dhtorch.extract.enriched import MapRows, View, camera_key, columns
+from dhtorch.extract.enriched import MapRows, View, camera_feature, camera_key, columns
+from dhtorch.extract.instants import Ahead
+from dhtorch.extract.nerf_target import NerfTarget
+from dhtorch.extract.origin import NO_RATE, RobotSet, rate
+from dhtorch.extract.robot_target import RobotTarget
 from dhtorch.extract.step_set import StepSet
+from dhtorch.extract.targets import Tally
 from dhtorch.methods import PAPER
 from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.synthetic.two_cameras import open_two_cameras
@@ -127,6 +134,91 @@ def test_a_changed_source_is_another_set(robot, whole, tmp_path, capsys):
     assert "another enriched set" in said and "data" in said and said.count("\n") == 1
 
 
+@pytest.mark.parametrize("format", ["lerobot", "nerfstudio"])
+def test_an_episode_made_with_other_settings_is_not_whole(format, robot, tmp_path):
+    out = enrich(robot, tmp_path / "set", "data=lerobot", "data.episode=0", f"format={format}")
+    key = json.loads((out / "meta" / "dhtorch.json").read_text())["key"]
+    views = {FRONT: View(FRONT, HW, HW, posed=True)}
+
+    def own(key, k=0):
+        if format == "nerfstudio":
+            return NerfTarget(out, views, [{FRONT: ""}, {FRONT: "1"}], key).own(k)
+        return RobotTarget(out, 3, views, origin=None, numbers=[0, 1], step=0.0, fps=30.0, task=None, key=key).own(k)
+
+    assert own(key)["length"] == LENGTHS[0]
+    assert own(f"{key}x") is None
+    assert own(key, 1) is None, "not there"
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_tasks_that_are_noted_for_an_episode_are_kept(version, tmp_path):
+    """Of several that describe it, the rows bear one."""
+    source = tmp_path / "source"
+    source.mkdir()
+    writers.write_lerobot(source, [shots(2)], depth="tiff", version=version)
+    noted = ["look", "look carefully"]
+    if version == 2:
+        file = source / "meta" / "episodes.jsonl"
+        file.write_text(json.dumps({**json.loads(file.read_text()), "tasks": noted}) + "\n")
+    else:
+        file = next((source / "meta" / "episodes").rglob("*.parquet"))
+        table = parquet.read_table(file)
+        parquet.write_table(table.set_column(table.column_names.index("tasks"), "tasks", [[noted]]), file)
+    out = enrich(source, tmp_path / "set")
+    (table,) = (out / "meta" / "episodes").rglob("*.parquet")
+    assert parquet.read_table(table)["tasks"].to_pylist() == [noted]
+    assert {row["task_index"] for row in rows(out)} == {0}
+
+
+def test_splits_are_in_the_new_numbers(tmp_path):
+    source = tmp_path / "source"
+    source.mkdir()
+    writers.write_lerobot(source, [shots(2), shots(2, 2), shots(2, 4)], depth="tiff")
+    info = source / "meta" / "info.json"
+    info.write_text(json.dumps(json.loads(info.read_text()) | {"splits": {"train": "0:2", "val": "2:3"}}))
+
+    def splits(out, *more):
+        return json.loads((enrich(source, out, *more) / "meta" / "info.json").read_text())["splits"]
+
+    assert splits(tmp_path / "all") == {"train": "0:2", "val": "2:3"}
+    assert splits(tmp_path / "one", "data=lerobot", "data.episode=2") == {"val": "0:1"}
+
+
+def test_a_video_that_no_episode_has_is_no_feature_of_the_new_set(tmp_path):
+    source = tmp_path / "source"
+    source.mkdir()
+    writers.write_lerobot(source, [shots(2)], depth="tiff", version=2)
+    info = source / "meta" / "info.json"
+    about = json.loads(info.read_text())
+    about["features"]["observation.images.wrist"] = about["features"][FRONT]
+    info.write_text(json.dumps(about))
+    found = RobotSet.open(source, [0])
+    assert set(found.features) == set(about["features"]) - {"observation.images.wrist"}
+    assert set(found.clips(0, 2)) == {FRONT}
+
+
+def test_a_nerfstudio_folder_holds_frames_with_a_pose_and_is_sure_of_its_own_depth_alone(tmp_path, monkeypatch):
+    """It has no pose that is not known, and no step beyond 65.534 m."""
+    made, in_metres = MapRows.features, []
+
+    def lost(self, opened, i):
+        row = made(self, opened, i)
+        in_metres.append(np.array(Image.open(io.BytesIO(row["depth"]))))
+        return {**row, "pose": np.full(16, np.nan)} if i == 1 else row
+
+    monkeypatch.setattr(MapRows, "features", lost)
+    source = tmp_path / "source"
+    source.mkdir()
+    writers.write_lerobot(source, [[shot.replace(depth=40 * shot.depth) for shot in shots(3)]], depth="tiff")
+    out = enrich(source, tmp_path / "set", "format=nerfstudio", "method.n=256")
+    found = json.loads((out / "transforms.json").read_text())["frames"]
+    assert [Path(frame["file_path"]).stem for frame in found] == ["frame_000000", "frame_000002"]
+    depth, sure = (np.array(Image.open(out / found[0][f"{name}_file_path"])) for name in ("depth", "confidence"))
+    held = (in_metres[0] > 0) & (in_metres[0] < 65.5)
+    assert 0 < held.sum() < (in_metres[0] > 0).sum()
+    assert np.array_equal(depth > 0, held) and np.array_equal(sure > 0, held)
+
+
 def test_two_writers_do_not_share_a_folder(robot, whole, tmp_path, capsys):
     with lock.held(tmp_path / ".set.lock", "out"):
         assert main(["enrich", str(robot), str(tmp_path / "set"), *ASKED]) == 2
@@ -191,6 +283,10 @@ def test_the_whole_is_never_held(tmp_path, monkeypatch):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 0.5 * 60 * len(content)
+    (table,) = (tmp_path / "set" / "data").rglob("*.parquet")
+    counted = parquet.read_table(table, columns=["index", "frame_index", "timestamp"]).to_pydict()
+    assert counted["index"] == counted["frame_index"] == list(range(60)), "over all parts"
+    assert np.allclose(counted["timestamp"], np.arange(60) / 30)
 
 
 # ---------------------------------------------------------------------------------------------------- other sources
@@ -242,6 +338,57 @@ def test_the_record_of_an_episode_is_read_once(tmp_path, monkeypatch):
     assert len(opened) <= 2 + columns, "one a column and group at most, not one a step"
 
 
+class Told(NamedTuple):
+    """Steps of an episode made by hand, as dhtorch.data.rlds_steps.Steps has them."""
+
+    features: dict[str, Described]
+    each: dict[str, list]  # feature → value of every step
+    instruction: str = "language_instruction"
+    n: int = 12
+
+    def values(self, name, steps):
+        found = [self.each[name][i] for i in steps]
+        return np.reshape(found, (len(found), -1)) if self.features[name].kind == "tensor" else found
+
+
+def test_steps_tell_their_time_their_task_and_how_pictures_are_encoded():
+    """Twelve steps, of which eight come together; a feature that is called as a column of every table stands apart."""
+    jpeg, png = b"\xff\xd8\xff\xe0", b"\x89PNG"
+    features = {
+        "language_instruction": Described("text", "string", ()),
+        "timestamp": Described("tensor", "float32", ()),
+        "observation/image_0": Described("image", "uint8", (48, 64, 3)),
+    }
+    each = {
+        "language_instruction": ["reach"] * 9 + ["grasp"] * 3,
+        "timestamp": [100.0 + k for k in range(12)],
+        "observation/image_0": [jpeg, png] * 6,
+    }
+    tasks = ["place", "reach"]  # of an episode before
+    tables = list(StepSet([], [0], 5.0, held={0: Told(features, each)}).batches(0, tasks))
+    found = [row for table in tables for row in table.to_pylist()]
+    assert [table.num_rows for table in tables] == [8, 4]
+    assert [row["timestamp"] for row in found] == pytest.approx([k / 5 for k in range(12)])
+    assert [row["source.timestamp"] for row in found] == each["timestamp"]
+    assert tasks == ["place", "reach", "grasp"] and [row["task_index"] for row in found] == [1] * 9 + [2] * 3
+    ends = [row["observation.images.image_0"]["path"].rpartition(".")[2] for row in found]
+    assert ends == ["jpg", "png"] * 6
+
+
+def test_counts_of_an_episode_are_sums_and_shares_along_it():
+    tally = Tally()
+    for k in range(48):  # two to a part; the second half is all recovered
+        pixels = [6, 0, 2] if k < 24 else [0, 0, 8]
+        row = {"depth": b"x", "pixels": pixels, "silent": [pixels[0], 0], "refuted": 0, "moments": np.ones(25)}
+        tally.add(row)
+    tally.add(None)
+    found = tally.summary()
+    assert found["pixels"].tolist() == [144, 0, 240] and found["silent"].tolist() == [144, 0]
+    assert np.allclose(found["over_time"], [[0.75, 0, 0.25]] * 12 + [[0, 0, 1]] * 12)
+    assert np.allclose(found["silent_over_time"], [[0.75, 0]] * 12 + [[0, 0]] * 12)
+    assert (found["frames"], found["unread"]) == (48, 1)
+
+
 def test_an_episode_of_which_nothing_can_be_read_is_said(tmp_path, capsys):
     source = tmp_path / "source"
     source.mkdir()
@@ -277,6 +424,53 @@ def test_another_camera_of_the_instant_is_another_view():
     assert alone.features["pixels"][2] == 0, "the first frame has nothing before it"
     assert left.features["pixels"][2] > 0 and right.features["pixels"][2] > 0
     assert camera_key(cut.shorter(scenes[1].recording, 2)) == "observation.images.right"
+
+
+@pytest.mark.parametrize(
+    ("name", "key"),
+    [
+        ("image_0", "image_0"),
+        ("observation/image_0", "image_0"),
+        ("observation/images/front", "front"),
+        ("hand/left/rgb", "hand_left_rgb"),
+    ],
+)
+def test_a_camera_of_another_format_is_a_feature_whose_name_is_no_path(name, key):
+    assert camera_feature(name) == f"observation.images.{key}"
+
+
+def test_a_frame_of_another_size_or_lens_than_the_first_is_said():
+    plain = SyntheticRoom(hw=HW, n_frames=1, supersample=1)[0]
+    lens = torch.tensor([[0.1, 0.0, 0.0, 0.0]])
+    frames = [
+        plain,
+        plain.replace(image=plain.image[..., :-8, :]),
+        plain.replace(camera=plain.camera.replace(distortion=lens)),
+        plain,
+    ]
+    scene = Scene(Recording(name="mixed", format="x", load=frames.__getitem__, number=torch.arange(4)))
+    view = View.of(scene, 64)
+    options = {"method": PAPER.replace(n=64), "gap": 1, "step": 0.0, "views": {view.key: view}, "dense": False}
+    made = MapRows([scene], plan.make([scene], 1, 1), columns(pictures=False), **options)
+    said = [made[i].complaint for i in range(4)]
+    assert "picture of 40x64, expected 48x64 as of the first frame" in said[1]
+    assert "expected none as of the first frame" in said[2]
+    assert said[0] == said[3] == ""
+
+
+def test_frames_that_were_skipped_do_not_slow_a_recording_down():
+    number = torch.tensor([0, 2, 4, 5])
+    known = {"name": "a", "format": "x", "load": shots(1).__getitem__, "number": number}
+    assert rate(Recording(**known, times=number.double() / 10)) == 10
+    assert rate(Recording(**known, times=number.double() / 10, rate_hz=15.0)) == 15
+    assert rate(Recording(**known)) == NO_RATE
+
+
+def test_a_row_is_taken_by_its_own_frame_alone():
+    rows = Ahead(iter([{"frame_index": 3}, {"frame_index": 5}]))
+    assert rows.take(2) is None and rows.take(4) is None, "it lies ahead, or behind"
+    assert rows.take(3) == {"frame_index": 3}
+    assert rows.take(5) == {"frame_index": 5} and rows.take(6) is None
 
 
 @pytest.mark.parametrize(

@@ -7,14 +7,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from dhtorch import AUTO, judge
+from dhtorch import AUTO, dense, judge
 from dhtorch.codes import State
 from dhtorch.evaluate.detection import auroc
 from dhtorch.evaluate.holdout import range_split
 from dhtorch.evidence import Said
 from dhtorch.synthetic import SyntheticRoom
 from dhtorch.tree import collate, stack
-from dhtorch.verdict import QUICK, cut, decided, share
+from dhtorch.verdict import QUICK, SENSOR_METRE, TRAJECTORY_METRE, cut, decided, judged, share
 
 RESULTS = Path(__file__).resolve().parents[1] / "benchmarks" / "results"
 NEAR, ANCHOR, OTHERS = 2.0, 5, (0, 2, 8, 11)
@@ -43,6 +43,13 @@ def true(room):
 
 
 @pytest.fixture(scope="module")
+def asked(anchor, others):
+    """What the sparse method makes of the views: the same for every map of the anchor."""
+    trace = {}
+    return dense.views_asked(METHOD(anchor, others, trace=trace), others, trace)
+
+
+@pytest.fixture(scope="module")
 def sound(true, anchor, others):
     return judge(true, anchor, others, **SMALL)
 
@@ -61,6 +68,31 @@ def test_a_true_map_is_consistent_and_its_numbers_hold(sound):
         assert low < 1.02
         assert high > 0.98
     assert sound.shift[0, 1] < 0 < sound.shift[0, 2]
+
+
+@pytest.mark.parametrize(("name", "good_for"), [("scale_near", SENSOR_METRE), ("ruler", TRAJECTORY_METRE)])
+def test_a_metre_is_told_no_closer_than_what_tells_it_is_good_for(name, good_for, sound):
+    """However many points agree: they share one sensor, or one trajectory."""
+    _, low, high = getattr(sound, name)[0]
+    assert math.log(high / low) > 2 * 1.96 * good_for
+
+
+def test_near_and_far_that_contradict_each_other_leave_the_scale_open(true, anchor, asked):
+    found = judged(torch.where(true > NEAR, 1.3 * true, true), anchor, asked, **SMALL, views=False)
+    near, far, both = (x[0].log() for x in (found.scale_near, found.scale_far, found.scale))
+    assert near[2] < far[1]
+    assert near[0] < both[0] < far[0]
+    assert both[2] - both[1] > 5 * (near[2] - near[1]), "agreeing, they would make it narrower than the near alone"
+
+
+@pytest.mark.parametrize("tilt", [0.2, 0.4])
+@pytest.mark.parametrize("side", [-1, -2])
+def test_a_tilt_is_the_error_from_one_side_of_the_picture_to_the_other(side, tilt, true, anchor):
+    n = true.shape[side]
+    place = ((torch.arange(n) + 0.5) / n - 0.5).reshape((n, 1) if side == -2 else (n,))
+    value, low, high = judge((1 + tilt * place) * true, anchor, **SMALL).tilt[0]
+    assert value == pytest.approx(tilt, rel=0.05)
+    assert 0 < low < tilt < high
 
 
 @pytest.mark.parametrize("factor", [1.1, 1 / 1.1])
@@ -167,6 +199,22 @@ def test_maps_of_other_views_see_through_what_stands_too_near(room, true, anchor
     assert (found.by_maps[told & ~inside] < -3).float().mean() < 0.1
 
 
+@pytest.mark.parametrize("fewer", [4, 8])
+def test_coarse_maps_of_other_views_see_through_no_true_outline(fewer, room, true, anchor, asked):
+    """An outline lies anywhere between two of their pixels, and what is before it may be either's."""
+    maps = torch.stack([room.truth(k)["depth"][:, fewer // 2 :: fewer, fewer // 2 :: fewer] for k in OTHERS])
+    assert not (judged(true, anchor, asked, other_maps=maps, **SMALL).by_maps < -3).any()
+
+
+@pytest.mark.parametrize(("n", "good"), [(2, (1,)), (7, (3, 6))])  # more than are looked at, too
+def test_a_view_that_tells_is_named_by_its_place_among_those_offered(n, good, true, anchor, others):
+    blank = torch.full_like(others.image[0], 128)
+    offered = [others[k % len(OTHERS)] for k in range(n)]
+    offered = [view if k in good else view.replace(image=blank) for k, view in enumerate(offered)]
+    found = judge(true, anchor, stack(offered), **SMALL)
+    assert set(found.view.unique().tolist()) == {-2, -1, *good}
+
+
 def test_a_map_that_is_cut_is_wrong_or_unknown_where_it_is(true, anchor, others):
     """A byte in centimetres: nothing is farther than 2.55 m, as windows at the outline of what is near would have it."""
     byte = (true * 100).round().clamp_max(255) / 100
@@ -255,10 +303,36 @@ def test_kinds_of_evidence_that_contradict_each_other_cannot_be_known():
         assert int(decided(*kinds)[0]) == expected
 
 
+def test_what_speaks_loudest_decides_and_of_what_is_fine_the_closest():
+    def said(misfit, sure, view):
+        return Said(torch.tensor([[[misfit]]]), torch.tensor([[[sure]]]), torch.tensor([[[view]]]))
+
+    silent = said(math.nan, False, -2)
+    cases = [
+        ((said(-4.0, True, -1), said(6.0, False, 3), silent), (6.0, 3)),
+        ((said(-4.0, True, -1), said(0.1, False, 3), silent), (-4.0, -1)),
+        ((said(0.5, True, -1), said(0.1, True, 3), said(0.01, False, 2)), (0.1, 3)),
+        ((silent, said(2.5, True, 3), silent), (2.5, 3)),
+    ]
+    for kinds, expected in cases:
+        _, evidence, view = decided(*kinds)
+        assert (float(evidence), int(view)) == (pytest.approx(expected[0]), expected[1])
+    assert int(decided(silent, silent)[2]) == -2
+
+
 def test_a_share_of_few_has_a_wide_interval():
     few, many = (share(torch.tensor([0.1 * n]), torch.tensor([n]))[0] for n in (10.0, 1000.0))
     assert few[1] < many[1] < 0.1 < many[2] < few[2]
     assert share(torch.zeros(1), torch.zeros(1)).isnan().all()
+
+
+@pytest.mark.parametrize("n", [5.0, 50.0])
+def test_none_of_some_may_still_be_a_few(n):
+    """Wilson's interval of none: from 0 to z² / (n + z²), not to 0."""
+    square = 1.96**2
+    none, all_of = (share(torch.tensor([part]), torch.tensor([n]))[0] for part in (0.0, n))
+    torch.testing.assert_close(none, torch.tensor([0.0, 0.0, square / (n + square)]))
+    torch.testing.assert_close(all_of, torch.tensor([1.0, n / (n + square), 1.0]))
 
 
 def test_area_under_the_curve():

@@ -219,6 +219,25 @@ def test_a_fit_moves_a_pixel_no_further_than_a_few_planes(scene, monkeypatch):
     assert float((found.q - start.q).abs().max()) * 23 < stereo.ALL_STEPS + stereo.STEP + stereo.SURFACE
 
 
+@pytest.mark.parametrize(("views", "planes"), [((1,), 1.0), ((0, 1), 0.5)])
+def test_a_view_that_goes_astray_asks_for_no_more_than_a_plane(views, planes, scene, monkeypatch):
+    """The second view asks for a place far away, the first, as sure, for none: they meet in between."""
+    anchor, asked = scene
+    base = sweep.base(*dense.resized(anchor, 80))
+    partners = [dense.partner_of(asked, torch.tensor([v]), 80, torch.tensor([True]), base.image) for v in views]
+    q = torch.linspace(0, 1, 24)[None]
+    start = stereo.Found(torch.full((1, *base.hw), 0.4), torch.zeros(1, *base.hw), torch.tensor(True))
+    even = dict.fromkeys(("contrast", "noise", "correlation"), torch.ones(1, *base.hw))
+
+    def astray(view, f):
+        return f._replace(step=torch.full_like(f.step, 1e4 if view.T_1_from_0.t[0, 0] > 0 else 0.0), **even)
+
+    changed(monkeypatch, astray)
+    with torch.no_grad():
+        found = stereo.fitted(base, partners, start, q, 1)
+    assert float((found.q - start.q).median()) * 23 == pytest.approx(planes * stereo.STEP, rel=1e-3)
+
+
 def test_what_a_motion_does_not_know_of_a_depth_is_its_derivative_along_the_line(scene):
     """How far the depth must go for a pixel to stay where it is seen, for each of six displacements of the pose."""
     anchor, asked = scene

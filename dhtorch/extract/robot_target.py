@@ -331,7 +331,7 @@ class RobotTarget:
             n_tasks=len(tasks),
             robot="unknown" if self.origin is None else self.origin.robot,
         )
-        about["splits"] |= self._splits(owns)
+        about["splits"] = self._splits(owns) or about["splits"]  # beside the origin's, "train: all" would be wrong
         lerobot.write_meta(self.root, self.version, about, episodes, tasks, self._stats(owns, features))
 
     def _stats(self, owns: Sequence[Row], features: Mapping[str, Feature]) -> dict[str, Any]:
