@@ -383,6 +383,7 @@ FOUND = {
 JUDGES = (
     ("judge_study", "judge", "`judge`"),
     ("judge_study_streams", "judge", "`judge`, streams"),
+    ("judge_study_unseen", "judge", "`judge`, rooms"),
     ("judge_study", "quick", "`QUICK`, no pictures"),
     ("judge_study_streams", "quick", "`QUICK`, streams"),
     ("judge_study", "photometric", "photometric check"),

@@ -38,6 +38,8 @@ EXPERIMENTS = {
     "dense": "experiment=dense_comparison data=shared_scenes experiment.anchors=6",
     "judge_study": "experiment=judge_study data=shared_scenes",
     "judge_study_streams": "experiment=judge_study data=streams experiment.rooms=[]",
+    "judge_study_unseen": "experiment=judge_study data=synthetic_seeds data.seed=[25,26,27,28,29] data.n_frames=30 "
+    "experiment.rooms=[]",
     "dense_streams": "experiment=dense_comparison data=streams experiment.anchors=6 experiment.rooms=[]",
     "anchor_study": "experiment=anchor_study data=shared_scenes",
     "anchor_study_streams": "experiment=anchor_study data=streams",
