@@ -49,8 +49,9 @@ NOTHING: Final = 0.3
 #: Depths between which what is off in places is found.
 BINS: Final = 48
 
-#: From how many sigmas on a return is off by more than the map's scatter.
-BEYOND: Final = 2.0
+#: From how many sigmas on a return is off by more than the map's scatter. Beyond two, chance leaves .08 of the variance
+#: of returns with normal noise, all over the map; beyond three, .005.
+BEYOND: Final = 3.0
 
 #: Returns off by more of these levels are no witnesses of what returns have by themselves.
 OUTSIDE: Final = 3.0
