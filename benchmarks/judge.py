@@ -5,9 +5,9 @@
 ``judge_sparse``: :func:`dhtorch.judge` of a map of 640×480 with one other view, by sparse evidence (``views=False``) of
 :data:`dhtorch.verdict.QUICK`, from the frames to the verdict; ``judge_sparse_512`` the same by 512 samples of ``map``,
 and ``judge_views`` asks the pictures of the view as well. Rows of mode ``native`` use the compiled code of ``python -m
-dhtorch.native``. All take turns in one process. The peer needs a motion like
-ours and gets one by the same method. Frames of TUM fr1/desk where DHTORCH_DATA is set, else of the built-in room;
-frames a second are 1000 / ms.
+dhtorch.native``. All take turns in one process, a second or more of frames in a row each, as a data set is judged. The
+peer needs a motion like ours and gets one by the same method. Frames of TUM fr1/desk where DHTORCH_DATA is set, else of
+the built-in room; frames a second are 1000 / ms.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def measure(threads: int, options: Any) -> list[dict[str, Any]]:
     modes = {"eager": ours, "native": harness.natively()(ours)}
     sides = [(name, mode) for mode in modes for name in asked]
     calls = [*(partial(modes[mode], *asked[name]) for name, mode in sides), check]
-    *found, peer = harness.in_turn(calls, repeats=options.repeats, clock=options.clock)
+    *found, peer = harness.in_turn(calls, repeats=options.repeats, clock=options.clock, least_ms=1000.0)
     return [
         harness.row(name, times, "photometric", peer, n=asked[name][0].n, mode=mode)
         for (name, mode), times in zip(sides, found, strict=True)

@@ -500,7 +500,8 @@ TABLES |= {
     "clients": clients,
     "anchor": partial(
         anchored,
-        *("anchor_study", "anchor_study_streams", "anchor_study_rooms", "anchor_study_unseen", "anchor_study_unseen_2"),
+        *("anchor_study", "anchor_study_streams", "anchor_study_rooms"),
+        *("anchor_study_unseen", "anchor_study_unseen_2", "anchor_study_unseen_3"),
     ),
 }
 TABLES |= {"every pixel": partial(every_pixel, "dense", "dense_streams")}

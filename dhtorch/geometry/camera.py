@@ -161,7 +161,7 @@ def undistort(camera: Camera, uv: Tensor, *, iterations: int = 12) -> Tensor:
     target = _planes(_normalised(camera, uv))
     with torch.no_grad():
         xy = _solved(camera.distortion, target.detach(), iterations)
-        miss = (_bent(camera.distortion, xy.movedim(0, -1)) - target.movedim(0, -1)).abs().amax(-1)
+        miss = (_distort(camera.distortion, xy)[0] - target).abs().amax(0)
         # A pixel counts as solved when it returns to itself within a hundredth of a pixel, at any focal length.
         solved = miss * camera.f.amax(-1)[:, None] < 0.01
         start = torch.where(solved, xy, 0.0)

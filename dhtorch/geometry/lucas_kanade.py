@@ -24,7 +24,6 @@ from typing import Any, NamedTuple
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch.utils import _pytree as pytree
 
 from dhtorch import native
 from dhtorch.geometry.exact import CHUNK, LANES
@@ -190,8 +189,15 @@ def for_some(wanted: Tensor, fn: Callable, values: tuple[Tensor, ...], columns: 
     if not len(some):
         return values
     some = _whole_lanes(some)
-    new = fn(*pytree.tree_map(lambda column: column.index_select(-1, some), columns))
+    new = fn(*(_picked(column, some) for column in columns))
     return tuple(old.index_copy(-1, some, n) for old, n in zip(values, new, strict=True))
+
+
+def _picked(column: Any, some: Tensor) -> Any:
+    """Points of a tensor (..., M), or of each in a named tuple of them."""
+    if isinstance(column, Tensor):
+        return column.index_select(-1, some)
+    return type(column)(*(_picked(part, some) for part in column))
 
 
 def _whole_lanes(index: Tensor) -> Tensor:

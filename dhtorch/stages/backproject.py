@@ -237,9 +237,21 @@ def _extremes(window: Tensor) -> tuple[Tensor, Tensor]:
 
 def _whole_extremes(depth: Tensor, size: int) -> tuple[Tensor, Tensor]:
     """What :func:`_extremes` finds around every pixel (B, h, w) of a map."""
-    depth = depth.detach().nan_to_num(0, 0, 0)
-    none = torch.nn.functional.threshold(depth, 0.0, torch.inf)
-    return extreme(none, size // 2, torch.minimum), extreme(depth, size // 2, torch.maximum)
+    low, high = [], []
+    for inside, around in _rows(depth.shape[1], size // 2):
+        some = depth[:, around].detach().nan_to_num(0, 0, 0)
+        none = torch.nn.functional.threshold(some, 0.0, torch.inf)
+        low.append(extreme(none, size // 2, torch.minimum)[:, inside])
+        high.append(extreme(some, size // 2, torch.maximum)[:, inside])
+    return torch.cat(low, 1), torch.cat(high, 1)
+
+
+def _rows(height: int, radius: int) -> Iterator[tuple[slice, slice]]:
+    """Some rows after the other: those of the picture that are read for them, and where they are among these."""
+    for first in range(0, height, ROWS):
+        top = max(first - radius, 0)
+        last = min(first + ROWS, height)
+        yield slice(first - top, last - top), slice(top, last + radius)
 
 
 def _nearest_return(depth: Tensor, place: Tensor, size: int, search_px: int) -> Tensor:
@@ -289,13 +301,10 @@ def _brightness(patch: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 def _whole_brightness(image: Tensor, size: int) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
     """What :func:`_brightness` finds around every pixel (B, H, W) of pictures of bytes, whose sums are exact in
     whatever order they are taken; some rows after the other, which need no fresh memory."""
-    radius, H = size // 2, image.shape[-2]
-    for first in range(0, H, ROWS):
-        last = min(first + ROWS, H)
-        top = max(first - radius, 0)
-        around = image[..., top : last + radius, :].to(torch.int16).flatten(0, 1)
-        total = window_sum(around, radius)[:, first - top : last - top].unflatten(0, image.shape[:2])
-        planes = image[..., first:last, :].contiguous()
+    for inside, around in _rows(image.shape[-2], size // 2):
+        some = image[..., around, :]
+        total = window_sum(some.to(torch.int16).flatten(0, 1), size // 2)[:, inside].unflatten(0, image.shape[:2])
+        planes = some[..., inside, :].contiguous()
         mean, centre = (luma(x, 1)[:, 0] for x in (total.float() / size**2, planes.float()))
         yield mean, centre, planes.amax(1).float(), planes.amin(1).float()
 
