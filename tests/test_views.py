@@ -170,6 +170,16 @@ def test_what_is_no_return_is_zero():
             assert found.sum() == found[0, 1, 1] == 0.5 and whole[0, 0] == -7 and whole[1, 1] == 500
 
 
+@pytest.mark.parametrize("kind", [np.uint16, np.int16, np.int32])
+def test_whole_depths_are_single_precision_whatever_type_tensors_have_by_default(kind):
+    torch.set_default_dtype(torch.float64)
+    try:
+        found = Views(depth_unit="mm").metres([torch.from_numpy(np.full((H, W), 500, kind))])
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert found.dtype == torch.float32 and (found == 0.5).all()
+
+
 def test_the_depth_range_is_open_below_and_closed_above():
     depth = np.full((H, W), 1.5, np.float32)
     depth[0] = [0.5, 0.5001, 1.0, 2.0, 2.0001, 0.0, 3.0, 0.1]

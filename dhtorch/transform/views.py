@@ -173,7 +173,7 @@ class Views:
         if len(words) < len(maps):
             z = self._scaled(torch.stack(list(maps)) if len(maps) > 1 else maps[0][None])
         else:
-            z = torch.empty(len(maps), *maps[0].shape, device=maps[0].device)
+            z = torch.empty(len(maps), *maps[0].shape, dtype=torch.float32, device=maps[0].device)
             unit = UNITS[self.depth_unit] if isinstance(self.depth_unit, str) else 0.0
             compiled = unit > 0 and native.serves(*words)
             for into, read, x in zip(z, words, maps, strict=True):
