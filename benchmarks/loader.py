@@ -12,7 +12,8 @@ Bars are about rows without workers (``workers0``).
 ``peer_ms`` is what two workers would take per sample if the transform scaled from one worker to two as the plain
 loader does. In ``step`` rows the transform alone stands beside a forward pass of DINOv2 (random weights).
 
-Pairs of TUM fr1/desk where DHTORCH_DATA is set, else of the built-in room; every process uses one thread.
+Pairs of TUM fr1/desk where DHTORCH_DATA is set, else of the built-in room; every process, that without workers too, is
+set up by ``one_thread``: one thread, and what is freed is kept.
 """
 
 from __future__ import annotations
@@ -224,7 +225,7 @@ def main() -> None:
     arguments.add_argument("--samples", type=int, default=512, help="points per image")
     arguments.add_argument("--workers", type=int, nargs="+", help="instead of 0 1 2")
     options = arguments.parse_args()
-    harness.set_threads(1)
+    one_thread()  # as a worker is set up, and what is measured without workers, too
     counts = options.workers or ([0, 1, 2, 4] if options.full else [0, 1, 2])
     modes = [(size, mode) for size in SIZES for mode in ("single", "pair")]
     benches = [Bench(*each, options.samples, options.repeats, options.clock) for each in modes]

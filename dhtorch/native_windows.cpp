@@ -14,6 +14,9 @@
 
 namespace {
 
+// Bytes that come near the processor together, and how many such lines can be read in a row while one is waited for.
+constexpr int64_t LINE = 64, FAR = 8;
+
 // Rows of a window, with room for the lanes that are computed beside it.
 constexpr int64_t WIDE = 16, ROOM = WIDE + 2;
 
@@ -345,6 +348,16 @@ std::unique_ptr<float[]> grey_picture(const uint8_t* at, const Windows& w) {
 }
 #endif
 
+// Read an image in the order in which it lies, which brings it near the processor several times as fast as its windows would
+// come one by one; where so few rows of windows are asked that they take less, nothing.
+template <typename T>
+inline void bring_near(const T* from, int64_t count, const Windows& w) {
+  const int64_t bytes = count * static_cast<int64_t>(sizeof(T));
+  if (w.n * w.size * FAR * LINE < bytes) return;
+  const volatile uint8_t* at = reinterpret_cast<const uint8_t*>(from);
+  for (int64_t k = 0; k < bytes; k += LINE) (void)at[k];
+}
+
 // Calls `each` with every window and a place in `kept`, and writes the textures (B, N) of as many as that holds at once.
 template <typename Each>
 void textures(const Windows& w, float unit, float* to, const Each& each) {
@@ -365,6 +378,7 @@ void window_texture(Tensor picture, Tensor pixel, Tensor found, int64_t image, i
   const Windows w = of_picture(windows(pixel, image, channel, row, column, channels, height, width, size), from);
   for (int64_t b = 0; b < w.batch; ++b) {
     float* to = data<float>(found) + b * w.n;
+    bring_near(from + b * image, image, w);
 #ifdef DHTORCH_SHUFFLES
     if (whole && size == 9) {
       const std::unique_ptr<float[]> grey = grey_picture(from + b * image, w);
@@ -474,6 +488,8 @@ void say(const float* map, const uint8_t* levels, const Windows& returns, const 
   const int64_t h = returns.height, w = returns.width;
   const float* end = map + returns.batch * h * w;
   for (int64_t b = returns.batch; b-- > 0;) {  // the last picture was collated just now, the first one's textures are next
+    bring_near(map + b * h * w, h * w, returns);
+    bring_near(picture + b * seen.image, seen.image, seen);
     for (int64_t k = 0; k < returns.n; ++k) {
       const int64_t i = b * returns.n + k;
       const int32_t* place = returns.pixel + 2 * i;

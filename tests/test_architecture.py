@@ -12,7 +12,7 @@ import dhtorch
 
 ROOT = Path(dhtorch.__file__).parent
 LEVELS = [
-    {"tree", "codes", "storage", "closure", "archive", "older", "console", "leash", "lock", "native"},
+    {"tree", "codes", "storage", "closure", "archive", "older", "console", "leash", "lock", "memory", "native"},
     {"geometry"},
     {"records", "drawing"},
     {"stages", "data", "evaluate", "export", "synthetic", "testing", "calibration", "anchors"},

@@ -28,6 +28,7 @@ import dhtorch
 from dhtorch import console, leash, lock
 from dhtorch.commands import errors, signals, together, words
 from dhtorch.commands.words import quote
+from dhtorch.memory import keep_freed
 
 #: Sub-command → module with ``main(argv) -> int``.
 COMMANDS = {"inspect": "dhtorch.commands.inspect", "report": "dhtorch.studies.report"}
@@ -96,6 +97,7 @@ def main(argv: list[str] | None = None) -> int:
     """Entry point of the console script; returns the exit code."""
     argv = sys.argv[1:] if argv is None else argv
     flags, argv = [a for a in argv if a in console.FLAGS], [a for a in argv if a not in console.FLAGS]
+    keep_freed()  # frame after frame asks for the same memory
     with console.neutral(), console.speaking(flags), console.hushed():
         with signals.ending() as told:
             code = _outcome(argv)

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset, IterableDataset, default_collate
 
+from dhtorch.memory import keep_freed
 from dhtorch.transform.extend_depth import ExtendDepth
 from dhtorch.transform.leaves import SampleError, find, has, to_tensor, without
 
@@ -217,8 +218,13 @@ def collate_kept(samples: Sequence[dict[str, Any] | None]) -> dict[str, Any]:
 
 
 def one_thread(worker: int = 0) -> None:
-    """One thread for torch and OpenCV: the ``worker_init_fn`` of a data loader. Workers are the parallelism there."""
+    """One thread for torch and OpenCV: the ``worker_init_fn`` of a data loader. Workers are the parallelism there.
+
+    A worker also keeps what it frees, where that can be asked for (:func:`dhtorch.memory.keep_freed`): its next batch
+    asks for the same memory.
+    """
     torch.set_num_threads(1)
+    keep_freed()
     opencv = sys.modules.get("cv2")
     if opencv is not None:
         opencv.setNumThreads(0)  # 1 would wait for the threads of the pool, which a forked worker does not have

@@ -1,0 +1,70 @@
+"""Memory that a process keeps: asked for again, it does not come from the system page by page."""
+
+import platform
+import subprocess
+import sys
+
+import pytest
+
+from dhtorch import memory
+
+glibc = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library has no such setting")
+
+ASKED = """
+import resource, sys, torch
+from dhtorch.memory import keep_freed
+from dhtorch.transform import one_thread
+
+def faults(mebibytes):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    blocks = [torch.ones(mebibytes << 18) for _ in range(3)]
+    del blocks
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+asked = {"nothing": lambda: None, "keep": keep_freed, "worker": one_thread}[sys.argv[1]]()
+for size in (1, 8, 64):
+    faults(size)
+print(asked, *(faults(size) for size in (1, 8, 64)))
+"""
+
+
+def said(how, **env):
+    done = subprocess.run(
+        [sys.executable, "-c", ASKED, how], env={**clean(), **env}, capture_output=True, text=True, check=True
+    )
+    asked, *counts = done.stdout.split()
+    return asked, [int(n) for n in counts]
+
+
+def clean():
+    return {k: v for k, v in memory.os.environ.items() if k not in memory.SETTINGS}
+
+
+@glibc
+def test_what_is_freed_is_not_asked_for_again():
+    _, given_back = said("nothing")
+    asked, kept = said("keep")
+    assert given_back[2] > 5000, "else this test would tell nothing"
+    assert asked == "True" and max(kept) < given_back[2] / 5  # blocks may come to lie elsewhere than before
+    assert max(said("worker")[1]) < given_back[2] / 5
+
+
+@glibc
+@pytest.mark.parametrize("name", ["MALLOC_TRIM_THRESHOLD_", "GLIBC_TUNABLES"])
+def test_what_the_environment_says_stands(name):
+    value = "glibc.malloc.trim_threshold=131072" if name == "GLIBC_TUNABLES" else "131072"
+    asked, counts = said("keep", **{name: value})
+    assert asked == "False" and counts[2] > 1000
+
+
+def test_another_allocator_is_left_alone(monkeypatch):
+    for name in memory.SETTINGS:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(memory.ctypes, "CDLL", lambda _: object())
+    assert memory.keep_freed() is False
+
+    def missing(_):
+        raise OSError("no such library")
+
+    monkeypatch.setattr(memory.ctypes, "CDLL", missing)
+    assert memory.keep_freed() is False
