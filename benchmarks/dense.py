@@ -5,8 +5,7 @@
 Ours is ``dense.swept`` with one other view and 96 planes, motions known, from the frames to the map; the peer is
 ``cv2.stereoRectify``, both maps and pictures, and ``cv2.StereoSGBM`` with 96 disparities in MODE_HH4, from grey
 pictures to disparities, without reading them back into the view. Frames of the built-in room at 640×480, and at
-1440×1920 with ``size=640``, where the peer's pictures are made as small. Both sides take turns in one process. Rows with ``kept`` are measured again
-after ``dhtorch.memory.keep_freed``: no side then waits for the system's pages.
+1440×1920 with ``size=640``, where the peer's pictures are made as small. Both sides take turns in one process.
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ import torch
 
 from dhtorch import MAP, dense
 from dhtorch.evaluate.holdout import range_split
-from dhtorch.memory import keep_freed
 from dhtorch.records import Frame
 from dhtorch.studies.baselines import stereo
 from dhtorch.synthetic import SyntheticRoom
@@ -29,7 +27,7 @@ from dhtorch.synthetic import SyntheticRoom
 SIZES, VIEWS, NEAR = ((480, 640), (1440, 1920)), (1, 9), 2.0
 
 
-def measure(hw: tuple[int, int], threads: int, options: Any, suffix: str = "") -> list[dict[str, Any]]:
+def measure(hw: tuple[int, int], threads: int, options: Any) -> list[dict[str, Any]]:
     """The sweep beside its peer: in torch, and with compiled code."""
     harness.set_threads(threads)
     room = SyntheticRoom(n_frames=max(VIEWS) + 1, hw=hw, depth_hw=(192, 256))
@@ -55,7 +53,7 @@ def measure(hw: tuple[int, int], threads: int, options: Any, suffix: str = "") -
 
     a, b, c = harness.in_turn([ours, peer, harness.natively()(ours)], repeats=options.repeats, clock=options.clock)
     more: dict[str, Any] = {"n": size[0] * size[1], "bar": True}
-    name, other_side = f"sweep_{hw[1]}x{hw[0]}{suffix}", "rectify + SGBM"
+    name, other_side = f"sweep_{hw[1]}x{hw[0]}", "rectify + SGBM"
     return [
         harness.row(name, a, other_side, b, **more),
         harness.row(name, c, other_side, b, mode="native", **more),
@@ -79,8 +77,6 @@ def main() -> None:
     """Print the table; write it with ``--json``."""
     options = harness.arguments(__doc__ or "").parse_args()
     rows = [row for hw in SIZES for row in measure(hw, 1, options)]
-    if keep_freed():
-        rows += [row for hw in SIZES for row in measure(hw, 1, options, "_kept")]
     print(f"milliseconds, medians of {options.repeats}")
     harness.report(rows, options.json)
 

@@ -22,6 +22,7 @@ import cv2
 import torch
 
 from dhtorch import archive, native, storage
+from dhtorch.memory import keep_freed
 
 #: Clocks by name: what a wall shows, or (on a busy machine) the time this process was really given.
 CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
@@ -147,6 +148,14 @@ class _Held(argparse.Action):
             os.execve(sys.executable, [sys.executable, *sys.argv], {**os.environ, **AVX2})
 
 
+class _Kept(argparse.Action):
+    """What is freed, by whichever side, stays with this process (:mod:`dhtorch.memory`)."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        if not keep_freed():
+            parser.error("found an allocator that keeps what it likes, expected glibc's without settings of its own")
+
+
 def arguments(description: str) -> argparse.ArgumentParser:
     """The options every script has."""
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -155,6 +164,7 @@ def arguments(description: str) -> argparse.ArgumentParser:
     parser.add_argument("--repeats", type=int, default=15)
     parser.add_argument("--clock", choices=[*CLOCKS], default="wall", help="cpu: on a machine that others use too")
     parser.add_argument("--avx2", action=_Held, nargs=0, help="torch, oneDNN, MKL and OpenCV without AVX-512")
+    parser.add_argument("--kept", action=_Kept, nargs=0, help="what is freed stays with the process")
     parser.add_argument("--device", default="cpu", help="cpu, or cuda where the script knows how")
     return parser
 

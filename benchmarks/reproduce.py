@@ -107,13 +107,14 @@ SCRIPTS |= {
     "clients": "",  # interpreters of the loaders in DHTORCH_CLIENTS
 }
 
-#: Speeds again with the vectors of processors that lack AVX-512.
-AVX2 = ("lk", "pair", "dense_speed")
-SCRIPTS |= {f"{name}_avx2": f"--avx2 {SCRIPTS[name]}".strip() for name in AVX2}
+#: Speeds again: with the vectors of processors that lack AVX-512, and where freed memory stays with the process, as in
+#: a worker (in which the loader is measured anyway).
+AGAIN = {"avx2": ("frontend", "lk", "pnp", "pair", "loader", "dense_speed"), "kept": ("lk", "pair", "dense_speed")}
+SCRIPTS |= {f"{name}_{how}": f"--{how} {SCRIPTS[name]}".strip() for how, names in AGAIN.items() for name in names}
 
 #: Scripts of another name than their result: ``kornia.py`` would be imported instead of the library.
 NAMED = {"kornia": "beside_kornia", "dense_speed": "dense", "clients": "clients/all", "judge_speed": "judge"}
-NAMED |= {f"{name}_avx2": NAMED.get(name, name) for name in AVX2}
+NAMED |= {f"{name}_{how}": NAMED.get(name, name) for how, names in AGAIN.items() for name in names}
 
 #: Options that change no number, and which a file may hold otherwise.
 ASIDE = {"figures", "traceback", "root"}

@@ -43,6 +43,7 @@ BARS = (
     ("lk", "lk_w21_n2048", "native", 1.3, "search there, n = 2048"),
     ("lk", "lk_w21_n512_b8", "native", 1.3, "search there, n = 512, B = 8"),
     ("lk", "lk_fb_w21_n2048", "native", 1.2, "search there and back, n = 2048"),
+    ("pair", "pair_paper_b1", "native", 1.3, "`paper`, whole pair, B = 1"),
     ("pair", "pair_paper_b8", "native", 1.0, "`paper`, whole pair, B = 8"),
     ("pair", "pair_map_b1", "native", 2.0, "`map`, whole pair, B = 1"),
     ("pair", "pair_map_b8", "native", 1.3, "`map`, whole pair, B = 8"),
@@ -61,9 +62,10 @@ SCRIPTS = ("frontend", "lk", "pnp", "triangulate", "pair", "loader", "judge_spee
 
 
 def timings(file: str) -> list[dict[str, Any]]:
-    """Rows of a benchmark's result file; none where it was not made with AVX2 alone."""
+    """Rows of a benchmark's result file; none where it was not made again otherwise."""
     path = RESULTS / f"{file}.json"
-    rows: list[dict[str, Any]] = [] if file.endswith("_avx2") and not path.is_file() else json.loads(path.read_text())
+    again = file.endswith(("_avx2", "_kept"))
+    rows: list[dict[str, Any]] = [] if again and not path.is_file() else json.loads(path.read_text())
     return rows
 
 
@@ -98,20 +100,22 @@ def _barred(file: str, name: str, mode: str) -> dict[str, Any] | None:
 
 
 def bars() -> str:
-    """Each speed that has a bar, one thread, beside that bar; last its ratio without vectors wider than AVX2's."""
+    """Each speed that has a bar, one thread, beside that bar; last its ratio without vectors wider than AVX2's, and
+    where freed memory is kept."""
     rows = []
     for file, name, mode, bar, words in BARS:
-        r, slower = _barred(file, name, mode), _barred(f"{file}_avx2", name, mode)
+        r, *again = (_barred(f"{file}{how}", name, mode) for how in ("", "_avx2", "_kept"))
         called = words if mode == "eager" else f"{words}, {mode}"
         if r is None:
-            rows.append([called, "–", "–", "–", f"≤ {bar:g}", "not measured", "–", "–", "–"])
+            rows.append([called, "–", "–", "–", f"≤ {bar:g}", "not measured", "–", "–", "–", "–"])
             continue
         cells = [called, f"{r['ours_ms']:.2f}", f"{r['peer_ms']:.2f}"]
         verdict = "met" if r["ratio"] <= bar else "missed"
         maker = f"{r['processor'].partition('(')[0].partition(',')[0]}, {r.get('git') or 'earlier code'}"
-        narrow = "–" if slower is None else ratio(slower["ratio"])
-        rows.append([*cells, ratio(r["ratio"]), f"≤ {bar:g}", verdict, errors(r), maker, narrow])
-    head = ["", "ours, ms", "peer, ms", "ratio", "bar", "", "errors, ours / peer", "on, code of", "ratio held to AVX2"]
+        others = ["–" if other is None else ratio(other["ratio"]) for other in again]
+        rows.append([*cells, ratio(r["ratio"]), f"≤ {bar:g}", verdict, errors(r), maker, *others])
+    head = ["", "ours, ms", "peer, ms", "ratio", "bar", "", "errors, ours / peer", "on, code of"]
+    head += ["ratio held to AVX2", "memory kept"]
     return text.grid(Table("", head, rows))
 
 

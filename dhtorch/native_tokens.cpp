@@ -93,11 +93,13 @@ void probe(Tensor depth, Tensor counts, int64_t step, double low, double high) {
   const float least = low, most = high, *z = data<float>(depth);
   int64_t *some = data<int64_t>(counts), *sound = some + batch;
   for (int64_t b = 0; b < batch; ++b, z += all) {
-    some[b] = sound[b] = 0;
-    for (int64_t k = 0; k < all; k += step) {
-      some[b] += z[k] > 0;
-      sound[b] += z[k] > least && z[k] < most;
+    int64_t positive = 0, between = 0;
+    for (int64_t k = 0; k < all; k += step) {  // no branch that would wait for the number before
+      positive += z[k] > 0;
+      between += (z[k] > least) & (z[k] < most);
     }
+    some[b] = positive;
+    sound[b] = between;
   }
 }
 

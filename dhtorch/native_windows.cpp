@@ -424,16 +424,17 @@ void places(Tensor uv, Tensor f, Tensor c, Tensor map_f, Tensor map_c, Tensor pi
   const float *own_focal = own ? data<float>(map_f) : focal, *own_centre = own ? data<float>(map_c) : centre;
   int32_t *pixels = data<int32_t>(pixel), *map = data<int32_t>(at);
   float* rays = data<float>(ray);
-  for (int64_t i = 0; i < batch * n; ++i) {
-    for (int64_t k = 0; k < 2; ++k) {
-      const float x = from[2 * i + k];
-      const int64_t of = 2 * (i / n) + k;
-      pixels[2 * i + k] = pixel_of(x);
-      const float scaled = same ? x : (x + 0.5f) * scale[k] - 0.5f;
-      map[2 * i + k] = pixel_of(own ? (x - centre[of]) / focal[of] * own_focal[of] + own_centre[of] : scaled);
-      rays[3 * i + k] = ((std::isfinite(x) ? x : 0.0f) - centre[of]) / focal[of];
+  for (int64_t b = 0, i = 0; b < batch; ++b, focal += 2, centre += 2, own_focal += 2, own_centre += 2) {
+    for (const int64_t end = i + n; i < end; ++i) {
+      for (int64_t k = 0; k < 2; ++k) {
+        const float x = from[2 * i + k];
+        pixels[2 * i + k] = pixel_of(x);
+        const float scaled = same ? x : (x + 0.5f) * scale[k] - 0.5f;
+        map[2 * i + k] = pixel_of(own ? (x - centre[k]) / focal[k] * own_focal[k] + own_centre[k] : scaled);
+        rays[3 * i + k] = ((std::isfinite(x) ? x : 0.0f) - centre[k]) / focal[k];
+      }
+      rays[3 * i + 2] = 1.0f;
     }
-    rays[3 * i + 2] = 1.0f;
   }
 }
 
