@@ -154,10 +154,10 @@ def test_every_sample_is_what_a_loop_says(options):
     assert len(seen) >= 6 and len(found.confidence.unique()) >= 4
 
 
-@pytest.mark.parametrize(("interleaved", "rows"), [(False, 64), (True, 64), (False, 7)])
-def test_all_pixels_at_once_are_told_bit_for_bit_what_a_few_are(interleaved, rows, monkeypatch):
+@pytest.mark.parametrize(("interleaved", "pixels"), [(False, 1 << 17), (True, 1 << 17), (False, 700)])
+def test_all_pixels_at_once_are_told_bit_for_bit_what_a_few_are(interleaved, pixels, monkeypatch):
     """So many are read from windows of the whole picture and map, some rows after the other; a few from patches."""
-    monkeypatch.setattr("dhtorch.stages.backproject.ROWS", rows)
+    monkeypatch.setattr("dhtorch.geometry.neighbours.BAND", pixels)
     frame = frames(dtype=torch.float32)
     image = (255 * frame.image).round().to(torch.uint8)
     frame = frame.replace(image=image.to(memory_format=torch.channels_last) if interleaved else image)

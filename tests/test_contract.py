@@ -514,6 +514,7 @@ ELSEWHERE = {
     "dhtorch.geometry.graphless.spared",
     "dhtorch.geometry.least_squares.has_graph",
     "dhtorch.geometry.near_far.squares_at",
+    "dhtorch.geometry.neighbours.bands",
     "dhtorch.geometry.p3p.p3p_of_planes",
     *(f"dhtorch.stages.sample.{name}" for name in ("spiral", "vogel", "grid")),
     *(

@@ -7,7 +7,7 @@ import pytest
 import torch
 from by_hand import levels as levels_by_hand
 
-from dhtorch.geometry import pyramid as module
+from dhtorch.geometry import neighbours
 from dhtorch.geometry.pyramid import GRAD_X, GRAD_Y, GREY, MARGIN, REACH, build_pyramid
 
 
@@ -18,7 +18,7 @@ def noise(B, C, H, W, seed=0, dtype=torch.float64):
 @pytest.mark.parametrize("hw", [(60, 81), (53, 64), (47, 47)])
 @pytest.mark.parametrize("band", [1 << 17, 500, 1])
 def test_levels_are_opencvs_mirrored_beyond_the_border_with_scharrs_gradients(hw, band, monkeypatch):
-    monkeypatch.setattr(module, "BAND", band)
+    monkeypatch.setattr(neighbours, "BAND", band)
     image = noise(2, 1, *hw)
     found = build_pyramid(image, 3, 7)
     assert found.pad == 7 // 2 + REACH and len(found.levels) == 3

@@ -70,9 +70,9 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_appearance", "mean <= limits.dark * white", "mean < limits.dark * white"),
         ("_appearance", "0.15 * top", "0.15 * white"),
         ("_appearance", "1 if image.is_floating_point() else 255", "1 if image.is_floating_point() else 256"),
-        ("_rows", "max(first - radius, 0)", "first"),
-        ("_rows", "slice(top, last + radius)", "slice(top, last)"),
-        ("_rows", "slice(first - top, last - top)", "slice(0, last - first)"),
+        ("_around", "max(part.start - radius, 0)", "part.start"),
+        ("_around", "slice(top, part.stop + radius)", "slice(top, part.stop)"),
+        ("_around", "slice(part.start - top, part.stop - top)", "slice(0, part.stop - part.start)"),
     ],
     "stages.holes": [
         (

@@ -145,13 +145,6 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_add_gradients", "slope = below - above", "slope = above - below"),
         ("_add_gradients", "torch.add(here * (10 / 32)", "torch.add(here * (2 / 32)"),
         ("_add_gradients", "border.zero_()", "pass"),
-        ("_bands", "min(top + rows, h)", "min(top + rows, h - 1)"),
-        (
-            "_bands",
-            "torch.compiler.is_compiling() or (image",
-            "(image",
-            "which rows are worked on at once changes no number",
-        ),
     ],
     "geometry.filters": [
         ("separable", "(k, k, i, i)", "(i, i, k, k)"),

@@ -12,6 +12,18 @@ from torch import Tensor
 
 from dhtorch import native
 
+#: Pixels that are worked on at once: few enough to stay in the cache, and to need no fresh memory.
+BAND = 1 << 17
+
+
+def bands(image: Tensor, hw: tuple[int, ...]) -> list[slice]:
+    """Rows of maps of size ``hw``, made from pictures (B, ...), to be worked on at once; all of them where a graph or a
+    compiler would have to carry each."""
+    h, w = hw
+    whole = torch.compiler.is_compiling() or (image.requires_grad and torch.is_grad_enabled())
+    rows = h if whole else max(BAND // max(len(image) * w, 1), 1)
+    return [slice(top, min(top + rows, h)) for top in range(0, h, rows)]
+
 
 def window_sum(x: Tensor, radius: int) -> Tensor:
     """Sum (B, h, w) of the (2 radius + 1)² pixels around each, the border's repeated outside. Gradient: to x."""

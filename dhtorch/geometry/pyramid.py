@@ -17,6 +17,7 @@ from torch import Tensor
 from dhtorch import native
 from dhtorch.geometry import filters
 from dhtorch.geometry.lookup import windows
+from dhtorch.geometry.neighbours import bands
 from dhtorch.geometry.shapes import check
 
 #: Padding beyond half a window: how far from a pixel of the image (or of ``MARGIN`` around it) a search may look.
@@ -24,9 +25,6 @@ REACH = 8
 
 #: How far outside the image the middle of a window may lie, px of the level.
 MARGIN = 4
-
-#: Pixels that are worked on at once: few enough to stay in the cache, and to need no fresh memory.
-BAND = 1 << 17
 
 #: Planes of a level.
 GREY, GRAD_X, GRAD_Y = 0, 1, 2
@@ -186,19 +184,11 @@ def _fill(level: Tensor, pad: int, image: Tensor, below: Tensor | None) -> None:
     """Fill a padded level of ``image``, of whose own pixels it is made, or of those of the level ``below`` it."""
     grey = level[:, GREY : GREY + 1]
     inside = grey[..., pad:-pad, pad:-pad]
-    for part in _bands(image, inside.shape[-2:]):
+    for part in bands(image, inside.shape[-2:]):
         inside[..., part, :] = filters.grey(image[..., part, :]) if below is None else _half(below, pad, part)
     _mirror(grey, pad)
     if level.shape[1] > 1:
         _add_gradients(level, pad, image)
-
-
-def _bands(image: Tensor, hw: tuple[int, ...]) -> list[slice]:
-    """Rows of a level to be worked on at once; all of them where a graph or a compiler would have to carry each."""
-    h, w = hw
-    whole = torch.compiler.is_compiling() or (image.requires_grad and torch.is_grad_enabled())
-    rows = h if whole else max(BAND // max(len(image) * w, 1), 1)
-    return [slice(top, min(top + rows, h)) for top in range(0, h, rows)]
 
 
 def _half(level: Tensor, pad: int, part: slice) -> Tensor:
@@ -235,7 +225,7 @@ def _add_gradients(level: Tensor, pad: int, image: Tensor) -> None:
     for border in (planes[..., :pad, :], planes[..., -pad:, :], planes[..., :pad], planes[..., -pad:]):
         border.zero_()
     rows, width = grey.shape[-2:]
-    for part in _bands(image, (rows - 2 * pad, width)):
+    for part in bands(image, (rows - 2 * pad, width)):
         top, bottom = part.start + pad, part.stop + pad
         above, here, below = (grey[..., top + k : bottom + k, pad - 1 : width - pad + 1] for k in (-1, 0, 1))
         across = torch.add(here * (10 / 32), above + below, alpha=3 / 32)

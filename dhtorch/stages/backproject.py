@@ -25,15 +25,12 @@ from dhtorch.geometry.lookup import (
     summarise,
     whole_is_faster,
 )
-from dhtorch.geometry.neighbours import extreme, window_sum
+from dhtorch.geometry.neighbours import bands, extreme, window_sum
 from dhtorch.geometry.shapes import check
 from dhtorch.records import Frame, Samples
 
 #: Search radius in a sparse depth map, px: the truth test reads sparse returns in 7×7 windows, so do the samples.
 SPARSE_SEARCH_PX = 3
-
-#: Rows of a picture that are looked at together where all of its pixels are.
-ROWS = 64
 
 #: Side of the neighbourhood that appearance and depth edges are judged on, px.
 NEIGHBOURHOOD = 5
@@ -238,7 +235,7 @@ def _extremes(window: Tensor) -> tuple[Tensor, Tensor]:
 def _whole_extremes(depth: Tensor, size: int) -> tuple[Tensor, Tensor]:
     """What :func:`_extremes` finds around every pixel (B, h, w) of a map."""
     low, high = [], []
-    for inside, around in _rows(depth.shape[1], size // 2):
+    for inside, around in _around(depth, size // 2):
         some = depth[:, around].detach().nan_to_num(0, 0, 0)
         none = torch.nn.functional.threshold(some, 0.0, torch.inf)
         low.append(extreme(none, size // 2, torch.minimum)[:, inside])
@@ -246,12 +243,11 @@ def _whole_extremes(depth: Tensor, size: int) -> tuple[Tensor, Tensor]:
     return torch.cat(low, 1), torch.cat(high, 1)
 
 
-def _rows(height: int, radius: int) -> Iterator[tuple[slice, slice]]:
-    """Some rows after the other: those of the picture that are read for them, and where they are among these."""
-    for first in range(0, height, ROWS):
-        top = max(first - radius, 0)
-        last = min(first + ROWS, height)
-        yield slice(first - top, last - top), slice(top, last + radius)
+def _around(image: Tensor, radius: int) -> Iterator[tuple[slice, slice]]:
+    """Some rows of a picture after the other: those that are read for them, and where they are among these."""
+    for part in bands(image, image.shape[-2:]):
+        top = max(part.start - radius, 0)
+        yield slice(part.start - top, part.stop - top), slice(top, part.stop + radius)
 
 
 def _nearest_return(depth: Tensor, place: Tensor, size: int, search_px: int) -> Tensor:
@@ -301,7 +297,7 @@ def _brightness(patch: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 def _whole_brightness(image: Tensor, size: int) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
     """What :func:`_brightness` finds around every pixel (B, H, W) of pictures of bytes, whose sums are exact in
     whatever order they are taken; some rows after the other, which need no fresh memory."""
-    for inside, around in _rows(image.shape[-2], size // 2):
+    for inside, around in _around(image, size // 2):
         some = image[..., around, :]
         total = window_sum(some.to(torch.int16).flatten(0, 1), size // 2)[:, inside].unflatten(0, image.shape[:2])
         planes = some[..., inside, :].contiguous()
