@@ -9,6 +9,7 @@
 #include <limits>
 #include <memory>
 #include <numeric>
+#include <vector>
 
 #include "native_vectors.h"
 
@@ -156,16 +157,15 @@ struct Brightness {
   float mean, centre, most, least;  // grey of the window; of the pixel in the middle grey, largest and smallest channel
 };
 
-template <int64_t SIZE, int64_t CHANNELS>
-inline Brightness brightness_at(const uint8_t* at, const Windows& w) {
-  const int64_t channels = CHANNELS ? CHANNELS : w.channels, centre = w.size / 2 * (w.row + w.column);
+// Of the sums over a window and its pixel in the middle.
+template <int64_t SIZE, int64_t CHANNELS, typename Sum>
+inline Brightness brightness_of(const Sum& sum, const uint8_t* centre, const Windows& w) {
+  const int64_t channels = CHANNELS ? CHANNELS : w.channels;
   const float count = static_cast<float>(w.size * w.size);
-  int32_t sum[3];
-  sums<SIZE>(at, w, sum);
   float mean[3] = {}, middle[3] = {};
   for (int64_t c = 0; c < channels; ++c) {
-    mean[c] = SIZE == 5 ? over<25>(sum[c]) : static_cast<float>(sum[c]) / count;
-    middle[c] = static_cast<float>(at[centre + c * w.channel]);
+    mean[c] = SIZE == 5 ? over<25>(sum(c)) : static_cast<float>(sum(c)) / count;
+    middle[c] = static_cast<float>(centre[c * w.channel]);
   }
   float most = middle[0], least = middle[0];
   for (int64_t c = 1; c < channels; ++c) {
@@ -174,6 +174,84 @@ inline Brightness brightness_at(const uint8_t* at, const Windows& w) {
   }
   return {luma(mean[0], mean[1], mean[2], channels), luma(middle[0], middle[1], middle[2], channels), most, least};
 }
+
+template <int64_t SIZE, int64_t CHANNELS>
+inline Brightness brightness_at(const uint8_t* at, const Windows& w) {
+  int32_t sum[3];
+  sums<SIZE>(at, w, sum);
+  const auto told = [&](int64_t c) { return sum[c]; };
+  return brightness_of<SIZE, CHANNELS>(told, at + w.size / 2 * (w.row + w.column), w);
+}
+
+// Whether windows of five pixels are asked around so many of an image's that all are found first, each from its neighbours':
+// lookup.py, WHOLE.
+inline bool most_are_asked(const Windows& w) { return w.size == 5 && 4 * w.n >= w.height * w.width; }
+
+// Smallest and largest return around every pixel of a map, but for the outermost two.
+struct WholeMap {
+  std::vector<float> least, most, low, high;
+
+  void find(const float* at, const Windows& w) {
+    const int64_t wide = w.width;
+    constexpr float none = std::numeric_limits<float>::infinity();
+    for (auto* all : {&least, &most}) all->resize(w.height * wide);
+    for (auto* row : {&low, &high}) row->resize(wide);
+    for (int64_t y = 2; y + 2 < w.height; ++y) {
+      float *__restrict a = low.data(), *__restrict b = high.data();
+      std::fill_n(a, wide, none);
+      std::fill_n(b, wide, 0.0f);
+      for (int64_t k = y - 2; k <= y + 2; ++k) {
+        const float* __restrict read = at + k * wide;
+        for (int64_t x = 0; x < wide; ++x) {
+          const bool some = (read[x] > 0.0f) & (read[x] < none);
+          const float z = some ? read[x] : none, up = some ? read[x] : 0.0f;
+          a[x] = z < a[x] ? z : a[x];
+          b[x] = up > b[x] ? up : b[x];
+        }
+      }
+      float *__restrict to = least.data() + y * wide, *__restrict up_to = most.data() + y * wide;
+      for (int64_t x = 2; x < wide - 2; ++x) {
+        to[x] = std::min(std::min(std::min(a[x - 2], a[x - 1]), std::min(a[x + 1], a[x + 2])), a[x]);
+        up_to[x] = std::max(std::max(std::max(b[x - 2], b[x - 1]), std::max(b[x + 1], b[x + 2])), b[x]);
+      }
+    }
+  }
+
+  Extremes at(int64_t first, const Windows& w) const {
+    const int64_t centre = first + 2 * (w.row + w.column);
+    return {least[centre], most[centre]};
+  }
+};
+
+// Sums of the bytes around every pixel of a picture, but for the outermost two, where the picture has those bytes.
+struct WholePicture {
+  std::vector<uint16_t> sum, column;
+
+  void find(const uint8_t* at, const Windows& w) {
+    const int64_t planes = w.column > 1 ? 1 : w.channels, step = w.column, line = w.row;  // a line holds all channels, or one
+    sum.resize(w.channels * w.height * w.width);
+    column.resize(line);
+    for (int64_t p = 0; p < planes; ++p) {
+      for (int64_t y = 2; y + 2 < w.height; ++y) {
+        const int64_t place = p * w.channel + y * line;
+        const uint8_t *__restrict a = at + place - 2 * line, *__restrict b = a + line, *__restrict c = b + line;
+        const uint8_t *__restrict d = c + line, *__restrict e = d + line;
+        uint16_t *__restrict five = column.data(), *__restrict to = sum.data() + place;
+        for (int64_t x = 0; x < line; ++x) five[x] = static_cast<uint16_t>(a[x] + b[x] + c[x] + d[x] + e[x]);
+        for (int64_t x = 2 * step; x < line - 2 * step; ++x) {
+          to[x] = static_cast<uint16_t>(five[x - 2 * step] + five[x - step] + five[x] + five[x + step] + five[x + 2 * step]);
+        }
+      }
+    }
+  }
+
+  template <int64_t SIZE, int64_t CHANNELS>
+  Brightness at(int64_t first, const uint8_t* picture, const Windows& w) const {
+    const int64_t centre = first + 2 * (w.row + w.column);
+    const auto told = [&](int64_t c) { return sum[centre + c * w.channel]; };
+    return brightness_of<SIZE, CHANNELS>(told, picture + centre, w);
+  }
+};
 
 template <int64_t SIZE, int64_t CHANNELS>
 void brightnesses(const uint8_t* from, const Windows& w, float* to) {
@@ -488,20 +566,25 @@ void say(const float* map, const uint8_t* levels, const Windows& returns, const 
          const float* rays, const Said& said, const Limits& limits) {
   const int64_t h = returns.height, w = returns.width;
   const float* end = map + returns.batch * h * w;
+  const bool whole_map = most_are_asked(returns), whole_picture = most_are_asked(seen);
+  WholeMap returned;
+  WholePicture shown;
   for (int64_t b = returns.batch; b-- > 0;) {  // the last picture was collated just now, the first one's textures are next
-    bring_near(map + b * h * w, h * w, returns);
-    bring_near(picture + b * seen.image, seen.image, seen);
+    const float* z = map + b * h * w;
+    const uint8_t* grey = picture + b * seen.image;
+    whole_map ? returned.find(z, returns) : bring_near(z, h * w, returns);
+    whole_picture ? shown.find(grey, seen) : bring_near(grey, seen.image, seen);
     for (int64_t k = 0; k < returns.n; ++k) {
-      const int64_t i = b * returns.n + k;
+      const int64_t i = b * returns.n + k, first = returns.first(b, k) - b * h * w, corner = seen.first(b, k) - b * seen.image;
       const int32_t* place = returns.pixel + 2 * i;
       const int64_t x = std::clamp<int64_t>(place[0], 0, w - 1), y = std::clamp<int64_t>(place[1], 0, h - 1);
-      const int64_t index = (b * h + y) * w + x;
-      const float read = fits(place, h, w, 1) ? map[index] : 0.0f;
+      const float read = fits(place, h, w, 1) ? z[y * w + x] : 0.0f;
       said.write(i,
-                 {std::isfinite(read) && read > 0 ? read : 0.0f, levels ? levels[index] : 2.0f,
-                  extremes_at(map + returns.first(b, k), returns, end),
-                  brightness_at<SIZE, CHANNELS>(picture + seen.first(b, k), seen), rays + 3 * i,
-                  !fits(seen.pixel + 2 * i, seen.height, seen.width, seen.size)},
+                 {std::isfinite(read) && read > 0 ? read : 0.0f, levels ? levels[(b * h + y) * w + x] : 2.0f,
+                  whole_map ? returned.at(first, returns) : extremes_at(z + first, returns, end),
+                  whole_picture ? shown.at<SIZE, CHANNELS>(corner, grey, seen)
+                                : brightness_at<SIZE, CHANNELS>(grey + corner, seen),
+                  rays + 3 * i, !fits(seen.pixel + 2 * i, seen.height, seen.width, seen.size)},
                  limits);
     }
   }

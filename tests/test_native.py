@@ -90,8 +90,9 @@ def test_pyramids_agree_up_to_one_rounding(loaded, monkeypatch, channels, kind, 
 
 @needs_compiler
 @pytest.mark.parametrize("layout", ["interleaved", "planar", "grey", "bgr of rgba"])
-@pytest.mark.parametrize("block", [3, 7, 9])
-def test_numbers_about_windows_agree_textures_up_to_rounding(loaded, monkeypatch, layout, block):
+@pytest.mark.parametrize(("block", "n"), [(3, 301), (7, 301), (9, 301), (7, 2500)])
+def test_numbers_about_windows_agree_textures_up_to_rounding(loaded, monkeypatch, layout, block, n):
+    """Of 2,173 pixels: where most are asked windows of all are found first."""
     image = volume(2, 1 if layout == "grey" else 3, 41, 53, most=256)
     if layout == "interleaved":
         image = image.contiguous(memory_format=torch.channels_last)
@@ -99,11 +100,11 @@ def test_numbers_about_windows_agree_textures_up_to_rounding(loaded, monkeypatch
         image = volume(2, 41, 53, 4, most=256).permute(0, 3, 1, 2)[:, [2, 1, 0]]
     depth = 4 * torch.rand(2, 41, 53, generator=torch.Generator().manual_seed(1)) - 1
     depth[:, ::7, ::5], depth[0, 3], depth[1, :, 9] = torch.nan, torch.inf, -torch.inf
-    uv = torch.rand(2, 301, 2, generator=torch.Generator().manual_seed(2)) * 70 - 8  # the border and beyond
+    uv = torch.rand(2, n, 2, generator=torch.Generator().manual_seed(2)) * 70 - 8  # the border and beyond
     uv[0, 0] = torch.nan
     camera = Camera(f=torch.full((2, 2), 50.0), c=torch.full((2, 2), 20.0))
     frame = Frame(image=image, depth=depth, camera=camera, conf=None)
-    at_once, alone = ["places", "samples"], ["window_extremes", "window_brightness"]
+    at_once, alone = ["places", "samples"], ["window_extremes", "window_brightness"] if n == 301 else []
     for options, reads in ({}, at_once), ({"search_px": 1}, alone):  # a search for returns is torch's
         calls = counted(monkeypatch, *at_once, *alone, "window_texture", "holes")
         ours, torchs = both_ways(
@@ -148,6 +149,7 @@ def test_pixels_are_the_same(loaded, monkeypatch):
 
 
 @needs_compiler
+@pytest.mark.parametrize("n", [301, 1000, 6000], ids=["a few", "most of the map", "most of the picture"])
 @pytest.mark.parametrize("lens", ["none", "of the map", "bent", "bent map"])
 @pytest.mark.parametrize(
     "options",
@@ -157,7 +159,7 @@ def test_pixels_are_the_same(loaded, monkeypatch):
         {"min_conf": 0, "edge_rel": 0.6, "dark": 0.5, "saturated": 0.6, "highlight": 0.4, "sigma_rel": 0.03},
     ],
 )
-def test_samples_and_holes_are_the_same_bits(loaded, monkeypatch, lens, options):
+def test_samples_and_holes_are_the_same_bits(loaded, monkeypatch, lens, options, n):
     frame = a_view(map_hw=(61, 83) if lens == "bent" else (48, 64))
     own = Camera(f=frame.camera.f * 0.7, c=frame.camera.c * 0.8)
     bent = torch.tensor([[0.2, -0.1, 0.001, 0.002, 0.0]]).expand(2, 5)
@@ -165,7 +167,7 @@ def test_samples_and_holes_are_the_same_bits(loaded, monkeypatch, lens, options)
         frame = frame.replace(camera=frame.camera.replace(distortion=bent), conf=None)
     if lens in ("of the map", "bent map"):
         frame = frame.replace(depth_camera=own.replace(distortion=bent if lens == "bent map" else None))
-    uv = torch.rand(301, 2, generator=torch.Generator().manual_seed(2)) * torch.tensor([99.0, 75.0]) - 7
+    uv = torch.rand(n, 2, generator=torch.Generator().manual_seed(2)) * torch.tensor([99.0, 75.0]) - 7
     uv[:5] = torch.tensor([torch.nan, torch.inf, -torch.inf, 3e9, -3e9])[:, None]
     calls = counted(monkeypatch, "places", "samples", "holes")
     ours, torchs = both_ways(lambda: classify(frame, backproject(frame, uv, **options)), monkeypatch)
@@ -192,7 +194,6 @@ def test_samples_that_compiled_code_does_not_take_are_torchs(loaded, monkeypatch
     backproject(frame.replace(image=frame.image.float() / 255), uv)
     backproject(frame, uv.double())
     backproject(frame.map(lambda x: x.double() if x.dtype == torch.float32 else x), uv.double())
-    backproject(frame, torch.rand(2, 4096, 2) * 50)  # windows of whole pictures
     leaf = frame.depth.nan_to_num(1, 1, 1).requires_grad_()
     found = backproject(frame.replace(depth=leaf), uv)
     (slope,) = torch.autograd.grad(found.xyz.nan_to_num().sum(), [leaf])

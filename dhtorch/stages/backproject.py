@@ -158,9 +158,8 @@ def _compiled(frame: Frame, uv: Tensor, limits: _Limits) -> Samples | None:
     h, w = frame.depth.shape[-2:]
     size, around = (min(NEIGHBOURHOOD, *hw) for hw in (frame.hw, (h, w)))
     conf = frame.depth.new_empty(0, dtype=torch.uint8) if frame.conf is None else frame.conf
-    whole = whole_is_faster(frame.hw, uv.shape[1], size) or whole_is_faster((h, w), uv.shape[1], around)
     bytes_alone = frame.image.dtype == conf.dtype == torch.uint8 and 0 <= limits.min_conf <= 255
-    if whole or not bytes_alone or frame.depth.dtype != uv.dtype or not native.serves(frame.depth, conf):
+    if not bytes_alone or frame.depth.dtype != uv.dtype or not native.serves(frame.depth, conf):
         return None
     looks = _looks(frame, uv)
     if looks is None:
