@@ -63,6 +63,7 @@ PLACES = (
     "transform",
     "closure",
     "archive",
+    "memory",
     "storage",
     "extract",
 )
