@@ -223,7 +223,7 @@ FORKED = """
 import os, cv2, numpy as np
 from dhtorch.transform import one_thread
 cv2.setNumThreads(2)
-cv2.GaussianBlur(np.ones((999, 999), np.float32), (31, 31), 5)
+cv2.remap(np.zeros((2000, 2000, 3), np.uint8), np.zeros((2000, 2000, 2), np.float32), None, cv2.INTER_LINEAR)
 pid = os.fork()
 if pid == 0:
     one_thread()
