@@ -8,6 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from reproduce import AGAIN
+
 from dhtorch.studies.report import Table, text
 
 RESULTS = Path(__file__).resolve().parent / "results"
@@ -64,7 +66,7 @@ SCRIPTS = ("frontend", "lk", "pnp", "triangulate", "pair", "loader", "judge_spee
 def timings(file: str) -> list[dict[str, Any]]:
     """Rows of a benchmark's result file; none where it was not made again otherwise."""
     path = RESULTS / f"{file}.json"
-    again = file.endswith(("_avx2", "_kept"))
+    again = file.endswith(tuple(f"_{how}" for how in AGAIN))
     rows: list[dict[str, Any]] = [] if again and not path.is_file() else json.loads(path.read_text())
     return rows
 
@@ -104,7 +106,7 @@ def bars() -> str:
     where freed memory is kept."""
     rows = []
     for file, name, mode, bar, words in BARS:
-        r, *again = (_barred(f"{file}{how}", name, mode) for how in ("", "_avx2", "_kept"))
+        r, *again = (_barred(f"{file}{how}", name, mode) for how in ("", *(f"_{how}" for how in AGAIN)))
         called = words if mode == "eager" else f"{words}, {mode}"
         if r is None:
             rows.append([called, "–", "–", "–", f"≤ {bar:g}", "not measured", "–", "–", "–", "–"])
@@ -115,7 +117,7 @@ def bars() -> str:
         others = ["–" if other is None else ratio(other["ratio"]) for other in again]
         rows.append([*cells, ratio(r["ratio"]), f"≤ {bar:g}", verdict, errors(r), maker, *others])
     head = ["", "ours, ms", "peer, ms", "ratio", "bar", "", "errors, ours / peer", "on, code of"]
-    head += ["ratio held to AVX2", "memory kept"]
+    head += [{"avx2": "ratio held to AVX2", "kept": "memory kept"}[how] for how in AGAIN]
     return text.grid(Table("", head, rows))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 
 #: What a user tells glibc's allocator of this by; it then stays as it was told.
@@ -22,6 +21,8 @@ def keep_freed() -> bool:
     Large tensors otherwise go back to the system whenever they are freed, and a data loader or a stream asks for the
     same memory with its next batch. The price: a process stays as large as it ever was. It cannot be taken back.
     """
+    import ctypes  # noqa: PLC0415  (a command that only says something must not pay for it)
+
     if any(name in os.environ for name in SETTINGS):
         return False
     try:

@@ -456,10 +456,10 @@ void window_texture(Tensor picture, Tensor pixel, Tensor found, int64_t image, i
   const Windows w = of_picture(windows(pixel, image, channel, row, column, channels, height, width, size), from);
   for (int64_t b = 0; b < w.batch; ++b) {
     float* to = data<float>(found) + b * w.n;
-    bring_near(from + b * image, image, w);
 #ifdef DHTORCH_SHUFFLES
     if (whole && size == 9) {
       const std::unique_ptr<float[]> grey = grey_picture(from + b * image, w);
+      if (!grey) bring_near(from + b * image, image, w);
       textures(w, UNIT, to, [&](int64_t i, Matrices& kept, int64_t k) {
         const int64_t first = w.first(b, i);
         if (grey) {
@@ -471,6 +471,7 @@ void window_texture(Tensor picture, Tensor pixel, Tensor found, int64_t image, i
       continue;
     }
 #endif
+    bring_near(from + b * image, image, w);
     textures(w, 1.0f, to, [&](int64_t i, Matrices& kept, int64_t k) { gradients(from + w.first(b, i), w, whole, kept, k); });
   }
 }

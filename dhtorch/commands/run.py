@@ -97,7 +97,6 @@ def main(argv: list[str] | None = None) -> int:
     """Entry point of the console script; returns the exit code."""
     argv = sys.argv[1:] if argv is None else argv
     flags, argv = [a for a in argv if a in console.FLAGS], [a for a in argv if a not in console.FLAGS]
-    keep_freed()  # frame after frame asks for the same memory
     with console.neutral(), console.speaking(flags), console.hushed():
         with signals.ending() as told:
             code = _outcome(argv)
@@ -204,6 +203,7 @@ def _run_configured(word: str, argv: list[str]) -> int:
         return _fail(errors.cause(error), show="traceback=true" in argv)
     module = importlib.import_module(CONFIGURED[word])
     _LOG.debug("%s: %s", word, ", ".join(f"{k}={v}" for k, v in groups.items()))
+    keep_freed()
     try:
         with console.unsaid():
             return int(module.run({**settings, "choices": groups}, parts, progress=console.progress) or DONE)
@@ -390,6 +390,7 @@ def _job(cfg: Any) -> Any:
     """One job, in whatever process a launcher runs it: build what the settings name and run it. Never raises."""
     if multiprocessing.current_process().name != "MainProcess":  # of a launcher
         leash.follow_parent()
+    keep_freed()  # frame after frame asks for the same memory
     with console.neutral():
         return _run_job(cfg)
 

@@ -243,7 +243,7 @@ def _whole_extremes(depth: Tensor, size: int) -> tuple[Tensor, Tensor]:
 
 
 def _around(image: Tensor, radius: int) -> Iterator[tuple[slice, slice]]:
-    """Some rows of a picture after the other: those that are read for them, and where they are among these."""
+    """Some rows of a picture after the other: where they are among those read for them, and which these are."""
     for part in bands(image, image.shape[-2:]):
         top = max(part.start - radius, 0)
         yield slice(part.start - top, part.stop - top), slice(top, part.stop + radius)
