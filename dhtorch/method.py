@@ -10,6 +10,7 @@ tracker as its ``hint``.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -148,6 +149,15 @@ def parts(*seats: Any) -> Iterator[Any]:
             yield from parts(seat.func, *seat.args, *seat.keywords.values())
         else:
             yield seat
+
+
+def options(seat: Any, function: Callable[..., Any]) -> dict[str, Any] | None:
+    """The options by name with which ``function`` sits in a seat, itself or in a partial; None where another does."""
+    own = seat.keywords if isinstance(seat, partial) and seat.func is function and not seat.args else {}
+    if seat is not function and not own:
+        return None
+    known = inspect.signature(function).parameters.values()
+    return {**{p.name: p.default for p in known if p.kind is p.KEYWORD_ONLY}, **own}
 
 
 def networks(*seats: Any) -> Iterator[torch.nn.Module]:

@@ -6,8 +6,8 @@ for it; nothing needs it.
     DHTORCH_NATIVE=1 python …           use it, in loader workers as well; or dhtorch.native.load() in a program
 
 ``dhtorch.stereo`` and ``pair``, ``dhtorch.stages.backproject``, ``holes`` and ``pose``, ``dhtorch.geometry.sweep``,
-``pyramid``, ``lookup``, ``neighbours``, ``lucas_kanade``, ``affine`` and ``near_far``, ``dhtorch.transform.tokens`` and
-``views`` ask here whether tensors may be handed over; where not (nothing was loaded, another device or type, under
+``pyramid``, ``lookup``, ``neighbours``, ``lucas_kanade``, ``affine`` and ``near_far``, ``dhtorch.transform.tokens``,
+``views`` and ``alone`` ask here whether tensors may be handed over; where not (nothing was loaded, another device or type, under
 vmap, a compiler or a graph) they do the same in torch, which is the reference. Tokens, depths in metres, the sensor's
 own map and the sweep are alike bit for bit, the fits of the sweep up to rounding: no more than one gate in 200 differs,
 and 99 of 100 depths by less than a tenth of their sigma. A pyramid, what is read around samples and what is said of

@@ -1,7 +1,6 @@
-// What a loader's transform does beside the stages: depth maps in metres, what some of their numbers say, the sensor's own
-// returns as a map, depth tokens of samples. Twin of dhtorch/transform/views.py and tokens.py and of dhtorch/pair.py, merge, which
-// are the reference: bit for bit, sums in double precision in the same order. One thread, no gradient. Callers check shapes, types
-// and strides.
+// What a loader's transform does beside the stages: depth maps in metres, depth tokens of samples. Twin of
+// dhtorch/transform/views.py and tokens.py, which are the reference: bit for bit, sums in double precision in the same order. One
+// thread, no gradient. Callers check shapes, types and strides.
 
 #include <torch/csrc/stable/library.h>
 
@@ -87,42 +86,9 @@ void metres(Tensor raw, Tensor z, double unit, bool sign) {
   }
 }
 
-// depth (B h w); counts (2, B), filled: of every `step`-th number how many are positive, and between both bounds.
-void probe(Tensor depth, Tensor counts, int64_t step, double low, double high) {
-  const int64_t batch = depth.size(0), all = depth.size(1) * depth.size(2);
-  const float least = low, most = high, *z = data<float>(depth);
-  int64_t *some = data<int64_t>(counts), *sound = some + batch;
-  for (int64_t b = 0; b < batch; ++b, z += all) {
-    int64_t positive = 0, between = 0;
-    for (int64_t k = 0; k < all; k += step) {  // no branch that would wait for the number before
-      positive += z[k] > 0;
-      between += (z[k] > least) & (z[k] < most);
-    }
-    some[b] = positive;
-    sound[b] = between;
-  }
-}
-
-// Samples as stage 2 says them: depth, sigma, confidence (B, N), xyz (B, N, 3). Fills z, noise, score and source (B, N) of those
-// with a point, 0 elsewhere.
-void sensed(Tensor depth, Tensor sigma, Tensor confidence, Tensor xyz, Tensor z, Tensor noise, Tensor score, Tensor source) {
-  const float *point = data<float>(xyz), *from[] = {data<float>(depth), data<float>(sigma), data<float>(confidence)};
-  float* to[] = {data<float>(z), data<float>(noise), data<float>(score)};
-  int32_t* sources = data<int32_t>(source);
-  for (int64_t i = 0; i < depth.numel(); ++i, point += 3) {
-    const bool usable = std::isfinite(point[0]) && std::isfinite(point[1]) && std::isfinite(point[2]);
-    for (int64_t k = 0; k < 3; ++k) to[k][i] = usable ? from[k][i] : 0.0f;
-    sources[i] = usable;
-  }
-}
-
 }  // namespace
 
 STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
-  m.def("probe(Tensor depth, Tensor(a!) counts, int step, float low, float high) -> ()");
-  m.def(
-      "sensed(Tensor depth, Tensor sigma, Tensor confidence, Tensor xyz, Tensor(a!) z, Tensor(b!) noise, Tensor(c!) score, "
-      "Tensor(d!) source) -> ()");
   m.def("metres(Tensor raw, Tensor(a!) z, float unit, bool sign) -> ()");
   m.def(
       "patch_tokens(Tensor uv, Tensor depth, Tensor sigma, Tensor source, Tensor hole, Tensor(a!) tokens, Tensor(b!) known, int "
@@ -130,8 +96,6 @@ STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
 }
 
 STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) {
-  m.impl("probe", TORCH_BOX(&probe));
-  m.impl("sensed", TORCH_BOX(&sensed));
   m.impl("metres", TORCH_BOX(&metres));
   m.impl("patch_tokens", TORCH_BOX(&patch_tokens));
 }

@@ -1,6 +1,7 @@
-// A few numbers about the window around each sample: extremes of depth, brightness, texture; and what stages 2 and 3 make of
-// them. Twin of dhtorch/geometry/lookup.py, stages/backproject.py and stages/holes.py, which are the reference: whole numbers are exact, textures up to
-// the rounding of their sums. One thread, no gradient. Callers check shapes, types and strides.
+// A few numbers about the window around each sample: extremes of depth, brightness, texture; what stages 2 and 3 make of them, and
+// the sensor's own map; the same of one picture at once. Twin of dhtorch/geometry/lookup.py, stages/backproject.py and
+// stages/holes.py, of dhtorch/transform/views.py and of dhtorch/pair.py, merge, which are the reference: whole numbers are exact,
+// textures up to the rounding of their sums. One thread, no gradient. Callers check shapes, types and strides.
 
 #include <torch/csrc/stable/library.h>
 
@@ -9,6 +10,7 @@
 #include <limits>
 #include <memory>
 #include <numeric>
+#include <type_traits>
 #include <vector>
 
 #include "native_vectors.h"
@@ -48,14 +50,28 @@ struct Extremes {
   float least = std::numeric_limits<float>::infinity(), most = 0.0f;  // as where there is no return
 };
 
-inline void extend(float read, Extremes& found) {
-  const float z = std::isfinite(read) ? read : 0.0f;
+template <typename Raw>
+inline void extend(Raw raw, Extremes& found) {
+  const float read = raw, z = std::isfinite(read) ? read : 0.0f;
   found.least = z > 0 ? std::min(found.least, z) : found.least;
   found.most = std::max(found.most, z);
 }
 
 constexpr int64_t EIGHT = 8;
 typedef float Eight __attribute__((vector_size(EIGHT * sizeof(float))));
+typedef int32_t EightWhole __attribute__((vector_size(4 * EIGHT)));
+
+template <typename Raw>
+inline Eight eight(const Raw* at) {
+  typedef Raw EightRaw __attribute__((vector_size(EIGHT * sizeof(Raw))));
+  EightRaw read;
+  std::memcpy(&read, at, sizeof(read));
+  if constexpr (std::is_same_v<Raw, float>) {
+    return read;
+  } else {
+    return __builtin_convertvector(__builtin_convertvector(read, EightWhole), Eight);
+  }
+}
 
 // What `join` makes of the first few of eight numbers, two by two.
 template <int64_t FEW, typename Join>
@@ -74,13 +90,13 @@ inline float joined(Eight x, float none, const Join& join) {
 }
 
 // Of five rows of five returns, which are read with the three beside them.
-inline Extremes five_extremes(const float* at, int64_t row) {
+template <typename Raw>
+inline Extremes five_extremes(const Raw* at, int64_t row) {
   const Eight none = {};
   const Eight infinity = none + std::numeric_limits<float>::infinity();
   Eight low = infinity, high = none;
   for (int64_t y = 0; y < 5; ++y) {
-    Eight read;
-    std::memcpy(&read, at + y * row, sizeof(read));
+    const Eight read = eight(at + y * row);
     const auto some = (read > none) & (read < infinity);
     const Eight least = some ? read : infinity, most = some ? read : none;
     low = least < low ? least : low;
@@ -92,7 +108,8 @@ inline Extremes five_extremes(const float* at, int64_t row) {
 }
 
 // Of the window that begins at a return; `end` is behind the last one.
-inline Extremes extremes_at(const float* at, const Windows& w, const float* end) {
+template <typename Raw>
+inline Extremes extremes_at(const Raw* at, const Windows& w, const Raw* end) {
   if (w.size == 5 && w.column == 1 && at + 4 * w.row + EIGHT <= end) return five_extremes(at, w.row);
   Extremes found;
   for (int64_t y = 0; y < w.size; ++y) {
@@ -347,7 +364,6 @@ inline void gradients(const uint8_t* at, const Windows& w, bool whole, Matrices&
 
 #ifdef DHTORCH_SHUFFLES
 typedef uint16_t EightWords __attribute__((vector_size(2 * EIGHT)));
-typedef int32_t EightWhole __attribute__((vector_size(4 * EIGHT)));
 
 // Grey values of interleaved pixels are 255000 times as large here: whole numbers, exact however they are summed.
 constexpr float UNIT = 255000.0f;
@@ -448,32 +464,35 @@ void textures(const Windows& w, float unit, float* to, const Each& each) {
   }
 }
 
+// Of one of the pictures that begin at `from`; see window_texture.
+void textures_of(const uint8_t* from, const Windows& w, int64_t b, bool whole, float* to) {
+  const uint8_t* picture = from + b * w.image;
+#ifdef DHTORCH_SHUFFLES
+  if (whole && w.size == 9) {
+    const std::unique_ptr<float[]> grey = grey_picture(picture, w);
+    if (!grey) bring_near(picture, w.image, w);
+    textures(w, UNIT, to, [&](int64_t i, Matrices& kept, int64_t k) {
+      const int64_t first = w.first(b, i);
+      if (grey) {
+        nine_gradients(&grey[(first - b * w.image) / 3], w.width, kept, k);
+      } else {
+        nine_gradients(from + first, w.row, kept, k);
+      }
+    });
+    return;
+  }
+#endif
+  bring_near(picture, w.image, w);
+  textures(w, 1.0f, to, [&](int64_t i, Matrices& kept, int64_t k) { gradients(from + w.first(b, i), w, whole, kept, k); });
+}
+
 // picture of bytes; found (1, B, N): smaller eigenvalue of the mean gradient matrix, by the Sobel filters over all but the
 // outermost pixels. Windows are at most WIDE pixels wide. With `whole` interleaved pixels become grey as whole numbers.
 void window_texture(Tensor picture, Tensor pixel, Tensor found, int64_t image, int64_t channel, int64_t row, int64_t column,
                     int64_t channels, int64_t height, int64_t width, int64_t size, bool whole) {
   const uint8_t* from = data<uint8_t>(picture);
   const Windows w = of_picture(windows(pixel, image, channel, row, column, channels, height, width, size), from);
-  for (int64_t b = 0; b < w.batch; ++b) {
-    float* to = data<float>(found) + b * w.n;
-#ifdef DHTORCH_SHUFFLES
-    if (whole && size == 9) {
-      const std::unique_ptr<float[]> grey = grey_picture(from + b * image, w);
-      if (!grey) bring_near(from + b * image, image, w);
-      textures(w, UNIT, to, [&](int64_t i, Matrices& kept, int64_t k) {
-        const int64_t first = w.first(b, i);
-        if (grey) {
-          nine_gradients(&grey[(first - b * image) / 3], width, kept, k);
-        } else {
-          nine_gradients(from + first, row, kept, k);
-        }
-      });
-      continue;
-    }
-#endif
-    bring_near(from + b * image, image, w);
-    textures(w, 1.0f, to, [&](int64_t i, Matrices& kept, int64_t k) { gradients(from + w.first(b, i), w, whole, kept, k); });
-  }
+  for (int64_t b = 0; b < w.batch; ++b) textures_of(from, w, b, whole, data<float>(found) + b * w.n);
 }
 
 // Bits of dhtorch/codes.py, Flag.
@@ -524,9 +543,31 @@ void pixels(Tensor uv, Tensor pixel) {
   for (int64_t i = 0; i < all; ++i) to[i] = pixel_of(from[i]);
 }
 
+inline bool is_point(const float* x) { return std::isfinite(x[0]) && std::isfinite(x[1]) && std::isfinite(x[2]); }
+
+// The sensor's own answers: what is said of samples with a point, 0 elsewhere.
+struct Sensed {
+  float *depth, *sigma, *score;
+  int32_t* source;
+
+  bool take(int64_t i, const float* point, const float* z, const float* noise, const float* sure) const {
+    const bool usable = is_point(point);
+    depth[i] = usable ? z[i] : 0.0f;
+    sigma[i] = usable ? noise[i] : 0.0f;
+    score[i] = usable ? sure[i] : 0.0f;
+    source[i] = usable;
+    return usable;
+  }
+};
+
 // What stage 2 takes for a return, and says of it.
 struct Limits {
   float near, conf, fixed, relative, edge, dim, white, bright;
+
+  Limits(double near_limit, double min_conf, double sigma_m, double sigma_rel, double edge_rel, double dark, double saturated,
+         double highlight)
+      : near(near_limit), conf(min_conf), fixed(sigma_m * sigma_m), relative(sigma_rel), edge(1.0 + edge_rel), dim(dark * 255),
+        white(saturated * 255), bright(highlight * 255) {}
 };
 
 // What is read around a sample, and its ray.
@@ -562,27 +603,49 @@ struct Said {
   }
 };
 
-template <int64_t SIZE, int64_t CHANNELS>
-void say(const float* map, const uint8_t* levels, const Windows& returns, const uint8_t* picture, const Windows& seen,
+// What is read of a map of float32 or, as files hold it, of numbers of two bytes, `unit` to a metre.
+template <typename Raw>
+struct Returns {
+  const Raw *map, *end;
+  float unit;
+
+  float over_unit(float read) const { return unit == 1.0f ? read : read / unit; }
+
+  // Of the map's k-th number; what is no return is 0.
+  float metres(int64_t k) const {
+    const float read = map[k];
+    return std::isfinite(read) && read > 0 ? over_unit(read) : 0.0f;
+  }
+
+  Extremes around(int64_t first, const Windows& w) const {
+    const Extremes found = extremes_at(map + first, w, end);
+    return {over_unit(found.least), over_unit(found.most)};
+  }
+};
+
+template <int64_t SIZE, int64_t CHANNELS, typename Raw>
+void say(const Returns<Raw>& map, const uint8_t* levels, const Windows& returns, const uint8_t* picture, const Windows& seen,
          const float* rays, const Said& said, const Limits& limits) {
   const int64_t h = returns.height, w = returns.width;
-  const float* end = map + returns.batch * h * w;
-  const bool whole_map = most_are_asked(returns), whole_picture = most_are_asked(seen);
+  constexpr bool in_metres = std::is_same_v<Raw, float>;
+  const bool whole_map = in_metres && most_are_asked(returns), whole_picture = most_are_asked(seen);
   WholeMap returned;
   WholePicture shown;
   for (int64_t b = returns.batch; b-- > 0;) {  // the last picture was collated just now, the first one's textures are next
-    const float* z = map + b * h * w;
     const uint8_t* grey = picture + b * seen.image;
-    whole_map ? returned.find(z, returns) : bring_near(z, h * w, returns);
+    if constexpr (in_metres) {
+      if (whole_map) returned.find(map.map + b * h * w, returns);
+    }
+    if (!whole_map) bring_near(map.map + b * h * w, h * w, returns);
     whole_picture ? shown.find(grey, seen) : bring_near(grey, seen.image, seen);
     for (int64_t k = 0; k < returns.n; ++k) {
-      const int64_t i = b * returns.n + k, first = returns.first(b, k) - b * h * w, corner = seen.first(b, k) - b * seen.image;
+      const int64_t i = b * returns.n + k, first = returns.first(b, k), corner = seen.first(b, k) - b * seen.image;
       const int32_t* place = returns.pixel + 2 * i;
       const int64_t x = std::clamp<int64_t>(place[0], 0, w - 1), y = std::clamp<int64_t>(place[1], 0, h - 1);
-      const float read = fits(place, h, w, 1) ? z[y * w + x] : 0.0f;
+      const int64_t there = (b * h + y) * w + x;
       said.write(i,
-                 {std::isfinite(read) && read > 0 ? read : 0.0f, levels ? levels[(b * h + y) * w + x] : 2.0f,
-                  whole_map ? returned.at(first, returns) : extremes_at(z + first, returns, end),
+                 {fits(place, h, w, 1) ? map.metres(there) : 0.0f, levels ? levels[there] : 2.0f,
+                  whole_map ? returned.at(first - b * h * w, returns) : map.around(first, returns),
                   whole_picture ? shown.at<SIZE, CHANNELS>(corner, grey, seen)
                                 : brightness_at<SIZE, CHANNELS>(grey + corner, seen),
                   rays + 3 * i, !fits(seen.pixel + 2 * i, seen.height, seen.width, seen.size)},
@@ -598,34 +661,104 @@ void samples(Tensor depth, Tensor conf, Tensor at, Tensor picture, Tensor pixel,
              int64_t column, int64_t channels, int64_t height, int64_t width, int64_t size, double near, double least_conf,
              double sigma_m, double sigma_rel, double edge_rel, double dark, double saturated, double highlight) {
   const int64_t h = depth.size(1), w = depth.size(2);
+  const float* map = data<float>(depth);
   const uint8_t *from = data<uint8_t>(picture), *levels = conf.numel() > 0 ? data<uint8_t>(conf) : nullptr;
   const Windows returns = windows(at, h * w, 0, w, 1, 1, h, w, reach);
   const Windows seen = of_picture(windows(pixel, image, channel, row, column, channels, height, width, size), from);
   const Said said = {data<float>(found), data<float>(sigma), data<float>(confidence), data<float>(xyz), data<int32_t>(flag)};
-  const auto single = [](double x) { return static_cast<float>(x); };
-  const Limits limits = {single(near),           single(least_conf), single(sigma_m * sigma_m), single(sigma_rel),
-                         single(1.0 + edge_rel), single(dark * 255), single(saturated * 255),   single(highlight * 255)};
-  (usual(seen) ? say<5, 3> : say<0, 0>)(data<float>(depth), levels, returns, from, seen, data<float>(ray), said, limits);
+  const Limits limits(near, least_conf, sigma_m, sigma_rel, edge_rel, dark, saturated, highlight);
+  const Returns<float> read = {map, map + depth.numel(), 1.0f};
+  (usual(seen) ? say<5, 3, float> : say<0, 0, float>)(read, levels, returns, from, seen, data<float>(ray), said, limits);
 }
 
-// Stage 3 from what was read: of a hole (B, N) the first class of dhtorch/codes.py, Hole, that holds.
-void holes(Tensor xyz, Tensor flag, Tensor trackability, Tensor hole, double min_trackability) {
+// Stage 3 from what was read: of a hole the first class of dhtorch/codes.py, Hole, that holds.
+void classes(const float* points, const int32_t* flags, const float* textures, float least, int32_t* kinds, int64_t all) {
   constexpr int32_t NONE = 0, TRACKABLE_NO_LIDAR = 1, LOW_TEXTURE = 2, TOO_BRIGHT = 3, TOO_DARK = 4, HIGHLIGHT = 5,
                     AT_BORDER = 6;
-  const float *points = data<float>(xyz), *textures = data<float>(trackability), least = min_trackability;
-  const int32_t* flags = data<int32_t>(flag);
-  int32_t* kinds = data<int32_t>(hole);
-  const int64_t all = hole.numel();
   for (int64_t i = 0; i < all; ++i) {
-    const float* x = points + 3 * i;
     const int32_t bits = flags[i];
     int32_t kind = textures[i] < least ? LOW_TEXTURE : TRACKABLE_NO_LIDAR;
     if (bits & SPECULAR) kind = HIGHLIGHT;
     if (bits & SATURATED) kind = TOO_BRIGHT;
     if (bits & UNDEREXPOSED) kind = TOO_DARK;
     if (bits & BORDER) kind = AT_BORDER;
-    if (std::isfinite(x[0]) && std::isfinite(x[1]) && std::isfinite(x[2])) kind = NONE;
+    if (is_point(points + 3 * i)) kind = NONE;
     kinds[i] = kind;
+  }
+}
+
+// xyz (B, N, 3), flag, trackability (B, N); hole (B, N), filled.
+void holes(Tensor xyz, Tensor flag, Tensor trackability, Tensor hole, double min_trackability) {
+  classes(data<float>(xyz), data<int32_t>(flag), data<float>(trackability), min_trackability, data<int32_t>(hole), hole.numel());
+}
+
+// Of every `step`-th number of a map how many are positive, and between both bounds.
+template <typename Raw>
+void count(const Returns<Raw>& map, int64_t step, float least, float most, int64_t* positive, int64_t* between) {
+  int64_t some = 0, sound = 0;
+  for (const Raw* at = map.map; at < map.end; at += step) {  // no branch that would wait for the number before
+    const float z = map.over_unit(*at);
+    some += z > 0;
+    sound += (z > least) & (z < most);
+  }
+  *positive = some;
+  *between = sound;
+}
+
+// depth (B h w); counts (2, B), filled: of every `step`-th number how many are positive, and between both bounds.
+void probe(Tensor depth, Tensor counts, int64_t step, double low, double high) {
+  const int64_t batch = depth.size(0), all = depth.size(1) * depth.size(2);
+  int64_t* to = data<int64_t>(counts);
+  for (int64_t b = 0; b < batch; ++b) {
+    const float* map = data<float>(depth) + b * all;
+    count<float>({map, map + all, 1.0f}, step, low, high, to + b, to + batch + b);
+  }
+}
+
+// Stages 2 and 3 of one picture and its map as they were decoded, and what dhtorch/pair.py, merge, makes of that: b is its row
+// in what is filled, all of it (B, N) but xyz (B, N, 3) and what probe counts (2, B). A map of numbers of two bytes is one of
+// int16, with a sign or without. Places as in `samples`, of one picture.
+void look(Tensor map, Tensor at, Tensor picture, Tensor pixel, Tensor ray, Tensor depth, Tensor sigma, Tensor score, Tensor xyz,
+          Tensor flag, Tensor hole, Tensor source, Tensor counts, int64_t b, double unit, bool sign, int64_t step, double low,
+          double high, int64_t reach, int64_t image, int64_t channel, int64_t row, int64_t column, int64_t channels,
+          int64_t height, int64_t width, int64_t size, double near, double least_conf, double sigma_m, double sigma_rel,
+          double edge_rel, double dark, double saturated, double highlight, int64_t block, bool whole, double min_trackability) {
+  const int64_t h = map.size(0), w = map.size(1), n = at.size(1), first = b * n;
+  const uint8_t* from = data<uint8_t>(picture);
+  const Windows returns = windows(at, h * w, 0, w, 1, 1, h, w, reach);
+  const Windows seen = of_picture(windows(pixel, image, channel, row, column, channels, height, width, size), from);
+  const Windows textured = of_picture(windows(pixel, image, channel, row, column, channels, height, width, block + 2), from);
+  const Limits limits(near, least_conf, sigma_m, sigma_rel, edge_rel, dark, saturated, highlight);
+  const Said said = {data<float>(depth) + first, data<float>(sigma) + first, data<float>(score) + first,
+                     data<float>(xyz) + 3 * first, data<int32_t>(flag) + first};
+  int64_t* counted = data<int64_t>(counts) + b;
+  const auto read = [&]<typename Raw>(const Raw* begin) {
+    const Returns<Raw> told = {begin, begin + h * w, static_cast<float>(unit)};
+    (usual(seen) ? say<5, 3, Raw> : say<0, 0, Raw>)(told, nullptr, returns, from, seen, data<float>(ray), said, limits);
+    count(told, step, low, high, counted, counted + counts.size(1));
+  };
+  if (map.scalar_type() == torch::headeronly::ScalarType::Float) {
+    read(data<float>(map));
+  } else {
+    sign ? read(data<int16_t>(map)) : read(data<uint16_t>(map));
+  }
+  std::vector<float> textures(n);
+  textures_of(from, textured, 0, whole, textures.data());
+  classes(said.xyz, said.flag, textures.data(), min_trackability, data<int32_t>(hole) + first, n);
+  const Sensed sensed = {said.depth, said.sigma, said.confidence, data<int32_t>(source) + first};
+  for (int64_t i = 0; i < n; ++i) {
+    if (sensed.take(i, said.xyz + 3 * i, said.depth, said.sigma, said.confidence)) continue;
+    std::fill_n(said.xyz + 3 * i, 3, 0.0f);
+  }
+}
+
+// Samples as stage 2 says them: depth, sigma, confidence (B, N), xyz (B, N, 3). Fills z, noise, score and source (B, N) of those
+// with a point, 0 elsewhere.
+void sensed(Tensor depth, Tensor sigma, Tensor confidence, Tensor xyz, Tensor z, Tensor noise, Tensor score, Tensor source) {
+  const Sensed to = {data<float>(z), data<float>(noise), data<float>(score), data<int32_t>(source)};
+  const float* points = data<float>(xyz);
+  for (int64_t i = 0; i < depth.numel(); ++i) {
+    to.take(i, points + 3 * i, data<float>(depth), data<float>(sigma), data<float>(confidence));
   }
 }
 
@@ -651,6 +784,16 @@ STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
       "int column, int channels, int height, int width, int size, float near_limit, float min_conf, float sigma_m, "
       "float sigma_rel, float edge_rel, float dark, float saturated, float highlight) -> ()");
   m.def("holes(Tensor xyz, Tensor flag, Tensor trackability, Tensor(a!) hole, float min_trackability) -> ()");
+  m.def("probe(Tensor depth, Tensor(a!) counts, int step, float low, float high) -> ()");
+  m.def(
+      "sensed(Tensor depth, Tensor sigma, Tensor confidence, Tensor xyz, Tensor(a!) z, Tensor(b!) noise, Tensor(c!) score, "
+      "Tensor(d!) source) -> ()");
+  m.def(
+      "look(Tensor map, Tensor at, Tensor picture, Tensor pixel, Tensor ray, Tensor(a!) depth, Tensor(b!) sigma, Tensor(c!) score, "
+      "Tensor(d!) xyz, Tensor(e!) flag, Tensor(f!) hole, Tensor(g!) source, Tensor(h!) counts, int b, float unit, bool sign, int step, "
+      "float low, float high, int reach, int image, int channel, int row, int column, int channels, int height, int width, int size, "
+      "float near_limit, float min_conf, float sigma_m, float sigma_rel, float edge_rel, float dark, float saturated, "
+      "float highlight, int block, bool whole, float min_trackability) -> ()");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) {
@@ -661,4 +804,7 @@ STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) {
   m.impl("pixels", TORCH_BOX(&pixels));
   m.impl("samples", TORCH_BOX(&samples));
   m.impl("holes", TORCH_BOX(&holes));
+  m.impl("probe", TORCH_BOX(&probe));
+  m.impl("sensed", TORCH_BOX(&sensed));
+  m.impl("look", TORCH_BOX(&look));
 }

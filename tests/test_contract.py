@@ -511,8 +511,10 @@ ROWS = [
 #: tested where they are at home (test_front_end.py, test_pose.py, test_evaluate.py, test_integrate.py).
 ELSEWHERE = {
     *(f"dhtorch.stages.given.{name}" for name in ("from_frames", "without")),
+    *(f"dhtorch.stages.backproject.{name}" for name in ("around", "places")),
     "dhtorch.geometry.graphless.spared",
     "dhtorch.geometry.least_squares.has_graph",
+    "dhtorch.geometry.lookup.product_is_exact",
     "dhtorch.geometry.near_far.squares_at",
     "dhtorch.geometry.neighbours.bands",
     "dhtorch.geometry.p3p.p3p_of_planes",

@@ -2,12 +2,15 @@
 up to the rounding of sums; nothing is compiled, loaded or used that nobody asked for."""
 
 import inspect
+import pickle
 import platform
 import shutil
 import subprocess
 import sys
+import warnings
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import test_map_pose
 import test_near_far
@@ -15,7 +18,7 @@ import torch
 from torch.autograd import forward_ad
 from torch.utils._pytree import tree_leaves
 
-from dhtorch import WINDOW, dense, native, stereo
+from dhtorch import PAPER, WINDOW, dense, native, stereo
 from dhtorch.codes import PoseCode, Source
 from dhtorch.evaluate.holdout import range_split
 from dhtorch.geometry import affine, least_squares, lookup, near_far, neighbours, p3p, pyramid, ransac, se3, sweep
@@ -25,14 +28,16 @@ from dhtorch.geometry.filters import gaussian
 from dhtorch.geometry.near_far import Problem
 from dhtorch.pair import merge
 from dhtorch.records import NO_HINT, Frame, Map, PoseFit, Samples, Shutter, TrackHint, Tracks
+from dhtorch.stages import sample
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.holes import classify, min_eigenvalue
 from dhtorch.stages.pose import SEARCH_POINTS, map_pose, pnp_ransac
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 from dhtorch.synthetic import SyntheticRoom
-from dhtorch.transform import patch_tokens
+from dhtorch.transform import ExtendDepth, ExtendedDataset, patch_tokens
 from dhtorch.transform.leaves import SampleError
-from dhtorch.transform.views import UNITS, Views
+from dhtorch.transform.problems import SampleProblem
+from dhtorch.transform.views import CAMERAS, UNITS, Views
 
 COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
 needs_compiler = pytest.mark.skipif(COMPILER is None or sys.platform == "win32", reason="no C++ compiler here")
@@ -925,3 +930,196 @@ def test_a_compiler_that_is_missing_or_fails_is_told(tmp_path, monkeypatch):
         with pytest.raises(OSError, match=r"false --kind .*exit code 1"):
             native.build()
         assert not list(tmp_path.iterdir())
+
+
+# ------------------------------------------------------------------------------------------------ a view alone, at once
+
+
+def decoded(kind, unit, *, hw=(61, 83), map_hw=(61, 83), channels=3, seed=0):
+    """A sample as a decoder hands it over: bytes, and returns of every kind."""
+    random = np.random.default_rng(seed)
+    image = (random.integers(0, 256, (*hw, channels)) // 4 + 120).astype(np.uint8)
+    image[:, :20], image[30:, 60:], image[40:41, 40:50] = 255, 5, 255
+    mm = random.integers(0, 4000, map_hw)
+    mm[random.random(map_hw) < 0.3], mm[:12, :12] = 0, 1500
+    depth = (mm if unit == "mm" else mm / 1000).astype(kind)
+    if depth.dtype.kind != "u":
+        depth[2, ::3] = -7
+    if depth.dtype.kind == "f":
+        depth[::9, 1], depth[1::9, 1], depth[2::9, 1] = np.nan, np.inf, -np.inf
+    K = np.array([[70.0, 0, hw[1] / 2 + seed % 3], [0, 71, hw[0] / 2], [0, 0, 1]])
+    return {"image": image, "depth": depth, "intrinsics": K, "index": seed}
+
+
+def by_stages(transform, monkeypatch, *calls):
+    """The same calls, of which the stages are asked."""
+    with monkeypatch.context() as patch:
+        patch.setattr(transform._alone, "limits", None)
+        return [call() for call in calls]
+
+
+def equal(ours, theirs):
+    """Two dicts of numbers hold the same bits, types and shapes."""
+    assert ours.keys() == theirs.keys()
+    for key in ours:
+        a, b = (torch.as_tensor(x[key]) for x in (ours, theirs))
+        assert a.dtype == b.dtype and a.shape == b.shape and torch.equal(a.nan_to_num(7), b.nan_to_num(7)), key
+        assert a.is_contiguous() or not a.numel()
+
+
+SEATS = [
+    {},
+    {"backproject": {"near_limit": 1.7, "sigma_m": 0.004, "min_conf": 2}, "classify": {"block": 3}},
+    {"backproject": {"edge_rel": 0.6, "dark": 0.5, "saturated": 0.6, "highlight": 0.4}, "sample": sample.vogel},
+    {"backproject": {"min_conf": 0}, "classify": {"min_trackability": 1e-3, "block": 9}, "sample": {"foveation": 0.5}},
+]
+
+
+@needs_compiler
+@pytest.mark.parametrize(("kind", "unit"), [("uint16", "mm"), ("int16", "mm"), ("float32", "m"), ("float32", "mm")])
+@pytest.mark.parametrize("seats", SEATS)
+@pytest.mark.parametrize(
+    ("hw", "map_hw", "layout"),
+    [
+        ((61, 83), (61, 83), "hwc"),
+        ((61, 83), (48, 64), "chw"),
+        ((12, 180), (4, 60), "hwc"),
+        ((60, 80), (240, 320), "hwc"),
+    ],
+)
+def test_a_view_alone_at_once_is_what_the_stages_say(loaded, monkeypatch, kind, unit, seats, hw, map_hw, layout):
+    transform = ExtendDepth(depth_unit=unit, method=PAPER.replace(**seats, n=50), patch=2, layout=layout)
+    samples = [decoded(kind, unit, hw=hw, map_hw=map_hw, seed=seed) for seed in range(3)]
+    samples += [decoded(kind, unit, hw=hw, map_hw=map_hw, seed=seed) for seed in range(3)]
+    if layout == "chw":
+        samples = [{**s, "image": s["image"].transpose(2, 0, 1).copy()} for s in samples]
+    calls, seen = counted(monkeypatch, "look"), []
+    for one in samples:
+        ours = transform(one)
+        seen.append([ours[f"dhtorch.{key}"] for key in ("valid", "hole", "flag")])
+        (stages,) = by_stages(transform, monkeypatch, lambda one=one: transform(one))
+        equal(ours, stages)
+    assert len(calls) == len(samples) and len(transform._alone.kept) == 3
+    assert transform.report()["no_second_view"] == 2 * len(samples)
+    valid, hole, flag = (torch.stack(x) for x in zip(*seen, strict=True))
+    most = 2 if hw[0] > 20 else 1  # a narrow picture has no middle of the bright and dark ones
+    assert 0 < valid.sum() < valid.numel() and hole.unique().numel() > most and flag.unique().numel() > most
+
+
+@needs_compiler
+@pytest.mark.parametrize("consumed", [(), ("image", "depth")])
+def test_a_batch_of_views_alone_need_not_be_collated_first(loaded, monkeypatch, consumed):
+    items = [decoded("uint16", "mm", seed=seed) for seed in range(5)]  # three cameras in one batch
+    transform = ExtendDepth(depth_unit="mm", n=99, batched=True)
+    dataset = ExtendedDataset(items, transform, by_batch=True, consumed=consumed)
+    calls = counted(monkeypatch, "look", "samples")
+    ours = dataset.collate(items)
+    assert calls == ["look"] * 5
+    (stages,) = by_stages(transform, monkeypatch, lambda: dataset.collate(items))
+    assert calls[5:] == ["samples"]
+    ours["dhtorch.uv"] = ours["dhtorch.uv"].contiguous()
+    stages["dhtorch.uv"] = stages["dhtorch.uv"].contiguous()
+    equal(ours, stages)
+    assert ours["dhtorch.uv"].data_ptr() != transform._alone.kept[next(iter(transform._alone.kept))].uv.data_ptr()
+    with pytest.raises(RuntimeError):  # as torch says it of pictures of two sizes
+        ExtendedDataset(items, transform, by_batch=True).collate([items[0], decoded("uint16", "mm", hw=(48, 64))])
+
+
+@needs_compiler
+def test_the_layouts_of_a_map_are_one(loaded, monkeypatch):
+    transform, plain = ExtendDepth(depth_unit="mm", n=50), decoded("uint16", "mm")
+    calls, expected = counted(monkeypatch, "look"), None
+    for depth in (plain["depth"], plain["depth"][None], plain["depth"][..., None], torch.from_numpy(plain["depth"])):
+        found = {k: v for k, v in transform({**plain, "depth": depth}).items() if k.startswith("dhtorch.")}
+        expected = expected or found
+        equal(found, expected)
+    nested = {"obs": plain, "info": {"K": plain["intrinsics"]}}
+    keys = {"image": "obs/image", "depth": "obs.depth", "intrinsics": "info.K"}
+    found = ExtendDepth(depth_unit="mm", n=50, **keys)(nested)
+    equal({k: v for k, v in found.items() if k.startswith("dhtorch.")}, expected)
+    assert len(calls) == 5
+
+
+@needs_compiler
+def test_what_is_not_as_usual_is_asked_of_the_stages(loaded, monkeypatch):
+    calls, plain = counted(monkeypatch, "look"), decoded("uint16", "mm")
+
+    def said(sample, unit="mm", **options):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            ExtendDepth(depth_unit=unit, **{"n": 50, **options})(sample)
+        return calls
+
+    assert said(plain) == ["look"] and not calls.clear()
+    levels = {**plain, "conf": np.ones((61, 83), np.uint8)}
+    said(levels, confidence="conf")
+    said({**plain, "image_is_pad": torch.tensor([False])})
+    said({**plain, "image": plain["image"].astype(np.float32) / 255})
+    said({**plain, "image": np.stack([plain["image"]] * 2)})
+    said({**plain, "image": torch.from_numpy(np.repeat(plain["image"], 2, 1))[:, ::2]})
+    said({**plain, "depth": plain["depth"].astype(np.int32)})
+    said({**plain, "depth": plain["depth"].astype(np.float64)})
+    said({**plain, "depth": torch.from_numpy(plain["depth"].astype(np.float32)).requires_grad_()})
+    said({**plain, "intrinsics": torch.from_numpy(plain["intrinsics"]).requires_grad_()})
+    said({**plain, "intrinsics": plain["intrinsics"].tolist()})
+    said(plain, sparse=True)
+    said(plain, depth_range=(0.0, 3.0))
+    said(plain, unit=0.001)
+    said(plain, distortion=(0.1, 0.0, 0.0, 0.0))
+    said(plain, index_key="index")
+    said(plain, dense=True)
+    said(plain, n=5000)
+    said({**plain, "before": plain["image"]}, other_image="before")
+    said(plain, method=PAPER.replace(sample=lambda hw, n, **o: sample.grid(hw, n)))
+    said(plain, method=PAPER.replace(backproject=lambda *looked: backproject(*looked, min_conf=1)))
+    said(plain, method=PAPER.replace(backproject={"search_px": 2}))
+    said(plain, method=PAPER.replace(classify={"block": 15}))
+    with forward_ad.dual_level():
+        said(plain)
+    monkeypatch.setattr(native, "_loaded", [])
+    said(plain)
+    assert not calls
+
+
+@needs_compiler
+@pytest.mark.parametrize("on_error", ["raise", "skip", "flag"])
+def test_what_contradicts_its_unit_is_told_as_the_stages_tell_it(loaded, monkeypatch, on_error):
+    transform, plain = ExtendDepth(depth_unit="mm", n=50, on_error=on_error), decoded("uint16", "mm")
+    none, wrong = np.zeros((61, 83), np.uint16), plain["depth"] // 500
+    transform(plain)
+    calls = counted(monkeypatch, "samples")
+    assert transform({**plain, "depth": none})["dhtorch.problem"] == SampleProblem.NO_DEPTH and calls == ["samples"]
+    if on_error == "raise":
+        with pytest.raises(SampleError, match="are the numbers metres"):
+            transform({**plain, "depth": wrong})
+        with pytest.raises(SampleError, match="depth: found no such key"):
+            transform({k: v for k, v in plain.items() if k != "depth"})
+        with pytest.raises(SampleError, match="expected a dict"):
+            transform(plain["image"])
+    else:
+        with pytest.warns(UserWarning, match="are the numbers metres"):
+            told = transform({**plain, "depth": wrong})
+        assert (told is None) == (on_error == "skip") and transform.report()["unreadable"] == 1
+
+
+@needs_compiler
+def test_what_samples_of_a_kind_share_is_kept_but_not_for_all_and_is_nobodys_to_change(loaded, monkeypatch):
+    transform, plain = ExtendDepth(depth_unit="mm", n=50), decoded("uint16", "mm")
+    with torch.inference_mode():
+        transform(plain)
+    assert not transform._alone.kept, "tensors of inference mode are of no use outside it"
+    first = transform(plain)
+    expected = {k: torch.as_tensor(v).clone() for k, v in first.items()}
+    for value in first.values():
+        if isinstance(value, torch.Tensor):
+            value.zero_()
+    equal(transform(plain), expected)
+    twin = pickle.loads(pickle.dumps(transform))
+    equal(twin(plain), expected)
+    for k in range(70):
+        K = plain["intrinsics"] + k * np.diag([1.0, 1, 0])
+        (stages,) = by_stages(transform, monkeypatch, lambda K=K: transform({**plain, "intrinsics": K}))
+        equal(transform({**plain, "intrinsics": K}), stages)
+    assert len(transform._alone.kept) == CAMERAS
+    transform.method = transform.method.replace(n=20)
+    assert transform(plain)["dhtorch.uv"].shape == (20, 2), "a method that somebody puts in is the one that is asked"

@@ -94,7 +94,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("summarise", "x if u == 1 else x * u", "x"),
         ("summarise", "(size, (v, u), **whole)", "(size, (u, v), **whole)"),
         ("summarise", "fill = middle.flatten(), -(B * N) % LANES", "fill = middle.flatten(), 0"),
-        ("summarise", "(grey and _product_is_exact(image))", "_product_is_exact(image)"),
+        ("summarise", "(grey and product_is_exact(image))", "product_is_exact(image)"),
         ("_must_fit", "size > min(H, W)", "size >= min(H, W)"),
         ("_must_fit", "size > min(H, W)", "size > max(H, W)"),
         (
@@ -105,7 +105,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ),
         ("_read_rows", "div_(255 * 1000)", "div_(256 * 1000)"),
         ("_read_rows", ".transpose(0, 1)", ""),
-        ("_product_is_exact", "return _view_is_safe(image) and not reduced", "return _view_is_safe(image)"),
+        ("product_is_exact", "return _view_is_safe(image) and not reduced", "return _view_is_safe(image)"),
         (
             "_view_is_safe",
             "image.requires_grad and torch.is_grad_enabled()",

@@ -69,7 +69,7 @@ def summarise(
         if image.dtype == kind:
             found = image.new_empty(count, B, N, dtype=torch.float32)
             shape = (b, c, v, u, C, H, W, size)
-            exact = (u == 3 and _product_is_exact(image),) if grey else ()
+            exact = (u == 3 and product_is_exact(image),) if grey else ()
             getattr(torch.ops.dhtorch, f"window_{compiled}").default(flat, pixel, found, *shape, *exact)
             return found.unbind(0)
     x, y = _moved_inside(pixel if image.numel() < 1 << 31 else pixel.long(), (H, W), size)
@@ -86,7 +86,7 @@ def summarise(
     around = (_around.__wrapped__ if is_transformed() else _around)(size, (v, u), **whole)
     if compiling:
         middle, at_once = _in_memory(middle), len(middle)  # computed once per point and not again for every pixel
-    if u == C == 3 and image.dtype == torch.uint8 and (compiling or (grey and _product_is_exact(image))):
+    if u == C == 3 and image.dtype == torch.uint8 and (compiling or (grey and product_is_exact(image))):
         read, grey = partial(_read_rows, flat, grey), False
     parts = (middle,) if len(middle) <= at_once else middle.split(at_once)
     seen = (read(around, part) for part in parts)
@@ -275,7 +275,7 @@ def round_half_up(uv: Tensor) -> Tensor:
     return torch.floor(uv.detach() + 0.5)
 
 
-def _product_is_exact(image: Tensor) -> bool:
+def product_is_exact(image: Tensor) -> bool:
     """Whether a matrix product has 24 bits here, and the overlapping view of rows that goes with it may be used."""
     reduced = torch.is_autocast_enabled(image.device.type) or torch.get_float32_matmul_precision() != "highest"
     return _view_is_safe(image) and not reduced

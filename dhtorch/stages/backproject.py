@@ -88,7 +88,7 @@ def backproject(
     if uv.dim() == 2:
         uv = uv.expand(sizes["B"], *uv.shape)
     check("backproject", uv=(uv, "B N 2"), f=(frame.camera.f, "B 2"))
-    limits = _Limits(
+    limits = Limits(
         near_limit=near_limit,
         min_conf=min_conf,
         sigma_m=sigma_m,
@@ -102,7 +102,9 @@ def backproject(
     return _in_torch(frame, uv, search_px, limits) if found is None else found
 
 
-class _Limits(NamedTuple):
+class Limits(NamedTuple):
+    """What is taken for a return, and what is said of it: options of :func:`backproject`."""
+
     near_limit: float | None
     min_conf: int
     sigma_m: float
@@ -112,8 +114,12 @@ class _Limits(NamedTuple):
     saturated: float
     highlight: float
 
+    def told(self) -> Limits:
+        """As compiled code is told them, which knows no None."""
+        return self if self.near_limit is not None else self._replace(near_limit=torch.inf)
 
-def _in_torch(frame: Frame, uv: Tensor, search_px: int | None, limits: _Limits) -> Samples:
+
+def _in_torch(frame: Frame, uv: Tensor, search_px: int | None, limits: Limits) -> Samples:
     """The reference, on any device, with a graph."""
     pixel = pixels(uv)
     depth, level, edge = _read_depth(frame, uv, pixel, search_px or 0, limits.edge_rel)
@@ -152,33 +158,38 @@ def _in_torch(frame: Frame, uv: Tensor, search_px: int | None, limits: _Limits) 
     )
 
 
-def _compiled(frame: Frame, uv: Tensor, limits: _Limits) -> Samples | None:
+def _compiled(frame: Frame, uv: Tensor, limits: Limits) -> Samples | None:
     """The same bits (sigma up to the rounding of its root) of dense maps and pictures of bytes; None where compiled
     code is not loaded or does not serve."""
-    h, w = frame.depth.shape[-2:]
-    size, around = (min(NEIGHBOURHOOD, *hw) for hw in (frame.hw, (h, w)))
     conf = frame.depth.new_empty(0, dtype=torch.uint8) if frame.conf is None else frame.conf
     bytes_alone = frame.image.dtype == conf.dtype == torch.uint8 and 0 <= limits.min_conf <= 255
     if not bytes_alone or frame.depth.dtype != uv.dtype or not native.serves(frame.depth, conf):
         return None
-    looks = _looks(frame, uv)
-    if looks is None:
+    found = places(frame, uv)
+    if found is None:
         return None
-    pixel, at, ray = looks
+    pixel, at, ray = found
     picture, steps = in_a_row(frame.image)
     depth, sigma, confidence = (ray.new_empty(ray.shape[:2]) for _ in range(3))
     flag = torch.empty_like(depth, dtype=torch.int32)
     xyz = torch.empty_like(ray)
-    told = limits._replace(near_limit=torch.inf if limits.near_limit is None else limits.near_limit)
     said = (depth, sigma, confidence, xyz, flag)
-    shape = (around, *steps, *frame.image.shape[1:], size)
-    torch.ops.dhtorch.samples.default(frame.depth, conf, at, picture, pixel, ray, *said, *shape, *told)
+    size, reach = around(frame)
+    shape = (reach, *steps, *frame.image.shape[1:], size)
+    torch.ops.dhtorch.samples.default(frame.depth, conf, at, picture, pixel, ray, *said, *shape, *limits.told())
     none = {"trackability": torch.zeros_like(depth), "hole": torch.zeros_like(flag)}
     return Samples(uv=uv, depth=depth, sigma=sigma, xyz=xyz, confidence=confidence, flag=flag, **none)
 
 
-def _looks(frame: Frame, uv: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
-    """Pixels of the picture and of the map (B, N, 2), and rays (B, N, 3); None where compiled code does not serve."""
+def around(frame: Frame) -> tuple[int, int]:
+    """Sides of the neighbourhoods in the picture and in the map, px."""
+    hw = frame.depth.shape[-2], frame.depth.shape[-1]
+    return min(NEIGHBOURHOOD, *frame.hw), min(NEIGHBOURHOOD, *hw)
+
+
+def places(frame: Frame, uv: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
+    """Where compiled code reads for samples (B, N, 2): pixels of picture and map (B, N, 2), and rays (B, N, 3); None
+    where it does not serve."""
     camera, own = frame.camera, frame.depth_camera
     (h, w), (H, W) = frame.depth.shape[-2:], frame.hw
     if camera.distortion is None and (own is None or own.distortion is None):
@@ -267,7 +278,7 @@ def _nearest_return(depth: Tensor, place: Tensor, size: int, search_px: int) -> 
     return torch.where(reachable.gather(-1, pick), found.to(place.dtype), place)
 
 
-def _appearance(image: Tensor, pixel: Tensor, limits: _Limits) -> tuple[Tensor, ...]:
+def _appearance(image: Tensor, pixel: Tensor, limits: Limits) -> tuple[Tensor, ...]:
     """What the picture alone decides, (B, N) each: at the border, too dark, clipped at white, a highlight."""
     hw = (image.shape[-2], image.shape[-1])
     size = min(NEIGHBOURHOOD, *hw)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -15,8 +15,9 @@ from dhtorch.geometry import camera as cam
 from dhtorch.method import Method, networks
 from dhtorch.methods import chosen
 from dhtorch.pair import merge
-from dhtorch.records import NO_HINT, DepthMap, Estimate, PoseFit, Samples, TrackHint
+from dhtorch.records import NO_HINT, DepthMap, Estimate, Map, PoseFit, Samples, TrackHint
 from dhtorch.transform import given, maps
+from dhtorch.transform.alone import Alone
 from dhtorch.transform.leaves import SampleError, check_sample, find, to_tensor
 from dhtorch.transform.problems import SampleProblem, Tally
 from dhtorch.transform.tokens import CHANNELS, FITS, grid, patch_tokens
@@ -113,12 +114,16 @@ class ExtendDepth(torch.nn.Module):
         self.on_error, self.batched, self.prefix = on_error, bool(batched), prefix
         self._stated = batched
         self.tally = Tally()
+        self._alone = Alone(self.views, self.method)
         self._seen_hw: tuple[int, int] | None = None
 
     def forward(self, sample: Mapping[str, Any]) -> dict[str, Any] | None:
         """The sample with our keys; None where it is skipped."""
         if sample is None and self.on_error == "skip":  # what a data set gives that could not read one
             return self.left_out({}, SampleError("sample: found None, expected a dict with pictures and depth"))
+        at_once = None if self.batched else self.uncollated([sample])
+        if at_once is not None:
+            return {**sample, **{key: x[0] for key, x in at_once.items()}}
         check_sample(sample, self.views.image, self.views.intrinsics, self._stated)
         with torch.set_grad_enabled(torch.is_grad_enabled() and get_worker_info() is None):
             try:
@@ -134,10 +139,30 @@ class ExtendDepth(torch.nn.Module):
             if flagged:
                 warnings.warn(f"flagged: {read.complaint()}", stacklevel=2)
             added = self._answer(read, seed, flagged)
-        self.tally.add(added["problem"])
-        if self._seen_hw != read.anchor.hw:  # torch looks twice at what a module is given
-            self._seen_hw = read.anchor.hw
+        self._counted(added["problem"], read.anchor.hw)
         return self._joined(sample, added)
+
+    def uncollated(self, samples: Sequence[Any]) -> dict[str, Tensor] | None:
+        """What is added to the batch that single samples make, without collating what is read of them first.
+
+        None where that cannot be: it needs the compiled code of ``python -m dhtorch.native``, one view in each sample,
+        pictures of bytes and depth in metres or whole millimetres, and nothing to complain of.
+
+        Gradient: none; None where one is wanted.
+        """
+        if self._alone.method is not self.method or self._alone.views is not self.views:  # somebody put in another one
+            self._alone = Alone(self.views, self.method)
+        stages = self.maps is not None or self.index_key is not None
+        seen = None if stages else self._alone.look(samples)
+        if seen is None:
+            return None
+        found, B = seen.found, len(samples)
+        pooled = patch_tokens(found, seen.hole, seen.hw, patch=self.patch, tokens_hw=self.tokens_hw, fit=self.fit)
+        paired = torch.zeros(B, dtype=torch.bool)
+        added = _added(found, pooled, xyz=seen.xyz, flag=seen.flag, hole=seen.hole, gate=None, fit=None, paired=paired)
+        problem = torch.full((B,), SampleProblem.NO_SECOND_VIEW, dtype=torch.int32)
+        self._counted(problem, seen.hw)
+        return {self.prefix + key: x for key, x in {**added, "problem": problem}.items()}
 
     def report(self) -> dict[str, int]:
         """Number of samples by problem since the transform was made, those of all workers together."""
@@ -163,29 +188,16 @@ class ExtendDepth(torch.nn.Module):
         fit = fits[-1] if fits else None
         found = merge(samples, estimate)
         pooled = (found, samples.hole) if dense is None else maps.as_samples(dense, frame, self.method)
-        tokens, known = patch_tokens(*pooled, frame.hw, patch=self.patch, tokens_hw=self.tokens_hw, fit=self.fit)
-        valid = found.source != Source.NONE
+        tokens = patch_tokens(*pooled, frame.hw, patch=self.patch, tokens_hw=self.tokens_hw, fit=self.fit)
         xyz = samples.xyz if estimate is None else cam.unproject(frame.camera, found.uv, found.depth)
-        added = {
-            "uv": found.uv,
-            "xyz": torch.where(valid[..., None], xyz, 0.0),
-            "depth": found.depth,
-            "sigma": found.sigma,
-            "score": found.score,
-            "valid": valid,
-            "source": found.source,
-            "flag": samples.flag,
-            "hole": samples.hole,
-            "gate": torch.full_like(samples.hole, Gate.NO_TRACK) if estimate is None else estimate.gate,
-            **_pose(fit, paired, found.depth),
-            **({} if self.views.pose is None else given.keys(fits, paired, given.name_of(self.views.pose))),
-            "tokens": tokens,
-            "tokens_valid": known,
-            **({} if dense is None else maps.as_keys(dense)),
-        }
+        xyz = torch.where((found.source != Source.NONE)[..., None], xyz, 0.0)
+        gate = None if estimate is None else estimate.gate
+        added = _added(found, tokens, xyz=xyz, flag=samples.flag, hole=samples.hole, gate=gate, fit=fit, paired=paired)
+        added |= {} if self.views.pose is None else given.keys(fits, paired, given.name_of(self.views.pose))
+        added |= {} if dense is None else maps.as_keys(dense)
         if flagged:
             added = {key: x.masked_fill(bad.view(-1, *[1] * (x.ndim - 1)), 0) for key, x in added.items()}
-        problem = torch.tensor(_problems(read, flagged), dtype=torch.int32, device=valid.device)
+        problem = torch.tensor(_problems(read, flagged), dtype=torch.int32, device=xyz.device)
         return {**added, "problem": problem}
 
     def _asked(self, read: Read, seed: int | Tensor) -> tuple[Samples, Estimate | None, list[PoseFit], DepthMap | None]:
@@ -237,6 +249,11 @@ class ExtendDepth(torch.nn.Module):
             out |= {key: torch.zeros(1, *size, dtype=torch.int32) for key in maps.CODES}
         return {**out, "problem": torch.full((1,), SampleProblem.UNREADABLE, dtype=torch.int32)}
 
+    def _counted(self, problem: Tensor, hw: tuple[int, int]) -> None:
+        self.tally.add(problem)
+        if self._seen_hw != hw:  # torch looks twice at what a module is given
+            self._seen_hw = hw
+
     def _joined(self, sample: Mapping[str, Any], added: Mapping[str, Tensor]) -> dict[str, Any]:
         # Copies of their own: a row of a shared table would be sent to the main process with the whole table.
         mine = {self.prefix + key: x if self.batched else x[0].contiguous() for key, x in added.items()}
@@ -255,6 +272,35 @@ def _problems(read: Read, flagged: bool) -> list[int]:
         return SampleProblem.NONE if paired else SampleProblem.NO_SECOND_VIEW
 
     return list(map(code, bad, read.sensed.tolist(), read.paired.tolist()))
+
+
+def _added(
+    found: Map,
+    tokens: tuple[Tensor, Tensor],
+    *,
+    xyz: Tensor,
+    flag: Tensor,
+    hole: Tensor,
+    gate: Tensor | None,
+    fit: PoseFit | None,
+    paired: Tensor,
+) -> dict[str, Tensor]:
+    """Keys of what was found; without an estimate nothing was tracked."""
+    return {
+        "uv": found.uv,
+        "xyz": xyz,
+        "depth": found.depth,
+        "sigma": found.sigma,
+        "score": found.score,
+        "valid": found.source != Source.NONE,
+        "source": found.source,
+        "flag": flag,
+        "hole": hole,
+        "gate": torch.full_like(hole, Gate.NO_TRACK) if gate is None else gate,
+        **_pose(fit, paired, found.depth),
+        "tokens": tokens[0],
+        "tokens_valid": tokens[1],
+    }
 
 
 def _pose(fit: PoseFit | None, paired: Tensor, like: Tensor) -> dict[str, Tensor]:

@@ -90,6 +90,15 @@ def to_tensor(value: Any, key: str, *, signed: bool = True) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(array))
 
 
+def plainly(value: Any) -> Hashable | None:
+    """What tells numbers from others; None of what numpy does not know, or a graph or another device has."""
+    if isinstance(value, Tensor) and value.dtype in (torch.float32, torch.float64) and not is_transformed():
+        value = value.numpy() if value.is_cpu and not has_graph(value) else value
+    if not isinstance(value, np.ndarray) or value.dtype.kind not in "buif":
+        return None
+    return value.tobytes(), value.dtype.str, value.shape
+
+
 #: Keys of numbers that samples have one of, and collated batches one for each sample.
 _COUNTED = ("episode_index", "index", "frame_index")
 
@@ -205,13 +214,10 @@ class Leaves:
         a type that numpy does not know has them, and in inference mode, whose tensors are of no use outside it."""
         if torch.is_inference_mode_enabled():
             return None
-        value = find(self.sample, numbers) if isinstance(numbers, str) else np.asarray(numbers)
-        if isinstance(value, Tensor) and value.dtype in (torch.float32, torch.float64) and not is_transformed():
-            value = value.numpy() if value.is_cpu and not has_graph(value) else value
-        if not isinstance(value, np.ndarray) or value.dtype.kind not in "buif" or self.like is None:
+        own = plainly(find(self.sample, numbers) if isinstance(numbers, str) else np.asarray(numbers))
+        if own is None or self.like is None:
             return None
-        kind = value.dtype.str, value.shape, self.dtype, self.like.device
-        return value.tobytes(), *kind, self.batched, len(self.like)
+        return own, self.dtype, self.like.device, self.batched, len(self.like)
 
     def camera(self, numbers: Numbers, T: int, at: int, distortion: Tensor | None) -> Camera:
         """Camera of the frame at a place along time."""

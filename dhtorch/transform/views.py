@@ -286,14 +286,18 @@ class Views:
 
     def _probed(self, depth: Tensor) -> tuple[Tensor, list[tuple[Tensor, Tensor, str]]]:
         """Which maps (B,) have a return, and what speaks against the unit."""
-        low, high = self.min_depth * (1 + _ROUNDING), self.max_depth * (1 - _ROUNDING)
+        low, high = self.bounds()
         if native.serves(depth):
             counts = depth.new_empty(2, len(depth), dtype=torch.int64)
-            torch.ops.dhtorch.probe.default(depth, counts, _step(depth), low, high)
-            if all(0 < some < 2 * sound for some, sound in zip(*counts.tolist(), strict=True)):  # so is the median
+            torch.ops.dhtorch.probe.default(depth, counts, step(depth), low, high)
+            if all_sound(counts):
                 return torch.ones(len(depth), dtype=torch.bool), []
         probes = _probes(depth.detach())
         return any_return(depth, probes), self._depth_checks(probes, low, high)
+
+    def bounds(self) -> tuple[float, float]:
+        """Between which a median return, m, surely speaks for the unit."""
+        return self.min_depth * (1 + _ROUNDING), self.max_depth * (1 - _ROUNDING)
 
     def _depth_checks(self, probes: Tensor, low: float, high: float) -> list[tuple[Tensor, Tensor, str]]:
         median = torch.where(probes > 0, probes, torch.nan).nanmedian(1).values
@@ -351,11 +355,18 @@ class Views:
 
 def _probes(depth: Tensor) -> Tensor:
     """Some of the numbers (B, k) of each map, evenly spread; far from each other, they are read once for all."""
-    return depth.flatten(1)[:, :: _step(depth)].contiguous()
+    return depth.flatten(1)[:, :: step(depth)].contiguous()
 
 
-def _step(depth: Tensor) -> int:
-    return max(1, depth.shape[1] * depth.shape[2] // PROBES)
+def step(depth: Tensor) -> int:
+    """From one of the numbers of maps (…, h, w) by which they are judged to the next."""
+    return max(1, depth.shape[-2] * depth.shape[-1] // PROBES)
+
+
+def all_sound(counts: Tensor) -> bool:
+    """Whether the median return of every map surely lies between both bounds; of how many of its numbers are returns,
+    and how many of these do (2, B)."""
+    return all(0 < some < 2 * sound for some, sound in zip(*counts.tolist(), strict=True))
 
 
 def any_return(depth: Tensor, probes: Tensor) -> Tensor:
