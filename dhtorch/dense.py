@@ -315,7 +315,7 @@ def _gated(
     lost = ~base.known.unflatten(-1, base.hw) | ~found.seen | beyond | (found.correlation < min_correlation)
     unsure = ~(sigma_rel <= max_sigma_rel) | ~alone
     gate = first_reason((lost, Gate.NO_TRACK), (unsure, Gate.UNCERTAIN))
-    pair = silent[:, None, None].expand_as(gate)
+    pair = silent[:, None, None]
     gate = torch.where(pair != Gate.ANSWER, pair, gate)
     keep = gate == Gate.ANSWER
     nan = torch.full_like(depth, torch.nan)
@@ -323,7 +323,7 @@ def _gated(
         depth=torch.where(keep, depth, nan),
         sigma=torch.where(keep, sigma_rel * depth.detach(), nan),
         score=torch.where(keep, 0.1 / (0.1 + sigma_rel), 0.0),
-        source=torch.where(keep, Source.SWEPT, Source.NONE).to(torch.int32),
+        source=keep.int() * Source.SWEPT,
         gate=gate,
     )
 
@@ -371,8 +371,8 @@ def _joined_with(told: DepthMap, returns: Returns) -> DepthMap:
         depth=torch.where(usable, returns.depth.to(nan), torch.where(keep, told.depth, nan)),
         sigma=torch.where(usable, returns.sigma.to(nan), torch.where(keep, told.sigma, nan)),
         score=torch.where(usable, returns.confidence.to(nan), torch.where(keep, told.score, 0.0)),
-        source=torch.where(usable, Source.SENSOR, torch.where(keep, Source.SWEPT, Source.NONE)).to(torch.int32),
-        gate=torch.where(usable, Gate.ANSWER, told.gate).to(torch.int32),
+        source=(keep.int() * Source.SWEPT).masked_fill(usable, Source.SENSOR),
+        gate=told.gate.masked_fill(usable, Gate.ANSWER),
     )
 
 

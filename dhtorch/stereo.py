@@ -38,6 +38,9 @@ WINDOW, EDGE = 4, 0.17
 #: Correlation of its windows from which on a view has a say in a pixel's depth.
 SAY = 0.5
 
+#: Below any weight that a view can have.
+NO_WEIGHT = 1e-37
+
 #: Planes that a fit may move a pixel in one step and in all, and by which one surface must be nearer to hide another.
 STEP, ALL_STEPS, NEARER = 1.0, 1.5, 1.5
 
@@ -171,11 +174,11 @@ def _joined(
             here = one.seen & use[:, None, None] & ~sweep.hidden(sweep.travel(base, view), at, NEARER * plane)
             moved = pose_variance(base, view, fit, at, one.motion) if last else None
         said = _also(said, one, here, STEP * plane, moved)
-    given = said.weight > 0
-    weight = torch.where(given, said.weight, 1.0)
-    infinite = torch.full_like(at, torch.inf)
-    own, shared = (torch.where(given, x / weight, infinite) for x in (torch.ones_like(at), said.shared))
-    return said.step / weight, Fitted(at, own, shared, said.best, said.seen)
+    step = said.step / said.weight.clamp_min(NO_WEIGHT)
+    own, shared = 1 / said.weight, said.shared
+    if last:
+        shared = torch.where(said.weight > 0, shared / said.weight, torch.inf)
+    return step, Fitted(at, own, shared, said.best, said.seen)
 
 
 class _Said(NamedTuple):

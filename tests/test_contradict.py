@@ -134,6 +134,9 @@ def test_a_pair_is_judged_by_the_noise_of_its_far_tracks_and_by_holes_without_a_
         before, after = ask(noisy), ask(noisy, max_far_noise=limit)
         expected = torch.where(before == 0, Gate.CONTRADICTED, before) if silent else before
         assert torch.equal(after, expected)
+    wide = cameras[0].replace(f=cameras[0].f / 4)  # whose pixels say nothing of those that tracks end in
+    gate = method.triangulate(samples, ideal, noisy, wide, cameras[1], max_far_noise=1.1 / f).gate
+    assert not (gate == Gate.CONTRADICTED).any()
     beyond = torch.where(samples.usable, 50.0, 0.0)
     far_off = samples.replace(depth=beyond)
     fit = fit.replace(inlier=fit.inlier & (torch.arange(512) % 16 == 0))  # less than what is asked

@@ -364,6 +364,14 @@ def test_the_anchor_is_sampled_once_and_every_view_is_a_pair_with_it():
         assert torch.equal(t["fit"].T_1_from_0.t, expected.T_1_from_0.t)
 
 
+def test_every_anchor_has_its_own_draws_in_all_its_views():
+    seats = Seats()
+    extend_window(seats.anchor, seats.others, **seats.seats(), seed=torch.tensor([4, 9]))
+    ((_, _, draws),) = seats.asked["pose"]
+    assert torch.equal(draws, uniform_draws(torch.tensor([4, 9] * 3), 6, 5).float())
+    assert not torch.equal(draws[0], draws[1])
+
+
 def test_a_search_begins_where_the_last_view_was_found_further_on_at_the_same_pace():
     seats = Seats(V=4)
     extend_window(seats.anchor, seats.others, **seats.seats())

@@ -14,7 +14,7 @@ from dhtorch.geometry import lucas_kanade as lk
 from dhtorch.geometry import start
 from dhtorch.geometry.exact import LANES
 from dhtorch.geometry.pyramid import build_pyramid
-from dhtorch.records import TrackHint
+from dhtorch.records import TrackHint, Tracks
 from dhtorch.stages import track
 from dhtorch.stages.track import MIN_EIGENVALUE, lucas_kanade, lucas_kanade_affine
 
@@ -272,3 +272,23 @@ def test_a_larger_picture_needs_more_levels_from_a_start(width: int, levels: int
     uv = torch.zeros(1, 10, 13, 2)
     flow = start.Flow(uv, uv, cells, torch.eye(2)[None], torch.ones(1))
     assert track._reaching(flow, (width * 3 // 4, width), 21) == levels
+
+
+def test_what_is_found_in_the_upright_picture_is_told_of_the_image():
+    """Noise turns and grows with the picture, what was found beyond the image is not in it, and a start is undone."""
+    turn = 1.3 * torch.tensor([[math.cos(0.5), -math.sin(0.5)], [math.sin(0.5), math.cos(0.5)]])
+    linear = torch.stack([turn, torch.eye(2)])
+    middle = torch.tensor([[[W / 2, H / 2]]]).expand(2, 1, 2)
+    none = start.Flow(middle[:, None], middle[:, None], torch.ones(2, 1, 1), linear, torch.ones(2))
+    image = torch.rand(2, 1, H, W, generator=torch.Generator().manual_seed(0))
+    undone = track._Upright(image, (none, none))
+    uv = torch.tensor([[150.0, 110.0], [2.0, 3.0], [-3.0, 3.0]]).expand(2, 3, 2)
+    cov = torch.tensor([[4.0, 1.0], [1.0, 0.5]]).expand(2, 3, 2, 2)
+    known = torch.ones(2, 3, dtype=torch.bool)
+    tracks = Tracks(uv_0=uv, uv_1=uv, cov=cov, valid=known, error=torch.zeros(2, 3), photometric=torch.zeros(2, 3))
+    told = undone.to_image(tracks)
+    assert torch.allclose(told.cov[0], turn @ cov[0] @ turn.T) and torch.equal(told.cov[1], cov[1])
+    centre = torch.tensor([(W - 1) / 2, (H - 1) / 2])
+    assert torch.allclose(told.uv_1[0], (uv[0] - centre) @ turn.T + centre, atol=1e-3)
+    assert told.valid.tolist() == [[True, False, False], [True] * 3], "a picture that is not turned is judged elsewhere"
+    assert torch.allclose(undone.begin(uv, told.uv_1), uv, atol=1e-3)

@@ -12,6 +12,7 @@ TESTS: dict[str, list[str]] = {
     "stages.track": [
         "tests/test_affine_by_hand.py",
         "tests/test_lucas_kanade.py",
+        "tests/test_start.py",
         "tests/test_track.py",
         "tests/test_contract.py",
     ],
