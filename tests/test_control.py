@@ -63,6 +63,15 @@ def student(share, freedom):
     return z + (z**3 + z) / 4 / freedom + (5 * z**5 + 16 * z**3 + 3 * z) / 96 / freedom**2
 
 
+def test_one_scene_more_stays_below_by_students_t_from_a_table():
+    risks = torch.tensor([[0.02], [0.05], [0.03], [0.06], [0.04]], dtype=torch.float64)
+    speaks = torch.ones_like(risks, dtype=torch.bool)
+    spread = statistics.stdev(risks[:, 0].tolist()) * math.sqrt(1 + 1 / 5)
+    for share, t in ((0.9, 1.533), (0.95, 2.132)):
+        assert float(control._one_more(risks, speaks, share)) == pytest.approx(0.04 + t * spread, rel=0.01)
+    assert float(control._one_more(risks, speaks & (risks < 0.025), 0.9)) == math.inf
+
+
 def brute_most(scenes, target, share, few):
     for threshold in every_threshold(scenes):
         losses = [table(p, threshold) for p in scenes]

@@ -139,6 +139,11 @@ def test_truth_of_a_pair_does_not_depend_on_its_batch():
             alone = holdout.truth_at(frame[b : b + 1], uv[b : b + 1])
             assert torch.equal(alone.depth, together.depth[b : b + 1])
             assert torch.equal(alone.code, together.code[b : b + 1])
+    dense, sparse, both = (holdout.truth_at(frame, uv) for frame in frames)
+    assert not torch.equal(dense.code[1], sparse.code[1]) and not torch.equal(dense.depth[1], sparse.depth[1])
+    for b, map_is_sparse in enumerate(frames[2].sparse.tolist()):
+        expected = sparse if map_is_sparse else dense
+        assert torch.equal(both.depth[b], expected.depth[b]) and torch.equal(both.code[b], expected.code[b])
 
 
 def test_candidates_are_held_back_smooth_and_textured_and_counted_by_rule():
