@@ -7,16 +7,16 @@ for it; nothing needs it.
 
 ``dhtorch.stereo`` and ``pair``, ``dhtorch.stages.backproject``, ``holes`` and ``pose``, ``dhtorch.geometry.sweep``,
 ``pyramid``, ``lookup``, ``neighbours``, ``lucas_kanade``, ``affine`` and ``near_far``, ``dhtorch.transform.tokens``,
-``views`` and ``alone`` ask here whether tensors may be handed over; where not (nothing was loaded, another device or type, under
-vmap, a compiler or a graph) they do the same in torch, which is the reference. Tokens, depths in metres, the sensor's
-own map and the sweep are alike bit for bit, the fits of the sweep up to rounding: no more than one gate in 200 differs,
-and 99 of 100 depths by less than a tenth of their sigma. A pyramid, what is read around samples and what is said of
-them do up to one rounding of a number, textures up to the rounding of their sums. The search and the registration do up
-to the rounding of sums over a window: half of the places that were searched for are equal and half of those that were
-registered lie within 1e-4 px, 99 of 100 lie within a tenth of their sigma, and no more than one verdict in 200 changes.
-Of poses, whose costs and equations it sums, 99 of 100 lie within a hundredth of their sigma. Nothing is ever compiled
-or downloaded without the command above. The file in the cache is named after its sources, torch's version and the
-processor, whose widest vectors it uses.
+``views`` and ``alone`` ask here whether tensors may be handed over; where not (nothing was loaded, another device or
+type, under vmap, a compiler or a graph) they do the same in torch, which is the reference. Tokens, depths in metres,
+the sensor's own map and the sweep are alike bit for bit, the fits of the sweep up to rounding: no more than one gate in
+200 differs, and 99 of 100 depths by less than a tenth of their sigma. A pyramid, what is read around samples and what
+is said of them do up to one rounding of a number, textures up to the rounding of their sums. The search and the
+registration do up to the rounding of sums over a window: half of the places that were searched for are equal and half
+of those that were registered lie within 1e-4 px, 99 of 100 lie within a tenth of their sigma, and no more than one
+verdict in 200 changes. Of poses, whose costs and equations it sums, 99 of 100 lie within a hundredth of their sigma.
+Nothing is ever compiled or downloaded without the command above. The file in the cache is named after its sources,
+torch's version and the processor, whose widest vectors it uses.
 """
 
 from __future__ import annotations

@@ -25,6 +25,9 @@ inline Vector nine(const Vector* x) {
   return x[0] + (((x[1] + x[2]) + (x[3] + x[4])) + ((x[5] + x[6]) + (x[7] + x[8])));
 }
 
+// A pixel of up to four channels, which are loaded together: single numbers that a vector gathers take several times as long.
+constexpr int64_t CHANNELS = 4;
+
 // Pictures (channels, H, W) read at up to w places at once.
 struct Reader {
   int64_t channels, H, W;
@@ -34,9 +37,8 @@ struct Reader {
   Reader(const Tensor& picture, int64_t w)
       : channels(picture.size(1)), H(picture.size(2)), W(picture.size(3)), first(w), right(w), down(w), weight(4 * w) {}
 
-  // As F.grid_sample in its border mode, of places that went through its normalised coordinates; channel after channel,
-  // `apart` numbers from each other.
-  void read(const float* picture, const float* u_of, const float* v_of, int64_t w, float* found, int64_t apart) {
+  // Where F.grid_sample reads in its border mode, of places that went through its normalised coordinates.
+  void place(const float* u_of, const float* v_of, int64_t w) {
     const float across = static_cast<float>(W), along = static_cast<float>(H);
     const int32_t wide = static_cast<int32_t>(W), last_u = wide - 1, last_v = static_cast<int32_t>(H) - 1;
     int32_t *__restrict at = first.data(), *__restrict aside = right.data(), *__restrict below = down.data();
@@ -63,10 +65,44 @@ struct Reader {
       sw[x] = e_ * n_;
       se[x] = w_ * n_;
     }
+  }
+
+  // The picture's three channels, pixel by pixel.
+  std::vector<float> beside(const float* picture) const {
+    const int64_t all = H * W;
+    std::vector<float> pixels(CHANNELS * all);
+    const float *__restrict a = picture, *__restrict b = a + all, *__restrict c = b + all;
+    float* __restrict to = pixels.data();
+    for (int64_t i = 0; i < all; ++i) {
+      to[CHANNELS * i] = a[i];
+      to[CHANNELS * i + 1] = b[i];
+      to[CHANNELS * i + 2] = c[i];
+    }
+    return pixels;
+  }
+
+  // What such pixels are at places, as many numbers each.
+  void read_beside(const float* pixels, const float* u_of, const float* v_of, int64_t w, float* __restrict found) {
+    place(u_of, v_of, w);
+    const float *nw = weight.data(), *ne = nw + w, *sw = ne + w, *se = sw + w;
+    for (int64_t x = 0; x < w; ++x) {
+      const float *here = pixels + CHANNELS * first[x], *under = here + CHANNELS * down[x];
+      const int64_t aside = CHANNELS * right[x];
+      for (int64_t k = 0; k < CHANNELS; ++k) {
+        const float upper = fused(here[aside + k], ne[x], here[k] * nw[x]);
+        found[CHANNELS * x + k] = fused(under[aside + k], se[x], fused(under[k], sw[x], upper));
+      }
+    }
+  }
+
+  // The same of single channels that lie one after the other, `apart` numbers from each other.
+  void read(const float* picture, const float* u_of, const float* v_of, int64_t w, float* found, int64_t apart) {
+    place(u_of, v_of, w);
+    const int32_t *__restrict at = first.data(), *__restrict aside = right.data(), *__restrict below = down.data();
+    const float *__restrict nw = weight.data(), *__restrict ne = nw + w, *__restrict sw = ne + w, *__restrict se = sw + w;
     for (int64_t k = 0; k < channels; ++k) {
       const float* plane = picture + k * H * W;
-      float* __restrict to = found + k * apart;
-#pragma GCC ivdep
+      float* to = found + k * apart;  // not said to lie apart, for then they would be gathered
       for (int64_t x = 0; x < w; ++x) {
         const float *here = plane + at[x], *under = here + below[x];
         const float upper = fused(here[aside[x]], ne[x], here[0] * nw[x]);
@@ -135,10 +171,11 @@ void fit_windows(Tensor grey, Tensor picture, Tensor uv, Tensor further, Tensor 
   const int64_t B = grey.size(0), h = grey.size(2), w = grey.size(3), H = picture.size(2), W = picture.size(3), N = h * w;
   const int64_t wide = (w + LANES - 1) / LANES * LANES, padded = wide + 2 * RADIUS + LANES;
   const float share = static_cast<float>(1.0 / (SIDE * SIDE));
-  std::vector<float> ring(SIDE * PRODUCTS * wide), column(padded), mean(PRODUCTS * wide), seen(3 * w);
+  std::vector<float> ring(SIDE * PRODUCTS * wide), column(padded), mean(PRODUCTS * wide), seen(CHANNELS * w);
   Reader reader(picture, w);
   for (int64_t k = 0; k < B; ++k) {
     const float* image = data<float>(grey) + k * N;
+    const std::vector<float> pixels = reader.beside(data<float>(picture) + 3 * k * H * W);
     const float *here = data<float>(uv) + 2 * k * N, *there = data<float>(further) + 2 * k * N;
     const float by = data<float>(little)[k];
     const Answers answers{data<float>(step) + k * N, data<float>(contrast) + k * N, data<float>(noise) + k * N,
@@ -147,7 +184,7 @@ void fit_windows(Tensor grey, Tensor picture, Tensor uv, Tensor further, Tensor 
       for (; next <= std::min(y + RADIUS, h - 1); ++next) {
         const float *u = here + next * w, *v = u + N, *u_then = there + next * w, *v_then = u_then + N;
         const float* __restrict I = image + next * w;
-        reader.read(data<float>(picture) + 3 * k * H * W, u, v, w, seen.data(), w);
+        reader.read_beside(pixels.data(), u, v, w, seen.data());
         reader.within(u, v, w, data<bool>(inside) + k * N + next * w);
         float *__restrict right_by = data<float>(motion) + 2 * k * N + next * w, *__restrict down_by = right_by + N;
 #pragma GCC ivdep
@@ -155,20 +192,21 @@ void fit_windows(Tensor grey, Tensor picture, Tensor uv, Tensor further, Tensor 
           right_by[x] = (u_then[x] - u[x]) / by;
           down_by[x] = (v_then[x] - v[x]) / by;
         }
-        const float *__restrict J = seen.data(), *__restrict du = J + w, *__restrict dv = du + w;
+        const float* __restrict read = seen.data();
         float* __restrict to = ring.data() + next % SIDE * PRODUCTS * wide;
 #pragma GCC ivdep
         for (int64_t x = 0; x < w; ++x) {
-          const float g = du[x] * right_by[x] + dv[x] * down_by[x];
+          const float J = read[CHANNELS * x];
+          const float g = read[CHANNELS * x + 1] * right_by[x] + read[CHANNELS * x + 2] * down_by[x];
           to[x] = I[x];
-          to[x + wide] = J[x];
+          to[x + wide] = J;
           to[x + 2 * wide] = g;
           to[x + 3 * wide] = I[x] * I[x];
-          to[x + 4 * wide] = J[x] * J[x];
-          to[x + 5 * wide] = I[x] * J[x];
+          to[x + 4 * wide] = J * J;
+          to[x + 5 * wide] = I[x] * J;
           to[x + 6 * wide] = g * g;
           to[x + 7 * wide] = g * I[x];
-          to[x + 8 * wide] = g * J[x];
+          to[x + 8 * wide] = g * J;
         }
       }
       for (int64_t p = 0; p < PRODUCTS; ++p) {

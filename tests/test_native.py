@@ -1021,8 +1021,8 @@ def test_a_batch_of_views_alone_need_not_be_collated_first(loaded, monkeypatch, 
     stages["dhtorch.uv"] = stages["dhtorch.uv"].contiguous()
     equal(ours, stages)
     assert ours["dhtorch.uv"].data_ptr() != transform._alone.kept[next(iter(transform._alone.kept))].uv.data_ptr()
-    with pytest.raises(RuntimeError):  # as torch says it of pictures of two sizes
-        ExtendedDataset(items, transform, by_batch=True).collate([items[0], decoded("uint16", "mm", hw=(48, 64))])
+    with pytest.raises(RuntimeError, match="equal size"):  # as torch says it of pictures of two sizes
+        dataset.collate([items[0], decoded("uint16", "mm", hw=(48, 64))])
 
 
 @needs_compiler
@@ -1054,6 +1054,8 @@ def test_what_is_not_as_usual_is_asked_of_the_stages(loaded, monkeypatch):
     levels = {**plain, "conf": np.ones((61, 83), np.uint8)}
     said(levels, confidence="conf")
     said({**plain, "image_is_pad": torch.tensor([False])})
+    said({**plain, "depth in metres": plain["depth"].astype(np.float32) / 500})
+    said({**plain, "own": plain["intrinsics"]}, depth_intrinsics="own")
     said({**plain, "image": plain["image"].astype(np.float32) / 255})
     said({**plain, "image": np.stack([plain["image"]] * 2)})
     said({**plain, "image": torch.from_numpy(np.repeat(plain["image"], 2, 1))[:, ::2]})
@@ -1094,6 +1096,9 @@ def test_what_contradicts_its_unit_is_told_as_the_stages_tell_it(loaded, monkeyp
             transform({**plain, "depth": wrong})
         with pytest.raises(SampleError, match="depth: found no such key"):
             transform({k: v for k, v in plain.items() if k != "depth"})
+        for _ in range(2):
+            with pytest.raises(SampleError, match="sizes off the centre"):
+                transform({**plain, "intrinsics": plain["intrinsics"] * 3})
         with pytest.raises(SampleError, match="expected a dict"):
             transform(plain["image"])
     else:

@@ -70,7 +70,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_judged", "2 * wrong.sum((1, 2)) > n", "wrong.sum((1, 2)) > 2 * n"),
         ("_judged", "sigma_told.square() + (share * told.depth.detach()).square()", "sigma_told.square()"),
         ("_joined_with", "told.keep & ~usable", "told.keep & usable"),
-        ("_joined_with", "torch.where(usable, Gate.ANSWER, told.gate)", "told.gate"),
+        ("_joined_with", "told.gate.masked_fill(usable, Gate.ANSWER)", "told.gate"),
     ],
     "stereo": [
         ("best_planes", "(best.plane + best.shift) * step", "best.plane * step"),
