@@ -7,6 +7,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <memory>
 #include <vector>
 
 #include "native_vectors.h"
@@ -68,15 +69,16 @@ struct Reader {
   }
 
   // The picture's three channels, pixel by pixel.
-  std::vector<float> beside(const float* picture) const {
+  std::unique_ptr<float[]> beside(const float* picture) const {
     const int64_t all = H * W;
-    std::vector<float> pixels(CHANNELS * all);
+    std::unique_ptr<float[]> pixels(new float[CHANNELS * all]);
     const float *__restrict a = picture, *__restrict b = a + all, *__restrict c = b + all;
-    float* __restrict to = pixels.data();
+    float* __restrict to = pixels.get();
     for (int64_t i = 0; i < all; ++i) {
       to[CHANNELS * i] = a[i];
       to[CHANNELS * i + 1] = b[i];
       to[CHANNELS * i + 2] = c[i];
+      to[CHANNELS * i + 3] = 0.0f;
     }
     return pixels;
   }
@@ -175,7 +177,7 @@ void fit_windows(Tensor grey, Tensor picture, Tensor uv, Tensor further, Tensor 
   Reader reader(picture, w);
   for (int64_t k = 0; k < B; ++k) {
     const float* image = data<float>(grey) + k * N;
-    const std::vector<float> pixels = reader.beside(data<float>(picture) + 3 * k * H * W);
+    const std::unique_ptr<float[]> pixels = reader.beside(data<float>(picture) + 3 * k * H * W);
     const float *here = data<float>(uv) + 2 * k * N, *there = data<float>(further) + 2 * k * N;
     const float by = data<float>(little)[k];
     const Answers answers{data<float>(step) + k * N, data<float>(contrast) + k * N, data<float>(noise) + k * N,
@@ -184,7 +186,7 @@ void fit_windows(Tensor grey, Tensor picture, Tensor uv, Tensor further, Tensor 
       for (; next <= std::min(y + RADIUS, h - 1); ++next) {
         const float *u = here + next * w, *v = u + N, *u_then = there + next * w, *v_then = u_then + N;
         const float* __restrict I = image + next * w;
-        reader.read_beside(pixels.data(), u, v, w, seen.data());
+        reader.read_beside(pixels.get(), u, v, w, seen.data());
         reader.within(u, v, w, data<bool>(inside) + k * N + next * w);
         float *__restrict right_by = data<float>(motion) + 2 * k * N + next * w, *__restrict down_by = right_by + N;
 #pragma GCC ivdep

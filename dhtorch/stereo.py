@@ -31,6 +31,9 @@ MISFIT = 40.0
 #: than one may be the better one, as where a texture repeats.
 RIVAL, ELSEWHERE_PX = 5, 3.0
 
+#: Every such pixel tells how far one moves in the pictures from plane to plane, of all rows and columns alike.
+SOME = 17
+
 #: A pixel whose window of so many pixels to each side holds a step of the surface may belong to the other side of it:
 #: standard deviation as a share of the step.
 WINDOW, EDGE = 4, 0.17
@@ -123,9 +126,11 @@ def _costs(base: sweep.Base, partners: list[Partner], q: Tensor) -> Tensor:
 def _elsewhere(base: sweep.Base, partners: list[Partner], q: Tensor, step: Tensor) -> Tensor:
     """Planes (B,) beyond which a pixel has moved by more than a few in the view that moves most."""
     moved = []
+    some = q.flatten(1)[:, ::SOME]  # whose median is that of all
     for view, _, _, use in partners:
         go = sweep.travel(base, view)
-        (u_0, v_0), (u_1, v_1) = (go.at(q.flatten(1) + k * step[:, None]) for k in (0, 1))
+        go = go._replace(a=go.a[..., ::SOME])
+        (u_0, v_0), (u_1, v_1) = (go.at(some + k * step[:, None]) for k in (0, 1))
         length = torch.hypot(u_1 - u_0, v_1 - v_0).median(-1).values
         moved.append(torch.where(use, length, 0.0))
     return (ELSEWHERE_PX / torch.stack(moved).amax(0).clamp_min(1e-3)).ceil().clamp(2, 1e4)
@@ -139,39 +144,46 @@ def fitted(base: sweep.Base, partners: list[Partner], start: Found, q: Tensor, s
     plane = q[:, 1] - q[:, 0]
     near = ALL_STEPS * plane[:, None, None]
     with torch.no_grad():
+        goes = [sweep.travel(base, partner.view) for partner in partners]
         at = neighbours.smooth(start.q, SURFACE * plane)
         for _ in range(steps):
-            moved = at + _joined(base, partners, at, plane)[0]
+            moved = at + _joined(base, partners, goes, at, plane)[0]
             at = torch.minimum(torch.maximum(moved, start.q - near), start.q + near).clamp_min(0)
             at = neighbours.smooth(at, SURFACE * plane)
-    step, found = _joined(base, partners, at, plane, last=True)
+    step, found = _joined(base, partners, goes, at, plane, last=True)
     if step.requires_grad:
-        step = step / _slope(base, partners, at, plane)
+        step = step / _slope(base, partners, goes, at, plane)
     edge = EDGE * neighbours.spread(at, WINDOW)
     own = found.own * (start.misfit / MISFIT).square() + edge.square()
     return found._replace(q=at + (step - step.detach()), own=own)
 
 
 @torch.no_grad()
-def _slope(base: sweep.Base, partners: list[Partner], at: Tensor, plane: Tensor) -> Tensor:
+def _slope(base: sweep.Base, partners: list[Partner], goes: list[sweep.Travel], at: Tensor, plane: Tensor) -> Tensor:
     """How much smaller a step gets (B, h, w) as a surface comes nearer to where it fits best: 1 where grey values are
     straight between pixels. By it the gradient of the step becomes that of the place where it ends."""
     little = LITTLE * plane[:, None, None]
-    before, after = (_joined(base, partners, at + sign * little, plane)[0] for sign in (-1, 1))
+    before, after = (_joined(base, partners, goes, at + sign * little, plane)[0] for sign in (-1, 1))
     return ((before - after) / (2 * little)).clamp_min(SLOPE)
 
 
 def _joined(
-    base: sweep.Base, partners: list[Partner], at: Tensor, plane: Tensor, *, last: bool = False
+    base: sweep.Base,
+    partners: list[Partner],
+    goes: list[sweep.Travel],
+    at: Tensor,
+    plane: Tensor,
+    *,
+    last: bool = False,
 ) -> tuple[Tensor, Fitted]:
     """The step (B, h, w) that the views together ask for at inverse depths ``at``, each by its own variance, and how
     well they fit there; what the motions add to that (``shared``) where it is the last. The gradient is the step's."""
     none = torch.zeros_like(at)
     said = _Said(none, none.clone(), none.clone(), best=torch.full_like(at, -1), seen=torch.zeros_like(at).bool())
-    for view, picture, fit, use in partners:
+    for (view, picture, fit, use), go in zip(partners, goes, strict=True):
         one = sweep.fit_windows(base, view, picture, at)
         with torch.no_grad():
-            here = one.seen & use[:, None, None] & ~sweep.hidden(sweep.travel(base, view), at, NEARER * plane)
+            here = one.seen & use[:, None, None] & ~sweep.hidden(go, at, NEARER * plane)
             moved = pose_variance(base, view, fit, at, one.motion) if last else None
         said = _also(said, one, here, STEP * plane, moved)
     step = said.step / said.weight.clamp_min(NO_WEIGHT)

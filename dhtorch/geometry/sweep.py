@@ -26,7 +26,7 @@ from dhtorch.geometry import se3
 from dhtorch.geometry.camera import Camera
 from dhtorch.geometry.neighbours import window_sum
 from dhtorch.geometry.se3 import Pose
-from dhtorch.geometry.shapes import check
+from dhtorch.geometry.shapes import check, surely_all
 from dhtorch.tree import Record, record
 
 #: Offsets (down, right) of the signs of a census: a checkerboard of 9 x 7 pixels without its middle.
@@ -130,9 +130,16 @@ def base(image: Tensor, camera: Camera) -> Base:
     """View 0 of a grey picture (B, 1, h, w). Gradient: to the picture and, through the rays, to the camera."""
     check("sweep.base", image=(image, "B 1 h w"), f=(camera.f, "B 2"))
     ray = pixel_rays(camera, (image.shape[-2], image.shape[-1]))
-    known = ray.isfinite().all(-1)
-    ahead = torch.where(known[..., None], ray, ray.new_tensor([0.0, 0.0, 1.0]))
-    return Base(image, camera, ahead, known, census(image.detach()))
+    known = ray.detach().abs().amax(-1) < torch.inf if camera.distortion is not None else _sees(camera, ray)
+    if not (known.is_cpu and surely_all(known)):
+        ray = torch.where(known[..., None], ray, ray.new_tensor([0.0, 0.0, 1.0]))
+    return Base(image, camera, ray, known, census(image.detach()))
+
+
+def _sees(camera: Camera, ray: Tensor) -> Tensor:
+    """Whether each ray (B, N, 3) of a camera without distortion is one, (B, N): a focal length is, or is none."""
+    fine = (camera.f.isfinite() & (camera.f != 0) & camera.c.isfinite()).all(-1, keepdim=True)
+    return fine.expand(ray.shape[:-1]).contiguous()
 
 
 def seen_at(view: View, ray: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
