@@ -89,7 +89,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     "transform.alone": [
         ("Alone.look", "any(one.spots.hw != hw for one in read)", "False"),
         ("Alone.look", "if not all_sound(counts)", "if False"),
-        ("Alone.look", "spots.shape[4] == 3", "spots.shape[4] == 1"),
+        ("Alone.look", "exact and spots.shape[4] == 3", "exact and spots.shape[4] == 1"),
         ("Alone._read", "or self.ready in sample", ""),
         ("Alone._read", "stated is None or has(sample, self.pad)", "stated is None"),
         ("Alone._read", "kind = stated, picture.shape", "kind = picture.shape"),

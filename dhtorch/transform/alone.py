@@ -94,10 +94,11 @@ class Alone:
         xyz, counts = torch.empty(B, self.n, 3, dtype=torch.float32), torch.empty(2, B, dtype=torch.int64)
         filled = depth, sigma, score, xyz, flag, hole, source, counts
         unit, (limits, (block, least)) = UNITS[str(self.views.depth_unit)], self.limits
+        look, exact = torch.ops.dhtorch.look.default, product_is_exact(read[0].picture)
         for b, (picture, z, signed, spots) in enumerate(read):
             where, seen = (z, spots.at, picture, spots.pixel, spots.ray), (b, unit, signed, spots.step, *self.bounds)
-            grey = block, spots.shape[4] == 3 and product_is_exact(picture), least
-            torch.ops.dhtorch.look.default(*where, *filled, *seen, *spots.shape, *limits, *grey)
+            grey = block, exact and spots.shape[4] == 3, least
+            look(*where, *filled, *seen, *spots.shape, *limits, *grey)
         if not all_sound(counts):
             return None
         uv = torch.cat([one.spots.uv for one in read])
