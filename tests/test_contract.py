@@ -563,7 +563,7 @@ ELSEWHERE = {
         f"dhtorch.pair.{name}"
         for name in ("ask_pair", "tracked", "under_pose", "merge", "lifted", "undistort_tracks", "uniform_draws")
     ),
-    *(f"dhtorch.method.{name}" for name in ("parts", "networks")),
+    *(f"dhtorch.method.{name}" for name in ("parts", "networks", "options")),
     "dhtorch.stages.fuse.inverse_variance",
     "dhtorch.stages.fuse.agree",
     "dhtorch.geometry.reach.within_reach",

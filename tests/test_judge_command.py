@@ -265,6 +265,8 @@ def test_a_loader_gets_verdicts_of_one_shape():
     assert batch["dhtorch.ceiling_known"].tolist() == [False, False] and not batch["dhtorch.ceiling"].any()
     cut = transform({**sample, "map": np.minimum(metres, np.float32(1.6))})
     assert bool(cut["dhtorch.ceiling_known"]) and float(cut["dhtorch.ceiling"]) == pytest.approx(1.6)
+    in_mm = JudgeDepth(map="map", map_unit=0.001, judging={"size": 64}, **OPTIONS)({**sample, "map": 1400 * metres})
+    assert float(in_mm["dhtorch.scale"][0]) == pytest.approx(float(batch["dhtorch.scale"][1, 0]), abs=1e-4)
     assert batch["dhtorch.state"].shape == (2, 64, 64)
     assert batch["dhtorch.scale_known"].all()
     assert batch["dhtorch.scale"][:, 0].tolist() == pytest.approx([1.0, 1.4], abs=0.02)
@@ -281,6 +283,12 @@ def test_a_loader_judges_the_sensor_by_another_view():
     assert (alone["dhtorch.state"] == State.CANNOT_KNOW).all()
     seen = JudgeDepth(judging={"size": 64}, other_at=-1, at=0, **OPTIONS)({**first, **both})
     assert seen["dhtorch.state"].shape == (64, 64)
+    assert (seen["dhtorch.state"] != State.CANNOT_KNOW).any()
+    several = {k: np.stack([v, v]) for k, v in {**first, **both}.items() if isinstance(v, np.ndarray)}
+    several["image_is_pad"] = np.array([[False, False], [False, True]])
+    judging = JudgeDepth(judging={"size": 64, "views": False}, other_at=-1, at=0, batched=True, **OPTIONS)
+    state = judging(several)["dhtorch.state"]
+    assert (state[0] != State.CANNOT_KNOW).any() and (state[1] == State.CANNOT_KNOW).all(), "one has another view"
 
 
 def test_options_of_the_transform_that_cannot_be():
@@ -290,6 +298,8 @@ def test_options_of_the_transform_that_cannot_be():
         JudgeDepth(method="none", **OPTIONS)
     with pytest.raises(ValueError, match="map_unit"):
         JudgeDepth(map="map", map_unit=0.0, **OPTIONS)
+    with pytest.raises(ValueError, match="map_unit"):
+        JudgeDepth(map="map", map_unit=-1.0, **OPTIONS)
     with pytest.raises(SampleError, match="no such key"):
         JudgeDepth(map="map", **OPTIONS)(dict(frames()[0]))
     assert frames()[0]["image"].shape[0] == SIDE

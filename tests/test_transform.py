@@ -16,7 +16,7 @@ import dhtorch
 from dhtorch import PAPER
 from dhtorch.codes import Flag, Gate, Source
 from dhtorch.geometry import camera as cam
-from dhtorch.records import Frame
+from dhtorch.records import Frame, Verdict
 from dhtorch.stages import score
 from dhtorch.transform import (
     ExtendDepth,
@@ -26,6 +26,7 @@ from dhtorch.transform import (
     SampleProblem,
     Views,
     collate_kept,
+    judge_depth,
     one_thread,
     views,
 )
@@ -457,6 +458,22 @@ def test_tokens_stand_beside_dinov2_and_both_learn():
     assert recovered.sum() > 20
     out["dhtorch.depth"][recovered].sum().backward()
     assert K.grad.abs().max() > 0
+
+
+def test_what_a_verdict_does_not_know_is_0_and_said_to_be_unknown():
+    """A number is known with both its bounds; a map that is cut at 0 m is cut."""
+    pixel, number, nan = torch.zeros(3, 1, 2), torch.tensor([[1.0, 0.9, 1.1]]).repeat(3, 1), float("nan")
+    number[1, 2], number[2] = nan, nan
+    told = {"state": pixel.int(), "view": pixel.int(), "ceiling": torch.tensor([0.0, 3.0, nan])}
+    told["depth"] = torch.tensor([[[1.0, 0.0]]]).expand(3, 1, 2)
+    told |= dict.fromkeys(("evidence", "by_answers", "by_views", "by_maps"), pixel)
+    numbers = ("scale", "scale_near", "scale_far", "ruler", "shift", "tilt", "wrong")
+    keys = judge_depth._as_keys(Verdict(**told, **dict.fromkeys(numbers, number)))
+    assert keys["state_share"].tolist() == [[1.0, 0.0, 0.0]] * 3, "where the map says nothing, nothing is shared out"
+    for name in judge_depth.NUMBERS:
+        assert keys[f"{name}_known"].tolist() == [True, False, False] and keys[name].isfinite().all()
+        assert torch.equal(keys[name][0], number[0]) and keys[name][2].tolist() == [0.0] * 3
+    assert keys["ceiling_known"].tolist() == [True, True, False] and keys["ceiling"].tolist() == [0.0, 3.0, 0.0]
 
 
 @pytest.mark.parametrize("transform", [ExtendDepth, JudgeDepth])

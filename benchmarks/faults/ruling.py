@@ -9,7 +9,7 @@ TESTS: dict[str, list[str]] = {
     "causes": ["tests/test_causes.py"],
     "verdict": ["tests/test_judge.py"],
     "evaluate.detection": ["tests/test_judge.py", "tests/test_contract.py"],
-    "transform.judge_depth": ["tests/test_transform.py", "tests/test_transform_adapters.py"],
+    "transform.judge_depth": ["tests/test_transform.py", "tests/test_judge_command.py"],
 }
 
 FAULTS: dict[str, list[tuple[str, ...]]] = {

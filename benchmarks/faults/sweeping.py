@@ -80,7 +80,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("fitted", "(start.misfit / MISFIT).square()", "(MISFIT / start.misfit).square()"),
         ("fitted", "+ edge.square()", ""),
         ("fitted", "if step.requires_grad:", "if False:"),
-        ("_joined", "& ~sweep.hidden(sweep.travel(base, view), at, NEARER * plane)", ""),
+        ("_joined", "& ~sweep.hidden(go, at, NEARER * plane)", ""),
         ("_joined", "use[:, None, None]", "one.seen"),
         ("_also", "one.correlation > SAY", "one.correlation > 0"),
         ("_also", "INDEPENDENT * one.contrast", "one.contrast"),

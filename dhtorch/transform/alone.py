@@ -91,7 +91,8 @@ class Alone:
         B = len(read)
         depth, sigma, score = (torch.empty(B, self.n, dtype=torch.float32) for _ in range(3))
         flag, hole, source = (torch.empty(B, self.n, dtype=torch.int32) for _ in range(3))
-        xyz, counts = torch.empty(B, self.n, 3, dtype=torch.float32), torch.empty(2, B, dtype=torch.int64)
+        xyz = torch.empty(B, self.n, 3, dtype=torch.float32)
+        counts = torch.empty(2, B, dtype=torch.int64)
         filled = depth, sigma, score, xyz, flag, hole, source, counts
         unit, (limits, (block, least)) = UNITS[str(self.views.depth_unit)], self.limits
         look, exact = torch.ops.dhtorch.look.default, product_is_exact(read[0].picture)
@@ -140,7 +141,8 @@ class Alone:
         if read.complaints or read.other is not None or not bool(read.sensed.all()):
             return None
         uv = self.method.sample(frame.hw, self.n, device=frame.camera.f.device, dtype=frame.camera.f.dtype)[None]
-        told, sizes = places(frame, uv), around(frame)
+        told = places(frame, uv)
+        sizes = around(frame)
         (h, w), widest = frame.depth.shape[-2:], 0 if self.limits is None else self.limits[1][0] + 2
         many = any(whole_is_faster(hw, self.n, size) for hw, size in zip((frame.hw, (h, w)), sizes, strict=True))
         if told is None or many or widest > min(WIDEST, *frame.hw):
