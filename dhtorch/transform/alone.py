@@ -88,11 +88,11 @@ class Alone:
         hw = read[0].spots.hw
         if any(one.spots.hw != hw for one in read):
             return None
-        B = len(read)
-        depth, sigma, score = (torch.empty(B, self.n, dtype=torch.float32) for _ in range(3))
-        flag, hole, source = (torch.empty(B, self.n, dtype=torch.int32) for _ in range(3))
-        xyz = torch.empty(B, self.n, 3, dtype=torch.float32)
-        counts = torch.empty(2, B, dtype=torch.int64)
+        B, like = len(read), read[0].spots.ray
+        depth, sigma, score = (like.new_empty(B, self.n) for _ in range(3))
+        flag, hole, source = (like.new_empty(B, self.n, dtype=torch.int32) for _ in range(3))
+        xyz = like.new_empty(B, self.n, 3)
+        counts = like.new_empty(2, B, dtype=torch.int64)
         filled = depth, sigma, score, xyz, flag, hole, source, counts
         unit, (limits, (block, least)) = UNITS[str(self.views.depth_unit)], self.limits
         look, exact = torch.ops.dhtorch.look.default, product_is_exact(read[0].picture)

@@ -158,9 +158,9 @@ class ExtendDepth(torch.nn.Module):
             return None
         found, B = seen.found, len(samples)
         pooled = patch_tokens(found, seen.hole, seen.hw, patch=self.patch, tokens_hw=self.tokens_hw, fit=self.fit)
-        paired = torch.zeros(B, dtype=torch.bool)
+        paired = found.depth.new_zeros(B, dtype=torch.bool)
         added = _added(found, pooled, xyz=seen.xyz, flag=seen.flag, hole=seen.hole, gate=None, fit=None, paired=paired)
-        problem = torch.full((B,), SampleProblem.NO_SECOND_VIEW, dtype=torch.int32)
+        problem = found.source.new_full((B,), SampleProblem.NO_SECOND_VIEW)
         self._counted(problem, seen.hw)
         return {self.prefix + key: x for key, x in {**added, "problem": problem}.items()}
 
