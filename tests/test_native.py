@@ -1108,6 +1108,14 @@ def test_what_contradicts_its_unit_is_told_as_the_stages_tell_it(loaded, monkeyp
 
 
 @needs_compiler
+def test_words_of_a_kind_that_was_seen_in_metres_are_still_asked_for_their_unit(loaded):
+    transform = ExtendDepth(depth_unit="m", n=50)
+    transform(decoded("float32", "m"))
+    with pytest.raises(SampleError, match="is the unit mm"):
+        transform(decoded("uint16", "mm"))
+
+
+@needs_compiler
 def test_what_samples_of_a_kind_share_is_kept_but_not_for_all_and_is_nobodys_to_change(loaded, monkeypatch):
     transform, plain = ExtendDepth(depth_unit="mm", n=50), decoded("uint16", "mm")
     with torch.inference_mode():

@@ -122,7 +122,7 @@ class Alone:
             depth = depth.view(torch.int16) if depth.dtype == torch.uint16 else depth
             if not _is_usual(picture, depth):
                 return None
-            kind = stated, picture.shape, depth.shape, depth.dtype, signed
+            kind = stated, picture.shape, depth.shape, depth.dtype
             spots = self.kept.get(kind) or self._spots(sample, kind)
         except SampleError:  # the stages say it
             return None
