@@ -220,13 +220,14 @@ def test_one_thread_is_one_of_torch_and_of_opencv():
 
 
 FORKED = """
-import os, cv2, numpy as np
+import os, time, cv2, numpy as np
 from dhtorch.transform import one_thread
 cv2.setNumThreads(2)
 picture, places = np.zeros((2000, 2000, 3), np.uint8), np.zeros((2000, 2000, 2), np.float32)
 said = set()
-for _ in range(20):  # on a busy machine a fork often finds the threads where nobody has to wait for them
+for _ in range(12):  # on a busy machine the threads are not asleep, and waited for, each time
     cv2.remap(picture, places, None, cv2.INTER_LINEAR)
+    time.sleep(0.2)
     pid = os.fork()
     if pid == 0:
         one_thread()
