@@ -267,16 +267,15 @@ def loader_times() -> str:
         names = (f"loader_{views}_640x480_workers0{kind}" for kind in ("", "_by_batch"))
         return [rows[name, mode] for name in names if (name, mode) in rows]
 
-    said = []
-    for views, words in (("single", "one view"), ("pair", "two views")):
-        alone, batch = taken(views, "eager")
-        said.append(f"{alone['ours_ms']:.0f} ms with {words} ({batch['ours_ms']:.0f} by batch)")
+    def said(mode: str) -> str:
+        both = (("single", "one view"), ("pair", "two views"))
+        times = [(*taken(views, mode), words) for views, words in both if taken(views, mode)]
+        return " and ".join(f"{a['ours_ms']:.2g} ms with {x} ({b['ours_ms']:.2g} by batch)" for a, b, x in times)
+
     plain, _ = taken("single", "eager")
-    compiled = [f"{r['ours_ms']:.0f}" for r in taken("pair", "native")]
-    after = "; after `python -m dhtorch.native`, which compiles inner loops, "
-    native = f"{after}{' and '.join(compiled)}" * bool(compiled)
+    after = f"; after `python -m dhtorch.native`, which compiles inner loops, {said('native')}" * bool(said("native"))
     return (
-        f"A sample of 640×480 takes {' and '.join(said)}{native}; {plain['peer_ms']:.0f} ms of it is decoding\n"
+        f"A sample of 640×480 takes {said('eager')}{after}; {plain['peer_ms']:.2g} ms of it is decoding\n"
         f"(`python benchmarks/loader.py`; one thread, {plain['processor']})."
     )
 
