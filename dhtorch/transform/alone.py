@@ -3,7 +3,7 @@
 A loader reads a sample with cold caches, where calling the stages one after the other costs more than what they do. Of
 samples alike (one size, layout and camera) the places to look at are the same, so they are kept; what is left is one
 pass over the picture and the depth map as they were decoded. The stages give the same bits, and are asked wherever
-anything is not as usual (``tests/test_alone.py``).
+anything is not as usual (``tests/test_native.py``).
 
 Alphabet: B samples, N places, C × H × W picture, h × w depth map.
 """
@@ -142,13 +142,15 @@ class Alone:
             return None
         uv = self.method.sample(frame.hw, self.n, device=frame.camera.f.device, dtype=frame.camera.f.dtype)[None]
         told = places(frame, uv)
-        sizes = around(frame)
-        (h, w), widest = frame.depth.shape[-2:], 0 if self.limits is None else self.limits[1][0] + 2
-        many = any(whole_is_faster(hw, self.n, size) for hw, size in zip((frame.hw, (h, w)), sizes, strict=True))
+        size, reach = around(frame)
+        h, w = frame.depth.shape[-2:]
+        many = whole_is_faster(frame.hw, self.n, size) or whole_is_faster((h, w), self.n, reach)
+        assert self.limits is not None
+        widest = self.limits[1][0] + 2  # the block whose texture is asked, and a pixel around it
         if told is None or many or widest > min(WIDEST, *frame.hw):
             return None
         _, steps = in_a_row(frame.image)
-        shape = (sizes[1], *steps, *frame.image.shape[1:], sizes[0])
+        shape = (reach, *steps, *frame.image.shape[1:], size)
         spots = self.kept[kind] = _Spots(frame.hw, uv, *told, step(frame.depth), shape)
         return spots
 
