@@ -399,11 +399,7 @@ struct Row {
   }
 
   // What lies beside the nine is read with them.
-  explicit Row(const float* at) {
-    Eight of[3];
-    for (int64_t k = 0; k < 3; ++k) std::memcpy(of + k, at + k, sizeof(Eight));
-    *this = {of[0], of[1], of[2]};
-  }
+  explicit Row(const float* at) : Row(eight(at), eight(at + 1), eight(at + 2)) {}
 
   Row(Eight left, Eight middle, Eight right) : across(right - left), along(left + middle + (middle + right)) {}
 };
