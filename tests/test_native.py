@@ -50,9 +50,9 @@ def unused(monkeypatch):
     monkeypatch.setattr(native, "_loaded", [])
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def cache(tmp_path_factory):
-    """A folder with the compiled file."""
+    """A folder with the compiled file; one of a process, in which operations are registered once."""
     folder = tmp_path_factory.mktemp("cache")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DHTORCH_CACHE", str(folder))
