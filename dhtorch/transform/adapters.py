@@ -110,11 +110,11 @@ class ExtendedDataset(_Wrapped, Dataset[Any]):
 
     def collate(self, samples: Sequence[Any]) -> dict[str, Any]:
         """One batch, collated as torch does and then extended as a whole; with ``by_batch``."""
-        # In a worker torch collates into memory that it shares: page by page a new one, several times as slow.
         told = self.transform.uncollated(samples)
         if told is not None:
             batch = default_collate([without(sample, self.consumed) for sample in samples])
             return self._returned({**batch, **told}) or {}
+        # In a worker torch collates into memory that it shares: page by page a new one, several times as slow.
         gone = {key: _each(samples, key) for key in self.consumed if has(samples[0], key)}
         views = self.transform.views
         own = {key: torch.stack(found) for key, found in gone.items() if key != views.depth}
