@@ -22,6 +22,7 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from functools import partial
+from itertools import product
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -113,7 +114,7 @@ def per_sample(dataset: Encoded | ExtendedDataset, workers: int, repeats: int, c
     """Milliseconds per sample, one number for each stretch, after one to warm up; of workers always by the wall."""
     now = harness.CLOCKS["wall" if workers else clock]
     options: dict[str, Any] = {"worker_init_fn": one_thread, "multiprocessing_context": "fork"} if workers else {}
-    collate = dataset.collate if isinstance(dataset, ExtendedDataset) and dataset.by_batch else None
+    collate = dataset.collate if isinstance(dataset, ExtendedDataset) else None
     loader = iter(DataLoader(dataset, BATCH, num_workers=workers, collate_fn=collate, **options))
     for k in range(repeats + 1):
         start = now()
@@ -121,6 +122,11 @@ def per_sample(dataset: Encoded | ExtendedDataset, workers: int, repeats: int, c
             next(loader)
         if k:
             yield 1e3 * (now() - start) / (STRETCH * BATCH)
+
+
+def mode_of(side: str) -> str:
+    """How a result file calls what a loader uses."""
+    return "native" if side in NATIVE else "eager"
 
 
 class Bench:
@@ -156,44 +162,50 @@ class Bench:
         consumed = (*self.keys, "depth")
         return ExtendedDataset(self.encoded(workers), transform, by_batch=transform.batched, consumed=consumed)
 
-    def measure(self, workers: int) -> None:
-        """Loaders take turns, so that a busy minute hits all alike."""
-        for _ in range(ROUNDS):
-            for name, transform in self.transforms.items():
-                with harness.natively() if name in NATIVE else nullcontext():
-                    found = list(per_sample(self.dataset(transform, workers), workers, self.repeats, self.clock))
-                self.times.setdefault((name, workers), []).extend(found)
-        rates = {name: 1e3 / median(self.times[name, workers]) for name in self.transforms}
-        said = ", ".join(f"{name} {rate:.1f}" for name, rate in rates.items())
-        print(f"{self.mode} {self.size}, {workers} workers: samples/s {said}", flush=True)
+    def measure(self, counts: Sequence[int]) -> None:
+        """Loaders and numbers of workers take turns, so that a busy minute hits all alike."""
+        for _, name, workers in product(range(ROUNDS), self.transforms, counts):
+            dataset = self.dataset(self.transforms[name], workers)
+            with harness.natively() if name in NATIVE else nullcontext():
+                found = list(per_sample(dataset, workers, self.repeats, self.clock))
+            self.times.setdefault((name, workers), []).extend(found)
+        for workers in counts:
+            rates = {name: 1e3 / median(self.times[name, workers]) for name in self.transforms}
+            said = ", ".join(f"{name} {rate:.1f}" for name, rate in rates.items())
+            print(f"{self.mode} {self.size}, {workers} workers: samples/s {said}", flush=True)
 
     def rows(self, workers: int) -> list[dict[str, Any]]:
         """Against the plain loader and against OpenCV; the bars stand on the larger pictures."""
         barred = {"single": "plain_loader", "pair": "opencv_seats"}[self.mode]
         name = f"loader_{self.mode}_{self.size}_workers{workers}"
-        ours = [side for side in self.transforms if NATIVE.get(side, side) in ("transform", "by_batch")]
         return [
             harness.row(
                 f"{name}_by_batch" if side.startswith("by_batch") else name,
                 self.times[side, workers],
                 peer,
                 self.times[peer, workers],
-                mode="native" if side in NATIVE else "eager",
+                mode=mode_of(side),
                 **self.common(peer == barred and not workers),
             )
-            for side in ours
+            for side in self.ours()
             for peer in self.transforms
-            if peer not in ours
+            if peer not in self.ours()
         ]
 
-    def scaling(self) -> dict[str, Any]:
+    def scaling(self, side: str) -> dict[str, Any]:
         """Two workers, against the plain loader's gain from one to two."""
         one, plain_one, plain_two = (
-            median(self.times[key]) for key in (("transform", 1), ("plain_loader", 1), ("plain_loader", 2))
+            median(self.times[key]) for key in ((side, 1), ("plain_loader", 1), ("plain_loader", 2))
         )
         expected = [one * plain_two / plain_one] * 2
         name = f"loader_scaling_{self.mode}_{self.size}"
-        return harness.row(name, self.times["transform", 2], "plain_scaling", expected, **self.common(True))
+        name = f"{name}_by_batch" if side.startswith("by_batch") else name
+        times = self.times[side, 2]
+        return harness.row(name, times, "plain_scaling", expected, mode=mode_of(side), **self.common(True))
+
+    def ours(self) -> list[str]:
+        """The loaders that are no peer."""
+        return [side for side in self.transforms if NATIVE.get(side, side) in ("transform", "by_batch")]
 
     def common(self, bar: bool) -> dict[str, Any]:
         """Fields of a row."""
@@ -232,11 +244,11 @@ def main() -> None:
     print(f"pairs of {benches[0].found[0]}")
     rows = []
     for bench in benches:
+        bench.measure(counts)
         for workers in counts:
-            bench.measure(workers)
             rows += bench.rows(workers)
         if {1, 2} <= set(counts):
-            rows.append(bench.scaling())
+            rows += [bench.scaling(side) for side in bench.ours()]
     rows += steps(benches, max(options.repeats // 5, 3), options.clock)
     harness.report(rows, options.json)
 

@@ -4,6 +4,7 @@ import copy
 import io
 import pickle
 import warnings
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -390,6 +391,45 @@ def test_corrupt_samples_in_the_middle(items):
     assert (rows["dhtorch.problem"] == SampleProblem.UNREADABLE).nonzero()[:, 0].tolist() == sorted(corrupt)
     assert flagging.report() == {"none": 0, "no_second_view": 10, "no_depth": 0, "unreadable": 2}
     assert batches[0]["image"].shape[1:] == (SIDE, SIDE, 3) and batches[1]["image"][1].sum() == 0
+
+
+class Nested(Frames):
+    """Frames with a dict inside."""
+
+    def __getitem__(self, i):
+        return {**super().__getitem__(i), "episode": {"number": torch.tensor(i)}}
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+@pytest.mark.parametrize("by_batch", [False, True])
+@pytest.mark.parametrize("context", ["fork", "spawn"])
+def test_what_is_added_leaves_a_worker_in_one_piece(items, in_process, by_batch, context):
+    extender = transform(index_key="index", seed=5, batched=by_batch or None)
+    dataset = ExtendedDataset(Nested(items), extender, gap=GAP, by_batch=by_batch, consumed=("depth",))
+    batches, _ = loaded(dataset, 1, context, 4, collate_fn=dataset.collate)
+    rows = in_rows(batches)
+    assert [k for k, v in in_process.items() if not torch.equal(v, rows[k]) or v.dtype != rows[k].dtype] == []
+    for batch in batches:
+        ours = {k: x for k, x in batch.items() if k.startswith("dhtorch.")}
+        assert len(ours) == len(in_process) and len({x.untyped_storage().data_ptr() for x in ours.values()}) == 1
+        bounds = sorted((x.data_ptr(), x.numel() * x.element_size()) for x in ours.values())
+        assert all(a + size <= b for (a, size), (b, _) in pairwise(bounds)), "one lies over another"
+        assert all(x.is_contiguous() and x.data_ptr() % 8 == 0 for x in ours.values())
+        assert all(x.untyped_storage().data_ptr() != batch["image"].untyped_storage().data_ptr() for x in ours.values())
+        assert batch["episode"]["number"].tolist() == batch["index"].tolist() and "depth" not in batch
+    (own,) = loaded(dataset, 0, None, 12, collate_fn=dataset.collate)[0]
+    mine = [x.untyped_storage().data_ptr() for k, x in own.items() if k.startswith("dhtorch.")]
+    assert len(set(mine)) == len(mine), "nothing is shared where nothing leaves the process"
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_skipped_samples_leave_a_batch(items):
+    skipping = ExtendedDataset(Frames(items, {3, 8}), transform(on_error="skip", other_image=None))
+    batches, _ = loaded(skipping, 2, "fork", 4, collate_fn=skipping.collate)
+    assert [b["dhtorch.skipped"].item() for b in batches] == [1, 0, 1]
+    rows = in_rows(batches)
+    expected = [transform(other_image=None)(items[i]) for i in range(12) if i not in (3, 8)]
+    assert [k for k, x in rows.items() if not torch.equal(x, torch.stack([e[k] for e in expected]))] == []
 
 
 @pytest.mark.filterwarnings("ignore")

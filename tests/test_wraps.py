@@ -207,6 +207,17 @@ def test_the_collator_counts_what_was_skipped():
     assert collate_kept([None, None]) == {"dhtorch.skipped": torch.tensor(2)}
 
 
+@SAYS_NOTHING
+def test_a_data_sets_own_collator_counts_them_where_it_skips():
+    for on_error, others in (("skip", {"dhtorch.skipped"}), ("flag", set())):
+        data, _ = looking_back(items=Items(corrupt={5}), on_error=on_error)
+        out = data.collate([data[i] for i in (4, 5, 6)])
+        assert out.keys() == data[4].keys() | others
+        assert out["index"].tolist() == ([4, 6] if others else [4, 0, 6])
+        assert torch.equal(out["dhtorch.depth"][-1], data[6]["dhtorch.depth"])
+    assert out["dhtorch.problem"].tolist()[1] == SampleProblem.UNREADABLE
+
+
 def test_one_thread_is_one_of_torch_and_of_opencv():
     before = torch.get_num_threads(), cv2.getNumThreads()
     try:

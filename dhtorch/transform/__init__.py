@@ -1,7 +1,8 @@
 """dhtorch inside a data loader: :class:`ExtendDepth` takes a sample dict and returns it with what the depth tells.
 
 transform = ExtendDepth(image="observation.images.wrist", depth="observation.depth.wrist", depth_unit="mm")
-loader = DataLoader(ExtendedDataset(dataset, transform), num_workers=2, worker_init_fn=one_thread)
+dataset = ExtendedDataset(dataset, transform)
+loader = DataLoader(dataset, collate_fn=dataset.collate, num_workers=2, worker_init_fn=one_thread)
 """
 
 from dhtorch.transform.adapters import (

@@ -18,6 +18,7 @@ import torch
 from torch.utils.data import Dataset, IterableDataset, default_collate
 
 from dhtorch.memory import keep_freed
+from dhtorch.transform.batches import collated, in_one_piece
 from dhtorch.transform.extend_depth import ExtendDepth
 from dhtorch.transform.leaves import SampleError, find, has, to_tensor, without
 
@@ -50,8 +51,8 @@ class ExtendedDataset(_Wrapped, Dataset[Any]):
         transform: for single samples; with ``by_batch`` for batches.
         gap: places from the other view to the anchor; None = the sample itself holds both.
         episode_key: key of a number that items of one episode share; None = there is one episode.
-        by_batch: items stay as they are, and :meth:`collate`, the loader's ``collate_fn``, extends the whole batch in
-            the worker: the same bits in less time.
+        by_batch: items stay as they are, and :meth:`collate`, then needed as the loader's ``collate_fn``, extends the
+            whole batch in the worker: the same bits in less time.
         consumed: keys among those that the transform reads, of which nobody has a use afterwards (the depth, the other
             view): items and batches come without them, so that no worker copies them into shared memory.
 
@@ -109,7 +110,15 @@ class ExtendedDataset(_Wrapped, Dataset[Any]):
         return self._returned(self.transform(sample))
 
     def collate(self, samples: Sequence[Any]) -> dict[str, Any]:
-        """One batch, collated as torch does and then extended as a whole; with ``by_batch``."""
+        """One batch, collated as torch does, with ``by_batch`` then extended as a whole; skipped samples are left out,
+        as :func:`collate_kept` does. From a worker what was added comes as views of one piece of shared memory."""
+        if not self.by_batch:
+            skips = self.transform.on_error == "skip"
+            return (collate_kept if skips else collated)(samples, self.transform.prefix)
+        return in_one_piece(self._extended(samples), self.transform.prefix)
+
+    def _extended(self, samples: Sequence[Any]) -> dict[str, Any]:
+        """A whole batch of samples that the transform has not seen."""
         told = self.transform.uncollated(samples)
         if told is not None:
             batch = default_collate([without(sample, self.consumed) for sample in samples])
@@ -208,17 +217,18 @@ class AddedCollate:
     def __call__(self, instances: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         """One batch."""
         mine = [{k: v for k, v in one.items() if k.startswith(self.prefix)} for one in instances]
-        return {**self.collate(instances), **default_collate(mine)}
+        return {**self.collate(instances), **collated(mine, self.prefix)}
 
 
-def collate_kept(samples: Sequence[dict[str, Any] | None]) -> dict[str, Any]:
-    """torch's default collate without the samples that were skipped; ``skipped`` tells how many.
+def collate_kept(samples: Sequence[dict[str, Any] | None], prefix: str = "dhtorch.") -> dict[str, Any]:
+    """torch's default collate without the samples that were skipped; ``dhtorch.skipped`` tells how many.
 
-    A batch of which every sample was skipped holds nothing but that number.
+    A batch of which every sample was skipped holds nothing but that number. From a worker what begins with ``prefix``
+    comes as views of one piece of shared memory.
     """
     kept = [sample for sample in samples if sample is not None]
     skipped = torch.tensor(len(samples) - len(kept))
-    return {**(default_collate(kept) if kept else {}), "dhtorch.skipped": skipped}
+    return {**(collated(kept, prefix) if kept else {}), "dhtorch.skipped": skipped}
 
 
 def one_thread(worker: int = 0) -> None:
