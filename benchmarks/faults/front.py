@@ -81,19 +81,14 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     ],
     "stages.holes": [
         (
-            "_first_class",
-            "((samples.flag & Flag.UNDEREXPOSED).bool(), Hole.TOO_DARK),\n"
-            "        ((samples.flag & Flag.SATURATED).bool(), Hole.TOO_BRIGHT),",
-            "((samples.flag & Flag.SATURATED).bool(), Hole.TOO_BRIGHT),\n"
-            "        ((samples.flag & Flag.UNDEREXPOSED).bool(), Hole.TOO_DARK),",
+            "_of_flag",
+            "((flag & Flag.UNDEREXPOSED).bool(), Hole.TOO_DARK),\n"
+            "        ((flag & Flag.SATURATED).bool(), Hole.TOO_BRIGHT),",
+            "((flag & Flag.SATURATED).bool(), Hole.TOO_BRIGHT),\n"
+            "        ((flag & Flag.UNDEREXPOSED).bool(), Hole.TOO_DARK),",
         ),
-        (
-            "_first_class",
-            "((samples.flag & Flag.SPECULAR).bool(), Hole.HIGHLIGHT),\n"
-            "        (trackability.detach() < min_trackability, Hole.LOW_TEXTURE),",
-            "(trackability.detach() < min_trackability, Hole.LOW_TEXTURE),\n"
-            "        ((samples.flag & Flag.SPECULAR).bool(), Hole.HIGHLIGHT),",
-        ),
+        ("_of_flag", "torch.arange(256", "torch.arange(129"),
+        ("_first_class", " & (hole == Hole.TRACKABLE_NO_LIDAR)", ""),
         ("_first_class", "trackability.detach() < min_trackability", "trackability.detach() <= min_trackability"),
         ("_first_class", "(samples.usable, Hole.NONE)", "(samples.depth > 0, Hole.NONE)"),
         ("classify", "block=block", "block=7"),

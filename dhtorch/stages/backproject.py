@@ -6,6 +6,7 @@ Fail loud, fail localised: a sample without a usable return is NaN and flagged, 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -26,7 +27,7 @@ from dhtorch.geometry.lookup import (
     whole_is_faster,
 )
 from dhtorch.geometry.neighbours import bands, extreme, window_sum
-from dhtorch.geometry.shapes import check
+from dhtorch.geometry.shapes import check, is_transformed
 from dhtorch.records import Frame, Samples
 
 #: Search radius in a sparse depth map, px: the truth test reads sparse returns in 7×7 windows, so do the samples.
@@ -322,5 +323,11 @@ def _bits(*masks: tuple[Tensor, int]) -> Tensor:
             (torch.where(mask, bit, 0) for mask, bit in masks[1:]), torch.where(masks[0][0], masks[0][1], 0)
         ).int()
     held = torch.stack([mask for mask, _ in masks])
-    bits = torch.tensor([bit for _, bit in masks], dtype=torch.uint8, device=held.device)
-    return torch.where(held, bits.view(-1, *[1] * (held.dim() - 1)), 0).sum(0, dtype=torch.int32)
+    bits = (_bytes.__wrapped__ if is_transformed() else _bytes)(tuple(bit for _, bit in masks), device=held.device)
+    return torch.where(held, bits, 0).sum(0, dtype=torch.int32)
+
+
+@lru_cache(maxsize=32)
+def _bytes(values: tuple[int, ...], *, device: torch.device) -> Tensor:
+    """Numbers below 256, (K, 1, 1); the same few are asked for again and again."""
+    return torch.tensor(values, dtype=torch.uint8, device=device)[:, None, None]

@@ -7,13 +7,15 @@ about why the sensor was silent.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import torch
 from torch import Tensor
 
 from dhtorch import native
 from dhtorch.codes import ROUTE_OF_HOLE, Flag, Hole, first_reason
 from dhtorch.geometry.lookup import pixels, summarise
-from dhtorch.geometry.shapes import check
+from dhtorch.geometry.shapes import check, is_transformed
 from dhtorch.geometry.small import eigenvalues
 from dhtorch.records import Frame, Samples
 
@@ -57,13 +59,21 @@ def classify(
 
 
 def _first_class(samples: Samples, trackability: Tensor, min_trackability: float) -> Tensor:
+    device = samples.flag.device
+    hole = (_of_flag.__wrapped__ if is_transformed() else _of_flag)(device)[samples.flag]
+    flat = (trackability.detach() < min_trackability) & (hole == Hole.TRACKABLE_NO_LIDAR)
+    return hole.masked_fill_(flat, Hole.LOW_TEXTURE).masked_fill_(samples.usable, Hole.NONE)
+
+
+@lru_cache(maxsize=8)
+def _of_flag(device: torch.device) -> Tensor:
+    """The class that each flag decides, whatever the texture, (256,): one look-up instead of four masks of samples."""
+    flag = torch.arange(256, dtype=torch.int32, device=device)
     return first_reason(
-        (samples.usable, Hole.NONE),
-        ((samples.flag & Flag.BORDER).bool(), Hole.AT_BORDER),
-        ((samples.flag & Flag.UNDEREXPOSED).bool(), Hole.TOO_DARK),
-        ((samples.flag & Flag.SATURATED).bool(), Hole.TOO_BRIGHT),
-        ((samples.flag & Flag.SPECULAR).bool(), Hole.HIGHLIGHT),
-        (trackability.detach() < min_trackability, Hole.LOW_TEXTURE),
+        ((flag & Flag.BORDER).bool(), Hole.AT_BORDER),
+        ((flag & Flag.UNDEREXPOSED).bool(), Hole.TOO_DARK),
+        ((flag & Flag.SATURATED).bool(), Hole.TOO_BRIGHT),
+        ((flag & Flag.SPECULAR).bool(), Hole.HIGHLIGHT),
         otherwise=Hole.TRACKABLE_NO_LIDAR,
     )
 
