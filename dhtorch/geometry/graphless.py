@@ -16,6 +16,7 @@ from torch.autograd import forward_ad
 from torch.utils import _pytree as pytree
 
 from dhtorch.geometry.shapes import is_transformed
+from dhtorch.tree import Record
 
 R = TypeVar("R")
 
@@ -33,7 +34,8 @@ def spared(fn: Callable[..., R], *args: Any, **options: Any) -> R:
         return fn(*args, **options)
     with torch.inference_mode():
         found = fn(*args, **options)
-    return pytree.tree_map(_usual, found)
+    # A record knows its own fields: a walk through it as a tree takes several times as long.
+    return found.map(_usual) if isinstance(found, Record) else pytree.tree_map(_usual, found)
 
 
 def _asked(*trees: Any) -> bool:

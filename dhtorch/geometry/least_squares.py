@@ -128,10 +128,10 @@ def robust(square: Tensor, kernel: str | None, scale: float) -> tuple[Tensor, Te
         return torch.where(outside, 2 * scale * size - k2, square), scale / size
     if kernel == "cauchy":
         bend = 1 + square / k2
-        return k2 * bend.log(), 1 / bend
+        return k2 * bend.log(), bend.reciprocal()
     if kernel == "geman_mcclure":
         bend = 1 + square / k2
-        return square / bend, 1 / (bend * bend)
+        return square / bend, (bend * bend).reciprocal()
     raise ValueError(f"robust: kernel is {kernel!r}, expected None, 'huber', 'cauchy' or 'geman_mcclure'")
 
 

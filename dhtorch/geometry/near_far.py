@@ -28,7 +28,7 @@ from dhtorch import native
 from dhtorch.geometry.exact import SUM_LANES
 from dhtorch.geometry.least_squares import MIN_DEPTH, Normal, move, normal_equations, robust, solve_spd
 from dhtorch.geometry.se3 import Pose, hat
-from dhtorch.geometry.shapes import check
+from dhtorch.geometry.shapes import check, perhaps_any
 from dhtorch.geometry.small import turned
 from dhtorch.tree import Record, record
 
@@ -127,6 +127,7 @@ class Fixed(NamedTuple):
     shape: Tensor  # (B, 3, N) the noise's covariance there, up to scale: xx, xy, yy
     height: Tensor  # (B, N) of the ray in camera 0
     nearest: Tensor  # (B, 1) 1/m, largest q of the near tracks
+    variance: Tensor  # (B, N) 1/m², of the sensor's q; 0 for tracks that have none
 
 
 def fixed(problem: Problem) -> Fixed:
@@ -137,6 +138,7 @@ def fixed(problem: Problem) -> Fixed:
         shape=problem.shape / torch.cat((f0 * f0, f0 * f1, f1 * f1), 1)[..., None],
         height=problem.ray[:, 1] / problem.ray[:, 2],
         nearest=torch.where(problem.near, problem.inverse, 0.0).amax(-1, keepdim=True).detach(),
+        variance=torch.where(problem.near, problem.variance, 0.0),
     )
 
 
@@ -146,7 +148,7 @@ class Linear(NamedTuple):
     u: Tensor  # (B, 7, N), along u: six columns of the pose, then the residual; or (B, 1, N), the residual alone
     v: Tensor  # (B, 7, N) or (B, 1, N), along v
     slope: Tensor  # (B, 2, N) m, d r / d q
-    variance: Tensor  # (B, N) 1/m², of q before this track is read: infinite for far tracks, 0 for one at infinity
+    free: Tensor  # (B, N) bool, neither the sensor nor infinity holds q: its variance before this track is infinite
     front: Tensor  # (B, N) bool, in front of camera 1 and not at the epipole; others are finite and have no meaning
     fixed: Fixed
 
@@ -167,20 +169,19 @@ def linearise_tracks(problem: Problem, at: Unknowns, *, columns: bool = True, kn
     # Where the ray and the plane of the epipolar line go, in one product.
     a, line = turned(torch.cat((at.T.R, torch.linalg.cross(t, at.T.R, dim=1)), 1), problem.ray).chunk(2, 1)
     with torch.no_grad():
-        free = _inverse_depth(a, t, line, seen, known.shape)
+        best = _inverse_depth(a, t, line, seen, known.shape)
         # A point cannot lie beyond infinity: there q is known, and nothing is eliminated.
-        variance = torch.where(free < 0, 0.0, torch.inf).to(free.dtype)
-    q = torch.where(problem.near, problem.inverse, free.clamp_min(0))
-    variance = torch.where(problem.near, problem.variance, variance)
+        free = ~(problem.near | (best < 0))
+    q = torch.where(problem.near, problem.inverse, best.clamp_min(0))
     Y = a + q[:, None] * t
     # At the epipole a track fits any pose if only its point is near enough, and then holds it as if it were a vice.
     front = (Y[:, 2] > MIN_DEPTH) & (problem.near | (q < MAX_NEARER * known.nearest))
-    w = 1 / Y[:, 2].masked_fill(~front, 1.0)
+    w = Y[:, 2].masked_fill(~front, 1.0).reciprocal()
     plane = Y[:, :2] * w[:, None]
     slope = (t[:, :2] - plane * t[:, 2:]) * w[:, None]
     if not columns:
         r = plane - seen
-        return Linear(r[:, :1], r[:, 1:], slope, variance, front, known)
+        return Linear(r[:, :1], r[:, 1:], slope, free, front, known)
     k = q * w
     (x, y) = plane.unbind(1)
     (x_r, y_r) = (plane - seen).unbind(1)
@@ -188,7 +189,7 @@ def linearise_tracks(problem: Problem, at: Unknowns, *, columns: bool = True, kn
     (xk, yk) = (plane * -k[:, None]).unbind(1)
     xy, zero = x * y, torch.zeros_like(x)
     u, v = torch.stack((-xy, xx, -y, k, zero, xk, x_r), 1), torch.stack((-yy, xy, x, zero, k, yk, y_r), 1)
-    return Linear(u, v, slope, variance, front, known)
+    return Linear(u, v, slope, free, front, known)
 
 
 def residuals(
@@ -205,7 +206,7 @@ def residuals(
         noise: scale of the tracks' ``shape``.
         turn: whether it has columns; (B, 7, 2, N) without.
 
-    Gradient: to ``linear``, variance excepted, and noise. Raises ValueError for wrong shapes.
+    Gradient: to ``linear`` and noise. Raises ValueError for wrong shapes.
     """
     check("residuals", u=(linear.u, "B 7 N"), noise=(noise, "B N"))
     return _rows(linear, _sphere(linear.fixed, noise), turn)
@@ -346,7 +347,7 @@ def _given(
     """What compiled code is told of tracks and unknowns; None where it cannot be told."""
     a, b, d = sphere
     turn = at.T.t.new_empty(0, 3) if at.turn is None else at.turn.contiguous()
-    told = {k: getattr(problem, k) for k in ("ray", "inverse", "variance", "near")} | known._asdict()
+    told = {k: getattr(problem, k) for k in ("ray", "inverse", "near")} | known._asdict()
     told |= {"a": a, "b": b, "d": d, "R": at.T.R.contiguous(), "t": at.T.t.contiguous(), "turn": turn}
     whole = problem.ray.shape[-1] % SUM_LANES == 0
     return told if whole and native.serves(*told.values()) else None
@@ -394,11 +395,15 @@ def _whitener(linear: Linear, sphere: tuple[Tensor, Tensor, Tensor]) -> tuple[Te
     s0, s1 = linear.slope.unbind(1)
     e0, e1 = a * s0, d * (s1 - b * s0)
     square = e0 * e0 + e1 * e1
-    flat = square < 1e-12  # the pixel does not depend on q
-    unit = square.masked_fill(flat, 1.0).rsqrt()
-    e0, e1 = (e0 * unit).masked_fill(flat, 1.0), (e1 * unit).masked_fill(flat, 0.0)
-    free = linear.variance.isinf()
-    left = (1 + square * linear.variance.masked_fill(free, 0.0)).rsqrt().masked_fill(free & ~flat, 0.0)
+    flat, free = square < 1e-12, linear.free
+    if perhaps_any(flat):  # there the pixel does not depend on q, and any axis will do
+        unit = square.masked_fill(flat, 1.0).rsqrt()
+        e0, e1 = (e0 * unit).masked_fill(flat, 1.0), (e1 * unit).masked_fill(flat, 0.0)
+        free = free & ~flat
+    else:
+        unit = square.rsqrt()
+        e0, e1 = e0 * unit, e1 * unit
+    left = (1 + square * linear.fixed.variance).rsqrt().masked_fill(free, 0.0)
     left0, left1, bd = left * e0, left * e1, b * d
     return (
         torch.stack((left0 * a - left1 * bd, -e1 * a - e0 * bd), 1),

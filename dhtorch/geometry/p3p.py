@@ -180,9 +180,11 @@ def _polish(d: Tensor, m: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
     x, y = d - next_d * m, next_d - d * m
     r = d * x + next_d * y - a[:, None]
     # Row k of half the Jacobian has x_k in column k and y_k in the next: Cramer's rule for this circle.
-    x2, r2 = x.roll(-2, 0), r.roll(-2, 0)
+    rows = torch.stack((x, r, y), 1)
+    x1, r1, y1 = rows.roll(-1, 0).unbind(1)
+    x2, r2, _ = rows.roll(-2, 0).unbind(1)
     det = 2 * (x[0] * x[1] * x[2] + y[0] * y[1] * y[2])
-    step = x2 * (r * x.roll(-1, 0) - r.roll(-1, 0) * y) + r2 * (y * y.roll(-1, 0))
+    step = x2 * (r * x1 - r1 * y) + r2 * (y * y1)
     step = step * (det / (det * det + 1e-20))  # none where two solutions coincide
     return d - step, step.abs().amax(0)
 

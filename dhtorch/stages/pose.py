@@ -33,7 +33,7 @@ from dhtorch.geometry.least_squares import (
 )
 from dhtorch.geometry.most_probable import FitOptions, most_probable, pose_covariance
 from dhtorch.geometry.near_far import Problem
-from dhtorch.geometry.shapes import check
+from dhtorch.geometry.shapes import check, surely_all
 from dhtorch.geometry.small import upper
 from dhtorch.records import Camera, Pose, PoseFit, Samples, Shutter, Tracks
 from dhtorch.tree import in_pieces
@@ -204,8 +204,11 @@ def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, camera: Came
         root = (lower * T.t[..., None]).sum(1)
         t_snr = (root * root).sum(-1).sqrt() / sigma_px
 
+    every = surely_all(ok)  # then nothing need be hidden
+
     def answer(x: Tensor) -> Tensor:
-        return torch.where(ok.view(-1, *[1] * (x.ndim - 1)), x.to(nan.dtype), nan)
+        x = x.to(nan.dtype)
+        return x if every else torch.where(ok.view(-1, *[1] * (x.ndim - 1)), x, nan)
 
     return PoseFit(
         T_1_from_0=Pose(answer(T.R), answer(T.t)),
