@@ -171,18 +171,21 @@ def normal_equations(
     Gradient: to rows and weights. Raises ValueError for wrong shapes.
     """
     N = check("normal_equations", rows=(rows, "B n 2 N"), weight=(weight, "B N"))["N"]
-    if block is None or block >= N:
-        sums = torch.bmm(*_factors(rows, weight))
-    else:
-        sums = torch.bmm(*_factors(rows[..., :block], weight[..., :block]))
-        for k in range(block, N, block):
-            sums = torch.baddbmm(sums, *_factors(rows[..., k : k + block], weight[..., k : k + block]))
+    weighted = rows[:, :-1] * weight[:, None, None]
+    (first, last), *more = zip(*(_in_blocks(x, block or N) for x in (weighted, rows)), strict=True)
+    sums = torch.bmm(first, last.transpose(1, 2))  # Σ w J (J, r)ᵀ (B, n, n + 1)
+    for left, right in more:
+        sums = torch.baddbmm(sums, left, right.transpose(1, 2))
     return sums[..., :-1], sums[..., -1]
 
 
-def _factors(rows: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Matrices whose product is Σ w J (J, r)ᵀ (B, n, n + 1)."""
-    return (rows[:, :-1] * weight[:, None, None]).flatten(2), rows.flatten(2).transpose(1, 2)
+def _in_blocks(x: Tensor, block: int) -> tuple[Tensor, ...]:
+    """Rows (B, n, 2, N) as matrices (B, n, 2 · block) of some points each, zeros behind the last."""
+    N = x.shape[-1]
+    if block >= N:
+        return (x.flatten(2),)
+    x = F.pad(x, (0, -N % block)) if N % block else x
+    return x.unflatten(-1, (-1, block)).permute(3, 0, 1, 2, 4).flatten(3).unbind(0)  # one copy for all
 
 
 def solve_spd(

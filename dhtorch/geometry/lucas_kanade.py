@@ -307,7 +307,7 @@ def _on_map(
     node = torch.arange(field.shape[1], dtype=p.dtype, device=p.device)[:, None]
     step = torch.zeros_like(p)
     for k in range(1, steps + 1):
-        hat = (1 - (p[:, None] - node).abs()).clamp_min(0)  # (2, n, M) bilinear weights
+        hat = torch.rsub((p[:, None] - node).abs_(), 1).clamp_min_(0)  # (2, n, M) bilinear weights, 1 - |p - node|
         last, step = step, ((field * hat[0]).sum(2) * hat[1]).sum(1)
         if len(field) == 3:
             step = step[:2] / step[2].clamp(*GAIN)
