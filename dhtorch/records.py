@@ -16,6 +16,7 @@ from dhtorch.codes import Gate, PoseCode, State
 from dhtorch.geometry.camera import Camera
 from dhtorch.geometry.pyramid import Pyramids
 from dhtorch.geometry.se3 import Pose
+from dhtorch.geometry.shapes import all_finite
 from dhtorch.geometry.start import Flow
 from dhtorch.tree import KEEP_DTYPE, Record, record
 
@@ -72,7 +73,7 @@ class Samples(Record):
     @property
     def usable(self) -> Tensor:
         """(B, N) bool: there is a point."""
-        return self.xyz.detach().abs().amax(-1) < torch.inf  # which what is no number is not; all of three takes longer
+        return all_finite(self.xyz, -1)
 
 
 @record

@@ -9,7 +9,7 @@ from kornia.geometry.camera import PinholeCamera
 
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.camera import Camera
-from dhtorch.geometry.shapes import check, is_static, perhaps_any, surely_all
+from dhtorch.geometry.shapes import all_finite, check, is_static, perhaps_any, surely_all
 
 HW = (480, 640)
 
@@ -362,3 +362,12 @@ def test_masks_are_looked_at_where_they_have_values_alone():
     told = []
     torch.vmap(lambda x: (told.append((surely_all(x), perhaps_any(x))), x)[1])(none[None])
     assert told == [(False, True)]
+
+
+def test_one_number_that_is_none_is_seen():
+    x = torch.tensor(
+        [[1.0, -3e38, 0.0], [torch.nan, 1, 1], [1, torch.inf, 1], [1, 1, -torch.inf], [-torch.inf, torch.nan, 0]]
+    )
+    for dim in (0, 1):
+        assert torch.equal(all_finite(x, dim), x.isfinite().all(dim))
+    assert all_finite(x, 1).tolist() == [True, False, False, False, False] and all_finite(x[:0], 1).shape == (0,)

@@ -521,7 +521,7 @@ ELSEWHERE = {
     *(f"dhtorch.stages.sample.{name}" for name in ("spiral", "vogel", "grid")),
     *(
         f"dhtorch.geometry.shapes.{name}"
-        for name in ("check", "is_static", "is_transformed", "perhaps_any", "surely_all")
+        for name in ("all_finite", "check", "is_static", "is_transformed", "perhaps_any", "surely_all")
     ),
     *(f"dhtorch.geometry.reference.{name}" for name in ("patch", "nearest", "luma", "offsets", "levels")),
     *(

@@ -273,7 +273,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
             "noise_shape(tracks.cov.detach(), usable, isotropic)",
             "noise_shape(tracks.cov.detach(), usable, 0.1)",
         ),
-        ("_near_far", "far = usable & ~xyz", "far = ~xyz"),
+        ("_near_far", "far = usable & ~samples", "far = ~samples"),
         ("_near_far", "& (sigma > 0) ", ""),
         ("_near_far", "cam.ideal(camera_0)", "cam.ideal(camera_1)"),
         ("_reprojection", "square < threshold_px**2", "square < threshold_px"),

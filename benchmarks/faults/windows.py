@@ -283,8 +283,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_on_map", "o.epsilon_px**2)", "o.epsilon_px)"),
         (
             "_on_map",
-            "torch.where(state.live & p.isfinite().all(0), p, start)",
-            "torch.where(p.isfinite().all(0), p, start)",
+            "torch.where(state.live & all_finite(p, 0), p, start)",
+            "torch.where(all_finite(p, 0), p, start)",
         ),
         ("_leap", "step / (1 - ratio.clamp(*RATIO))", "step / (1 + ratio.clamp(*RATIO))"),
         ("_leap", "(last * last).sum(0)", "(step * step).sum(0)"),

@@ -29,7 +29,7 @@ from dhtorch import native
 from dhtorch.geometry.exact import CHUNK, LANES
 from dhtorch.geometry.lookup import QUANTISATION
 from dhtorch.geometry.pyramid import GRAD_X, GRAD_Y, GREY, Pyramid
-from dhtorch.geometry.shapes import is_static
+from dhtorch.geometry.shapes import all_finite, is_static
 from dhtorch.geometry.small import adjugate, determinant, eigenvalues
 
 #: Width of a cell, px of its level, and the finest level with cells. Coarse levels only say where the next one starts:
@@ -314,7 +314,7 @@ def _on_map(
         if k == LEAP and k < steps and pair.level == 0:
             step = _leap(last, step, o.epsilon_px)
         p = p - step
-    p = torch.where(state.live & p.isfinite().all(0), p, start)
+    p = torch.where(state.live & all_finite(p, 0), p, start)
     held = (p == p.clamp(0, field.shape[1] - 1.0)).all(0)
     restless = ~held | ((step * step).sum(0) > o.epsilon_px**2)
     live = state.live & restless & within(p, pair.low - corner, pair.high - corner)

@@ -80,6 +80,11 @@ def perhaps_any(mask: Tensor) -> bool:
     return is_static(mask) or bool(mask.any())
 
 
+def all_finite(x: Tensor, dim: int) -> Tensor:
+    """Whether no number along ``dim`` is infinite or NaN; ``x.isfinite().all(dim)`` in less time. Gradient: none."""
+    return x.detach().abs().amax(dim) < torch.inf
+
+
 def is_transformed() -> bool:
     """Whether this runs inside ``torch.compile`` or a transform of ``torch.func``, whatever it is given."""
     return torch.compiler.is_compiling() or torch._C._functorch.maybe_current_level() is not None

@@ -26,7 +26,7 @@ from dhtorch.geometry import se3
 from dhtorch.geometry.camera import Camera
 from dhtorch.geometry.neighbours import window_sum
 from dhtorch.geometry.se3 import Pose
-from dhtorch.geometry.shapes import check, surely_all
+from dhtorch.geometry.shapes import all_finite, check, surely_all
 from dhtorch.tree import Record, record
 
 #: Offsets (down, right) of the signs of a census: a checkerboard of 9 x 7 pixels without its middle.
@@ -130,7 +130,7 @@ def base(image: Tensor, camera: Camera) -> Base:
     """View 0 of a grey picture (B, 1, h, w). Gradient: to the picture and, through the rays, to the camera."""
     check("sweep.base", image=(image, "B 1 h w"), f=(camera.f, "B 2"))
     ray = pixel_rays(camera, (image.shape[-2], image.shape[-1]))
-    known = ray.detach().abs().amax(-1) < torch.inf if camera.distortion is not None else _sees(camera, ray)
+    known = all_finite(ray, -1) if camera.distortion is not None else _sees(camera, ray)
     if not (known.is_cpu and surely_all(known)):
         ray = torch.where(known[..., None], ray, ray.new_tensor([0.0, 0.0, 1.0]))
     return Base(image, camera, ray, known, census(image.detach()))

@@ -27,7 +27,7 @@ from dhtorch.geometry.lookup import (
     whole_is_faster,
 )
 from dhtorch.geometry.neighbours import bands, extreme, window_sum
-from dhtorch.geometry.shapes import check, is_transformed
+from dhtorch.geometry.shapes import all_finite, check, is_transformed
 from dhtorch.records import Frame, Samples
 
 #: Search radius in a sparse depth map, px: the truth test reads sparse returns in 7×7 windows, so do the samples.
@@ -133,7 +133,7 @@ def _in_torch(frame: Frame, uv: Tensor, search_px: int | None, limits: Limits) -
     unsure = returned & (level < limits.min_conf)
     xyz = cam.unproject(frame.camera, uv.nan_to_num(0.0, 0.0, 0.0), depth)  # no gradient to what is no number
     usable = returned & ~(unsure | beyond)
-    usable = usable & (xyz.detach().abs().amax(-1) < torch.inf)  # a pixel outside the lens model has no ray
+    usable = usable & all_finite(xyz, -1)  # a pixel outside the lens model has no ray
     confidence = (level.to(depth.dtype) / 2).clamp(0, 1)
     for doubt in (edge, shine, white):
         confidence = torch.where(doubt, confidence / 2, confidence)

@@ -33,7 +33,7 @@ from dhtorch.geometry.least_squares import (
 )
 from dhtorch.geometry.most_probable import FitOptions, most_probable, pose_covariance
 from dhtorch.geometry.near_far import Problem
-from dhtorch.geometry.shapes import check, surely_all
+from dhtorch.geometry.shapes import all_finite, check, surely_all
 from dhtorch.geometry.small import upper
 from dhtorch.records import Camera, Pose, PoseFit, Samples, Shutter, Tracks
 from dhtorch.tree import in_pieces
@@ -231,7 +231,7 @@ def _weighed(o: _Options, rows: Tensor, inlier: Tensor) -> tuple[Tensor, Tensor]
 def _planes(xyz: Tensor, uv: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
     """x, y, z, u, v (B, 5, N') and usable (B, N'), N' > 0 a multiple of PRODUCT_LANES; unusable points at zero."""
     points = torch.cat((xyz.transpose(1, 2), uv.transpose(1, 2)), 1)
-    usable = valid & (points.abs().amax(1) < torch.inf)
+    usable = valid & all_finite(points, 1)
     points = torch.where(usable[:, None], points, torch.zeros_like(points))
     N = usable.shape[1]
     more = (0, filled(N, PRODUCT_LANES) - N)
@@ -473,10 +473,10 @@ def _fit_all(o: FitOptions, threshold_px: float, first: PoseFit, problem: Proble
 
 def _near_far(samples: Samples, tracks: Tracks, camera_0: Camera, camera_1: Camera, isotropic: float) -> Problem:
     """The tracks as planes, N' > 0 a multiple of ``SUM_LANES``; unused ones at a safe place."""
-    usable = tracks.valid & tracks.uv_1.isfinite().all(-1) & tracks.uv_0.isfinite().all(-1)
+    usable = tracks.valid & all_finite(tracks.uv_1, -1) & all_finite(tracks.uv_0, -1)
     xyz, sigma = samples.xyz, samples.sigma.detach()
-    near = usable & xyz.isfinite().all(-1) & (xyz[..., 2] > 0) & (sigma > 0) & sigma.isfinite()
-    far = usable & ~xyz.isfinite().all(-1)
+    near = usable & samples.usable & (xyz[..., 2] > 0) & (sigma > 0) & sigma.isfinite()
+    far = usable & ~samples.usable
     z = torch.where(near, xyz[..., 2], torch.ones_like(sigma))
     shape = covariance.noise_shape(tracks.cov.detach(), usable, isotropic)
     ray = cam.rays(cam.ideal(camera_0), torch.where(usable[..., None], tracks.uv_0, torch.zeros_like(tracks.uv_0)))

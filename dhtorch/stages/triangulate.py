@@ -14,7 +14,7 @@ from dhtorch.geometry import epipolar
 from dhtorch.geometry.covariance import median, noise_shape
 from dhtorch.geometry.near_far import straighten
 from dhtorch.geometry.reach import within_reach
-from dhtorch.geometry.shapes import check
+from dhtorch.geometry.shapes import all_finite, check
 from dhtorch.records import Camera, Estimate, PoseFit, Samples, Tracks
 
 #: Least trackability that a grey difference is divided by.
@@ -105,7 +105,7 @@ def two_view(
     """
     check("two_view", uv_0=(tracks.uv_0, "B N 2"), uv=(samples.uv, "B N 2"), R=(fit.T_1_from_0.R, "B 3 3"))
     posed, still = fit.ok[:, None], fit.code == PoseCode.NO_BASELINE
-    tracked = tracks.valid & tracks.uv_0.isfinite().all(-1) & tracks.uv_1.isfinite().all(-1)
+    tracked = tracks.valid & all_finite(tracks.uv_0, -1) & all_finite(tracks.uv_1, -1)
     uv_0, uv_1 = _silence(tracks.uv_0, tracked), _silence(tracks.uv_1, tracked)
     cov = _silence(tracks.cov.flatten(-2), tracked).unflatten(-1, (2, 2))
     grey, round_trip, texture = (
