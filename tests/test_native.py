@@ -37,6 +37,7 @@ from dhtorch.synthetic import SyntheticRoom
 from dhtorch.transform import ExtendDepth, ExtendedDataset, patch_tokens
 from dhtorch.transform.leaves import SampleError
 from dhtorch.transform.problems import SampleProblem
+from dhtorch.transform.tokens import FITS
 from dhtorch.transform.views import CAMERAS, UNITS, Views
 
 COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
@@ -1004,6 +1005,17 @@ def test_a_view_alone_at_once_is_what_the_stages_say(loaded, monkeypatch, kind, 
     valid, hole, flag = (torch.stack(x) for x in zip(*seen, strict=True))
     most = 2 if hw[0] > 20 else 1  # a narrow picture has no middle of the bright and dark ones
     assert 0 < valid.sum() < valid.numel() and hole.unique().numel() > most and flag.unique().numel() > most
+
+
+@needs_compiler
+@pytest.mark.parametrize("fit", FITS)
+def test_a_view_alone_has_tokens_of_the_size_that_the_network_sees(loaded, monkeypatch, fit):
+    transform = ExtendDepth(depth_unit="mm", n=200, tokens_hw=(28, 28), fit=fit)
+    one, calls = decoded("uint16", "mm"), counted(monkeypatch, "look")
+    ours = transform(one)
+    (stages,) = by_stages(transform, monkeypatch, lambda: transform(one))
+    equal(ours, stages)
+    assert calls == ["look"] and ours["dhtorch.tokens"].shape == (4, 10)
 
 
 @needs_compiler
