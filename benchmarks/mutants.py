@@ -114,6 +114,16 @@ def module_of(name: str, known: Iterable[str]) -> str:
     return ends[0]
 
 
+def within(places: Sequence[str], known: Iterable[str]) -> list[str]:
+    """The known modules that are, or lie in, some places by dotted name."""
+    known = list(known)
+    found = {place: [m for m in known if f"{m}.".startswith(f"{place}.")] for place in places}
+    for place, modules_there in found.items():
+        if not modules_there:
+            raise ValueError(f"mutants: {place!r} names no module, expected one or a folder of {', '.join(PLACES)}")
+    return [m for m in known if any(m in there for there in found.values())]
+
+
 def span(source: str, function: str) -> tuple[int, int]:
     """Where the definition of ``function`` begins and ends, in characters."""
     body: Sequence[ast.stmt] = _parsed(source).body
@@ -490,7 +500,7 @@ def main() -> int:
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     known = modules()
-    wanted = [m for m in known if not args.modules or any(f"{m}.".startswith(f"{w}.") for w in args.modules)]
+    wanted = within(args.modules, known) if args.modules else list(known)
     if args.sweep:
         drawn = [f for m in wanted for f in by_rule(known[m].read_text(), m)]
         faults = random.Random(args.seed).sample(drawn, round(args.sweep * len(drawn)))

@@ -60,3 +60,10 @@ def test_the_command_says_what_it_takes():
     words = [sys.executable, "benchmarks/mutants.py", "--help"]
     told = subprocess.run(words, cwd=REPO, capture_output=True, text=True, check=True)
     assert "--sweep" in told.stdout
+
+
+def test_a_place_that_is_none_is_refused():
+    assert mutants.within(["geometry.se3", "memory"], KNOWN) == ["geometry.se3", "memory"]
+    assert set(mutants.within(["stages"], KNOWN)) == {m for m in KNOWN if m.startswith("stages.") or m == "stages"}
+    with pytest.raises(ValueError, match="'se3' names no module"):
+        mutants.within(["memory", "se3"], KNOWN)
