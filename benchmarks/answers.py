@@ -13,7 +13,7 @@ import torch
 
 from dhtorch import MAP, PAPER, data
 from dhtorch.data.pairs import by_gap
-from dhtorch.evaluate import holdout
+from dhtorch.metrics import holdout
 
 #: Scene, near limit (m) and gap (frames); the last one was taken through a lens.
 SCENES = (("holo_a", 2.5, 3), ("7s_redkitchen_000", 2.0, 20), ("7s_redkitchen_400", 2.0, 20), ("tum_fr1_desk9", 1.0, 4))

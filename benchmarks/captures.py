@@ -20,7 +20,8 @@ from typing import Any
 
 import cv2
 
-from dhtorch import archive, storage
+from dhtorch.runtime import results as archive
+from dhtorch.runtime import storage
 
 #: Options that are not as they come.
 SHORT = ("minutes=0.5", "recordings=2")

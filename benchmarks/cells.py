@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dhtorch.studies.report import Table, text
+from dhtorch.experiments.report import Table, text
 
 
 def percent(value: float | None) -> str:

@@ -22,13 +22,14 @@ import torch
 from degenerate_pairs import KINDS, Pair, make
 from torch import Tensor
 
-from dhtorch import storage, tree
+from dhtorch import pytree as tree
 from dhtorch.codes import Gate, PoseCode, names
-from dhtorch.geometry.lookup import nearest
-from dhtorch.method import Trace
-from dhtorch.methods import METHODS
-from dhtorch.pair import merge
+from dhtorch.geometry.patches import nearest
+from dhtorch.pipeline.pair import merge
+from dhtorch.pipeline.presets import METHODS
+from dhtorch.pipeline.spec import Trace
 from dhtorch.records import Estimate, Frame, PoseFit
+from dhtorch.runtime import storage
 
 BATCH = 64
 

@@ -17,10 +17,11 @@ import harness
 import numpy as np
 import torch
 
-from dhtorch import MAP, dense
-from dhtorch.evaluate.holdout import range_split
+from dhtorch import MAP
+from dhtorch.experiments.baselines import stereo
+from dhtorch.metrics.holdout import range_split
+from dhtorch.pipeline import dense
 from dhtorch.records import Frame
-from dhtorch.studies.baselines import stereo
 from dhtorch.synthetic import SyntheticRoom
 
 #: The room's frames: height and width, anchor and other view, near limit in m.

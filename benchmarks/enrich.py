@@ -27,13 +27,15 @@ from typing import Any
 
 import numpy as np
 
-from dhtorch import archive, data, storage, testing
+from dhtorch import data, testing
 from dhtorch.data.codecs.tiff import decode_tiff
 from dhtorch.data.recording import Recording
 from dhtorch.extract.enriched import camera_key, pixels
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.records import Frame
+from dhtorch.runtime import results as archive
+from dhtorch.runtime import storage
 from dhtorch.synthetic.recording import SyntheticRoom
 
 FRAMES, STEP = 3, 2.0**-10

@@ -23,14 +23,16 @@ import hydra
 import torch
 from hydra.utils import instantiate
 
-from dhtorch import calibration, tree
-from dhtorch.commands.run import config_dir
+from dhtorch import calibration
+from dhtorch import pytree as tree
+from dhtorch.calibration import score_calibration
+from dhtorch.cli.run import config_dir
 from dhtorch.data.pairs import around, by_gap
-from dhtorch.evaluate import control, score_calibration
-from dhtorch.evaluate.compare import MIN_ABOVE as FEW
-from dhtorch.evaluate.errors import Points
-from dhtorch.studies import protocol
-from dhtorch.studies.compare import dense_comparison
+from dhtorch.experiments import protocol
+from dhtorch.experiments.compare import dense_comparison
+from dhtorch.experiments.compare_methods import MIN_ABOVE as FEW
+from dhtorch.metrics import control
+from dhtorch.metrics.errors import Points
 
 #: Anchors of every scene whose maps a calibration of swept pixels is fitted on.
 ANCHORS = 4

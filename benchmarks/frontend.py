@@ -6,7 +6,7 @@ One view of the built-in room with its LiDAR model (depth 192x256 with confidenc
 1440x1920, three channels uint8, interleaved in memory as decoders leave them. The peer answers the same questions about
 the same pixels in numpy + OpenCV: depth, points, noise, confidence, flags, texture, class. Both sides keep the spiral,
 which depends on the picture's size alone. Mode ``compiled`` is ``torch.compile`` of the three stages with calls in C++
-(``options={"cpp_wrapper": True}``), ``native`` the stages with the compiled code of ``python -m dhtorch.native``.
+(``options={"cpp_wrapper": True}``), ``native`` the stages with the compiled code of ``python -m dhtorch.ops.loader``.
 
 Errors: median relative difference of the trackability from float64 arithmetic on grey values that were not rounded.
 """
@@ -26,14 +26,14 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from dhtorch.codes import Flag, Hole
-from dhtorch.evaluate import holdout
+from dhtorch.experiments.baselines import dinov2
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry.lookup import luma
+from dhtorch.geometry.patches import luma
+from dhtorch.metrics import holdout
 from dhtorch.records import Frame, Samples
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.holes import classify
 from dhtorch.stages.sample import spiral
-from dhtorch.studies.baselines import dinov2
 from dhtorch.synthetic.recording import SyntheticRoom
 
 SIZES = {"224": (224, 224), "1440": (1440, 1920)}

@@ -4,9 +4,9 @@
     python benchmarks/fuzz.py --full --json benchmarks/results/fuzz.json   # 20,000 and more
     python benchmarks/fuzz.py --only lerobot_v2 --case 17                  # one case again
 
-Half of the cases are bytes damaged (``tests/mutations.py``), half are files taken apart and put together again with one
-thing changed (``tests/recoders.py``). A case is known by its format, seed and number. Exit code 1 where one is neither
-valid data nor a FormatError in one line.
+Half of the cases are bytes damaged (``tests/support/byte_damage.py``), half are files taken apart and put together
+again with one thing changed (``tests/support/format_damage.py``). A case is known by its format, seed and number. Exit
+code 1 where one is neither valid data nor a FormatError in one line.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ import mutations  # noqa: E402
 import recoders  # noqa: E402
 from test_hostile import SAMPLES  # noqa: E402
 
-from dhtorch import storage  # noqa: E402
-from dhtorch.data.doors import MAX_MEMORY  # noqa: E402
+from dhtorch.data.io.safe_open import MAX_MEMORY  # noqa: E402
+from dhtorch.runtime import storage  # noqa: E402
 
 SOME, MANY = 150, 1000  # cases of every format
 SECONDS = 20  # of a processor

@@ -20,19 +20,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dhtorch import data, storage
+from dhtorch import data
 from dhtorch.codes import PoseCode
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
-from dhtorch.evaluate import errors, holdout
 from dhtorch.geometry import se3
-from dhtorch.geometry.conventions import CONVENTIONS, STATED, camera_axes
-from dhtorch.method import Method
-from dhtorch.methods import METHODS
+from dhtorch.geometry.pose_conventions import CONVENTIONS, STATED, camera_axes
+from dhtorch.metrics import errors, holdout
+from dhtorch.pipeline.method import Method
+from dhtorch.pipeline.presets import METHODS
+from dhtorch.pytree import collate
 from dhtorch.records import Frame, GivenPose, Pose, PoseFit
-from dhtorch.stages import given
+from dhtorch.runtime import storage
+from dhtorch.stages import pose_prior as given
 from dhtorch.synthetic import SyntheticRoom
-from dhtorch.tree import collate
 
 #: Captures whose poses come from a device or a tracker, with cutoff (m), frames between two views, and what they need.
 CAPTURES: tuple[dict[str, Any], ...] = (

@@ -24,10 +24,10 @@ import torch
 import triangulate
 from frontend import front_end
 
-from dhtorch import tree
+from dhtorch import pytree as tree
 from dhtorch.geometry import epipolar
-from dhtorch.methods import METHODS
-from dhtorch.pair import uniform_draws
+from dhtorch.pipeline.pair import uniform_draws
+from dhtorch.pipeline.presets import METHODS
 from dhtorch.records import Frame
 from dhtorch.stages.pose import pnp_ransac
 

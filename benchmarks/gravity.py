@@ -25,12 +25,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dhtorch import data, storage
+from dhtorch import data
 from dhtorch.data.recording import Recording
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.integrate.level import GRAVITY, directions, mean_upwards
 from dhtorch.records import Frame
+from dhtorch.runtime import storage
 
 #: Frames that are looked at, and columns of a depth map that are kept.
 FRAMES, COLUMNS = 12, 128

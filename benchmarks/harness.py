@@ -21,8 +21,10 @@ from typing import Any
 import cv2
 import torch
 
-from dhtorch import archive, native, storage
-from dhtorch.memory import keep_freed
+from dhtorch.ops import loader as native
+from dhtorch.runtime import results as archive
+from dhtorch.runtime import storage
+from dhtorch.runtime.allocator import keep_freed
 
 #: Clocks by name: what a wall shows, or (on a busy machine) the time this process was really given.
 CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
@@ -149,7 +151,7 @@ class _Held(argparse.Action):
 
 
 class _Kept(argparse.Action):
-    """What is freed, by whichever side, stays with this process (:mod:`dhtorch.memory`)."""
+    """What is freed, by whichever side, stays with this process (:mod:`dhtorch.runtime.allocator`)."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
         if not keep_freed():

@@ -3,11 +3,11 @@
     python benchmarks/judge.py --json benchmarks/results/judge_speed.json --clock cpu --repeats 9
 
 ``judge_sparse``: :func:`dhtorch.judge` of a map of 640×480 with one other view, by sparse evidence (``views=False``) of
-:data:`dhtorch.verdict.QUICK`, from the frames to the verdict; ``judge_sparse_512`` the same by 512 samples of ``map``,
-and ``judge_views`` asks the pictures of the view as well. Rows of mode ``native`` use the compiled code of ``python -m
-dhtorch.native``. All take turns in one process, a second or more of frames in a row each, as a data set is judged. The
-peer needs a motion like ours and gets one by the same method. Frames of TUM fr1/desk where DHTORCH_DATA is set, else of
-the built-in room; frames a second are 1000 / ms.
+:data:`dhtorch.validation.validate.QUICK`, from the frames to the verdict; ``judge_sparse_512`` the same by 512 samples
+of ``map``, and ``judge_views`` asks the pictures of the view as well. Rows of mode ``native`` use the compiled code of
+``python -m dhtorch.ops.loader``. All take turns in one process, a second or more of frames in a row each, as a data set
+is judged. The peer needs a motion like ours and gets one by the same method. Frames of TUM fr1/desk where DHTORCH_DATA
+is set, else of the built-in room; frames a second are 1000 / ms.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ import harness
 import pair as pairs
 import torch
 
-from dhtorch import MAP, dense, judge
-from dhtorch.method import Method
-from dhtorch.studies.baselines import photometric
-from dhtorch.verdict import QUICK
+from dhtorch import MAP, judge
+from dhtorch.experiments.baselines import photometric
+from dhtorch.pipeline import dense
+from dhtorch.pipeline.method import Method
+from dhtorch.validation.validate import QUICK
 
 METHOD = MAP.replace(n=512)
 

@@ -17,7 +17,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from dhtorch import archive, storage
+from dhtorch.runtime import results as archive
+from dhtorch.runtime import storage
 
 #: Capture → options beside those as they come. The RealSense's K is nobody's: the field of view is the maker's. The
 #: last are single views, each in a folder of its own.

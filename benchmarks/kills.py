@@ -26,8 +26,14 @@ from multiprocessing.context import ForkProcess
 from pathlib import Path
 from typing import cast
 
-from dhtorch import archive, extract, storage  # noqa: F401 (imported once, before commands are forked)
-from dhtorch.commands import enrich, run  # noqa: F401
+from dhtorch import extract  # noqa: F401 (imported once, before commands are forked)
+from dhtorch.cli import enrich, run  # noqa: F401
+from dhtorch.runtime import (
+    results as archive,
+)
+from dhtorch.runtime import (
+    storage,
+)
 
 ROOM = ("data=synthetic", "data.n_frames=6", "data.hw=[96,128]", "data.depth_hw=[48,64]", "method.n=64", "workers=2")
 COMMANDS = {

@@ -30,13 +30,13 @@ from kornia.geometry.solvers import solve_cubic
 from torch import Tensor
 
 from dhtorch.data import convert
+from dhtorch.experiments.baselines import dinov2
+from dhtorch.experiments.focal import filling, sharpness
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import epipolar, filters, p3p, pyramid, se3
-from dhtorch.geometry.lookup import luma
+from dhtorch.geometry.patches import luma
 from dhtorch.records import Camera, Pose
 from dhtorch.stages import holes
-from dhtorch.studies.baselines import dinov2
-from dhtorch.studies.focal import filling, sharpness
 
 Make = Callable[[torch.dtype, int, int], tuple[Any, ...]]
 

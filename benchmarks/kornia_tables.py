@@ -8,7 +8,7 @@ from typing import Any
 
 from speed_tables import ratio
 
-from dhtorch.studies.report import Table, text
+from dhtorch.experiments.report import Table, text
 
 RESULTS = Path(__file__).resolve().parent / "results"
 

@@ -5,7 +5,7 @@
 *Forward* is both pyramids and one search; mode ``cached`` has the pyramid of image 0 made before, as for an anchor seen
 from many views. Mode ``compiled`` has the steps on maps compiled: the whole search under ``torch.compile`` would unroll
 every map that the eager search makes for few points only, and was not compiled after 400 s. Mode ``native`` uses
-``python -m dhtorch.native``. *Forward-backward* is
+``python -m dhtorch.ops.loader``. *Forward-backward* is
 ``lucas_kanade`` with all its fields against two calls of OpenCV. Times are of real pairs where DHTORCH_DATA is set,
 else of the built-in room; both sides take turns in one process.
 
@@ -31,14 +31,14 @@ from torch import Tensor
 
 from dhtorch import data
 from dhtorch.data.pairs import by_gap
+from dhtorch.experiments.baselines import opencv
 from dhtorch.geometry import lucas_kanade as lk
-from dhtorch.geometry.exact import LANES
-from dhtorch.geometry.lookup import luma
+from dhtorch.geometry.determinism import LANES
+from dhtorch.geometry.patches import luma
 from dhtorch.geometry.pyramid import Pyramid, Pyramids, build_pyramid
 from dhtorch.records import TrackHint
 from dhtorch.stages import track
 from dhtorch.stages.sample import spiral
-from dhtorch.studies.baselines import opencv
 from dhtorch.synthetic.recording import SyntheticRoom
 
 #: Real pairs: folder → gap; all 640x480.

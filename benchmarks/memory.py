@@ -17,9 +17,10 @@ from typing import Any
 
 import harness
 
-from dhtorch import MAP, storage
-from dhtorch.commands.stream import streamed
+from dhtorch import MAP
+from dhtorch.cli.stream import streamed
 from dhtorch.data.scene import Scene
+from dhtorch.runtime import storage
 from dhtorch.synthetic import SyntheticRoom
 
 #: Frames in all, those that may take memory, the size of a picture and the samples of each.

@@ -9,7 +9,7 @@ take turns in one process; errors are medians of the relative depth error over t
 such answers ours gives in the same time. ``every_pixel`` is the same for ``complete``, whose answers are pixels,
 counted on every fourth row and column and multiplied by sixteen. ``anchor_auto`` is ``auto`` beside the first release's
 ``WINDOW_1``: one anchor, the same frames around it offered to both, from which each chooses. Mode ``native`` is ours
-with the compiled code of ``python -m dhtorch.native``; the peer stays as it is.
+with the compiled code of ``python -m dhtorch.ops.loader``; the peer stays as it is.
 """
 
 from __future__ import annotations
@@ -25,16 +25,18 @@ from typing import Any
 import harness
 import torch
 
-from dhtorch import data, dense, tree
+from dhtorch import data
+from dhtorch import pytree as tree
 from dhtorch.codes import Source
 from dhtorch.data.pairs import by_gap
-from dhtorch.evaluate import errors, holdout
-from dhtorch.first_release import WINDOW_1
-from dhtorch.methods import AUTO, MAP, PAPER
-from dhtorch.offers import choosing
+from dhtorch.experiments.baselines import opencv
+from dhtorch.experiments.baselines.frozen import WINDOW_1
+from dhtorch.metrics import errors, holdout
+from dhtorch.pipeline import dense
+from dhtorch.pipeline.presets import AUTO, MAP, PAPER
+from dhtorch.pipeline.view_report import choosing
 from dhtorch.records import DepthMap, Frame
 from dhtorch.stages import triangulate
-from dhtorch.studies.baselines import opencv
 from dhtorch.synthetic.recording import SyntheticRoom
 
 #: Ours, by name.

@@ -15,7 +15,8 @@ from pathlib import Path
 
 from captures import row
 
-from dhtorch import archive, storage
+from dhtorch.runtime import results as archive
+from dhtorch.runtime import storage
 from dhtorch.synthetic import SyntheticRoom
 from dhtorch.testing.stray import write_stray
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from cells import percent, table
 
-from dhtorch.console import many
+from dhtorch.runtime.console import many
 
 RESULTS = Path(__file__).resolve().parent / "results"
 

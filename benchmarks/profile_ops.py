@@ -20,8 +20,8 @@ import pair as pairs
 import torch
 from torch.profiler import ProfilerActivity, profile
 
-from dhtorch.method import Method
-from dhtorch.methods import METHODS
+from dhtorch.pipeline.method import Method
+from dhtorch.pipeline.presets import METHODS
 
 STAGES = ("sample", "backproject", "classify", "track", "pose", "triangulate", "score")
 

@@ -24,14 +24,16 @@ from typing import Any
 
 import torch
 
-from dhtorch import archive, data, storage
+from dhtorch import data
 from dhtorch import testing as writers
+from dhtorch.experiments.focal import formats
+from dhtorch.experiments.focal import writers as stack_writers
+from dhtorch.experiments.focal.stacks import FocalStack
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame, Pose
-from dhtorch.studies.focal import formats
-from dhtorch.studies.focal import writers as stack_writers
-from dhtorch.studies.focal.stacks import FocalStack
+from dhtorch.runtime import results as archive
+from dhtorch.runtime import storage
 
 PERIOD = 20
 HW, LOW_HW = (480, 640), (192, 256)

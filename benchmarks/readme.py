@@ -25,9 +25,9 @@ import pose_tables
 import speed_tables
 from cells import number, percent, table
 
-from dhtorch import archive
-from dhtorch.studies.compare import method_comparison
-from dhtorch.studies.report import Table, layouts, text
+from dhtorch.experiments.compare import method_comparison
+from dhtorch.experiments.report import Table, layouts, text
+from dhtorch.runtime import results as archive
 
 HERE = Path(__file__).resolve().parent
 README = HERE.parent / "README.md"
@@ -273,7 +273,9 @@ def loader_times() -> str:
         return " and ".join(f"{a['ours_ms']:.2g} ms with {x} ({b['ours_ms']:.2g} by batch)" for a, b, x in times)
 
     plain, _ = taken("single", "eager")
-    after = f"; after `python -m dhtorch.native`, which compiles inner loops, {said('native')}" * bool(said("native"))
+    after = f"; after `python -m dhtorch.ops.loader`, which compiles inner loops, {said('native')}" * bool(
+        said("native")
+    )
     return (
         f"A sample of 640×480 takes {said('eager')}{after}; {plain['peer_ms']:.2g} ms of it is decoding\n"
         f"(`python benchmarks/loader.py`; one thread, {plain['processor']})."

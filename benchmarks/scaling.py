@@ -21,14 +21,14 @@ import pnp
 import torch
 from torch.nn.functional import interpolate
 
-from dhtorch import tree
-from dhtorch.evaluate import holdout
+from dhtorch import pytree as tree
+from dhtorch.experiments.memory import peak_mib
 from dhtorch.geometry import camera as cam
-from dhtorch.methods import METHODS, PAPER
-from dhtorch.pair import uniform_draws
+from dhtorch.metrics import holdout
+from dhtorch.pipeline.pair import uniform_draws
+from dhtorch.pipeline.presets import METHODS, PAPER
 from dhtorch.records import Frame
 from dhtorch.stages.pose import pnp_ransac
-from dhtorch.studies.memory import peak_mib
 from dhtorch.synthetic.recording import SyntheticRoom
 
 #: The largest exponent that counts as proportional.

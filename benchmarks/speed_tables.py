@@ -10,7 +10,7 @@ from typing import Any
 
 from reproduce import AGAIN
 
-from dhtorch.studies.report import Table, text
+from dhtorch.experiments.report import Table, text
 
 RESULTS = Path(__file__).resolve().parent / "results"
 

@@ -22,14 +22,14 @@ import torch
 from dhtorch import data, extend
 from dhtorch.data.pairs import around, between
 from dhtorch.data.recording import Recording
-from dhtorch.evaluate.holdout import range_split
-from dhtorch.methods import AUTO, WINDOW
+from dhtorch.experiments.baselines import opencv
+from dhtorch.metrics.holdout import range_split
+from dhtorch.pipeline.presets import AUTO, WINDOW
+from dhtorch.pipeline.stream import Stream
+from dhtorch.pytree import stack
 from dhtorch.records import Frame
 from dhtorch.stages import triangulate
-from dhtorch.stream import Stream
-from dhtorch.studies.baselines import opencv
 from dhtorch.synthetic.recording import SyntheticRoom
-from dhtorch.tree import stack
 
 PEER = partial(
     extend,

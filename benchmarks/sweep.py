@@ -15,7 +15,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from dhtorch import archive, storage
+from dhtorch.runtime import results as archive
+from dhtorch.runtime import storage
 
 #: The command, as README has it.
 COMMAND = "dhtorch -m method=paper,map,auto method.n=512,2048"

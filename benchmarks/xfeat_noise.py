@@ -1,4 +1,4 @@
-"""How wrong XFeat's matches are: the constants of ``dhtorch.studies.baselines.xfeat.noise``, fitted and tested.
+"""How wrong XFeat's matches are: the constants of ``dhtorch.experiments.baselines.xfeat.noise``, fitted and tested.
 
 python benchmarks/xfeat_noise.py [--json FILE]      a few minutes; needs the extra ``matchers``
 
@@ -20,10 +20,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from dhtorch.experiments.baselines import xfeat
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
-from dhtorch.geometry.lookup import nearest
-from dhtorch.studies.baselines import xfeat
+from dhtorch.geometry.patches import nearest
 from dhtorch.synthetic import SyntheticRoom
 
 #: Rooms that the constants are fitted in, and rooms that they are tested in.

@@ -12,15 +12,26 @@ import importlib.util
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dhtorch.method import Method
-    from dhtorch.methods import AUTO, MAP, PAPER, WINDOW, extend
-    from dhtorch.metric import anchor
-    from dhtorch.pair import merge
-    from dhtorch.records import Camera, Estimate, Frame, Map, Pose, PoseFit, Samples, TrackHint, Tracks, Verdict
-    from dhtorch.stream import Stream
-    from dhtorch.transform import ExtendDepth, JudgeDepth
-    from dhtorch.tree import collate
-    from dhtorch.verdict import judge
+    from dhtorch.alignment.align import anchor
+    from dhtorch.pipeline.method import Method
+    from dhtorch.pipeline.pair import merge
+    from dhtorch.pipeline.presets import AUTO, MAP, PAPER, WINDOW, extend
+    from dhtorch.pipeline.stream import Stream
+    from dhtorch.pytree import collate
+    from dhtorch.records import (
+        Camera,
+        Estimate,
+        Frame,
+        Map,
+        Pose,
+        PoseFit,
+        Samples,
+        TrackHint,
+        Tracks,
+        Verdict,
+    )
+    from dhtorch.transforms import ExtendDepth, JudgeDepth
+    from dhtorch.validation.validate import judge
 
 __version__ = "0.1.0"
 
@@ -51,15 +62,16 @@ __all__ = [
 ]
 
 #: Where a public name lives, if not among the records.
-_HOMES = dict.fromkeys(("AUTO", "MAP", "PAPER", "WINDOW", "extend"), "methods") | {"Method": "method"}
+_HOMES = dict.fromkeys(("AUTO", "MAP", "PAPER", "WINDOW", "extend"), "pipeline.presets")
 _HOMES |= {
-    "ExtendDepth": "transform",
-    "JudgeDepth": "transform",
-    "Stream": "stream",
-    "anchor": "metric",
-    "collate": "tree",
-    "judge": "verdict",
-    "merge": "pair",
+    "ExtendDepth": "transforms",
+    "JudgeDepth": "transforms",
+    "Method": "pipeline.method",
+    "Stream": "pipeline.stream",
+    "anchor": "alignment.align",
+    "collate": "pytree",
+    "judge": "validation.validate",
+    "merge": "pipeline.pair",
 }
 
 

@@ -2,6 +2,6 @@
 
 import sys
 
-from dhtorch.commands.run import main
+from dhtorch.cli.run import main
 
 sys.exit(main())

@@ -14,11 +14,11 @@ from torch import Tensor
 
 from dhtorch.codes import Gate, PoseCode, State
 from dhtorch.geometry.camera import Camera
+from dhtorch.geometry.checks import all_finite
+from dhtorch.geometry.coarse_flow import Flow
 from dhtorch.geometry.pyramid import Pyramids
 from dhtorch.geometry.se3 import Pose
-from dhtorch.geometry.shapes import all_finite
-from dhtorch.geometry.start import Flow
-from dhtorch.tree import KEEP_DTYPE, Record, record
+from dhtorch.pytree import KEEP_DTYPE, Record, record
 
 __all__ = [
     "Camera",
@@ -146,7 +146,7 @@ class PoseFit(Record):
 class GivenPose(Record):
     """A relative pose from elsewhere (kinematics, SLAM, a device's own tracker, a calibration), for ``fit=``.
 
-    Near returns are held against it (:func:`dhtorch.stages.given.hold`): a pose that they contradict is not used.
+    Near returns are held against it (:func:`dhtorch.stages.pose_prior.hold`): a pose that they contradict is not used.
     """
 
     T_1_from_0: Pose  # not finite = not known

@@ -28,9 +28,9 @@ import licences as terms  # noqa: E402
 from docstrings import markdown as as_markdown  # noqa: E402
 
 import dhtorch  # noqa: E402
+from dhtorch.cli import run  # noqa: E402
 from dhtorch.codes import Gate, Hole, Source, names, words  # noqa: E402
-from dhtorch.commands import run  # noqa: E402
-from dhtorch.drawing import colours as palette  # noqa: E402
+from dhtorch.viz.plots import colours as palette  # noqa: E402
 
 #: Words of the command with a help text of their own.
 WORDS = ("", "inspect", "report", "complete", "anchor", "judge", "extract", "integrate", "stream", "view")
@@ -162,7 +162,9 @@ def api_page(part: str) -> str:
 def _home(name: str, value: Any) -> str:
     """The dotted name under which a public name is described."""
     return (
-        f"dhtorch.methods.{name}" if isinstance(value, dhtorch.Method) else f"{value.__module__}.{value.__qualname__}"
+        f"dhtorch.pipeline.presets.{name}"
+        if isinstance(value, dhtorch.Method)
+        else f"{value.__module__}.{value.__qualname__}"
     )
 
 
@@ -215,7 +217,7 @@ def module(dotted: str) -> str:
 
 def reader(name: str) -> str:
     """What a reader says of its format, and how its options are named."""
-    wing = "dhtorch.data" if (REPO / "dhtorch" / "data" / f"{name}.py").is_file() else "dhtorch.studies.focal"
+    wing = "dhtorch.data" if (REPO / "dhtorch" / "data" / f"{name}.py").is_file() else "dhtorch.experiments.focal"
     home = "dhtorch.synthetic.recording" if name == "synthetic" else f"{wing}.{name}"
     text = f"**`{home}`** — {module(home)}\n"
     options = REPO / "conf" / "data" / f"{name}.yaml"

@@ -28,18 +28,19 @@ import torch
 from matplotlib.figure import Figure
 from PIL import Image
 
-from dhtorch import calibration, data, dense
+from dhtorch import calibration, data
 from dhtorch.codes import Source
 from dhtorch.data.pairs import by_choice
 from dhtorch.data.scene import Scene
-from dhtorch.drawing import Axis, Key, Panel, Stroke, colours, save
-from dhtorch.evaluate.holdout import range_split
+from dhtorch.experiments.exhibits import look
+from dhtorch.experiments.protocol import Settings
 from dhtorch.integrate.sweeps import Sweep
-from dhtorch.methods import AUTO
-from dhtorch.studies.exhibits import look
-from dhtorch.studies.protocol import Settings
-from dhtorch.tree import stack
-from dhtorch.viewer import html
+from dhtorch.metrics.holdout import range_split
+from dhtorch.pipeline import dense
+from dhtorch.pipeline.presets import AUTO
+from dhtorch.pytree import stack
+from dhtorch.viz.plots import Axis, Key, Panel, Stroke, colours, save
+from dhtorch.viz.viewer import html
 
 REPO = Path(__file__).resolve().parents[1]
 ASSETS = REPO / "docs" / "assets"

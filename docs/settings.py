@@ -23,10 +23,11 @@ from typing import Any
 
 import torch
 
-from dhtorch import first_release
-from dhtorch.method import Method
-from dhtorch.methods import METHODS
-from dhtorch.studies.baselines import opencv, xfeat
+from dhtorch.experiments.baselines import frozen as first_release
+from dhtorch.experiments.baselines import opencv, xfeat
+from dhtorch.pipeline.method import Method
+from dhtorch.pipeline.presets import METHODS
+from dhtorch.pipeline.spec import MethodSpec
 
 FOLDER = Path(__file__).resolve().parent.parent / "conf" / "method"
 
@@ -49,8 +50,8 @@ WIDTH = 120
 def document(name: str, method: Method) -> str:
     """The file of a method."""
     lines = [f"# {line}" for line in _said(name)]
-    lines += ["# Written from its record by `make conf`.", "_target_: dhtorch.method.Method"]
-    comments = _comments(Method)
+    lines += ["# Written from its record by `make conf`.", "_target_: dhtorch.pipeline.method.Method"]
+    comments = _comments(MethodSpec)
     for field in fields(method):
         lines += _option(field.name, getattr(method, field.name), comments.get(field.name), 0)
     return "\n".join(lines) + "\n"
@@ -94,7 +95,7 @@ def _scalar(value: Any) -> str:
 
 def _said(name: str) -> list[str]:
     """The comment above a method's name in its module."""
-    for module in (sys.modules["dhtorch.methods"], first_release, opencv, xfeat):
+    for module in (sys.modules["dhtorch.pipeline.presets"], first_release, opencv, xfeat):
         source = inspect.getsource(module)
         if found := re.search(rf"((?:^#: .*\n)+)^{name.upper()} = ", source, re.M):
             return [line.removeprefix("#: ").replace("``", "`") for line in found[1].splitlines()]

@@ -11,98 +11,120 @@ import pytest
 import dhtorch
 
 ROOT = Path(dhtorch.__file__).parent
-LEVELS = [
-    {"tree", "codes", "storage", "closure", "archive", "older", "console", "leash", "lock", "memory", "native"},
+#: Packages and modules of the root by floor, highest first: imports go down only. Those of one floor do not import each
+#: other. There are no exceptions.
+FLOORS = (
+    {"cli"},
+    {"extract", "experiments"},
+    {"transforms"},
+    {"validation", "integrate", "synthetic"},
+    {"pipeline", "testing"},
+    {"calibration"},
+    {"stages", "alignment", "metrics", "export", "data"},
+    {"viz"},
+    {"records"},
     {"geometry"},
-    {"records", "drawing"},
-    {"stages", "data", "evaluate", "export", "synthetic", "testing", "calibration", "anchors"},
-    {"method", "frames", "distortion", "scatter", "stereo"},
-    {"pair", "window", "methods", "first_release", "views", "offers"},
-    {"stream", "dense", "rig", "metric"},
-    {"evidence", "causes"},
-    {"verdict"},
-    {"transform", "integrate", "viewer"},
-    {"extract"},
-    {"studies"},
-    {"commands", "__main__"},
-]
-LEVEL = {name: level for level, group in enumerate(LEVELS) for name in group}
-SIDEWAYS = {
-    ("archive", "closure"),
-    ("archive", "storage"),
-    ("lock", "storage"),
-    ("native", "archive"),
-    ("synthetic", "data"),
-    ("synthetic", "testing"),
-    ("testing", "data"),
-    ("testing", "export"),
-    ("calibration", "evaluate"),
-    ("method", "frames"),
-    ("method", "pair"),  # when it is called
-    ("method", "window"),
-    ("window", "pair"),
-    ("views", "pair"),
-    ("window", "views"),
-    ("offers", "views"),
-    ("methods", "views"),
-    ("__main__", "commands"),
-}
+    {"ops"},
+    {"runtime"},
+    {"codes", "pytree"},
+)
+FLOOR = {name: -k for k, names in enumerate(FLOORS) for name in names}
+
+#: Modules whose functions may import dhtorch: public names on first use; help and misspelt options before torch.
+LAZY = ("__init__.py", "__main__.py", "cli/")
+
 FILES = sorted(ROOT.rglob("*.py"))
 
 
-def imported(path):
-    """Dotted names a file imports, `from a import b` as a.b, with whether the import runs when the module loads."""
+def imports(path):
+    """Of each import of a file its dotted name, `from a import b` as a.b, and whether it stands within a function."""
     tree = ast.parse(path.read_text())
-    inside = {id(n) for f in ast.walk(tree) if isinstance(f, ast.FunctionDef | ast.ClassDef) for n in ast.walk(f)}
+    within = {id(n) for f in ast.walk(tree) if isinstance(f, ast.FunctionDef) for n in ast.walk(f)}
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            yield from ((alias.name, id(node) not in inside) for alias in node.names)
+            yield from ((alias.name, id(node) in within) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
-            yield from ((f"{node.module}.{alias.name}", id(node) not in inside) for alias in node.names)
+            yield from ((f"{node.module}.{alias.name}", id(node) in within) for alias in node.names)
 
 
-def part(path):
-    relative = path.relative_to(ROOT)
-    return relative.parts[0] if len(relative.parts) > 1 else relative.stem
+def module_of(name):
+    """The module or package of dhtorch that a dotted name belongs to, as its path below the package; None if another's."""
+    parts = name.split(".")
+    if parts[0] != "dhtorch":
+        return None
+    for n in range(len(parts), 0, -1):
+        base = ROOT.joinpath(*parts[1:n])
+        if base.with_suffix(".py").is_file() or (base / "__init__.py").is_file():
+            return base.relative_to(ROOT)
+    raise AssertionError(f"{name}: no module")
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
 def test_imports_go_down_only(path):
-    here = part(path)
-    if here == "__init__":
+    relative = path.relative_to(ROOT)
+    if str(relative) in ("__init__.py", "__main__.py"):
         return
-    assert here in LEVEL, f"{path}: {here} has no floor"
-    for name, _ in imported(path):
-        pieces = name.split(".")
-        if pieces[0] != "dhtorch" or len(pieces) < 2:
+    part = relative.parts[0].removesuffix(".py")
+    assert part in FLOOR, f"{relative}: {part} has no floor"
+    for name, _ in imports(path):
+        module = module_of(name)
+        if module is None or not module.parts:
             continue
-        there = pieces[1]
-        assert there in LEVEL, f"{path}: imports {name}, which has no floor"
-        if there == here:
-            alike = here != "stages" or len(pieces) == 2 or pieces[2] == path.stem
-            assert alike, f"{path}: a stage imports a stage"
+        other = module.parts[0]
+        assert other in FLOOR, f"{relative}: imports {name}, which has no floor"
+        assert other == part or FLOOR[other] < FLOOR[part], f"{relative}: imports {name}"
+        assert part != "stages" or other != part or module == Path("stages"), f"{relative}: a stage imports a stage"
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_no_function_imports_the_package(path):
+    relative = str(path.relative_to(ROOT))
+    late = [name for name, within in imports(path) if within and name.split(".")[0] == "dhtorch"]
+    assert relative.startswith(LAZY) or not late, f"{relative}: imports {late} within a function"
+
+
+def test_no_two_modules_import_each_other():
+    """The import graph has no circle, however long. A package stands for its ``__init__`` module."""
+    graph = {}
+    for path in FILES:
+        relative = path.relative_to(ROOT)
+        here = relative.parent if path.stem == "__init__" else relative.with_suffix("")
+        if here == Path():  # public names are imported on first use
             continue
-        allowed = LEVEL[there] < LEVEL[here] or (here, there) in SIDEWAYS
-        assert allowed, f"{path}: imports {name} from floor {LEVEL[there]}, stands on {LEVEL[here]}"
+        graph[here] = {m for name, within in imports(path) if not within and (m := module_of(name)) not in (None, here)}
+    done, open_ = set(), []
+
+    def visit(module):
+        assert module not in open_, " -> ".join(map(str, [*open_[open_.index(module) :], module]))
+        if module in done:
+            return
+        open_.append(module)
+        for other in sorted(graph.get(module, ())):
+            visit(other)
+        open_.pop()
+        done.add(module)
+
+    for module in sorted(graph):
+        visit(module)
 
 
 @pytest.mark.parametrize(
     ("library", "homes"),
     [
-        ("cv2", {"data/files.py", "studies/baselines/opencv.py", "studies/baselines/stereo.py"}),
-        ("hydra", {"commands/run.py", "commands/words.py"}),
-        ("omegaconf", {"commands/run.py"}),
+        ("cv2", {"data/io/decode.py", "experiments/baselines/opencv.py", "experiments/baselines/stereo.py"}),
+        ("hydra", {"cli/run.py", "cli/option_checks.py"}),
+        ("omegaconf", {"cli/run.py"}),
     ],
 )
 def test_libraries_stay_at_home(library, homes):
-    users = {str(p.relative_to(ROOT)) for p in FILES if any(n.split(".")[0] == library for n, _ in imported(p))}
+    users = {str(p.relative_to(ROOT)) for p in FILES if any(n.split(".")[0] == library for n, _ in imports(p))}
     assert users <= homes
 
 
 def test_heavy_libraries_are_not_imported_with_the_package():
     heavy = ("matplotlib", "rich", "hydra", "cv2", "scipy", "transformers", "torch._dynamo", "sympy")
-    code = "import sys, dhtorch; from dhtorch.pair import uniform_draws; uniform_draws(0, 1, 2)\n"
+    code = "import sys, dhtorch; from dhtorch.pipeline.pair import uniform_draws; uniform_draws(0, 1, 2)\n"
     code += f"print([m for m in {heavy} if m in sys.modules])"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"
@@ -113,7 +135,7 @@ def test_heavy_libraries_are_not_imported_with_the_package():
     [["--version"], ["--help"], ["sede=1"], ["method.track.windw=3"], ["view", "--help"], ["extract", "mehtod=map"]],
 )
 def test_help_and_misspelt_options_are_answered_before_torch_is_loaded(words):
-    code = "import atexit, sys\nfrom dhtorch.commands import run\n"
+    code = "import atexit, sys\nfrom dhtorch.cli import run\n"
     code += "atexit.register(lambda: print('torch' in sys.modules, 'kornia' in sys.modules))\n"
     code += f"run.main({words})"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -11,9 +11,9 @@ import pytest
 pytest.importorskip("pyarrow")
 
 from pyarrow import parquet
-from sample_dicts import room
+from support.sample_dicts import room
 
-from dhtorch.commands.run import main
+from dhtorch.cli.run import main
 from dhtorch.testing import write_rlds
 
 CLIENTS = Path(__file__).resolve().parents[1] / "benchmarks" / "clients"

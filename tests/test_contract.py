@@ -7,55 +7,93 @@ import pkgutil
 
 import pytest
 import torch
-from contract import PROMISES, NoMasksAsNumbers, Row, equal, leaves, reorder, take, tensor_map
+from support.contract_rows import PROMISES, NoMasksAsNumbers, Row, equal, leaves, reorder, take, tensor_map
 
-from dhtorch import (
-    anchors,
-    causes,
-    dense,
-    distortion,
-    evidence,
-    method,
-    metric,
-    pair,
-    scatter,
-    stereo,
-    verdict,
-    views,
-    window,
+from dhtorch.alignment import (
+    align as metric,
 )
-from dhtorch.evaluate import holdout, probe
+from dhtorch.alignment import (
+    error_model as distortion,
+)
+from dhtorch.alignment import (
+    references as anchors,
+)
+from dhtorch.alignment import (
+    residual_noise as scatter,
+)
+from dhtorch.experiments.baselines.device_pose import given_pose
+from dhtorch.experiments.focal import blur, filling, sharpness
+from dhtorch.experiments.negative import arms, clusters, registration
+from dhtorch.experiments.probes import ridge as probe
 from dhtorch.geometry import (
-    affine,
+    affine_alignment as affine,
+)
+from dhtorch.geometry import (
     camera,
-    conventions,
     covariance,
     epipolar,
-    exact,
     filters,
     least_squares,
-    lookup,
-    most_probable,
-    near_far,
-    neighbours,
     p3p,
     pyramid,
     ransac,
-    rigid,
     se3,
-    small,
     sparse_grid,
-    start,
-    sweep,
     thin_lens,
 )
-from dhtorch.methods import MAP, PAPER, WINDOW
+from dhtorch.geometry import (
+    coarse_flow as start,
+)
+from dhtorch.geometry import (
+    determinism as exact,
+)
+from dhtorch.geometry import (
+    linalg as small,
+)
+from dhtorch.geometry import (
+    map_estimate as most_probable,
+)
+from dhtorch.geometry import (
+    patches as lookup,
+)
+from dhtorch.geometry import (
+    plane_sweep as sweep,
+)
+from dhtorch.geometry import (
+    pose_averaging as rigid,
+)
+from dhtorch.geometry import (
+    pose_conventions as conventions,
+)
+from dhtorch.geometry import (
+    reprojection_problem as near_far,
+)
+from dhtorch.geometry import (
+    windows as neighbours,
+)
+from dhtorch.metrics import holdout
+from dhtorch.pipeline import (
+    dense,
+    method,
+    pair,
+)
+from dhtorch.pipeline import (
+    multiview as window,
+)
+from dhtorch.pipeline import (
+    surface as stereo,
+)
+from dhtorch.pipeline import (
+    view_selection as views,
+)
+from dhtorch.pipeline.presets import MAP, PAPER, WINDOW
 from dhtorch.records import Camera, Frame, Samples, Tracks
-from dhtorch.stages import backproject, given, holes, pose, score, track, triangulate
-from dhtorch.studies.baselines.device_pose import given_pose
-from dhtorch.studies.focal import blur, filling, sharpness
-from dhtorch.studies.negative import arms, clusters, registration
+from dhtorch.stages import backproject, holes, pose, score, track, triangulate
+from dhtorch.stages import pose_prior as given
 from dhtorch.synthetic import SyntheticRoom
+from dhtorch.validation import evidence
+from dhtorch.validation import faults as causes
+from dhtorch.validation import validate as verdict
 
 HW = (48, 64)
 FEW = 11  # points; no other axis of any answer is as long
@@ -508,30 +546,27 @@ ROWS = [
 ]  # fmt: skip
 
 #: Functions without a batch of points: samplers, loops over a callable, flat lists of pooled points. Their promises are
-#: tested where they are at home (test_front_end.py, test_pose.py, test_evaluate.py, test_integrate.py).
+#: tested where they are at home (test_front_end.py, test_pose.py, test_errors.py, test_integrate.py).
 ELSEWHERE = {
-    *(f"dhtorch.stages.given.{name}" for name in ("from_frames", "without")),
+    *(f"dhtorch.stages.pose_prior.{name}" for name in ("from_frames", "without")),
     *(f"dhtorch.stages.backproject.{name}" for name in ("around", "places")),
-    "dhtorch.geometry.graphless.spared",
+    "dhtorch.geometry.inference_mode.spared",
     "dhtorch.geometry.least_squares.has_graph",
-    "dhtorch.geometry.lookup.product_is_exact",
-    "dhtorch.geometry.near_far.squares_at",
-    "dhtorch.geometry.neighbours.bands",
+    "dhtorch.geometry.patches.product_is_exact",
+    "dhtorch.geometry.reprojection_problem.squares_at",
+    "dhtorch.geometry.windows.bands",
     "dhtorch.geometry.p3p.p3p_of_planes",
     *(f"dhtorch.stages.sample.{name}" for name in ("spiral", "vogel", "grid")),
     *(
-        f"dhtorch.geometry.shapes.{name}"
+        f"dhtorch.geometry.checks.{name}"
         for name in ("all_finite", "check", "is_static", "is_transformed", "perhaps_any", "surely_all")
     ),
-    *(f"dhtorch.geometry.reference.{name}" for name in ("patch", "nearest", "luma", "offsets", "levels")),
+    *(f"support.reference.{name}" for name in ("patch", "nearest", "luma", "offsets", "levels")),
     *(
-        f"dhtorch.geometry.reference.{name}"
+        f"support.reference.{name}"
         for name in ("lucas_kanade", "search", "descend", "template", "one_step", "leap", "difference", "within")
     ),
-    *(
-        f"dhtorch.geometry.reference.{name}"
-        for name in ("register", "register_step", "composed", "believed", "nearest_inside")
-    ),
+    *(f"support.reference.{name}" for name in ("register", "register_step", "composed", "believed", "nearest_inside")),
     *(f"dhtorch.geometry.sparse_grid.{name}" for name in ("occupied", "components")),
     *(f"dhtorch.integrate.volume.{name}" for name in ("empty", "fuse", "reserve", "confirmed", "splat")),
     "dhtorch.integrate.sweeps.edges",
@@ -558,65 +593,74 @@ ELSEWHERE = {
         )
     ),
     "dhtorch.geometry.filters.gaussian_taps",
-    "dhtorch.window.ask_window",
+    "dhtorch.pipeline.multiview.ask_window",
     *(
-        f"dhtorch.pair.{name}"
+        f"dhtorch.pipeline.pair.{name}"
         for name in ("ask_pair", "tracked", "under_pose", "merge", "lifted", "undistort_tracks", "uniform_draws")
     ),
-    *(f"dhtorch.method.{name}" for name in ("parts", "networks", "options")),
+    *(f"dhtorch.pipeline.method.{name}" for name in ("parts", "networks", "options")),
     "dhtorch.stages.fuse.inverse_variance",
     "dhtorch.stages.fuse.agree",
-    "dhtorch.geometry.reach.within_reach",
-    *(f"dhtorch.views.{name}" for name in ("by_probes", "shrunk", "weighed")),
-    *(f"dhtorch.geometry.start.{name}" for name in ("small", "is_turned", "inverse")),
+    "dhtorch.geometry.free_space.within_reach",
+    *(f"dhtorch.pipeline.view_selection.{name}" for name in ("by_probes", "shrunk", "weighed")),
+    *(f"dhtorch.geometry.coarse_flow.{name}" for name in ("small", "is_turned", "inverse")),
     "dhtorch.stages.track.coarse",
-    "dhtorch.geometry.lookup.whole_is_faster",
-    *(f"dhtorch.geometry.sweep.{name}" for name in ("add_costs", "level", "misfit", "rivals")),
-    *(f"dhtorch.dense.{name}" for name in ("complete", "map_hw", "options", "pixels", "resized", "sensed", "shipped")),
-    *(f"dhtorch.dense.{name}" for name in ("swept", "views_asked", "worthiest")),
-    "dhtorch.dense.partner_of",
-    *(f"dhtorch.stereo.{name}" for name in ("best_planes", "fitted", "pose_variance")),
-    *(f"dhtorch.verdict.{name}" for name in ("judge", "judged", "decided", "cut", "share")),
-    *(f"dhtorch.evidence.{name}" for name in ("references", "extent", "coarser", "centres", "loosened", "silent")),
-    *(f"dhtorch.evidence.{name}" for name in ("by_answers", "by_views", "by_maps", "nearest_surface")),
-    *(f"dhtorch.causes.{name}" for name in ("turned", "name_cause", "decided", "watch", "ray_lengths")),
-    "dhtorch.evaluate.detection.auroc",
-    "dhtorch.metric.anchor",
-    *(f"dhtorch.anchors.{name}" for name in ("gathered", "at_anchors", "spread_within")),
-    *(f"dhtorch.distortion.{name}" for name in ("basis_of", "fields", "curves", "log_depth", "predicted", "fit")),
-    *(f"dhtorch.distortion.{name}" for name in ("reading", "freedom_of", "leans", "between_nodes")),
-    "dhtorch.scatter.variance",
-    "dhtorch.geometry.exact.filled",
+    "dhtorch.geometry.patches.whole_is_faster",
+    *(f"dhtorch.geometry.plane_sweep.{name}" for name in ("add_costs", "level", "misfit", "rivals")),
+    *(
+        f"dhtorch.pipeline.dense.{name}"
+        for name in ("complete", "map_hw", "options", "pixels", "resized", "sensed", "shipped")
+    ),
+    *(f"dhtorch.pipeline.dense.{name}" for name in ("swept", "views_asked", "worthiest")),
+    "dhtorch.pipeline.dense.partner_of",
+    *(f"dhtorch.pipeline.surface.{name}" for name in ("best_planes", "fitted", "pose_variance")),
+    *(f"dhtorch.validation.validate.{name}" for name in ("judge", "judged", "decided", "cut", "share")),
+    *(
+        f"dhtorch.validation.evidence.{name}"
+        for name in ("references", "extent", "coarser", "centres", "loosened", "silent")
+    ),
+    *(f"dhtorch.validation.evidence.{name}" for name in ("by_answers", "by_views", "by_maps", "nearest_surface")),
+    *(f"dhtorch.validation.faults.{name}" for name in ("turned", "name_cause", "decided", "watch", "ray_lengths")),
+    "dhtorch.metrics.detection.auroc",
+    "dhtorch.alignment.align.anchor",
+    *(f"dhtorch.alignment.references.{name}" for name in ("gathered", "at_anchors", "spread_within")),
+    *(
+        f"dhtorch.alignment.error_model.{name}"
+        for name in ("basis_of", "fields", "curves", "log_depth", "predicted", "fit")
+    ),
+    *(f"dhtorch.alignment.error_model.{name}" for name in ("reading", "freedom_of", "leans", "between_nodes")),
+    "dhtorch.alignment.residual_noise.variance",
+    "dhtorch.geometry.determinism.filled",
     "dhtorch.geometry.least_squares.minimise",
-    "dhtorch.geometry.near_far.equations",
+    "dhtorch.geometry.reprojection_problem.equations",
     *(
         f"dhtorch.geometry.lucas_kanade.{n}"
         for n in ("search", "step", "squares", "window_covariance", "for_some", "within")
     ),
     *(f"dhtorch.geometry.ransac.{name}" for name in ("msac_cost", "search")),
-    *(f"dhtorch.evaluate.errors.{name}" for name in ("points", "select", "measure", "summarise", "unit")),
+    *(f"dhtorch.metrics.errors.{name}" for name in ("points", "select", "measure", "summarise", "unit")),
     *(
-        f"dhtorch.evaluate.risk.{name}"
+        f"dhtorch.metrics.risk.{name}"
         for name in ("ause", "capped", "curve", "measure", "realised", "risk_coverage", "surest")
     ),
     *(
-        f"dhtorch.evaluate.reliability.{n}"
+        f"dhtorch.metrics.reliability.{n}"
         for n in ("diagram", "excess_ece", "pool", "measure", "ece_interval", "leave_one_room_out")
     ),
-    *(f"dhtorch.evaluate.score_calibration.{name}" for name in ("fit", "fit_sigma", "from_json")),
-    *(f"dhtorch.evaluate.monotone.{name}" for name in ("isotonic", "pool_adjacent_violators", "platt")),
+    *(f"dhtorch.calibration.score_calibration.{name}" for name in ("fit", "fit_sigma", "from_json")),
+    *(f"dhtorch.calibration.monotone.{name}" for name in ("isotonic", "pool_adjacent_violators", "platt")),
     *(
-        f"dhtorch.evaluate.control.{name}"
+        f"dhtorch.metrics.control.{name}"
         for name in ("plug_in", "most_scenes", "conformal", "scenes_needed", "p_value")
     ),
     *(
-        f"dhtorch.evaluate.compare.{name}"
+        f"dhtorch.experiments.compare_methods.{name}"
         for name in ("against", "completed", "equal_coverage", "method_ratios", "promises", "ratio_over_seeds")
     ),
-    "dhtorch.evaluate.curves.sampled",
-    *(f"dhtorch.evaluate.correlation.{name}" for name in ("pearson", "spearman", "ranks")),
-    *(f"dhtorch.evaluate.bootstrap.{name}" for name in ("interval", "interval_of", "resample", "single")),
-    *(f"dhtorch.evaluate.probe.{name}" for name in ("columns", "folds", "mean_error", "ratio", "equivalent")),
+    "dhtorch.metrics.curves.sampled",
+    *(f"dhtorch.metrics.correlation.{name}" for name in ("pearson", "spearman", "ranks")),
+    *(f"dhtorch.metrics.bootstrap.{name}" for name in ("interval", "interval_of", "resample", "single")),
+    *(f"dhtorch.experiments.probes.ridge.{name}" for name in ("columns", "folds", "mean_error", "ratio", "equivalent")),
 }
 
 

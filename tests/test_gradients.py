@@ -6,16 +6,17 @@ from functools import partial
 
 import pytest
 import torch
-from contract import leaves, tensor_map
+from support.contract_rows import leaves, tensor_map
 from test_contract import shifted, tracked
 from torch.func import jacfwd, jacrev, vmap
 from torch.utils import _pytree as pytree
 
-from dhtorch import MAP, PAPER, extend, tree
-from dhtorch.evaluate import holdout
-from dhtorch.geometry.lookup import nearest
-from dhtorch.methods import METHODS
-from dhtorch.pair import merge, undistort_tracks, uniform_draws
+from dhtorch import MAP, PAPER, extend
+from dhtorch import pytree as tree
+from dhtorch.geometry.patches import nearest
+from dhtorch.metrics import holdout
+from dhtorch.pipeline.pair import merge, undistort_tracks, uniform_draws
+from dhtorch.pipeline.presets import METHODS
 from dhtorch.records import Camera
 from dhtorch.stages import backproject, holes, pose, sample, score, track, triangulate
 from dhtorch.synthetic.recording import SyntheticRoom

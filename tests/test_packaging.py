@@ -64,7 +64,7 @@ def test_the_wheel_says_what_it_is(wheel):
     project = tomllib.loads((REPO / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert "License-Expression: Apache-2.0" in facts and "# dhtorch" in facts
     assert set(re.findall(r"^Provides-Extra: (.*)$", facts, re.M)) == set(project["optional-dependencies"])
-    assert "dhtorch = dhtorch.commands.run:main" in entry
+    assert "dhtorch = dhtorch.cli.run:main" in entry
 
 
 @pytest.mark.timeout(600)  # seconds of work, but a busy machine stretches them
@@ -88,7 +88,7 @@ def test_the_wheel_works_where_no_checkout_is(wheel, tmp_path):
         ["inspect", "job", "--out", "sheets", "--format", "nothing"],
     ]
     code = (
-        "import json, sys, dhtorch; from dhtorch.commands.run import config_dir, main;"
+        "import json, sys, dhtorch; from dhtorch.cli.run import config_dir, main;"
         "print('\\x00' + json.dumps([[main(a) for a in json.loads(sys.argv[1])], dhtorch.__file__, str(config_dir())]))"
     )
     env = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "DHTORCH_DATA")}

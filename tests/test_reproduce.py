@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from dhtorch import archive
+from dhtorch.runtime import results as archive
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 

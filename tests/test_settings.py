@@ -14,11 +14,11 @@ from hydra.errors import HydraException
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from dhtorch.commands import words
-from dhtorch.commands.run import config_dir
+from dhtorch.cli import option_checks as words
+from dhtorch.cli.run import config_dir
 from dhtorch.data import FORMATS
 from dhtorch.data.pairs import by_choice, by_gap, by_time
-from dhtorch.method import Method
+from dhtorch.pipeline.method import Method
 from dhtorch.synthetic import SyntheticRoom
 
 CONF = config_dir()

@@ -19,7 +19,7 @@ from lerobot.policies.factory import make_pre_post_processors
 from torch.nn.functional import interpolate
 
 from dhtorch import ExtendDepth
-from dhtorch.transform import ExtendedDataset
+from dhtorch.transforms import ExtendedDataset
 
 SIDE, HORIZON = 96, 4  # px; frames that are predicted
 ACT = {"dim_model": 64, "dim_feedforward": 64, "n_heads": 2, "device": "cpu"}

@@ -16,7 +16,7 @@ from openpi_client import image_tools
 from torch_loader import Rows
 
 from dhtorch import ExtendDepth
-from dhtorch.transform import NumpyTransform
+from dhtorch.transforms import NumpyTransform
 
 GAP, SIDE = 2, 224  # frames; px
 KEYS = {f"{key}": f"observation/{key}" for key in ("image", "other_image", "depth", "intrinsics")}

@@ -18,7 +18,7 @@ from dhtorch import ExtendDepth
 from dhtorch.data import open_all
 from dhtorch.data.codecs import tfrecord
 from dhtorch.geometry.camera import to_matrix
-from dhtorch.transform import RldsBatchTransform
+from dhtorch.transforms import RldsBatchTransform
 
 IMAGE, GAP = "observation.image_primary", 2
 

@@ -17,7 +17,7 @@ from pyarrow import parquet
 from torch.utils.data import DataLoader, Dataset
 
 from dhtorch import ExtendDepth
-from dhtorch.transform import ExtendedDataset, one_thread
+from dhtorch.transforms import ExtendedDataset, one_thread
 
 
 class Rows(Dataset[dict[str, Any]]):

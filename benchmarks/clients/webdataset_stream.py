@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader
 from torch_loader import Rows
 
 from dhtorch import ExtendDepth
-from dhtorch.transform import ExtendedStream
+from dhtorch.transforms import ExtendedStream
 
 GAP = 2
 

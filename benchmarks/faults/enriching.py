@@ -1,6 +1,6 @@
 """Data sets with depth beside every picture."""
 
-WHOLE = ["tests/test_enrich.py", "tests/test_enrich_guarantees.py"]
+WHOLE = ["tests/cli/test_enrich.py", "tests/extract/test_enrich_guarantees.py"]
 
 TESTS: dict[str, list[str]] = {
     f"extract.{name}": WHOLE

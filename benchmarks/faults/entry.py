@@ -1,30 +1,34 @@
 """The transform inside a loader, whole data sets, result files."""
 
 TESTS: dict[str, list[str]] = {
-    "transform": ["tests/test_extender.py"],
-    "transform.views": ["tests/test_views.py"],
-    "transform.leaves": ["tests/test_views.py", "tests/test_extender.py"],
-    "transform.adapters": ["tests/test_wraps.py", "tests/test_memory.py"],
-    "transform.tokens": ["tests/test_tokens.py"],
-    "transform.problems": ["tests/test_extender.py"],
-    "transform.extend_depth": ["tests/test_extender.py", "tests/test_wraps.py", "tests/test_native.py"],
-    "transform.alone": ["tests/test_native.py"],
-    "transform.batches": ["tests/test_batches.py"],
-    "memory": ["tests/test_memory.py"],
-    "archive": ["tests/test_archive.py", "tests/test_shards.py"],
-    "storage": ["tests/test_archive.py"],
-    "closure": ["tests/test_closure.py"],
-    "extract": ["tests/test_extraction.py", "tests/test_extract_plan.py"],
-    "extract.columns": ["tests/test_shards.py"],
-    "extract.engines": ["tests/test_shards.py", "tests/test_extraction.py"],
-    "extract.features": ["tests/test_shards.py"],
-    "extract.plan": ["tests/test_extract_plan.py"],
-    "extract.dataset": ["tests/test_extract_plan.py"],
-    "extract.shards": ["tests/test_shards.py"],
+    "transforms": ["tests/transforms/test_extend_depth_stub.py"],
+    "transforms.sample_spec": ["tests/transforms/test_sample_spec.py"],
+    "transforms.sample_access": ["tests/transforms/test_sample_spec.py", "tests/transforms/test_extend_depth_stub.py"],
+    "transforms.adapters": ["tests/transforms/test_wrappers.py", "tests/runtime/test_allocator.py"],
+    "transforms.tokens": ["tests/transforms/test_tokens.py"],
+    "transforms.status": ["tests/transforms/test_extend_depth_stub.py"],
+    "transforms.extend_depth": [
+        "tests/transforms/test_extend_depth_stub.py",
+        "tests/transforms/test_wrappers.py",
+        "tests/ops/test_compiled.py",
+    ],
+    "transforms.fast_path": ["tests/ops/test_compiled.py"],
+    "transforms.collate": ["tests/transforms/test_collate.py"],
+    "runtime.allocator": ["tests/runtime/test_allocator.py"],
+    "runtime.results": ["tests/runtime/test_results.py", "tests/extract/test_shards.py"],
+    "runtime.storage": ["tests/runtime/test_results.py"],
+    "runtime.code_dependencies": ["tests/runtime/test_code_dependencies.py"],
+    "extract": ["tests/extract/test_extract_stub.py", "tests/extract/test_plan.py"],
+    "extract.columns": ["tests/extract/test_shards.py"],
+    "extract.engines": ["tests/extract/test_shards.py", "tests/extract/test_extract_stub.py"],
+    "extract.features": ["tests/extract/test_shards.py"],
+    "extract.plan": ["tests/extract/test_plan.py"],
+    "extract.dataset": ["tests/extract/test_plan.py"],
+    "extract.shards": ["tests/extract/test_shards.py"],
 }
 
 FAULTS: dict[str, list[tuple[str, ...]]] = {
-    "transform.views": [
+    "transforms.sample_spec": [
         ("Views._camera", "(stated, hw, T, at)", "(stated, T, at)"),
         ("Views._camera", " and len(self._cameras) < CAMERAS", ""),
         ("UNITS", '"mm": 1000.0', '"mm": 100.0'),
@@ -87,7 +91,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_unit_range_checks", "bad_low | bad_high,", "bad_high,"),
         ("_is_level", "conf != conf.floor()", "conf < conf.floor()"),
     ],
-    "transform.alone": [
+    "transforms.fast_path": [
         ("Alone.look", "any(one.spots.hw != hw for one in read)", "False"),
         ("Alone.look", "if not all_sound(counts)", "if False"),
         ("Alone.look", "exact and spots.shape[4] == 3", "exact and spots.shape[4] == 1"),
@@ -105,7 +109,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_told", ' or views.depth_range != (0.0, float("inf"))', ""),
         ("_told", "views.depth_unit not in UNITS", "not views.depth_unit"),
     ],
-    "transform.batches": [
+    "transforms.collate": [
         ("_ALIGNED", "64", "1"),
         ("collated", "_places(mine, len(samples))", "_places(mine)"),
         ("collated", "[sample[key] for sample in samples]", "[samples[0][key]] * len(samples)"),
@@ -117,7 +121,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_places", ".view(x.dtype)", ".view(torch.int32)"),
         ("_places", "size + -size % _ALIGNED", "size"),
     ],
-    "transform.leaves": [
+    "transforms.sample_access": [
         ("_found", 'key.replace("/", ".")', 'key.replace(".", "/").replace("/", ".", 1)'),
         ("_found", "if key in sample:", "if False:"),
         ("_SIGNED", "torch.uint16: torch.int32", "torch.uint16: torch.int16"),
@@ -139,7 +143,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("Leaves.pad", "x.shape[1] != T", "x.shape[1] < T"),
         ("_keys", 'f"{prefix}{key}."', 'f"{key}."'),
     ],
-    "transform.adapters": [
+    "transforms.adapters": [
         ("ExtendedDataset.__init__", "gap < 1 or", "gap < 0 or"),
         ("ExtendedDataset._loaded", "if i >= self.gap else sample", "if i > self.gap else sample"),
         ("ExtendedDataset._loaded", "self.dataset[i - self.gap]", "self.dataset[i - 1]"),
@@ -157,7 +161,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("one_thread", "keep_freed()", "pass"),
         ("_zero", "return type(value)()", "return value"),
     ],
-    "memory": [
+    "runtime.allocator": [
         ("_TRIM_THRESHOLD", "-1, -3", "-2, -4"),
         ("_LIMIT", "1 << 30", "1 << 17"),
         ("SETTINGS", '"MALLOC_TRIM_THRESHOLD_", ', ""),
@@ -166,7 +170,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("keep_freed", "(AttributeError, OSError, TypeError)", "(AttributeError, TypeError)"),
         ("keep_freed", "bool(allocator(_MMAP_THRESHOLD, _LIMIT) and", "bool("),
     ],
-    "transform.tokens": [
+    "transforms.tokens": [
         ("grid", "min(height, width) < patch", "min(height, width) <= patch"),
         ("grid", "hw if tokens_hw is None else tokens_hw", "hw"),
         ("patch_tokens", "(found.source != Source.NONE) & (found.depth > 0)", "found.depth > 0"),
@@ -186,7 +190,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_placement", "- hw[k] * s) / 2", "- hw[k] * s)"),
         ("_cells", "column.clamp(0, columns - 1)", "column.clamp(0, columns)"),
     ],
-    "transform.problems": [
+    "transforms.status": [
         ("SampleProblem", "NO_SECOND_VIEW: Final = 1", "NO_SECOND_VIEW: Final = 4"),
         ("Tally.add", "1 + worker.id % (_ROWS - 1)", "worker.id % (_ROWS - 1)"),
         ("Tally.add", "1 + worker.id % (_ROWS - 1)", "1 + worker.id"),
@@ -194,7 +198,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("Tally.__deepcopy__", "_shared(self.counts.clone())", "self.counts"),
         ("_shared", "counts.share_memory_()", "counts"),
     ],
-    "transform.extend_depth": [
+    "transforms.extend_depth": [
         ("_added", "torch.full_like(hole, Gate.NO_TRACK)", "torch.full_like(hole, Gate.ANSWER)"),
         ("ExtendDepth.uncollated", "SampleProblem.NO_SECOND_VIEW", "SampleProblem.NONE"),
         ("ExtendDepth.uncollated", "self.maps is not None or self.index_key is not None", "self.maps is not None"),
@@ -228,7 +232,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_pose", "[[0.0, 0.0, 0.0, 1.0]]", "[[0.0, 0.0, 0.0, 0.0]]"),
         ("_pose", "torch.where(paired, fit.code, torch.zeros_like(fit.code))", "fit.code"),
     ],
-    "closure": [
+    "runtime.code_dependencies": [
         ("targets", "settings = list(settings.values())", "settings = []"),
         ("targets", "list | tuple", "tuple"),
         ("reached", 'if key != "__init__.py"', 'if key == "__init__.py"'),
@@ -240,7 +244,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_files", "(path, *packages)", "(path,)"),
         ("_others", "if ours else {}", "if not ours else {}"),
     ],
-    "storage": [
+    "runtime.storage": [
         ("strict", "value if math.isfinite(value) else None", "value if not math.isnan(value) else None"),
         ("strict", "{str(k): strict(v)", "{k: strict(v)"),
         ("dumps", ", allow_nan=False", ""),
@@ -250,7 +254,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("whole", "unfinished.unlink(missing_ok=True)", "pass"),
         ("replace_file", "0o644", "0o600"),
     ],
-    "archive": [
+    "runtime.results": [
         ("SCHEMA", "1", "2"),
         ("EDGE_BYTES", "64 * 1024", "64 * 1000"),
         ("UNKEYED", '"workers", ', ""),

@@ -1,16 +1,16 @@
 """Cameras, rigid motions, two-view geometry."""
 
 TESTS: dict[str, list[str]] = {
-    "geometry.camera": ["tests/test_camera.py", "tests/test_contract.py"],
-    "geometry.se3": ["tests/test_se3.py", "tests/test_contract.py"],
-    "geometry.epipolar": ["tests/test_epipolar.py", "tests/test_contract.py"],
-    "geometry.shapes": ["tests/test_camera.py", "tests/test_contract.py"],
-    "geometry.exact": ["tests/test_se3.py", "tests/test_contract.py"],
-    "geometry.small": ["tests/test_small.py", "tests/test_contract.py"],
+    "geometry.camera": ["tests/geometry/test_camera.py", "tests/test_contract.py"],
+    "geometry.se3": ["tests/geometry/test_se3.py", "tests/test_contract.py"],
+    "geometry.epipolar": ["tests/geometry/test_epipolar.py", "tests/test_contract.py"],
+    "geometry.checks": ["tests/geometry/test_camera.py", "tests/test_contract.py"],
+    "geometry.determinism": ["tests/geometry/test_se3.py", "tests/test_contract.py"],
+    "geometry.linalg": ["tests/geometry/test_linalg.py", "tests/test_contract.py"],
 }
 
 FAULTS: dict[str, list[tuple[str, ...]]] = {
-    "geometry.small": [
+    "geometry.linalg": [
         ("determinant", "a * d - b * c", "a * d + b * c"),
         ("adjugate", "d, -b, -c, a", "a, -b, -c, d"),
         ("adjugate", "d, -b, -c, a", "d, -c, -b, a"),
@@ -223,7 +223,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
             "_length(cross), Y.norm(dim=-1) * (Y - t).norm(dim=-1)",
         ),
     ],
-    "geometry.shapes": [
+    "geometry.checks": [
         ("_bound", "ok = len(axes) == len(shape)", "ok = len(axes) <= len(shape)"),
         ("_bound", "ok = len(axes) == len(shape)", "ok = True"),
         ("_bound", "ok and (int(axis) == size", "(int(axis) == size"),
@@ -243,7 +243,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("is_static", "torch.compiler.is_compiling() or ", ""),
         ("is_static", " or torch._C._functorch.is_functorch_wrapped_tensor(x)", ""),
     ],
-    "geometry.exact": [
+    "geometry.determinism": [
         ("LANES", "64", "8"),
         ("filled", "count + -count % lanes", "count + count % lanes"),
         ("filled", ", lanes)", ", 0)"),

@@ -1,15 +1,15 @@
 """Poses from elsewhere and of rigs, and what asks for no graph."""
 
 TESTS: dict[str, list[str]] = {
-    "stages.given": ["tests/test_given_pose.py"],
-    "geometry.conventions": ["tests/test_given_pose.py", "tests/test_contract.py"],
-    "geometry.rigid": ["tests/test_rig.py", "tests/test_contract.py"],
-    "geometry.graphless": ["tests/test_graphless.py"],
-    "transform.given": ["tests/test_given_pose.py"],
+    "stages.pose_prior": ["tests/stages/test_pose_prior.py"],
+    "geometry.pose_conventions": ["tests/stages/test_pose_prior.py", "tests/test_contract.py"],
+    "geometry.pose_averaging": ["tests/pipeline/test_rig.py", "tests/test_contract.py"],
+    "geometry.inference_mode": ["tests/geometry/test_inference_mode.py"],
+    "transforms.poses": ["tests/stages/test_pose_prior.py"],
 }
 
 FAULTS: dict[str, list[tuple[str, ...]]] = {
-    "stages.given": [
+    "stages.pose_prior": [
         ("hold", "refuted, still = refuted | (enough & found.ok & far)", "refuted, still = refuted"),
         ("hold", "own_cov + xi[:, :, None] * xi[:, None]", "own_cov"),
         ("hold", "(count < min_confirmed) | ", ""),
@@ -26,7 +26,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_looks", "< 0.5", "< 5.0"),
         ("_t_snr", "torch.where(exact, ", "torch.where(~exact, "),
     ],
-    "geometry.conventions": [
+    "geometry.pose_conventions": [
         ("UNITS", '"millimetres": 1e-3', '"millimetres": 1e3'),
         ("readings", "other_way if way else T", "T"),
         ("in_axes", "M.T @ T.R @ M", "M @ T.R @ M.T"),
@@ -34,7 +34,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("relative_covariance", "cov_0 + cov_1", "cov_1"),
         ("relative_covariance", "se3.invert(T_world_from_1)", "T_world_from_1"),
     ],
-    "geometry.rigid": [
+    "geometry.pose_averaging": [
         ("rigid_mean", "(1 + square / limit) ** -2", "torch.ones_like(square)"),
         ("rigid_mean", "& (n >= min_agree * valid.sum(-1))", ""),
         ("rigid_mean", "n >= at_least", "n >= 1"),
@@ -42,12 +42,12 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_start", "argmin(0)", "argmax(0)", "from an outlier, too, the reweighed steps reach the mean of the others"),
         ("_scale", ".clamp_min(1.0)", ""),
     ],
-    "geometry.graphless": [
+    "geometry.inference_mode": [
         ("spared", "forward_ad._current_level >= 0 or ", ""),
         ("_asked", "x.requires_grad", "False"),
         ("_usual", "x.clone() if", "x if"),
     ],
-    "transform.given": [
+    "transforms.poses": [
         ("check_constant", 'or kind != "1_from_0"', ""),
         ("sigmas", "0 <= s < ", "0 < s < "),
         ("motions", "keys[1] or name", "name"),

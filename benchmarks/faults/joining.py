@@ -1,18 +1,24 @@
 """The line of seats, and several views."""
 
 TESTS: dict[str, list[str]] = {
-    "pair": ["tests/test_merge.py", "tests/test_pair.py", "tests/test_method.py"],
-    "method": ["tests/test_method.py"],
-    "methods": ["tests/test_merge.py", "tests/test_method.py"],
-    "stages.fuse": ["tests/test_fusion.py", "tests/test_agree.py", "tests/test_window.py", "tests/test_contradict.py"],
-    "views": ["tests/test_agree.py", "tests/test_fusion.py"],
-    "stream": ["tests/test_stream.py"],
-    "window": ["tests/test_fusion.py", "tests/test_window.py"],
-    "offers": ["tests/test_offers.py"],
+    "pipeline.pair": ["tests/pipeline/test_merge.py", "tests/pipeline/test_pair.py", "tests/pipeline/test_method.py"],
+    "pipeline.method": ["tests/pipeline/test_method.py"],
+    "pipeline.spec": ["tests/pipeline/test_method.py"],
+    "pipeline.presets": ["tests/pipeline/test_merge.py", "tests/pipeline/test_method.py"],
+    "stages.fuse": [
+        "tests/stages/test_inverse_variance.py",
+        "tests/stages/test_fuse.py",
+        "tests/pipeline/test_multiview.py",
+        "tests/stages/test_contradicted.py",
+    ],
+    "pipeline.view_selection": ["tests/stages/test_fuse.py", "tests/stages/test_inverse_variance.py"],
+    "pipeline.stream": ["tests/pipeline/test_stream.py"],
+    "pipeline.multiview": ["tests/stages/test_inverse_variance.py", "tests/pipeline/test_multiview.py"],
+    "pipeline.view_report": ["tests/pipeline/test_view_report.py"],
 }
 
 FAULTS: dict[str, list[tuple[str, ...]]] = {
-    "pair": [
+    "pipeline.pair": [
         ("tracked", "hint=hint)", "hint=NO_HINT)"),
         ("PAIRS", "8", "16"),
         ("under_pose", "tracks.valid & textured)", "tracks.valid)"),
@@ -67,20 +73,22 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_drawn", "manual_seed(int(s)) for s in seed.tolist()", "manual_seed(k) for k, s in enumerate(seed.tolist())"),
         ("Clock.__call__", "self.ms.get(name, 0.0) + 1e3", "1e3"),
     ],
-    "method": [
-        ("Method", "min_trackability: float = 1e-5", "min_trackability: float = 1e-6"),
-        ("Method", "hypotheses: int = 200", "hypotheses: int = 100"),
-        ("Method", "n: int = 2048", "n: int = 1024"),
+    "pipeline.method": [
         ("Method.__call__", "self.replace(**changes) if changes else self", "self"),
         ("Method.__call__", "others.image.dim() == 4", "others.image.dim() != 4"),
         ("Method.__call__", "fit=fit, hint=hint, trace=trace)", "fit=fit, trace=trace)"),
         ("Method.__call__", "fit=fit, hint=hint, trace=trace)", "hint=hint, trace=trace)"),
-        ("Method.replace", "partial(getattr(self, k), **v)", "partial(getattr(Method, k), **v)"),
-        ("Method.look", "dtype=like.dtype", "dtype=torch.float32"),
-        ("Method.look_at", "self.classify(frame, self.backproject(frame, uv))", "self.backproject(frame, uv)"),
+    ],
+    "pipeline.spec": [
+        ("MethodSpec", "min_trackability: float = 1e-5", "min_trackability: float = 1e-6"),
+        ("MethodSpec", "hypotheses: int = 200", "hypotheses: int = 100"),
+        ("MethodSpec", "n: int = 2048", "n: int = 1024"),
+        ("MethodSpec.replace", "partial(getattr(self, k), **v)", "partial(getattr(MethodSpec, k), **v)"),
+        ("MethodSpec.look", "dtype=like.dtype", "dtype=torch.float32"),
+        ("MethodSpec.look_at", "self.classify(frame, self.backproject(frame, uv))", "self.backproject(frame, uv)"),
         ("parts", "*seat.args, ", ""),
     ],
-    "methods": [
+    "pipeline.presets": [
         ("LEVELS", "5", "4"),
         ("MAP", "min_t_snr=30.0", "min_t_snr=3.0"),
         ("MAP", "max_mismatch_px=10.0,\n", "\n"),
@@ -91,7 +99,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("WINDOW", "MAP.replace(views=5)", "PAPER.replace(views=5)"),
         ("WINDOW", "views=5", "views=4"),
     ],
-    "views": [
+    "pipeline.view_selection": [
         ("by_probes", "estimate.sigma / k", "estimate.sigma * k"),
         ("by_probes", "x.expand(V, *x.shape).flatten(0, 1)", "x.repeat_interleave(V, 0)"),
         ("shrunk", "frame.camera.f / picture.scale", "frame.camera.f"),
@@ -104,7 +112,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("weighed", "gain - steady(torch.log1p, known).sum(-1)", "gain"),
         ("weighed", "added.flip(0).gather(0, index)", "added.gather(0, index)"),
     ],
-    "stream": [
+    "pipeline.stream": [
         ("Stream.push", "s <= len(self.past)", "s < len(self.past)"),
         ("Stream.push", "reversed(steps)]  # in", "steps]  # in"),
         ("Stream.push", "self.cuts.append(self.pushed)", "self.cuts.append(self.pushed + 1)"),
@@ -173,13 +181,13 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_inverse_depth", "whole.square() - shared.square()", "whole.square()"),
         ("_last_reason", "zip(gate, said, strict=True)", "zip(gate.flip(0), said.flip(0), strict=True)"),
     ],
-    "offers": [
+    "pipeline.view_report": [
         ("choosing", "method if method.choose is not None", "method if method.choose is None"),
         ("choosing", "chain=False", "chain=True"),
         ("picked", "choice.index[:, b]", "choice.index[:, 0]"),
         ("picked", "choice.mute[:, b].sum()", "(~choice.mute[:, b]).sum()"),
     ],
-    "window": [
+    "pipeline.multiview": [
         ("_chosen", "thin = samples[:, :: max(1, method.n // PROBES)]", "thin = samples"),
         ("ask_window", "len(others.image) > method.views", "len(others.image) >= method.views"),
         ("ask_window", "None if fit is None else fit[pick]", "fit"),

@@ -1,22 +1,22 @@
 """Numbers from answers and truth."""
 
 TESTS: dict[str, list[str]] = {
-    "evaluate.bootstrap": ["tests/test_evaluate.py"],
-    "evaluate.correlation": ["tests/test_evaluate.py"],
-    "evaluate.curves": ["tests/test_evaluate.py"],
-    "evaluate.errors": ["tests/test_evaluate.py"],
-    "evaluate.holdout": ["tests/test_holdout.py"],
-    "evaluate.risk": ["tests/test_risk.py"],
-    "evaluate.reliability": ["tests/test_reliability.py"],
-    "evaluate.monotone": ["tests/test_monotone.py"],
-    "evaluate.score_calibration": ["tests/test_score_calibration.py"],
-    "evaluate.compare": ["tests/test_compare.py"],
-    "evaluate.control": ["tests/test_control.py"],
-    "evaluate.probe": ["tests/test_ridge.py"],
+    "metrics.bootstrap": ["tests/metrics/test_errors.py"],
+    "metrics.correlation": ["tests/metrics/test_errors.py"],
+    "metrics.curves": ["tests/metrics/test_errors.py"],
+    "metrics.errors": ["tests/metrics/test_errors.py"],
+    "metrics.holdout": ["tests/metrics/test_holdout.py"],
+    "metrics.risk": ["tests/metrics/test_risk.py"],
+    "metrics.reliability": ["tests/metrics/test_reliability.py"],
+    "calibration.monotone": ["tests/calibration/test_monotone.py"],
+    "calibration.score_calibration": ["tests/calibration/test_score_calibration.py"],
+    "experiments.compare_methods": ["tests/experiments/test_compare_methods.py"],
+    "metrics.control": ["tests/metrics/test_control.py"],
+    "experiments.probes.ridge": ["tests/experiments/test_ridge.py"],
 }
 
 FAULTS: dict[str, list[tuple[str, ...]]] = {
-    "evaluate.bootstrap": [
+    "metrics.bootstrap": [
         ("interval", "v is not None and math.isfinite(v)", "v is not None and not math.isnan(v)"),
         ("interval", "level=level, draws=draws, seed=seed", "level=level, draws=draws"),
         ("interval", "level=level, draws=draws, seed=seed", "draws=draws, seed=seed"),
@@ -29,7 +29,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_median", "ordered[:, (n - 1) // 2] + ordered[:, n // 2]", "ordered[:, n // 2] + ordered[:, n // 2]"),
         ("_geometric_mean", "x.log().mean(-1).exp()", "x.mean(-1)"),
     ],
-    "evaluate.reliability": [
+    "metrics.reliability": [
         ("GOOD", "0.1", "0.2"),
         ("Reliability.ece", "(self.claimed - self.realised).abs()", "(self.claimed - self.realised)"),
         ("diagram", "claimed.double().clamp(0, 1)", "claimed.double()"),
@@ -45,7 +45,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_mass_below", "mass.cumsum(0) - mass / 2", "mass.cumsum(0)"),
         ("_mass_below", "index_add(0, group, weight[order])", "index_add(0, group, weight)"),
     ],
-    "evaluate.compare": [
+    "experiments.compare_methods": [
         ("ratio_over_seeds", "min(kept) < min_answers", "min(kept) <= min_answers"),
         ("ratio_over_seeds", "min(kept) < min_answers", "max(kept) < min_answers"),
         ("ratio_over_seeds", "max(a, SMALLEST) / max(b, SMALLEST)", "max(b, SMALLEST) / max(a, SMALLEST)"),
@@ -70,7 +70,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("method_ratios", "row[key] is None", "not row[key]"),
         ("method_ratios", "rooms, rows, draws, seed", "rooms, rows, 2000, seed"),
     ],
-    "evaluate.control": [
+    "metrics.control": [
         ("most_scenes", "share * (len(scenes) + 1)", "share * len(scenes)"),
         ("most_scenes", "fits & (_one_more", "fits | (_one_more"),
         ("_one_more", "(1 + 1 / n.clamp_min(1))", "1"),
@@ -98,13 +98,13 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_binomial_cdf", "range(k + 1)", "range(k)"),
         ("Control.why", "self.n < self.needed", "self.n <= self.needed"),
     ],
-    "evaluate.correlation": [
+    "metrics.correlation": [
         ("pearson", "x - x.mean(), y - y.mean()", "x - x.mean(), y"),
         ("pearson", "if x.numel() < 2", "if x.numel() <= 2"),
         ("spearman", "pearson(ranks(x), ranks(y))", "pearson(ranks(x), y)"),
         ("ranks", "(count + 1) / 2", "count"),
     ],
-    "evaluate.curves": [
+    "metrics.curves": [
         ("sampled", "(k + 1) / STEPS", "k / STEPS"),
         ("sampled", "descending=True, stable=True", "stable=True"),
         ("sampled", "oracle[at - 1]", "mean[at - 1]"),
@@ -114,7 +114,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_by_distance", "here.keep.double().mean()", "here.keep.double().sum()"),
         ("_rounded", "v:.5g", "v:.4g"),
     ],
-    "evaluate.errors": [
+    "metrics.errors": [
         ("WRONG", "0.2", "0.25"),
         ("Points.error", "/ self.true_depth", "/ self.depth"),
         ("points", "score.nan_to_num(nan=0.0)", "score.nan_to_num(nan=1.0)"),
@@ -134,7 +134,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_flatten", " and not isinstance(value, bool)", ""),
         ("_quantile", "q * (x.numel() - 1)", "q * x.numel()"),
     ],
-    "evaluate.holdout": [
+    "metrics.holdout": [
         ("CLOSE_SPREAD", "0.15", "0.2"),
         ("Rule", "CLOSE = 3", "CLOSE = 4"),
         ("Truth.dropped", "code > Rule.NEAR", "code >= Rule.NEAR"),
@@ -175,7 +175,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
             "a window beyond the far corner is as empty as one beyond the near corner",
         ),
     ],
-    "evaluate.monotone": [
+    "calibration.monotone": [
         ("Table.__call__", "share.clamp(0, 1)", "share"),
         ("Table.__call__", "right=True", "right=False", "both neighbours of a corner agree about its value"),
         ("Table.__call__", "return values[0] + 0 * x", "return values[0].expand_as(x)"),
@@ -198,7 +198,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_tilt", "step / 4", "step / 2"),
         ("_logit", "EDGE, 1 - EDGE", "0.001, 1 - 0.001"),
     ],
-    "evaluate.probe": [
+    "experiments.probes.ridge": [
         ("join", "b.n / n.clamp_min(1)", "a.n / n.clamp_min(1)"),
         ("join", "between[..., None] * dx[..., :, None] * dy", "dx[..., :, None] * dy"),
         ("columns", ".index_select(-1, index).index_select(-2, index)", ".index_select(-1, index)"),
@@ -222,7 +222,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_solve", "+ penalty", "+ penalty.mean()"),
         ("_quotient", "above[index].sum(-1) / total", "(above[index] / below[index]).mean(-1)"),
     ],
-    "evaluate.score_calibration": [
+    "calibration.score_calibration": [
         ("TWO_SIGMA", "0.91", "0.95"),
         ("FLOORS", "range(31)", "range(21)"),
         ("SigmaModel.__call__", "(self.floor * depth)", "(self.floor * sigma)"),
@@ -250,7 +250,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_read_thresholds", "len(name) <= 2", "len(name) <= 3"),
         ("_number", " and not isinstance(value, bool)", ""),
     ],
-    "evaluate.risk": [
+    "metrics.risk": [
         ("risk_coverage", "-loss if oracle else answered.score", "answered.score"),
         ("risk_coverage", "max(pooled.keep.numel(), 1)", "max(answered.keep.numel(), 1)"),
         (

@@ -1,19 +1,31 @@
 """The ruler for anybody's depth: maps in metres, and what is said of them."""
 
 TESTS: dict[str, list[str]] = {
-    "anchors": ["tests/test_anchors.py", "tests/test_metric.py", "tests/test_scatter.py"],
-    "distortion": ["tests/test_distortion.py", "tests/test_metric.py", "tests/test_metric_choice.py"],
-    "scatter": ["tests/test_scatter.py", "tests/test_metric.py"],
-    "metric": ["tests/test_metric_choice.py", "tests/test_metric.py", "tests/test_distortion.py"],
-    "evidence": ["tests/test_evidence.py", "tests/test_judge.py"],
-    "causes": ["tests/test_causes.py"],
-    "verdict": ["tests/test_judge.py"],
-    "evaluate.detection": ["tests/test_judge.py", "tests/test_contract.py"],
-    "transform.judge_depth": ["tests/test_transform.py", "tests/test_judge_command.py"],
+    "alignment.references": [
+        "tests/alignment/test_references.py",
+        "tests/alignment/test_align.py",
+        "tests/alignment/test_residual_noise.py",
+    ],
+    "alignment.error_model": [
+        "tests/alignment/test_error_model.py",
+        "tests/alignment/test_align.py",
+        "tests/alignment/test_model_selection.py",
+    ],
+    "alignment.residual_noise": ["tests/alignment/test_residual_noise.py", "tests/alignment/test_align.py"],
+    "alignment.align": [
+        "tests/alignment/test_model_selection.py",
+        "tests/alignment/test_align.py",
+        "tests/alignment/test_error_model.py",
+    ],
+    "validation.evidence": ["tests/validation/test_evidence.py", "tests/validation/test_validate.py"],
+    "validation.faults": ["tests/validation/test_faults.py"],
+    "validation.validate": ["tests/validation/test_validate.py"],
+    "metrics.detection": ["tests/validation/test_validate.py", "tests/test_contract.py"],
+    "transforms.validate_depth": ["tests/transforms/test_extend_depth.py", "tests/cli/test_validate_command.py"],
 }
 
 FAULTS: dict[str, list[tuple[str, ...]]] = {
-    "anchors": [
+    "alignment.references": [
         ("Anchors.block", "2 * (row * columns + column) + self.near.long()", "2 * (row * columns + column)"),
         ("Anchors.weight", "1 + CORRELATED * (count - 1).clamp_min(0)", "1"),
         ("gathered", "torch.linspace(0, n - 1, min(n, MOST)", "torch.arange(min(n, MOST)"),
@@ -26,7 +38,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("spread_within", "total / 3", "total"),
         ("at_anchors", "- 0.5", ""),
     ],
-    "distortion": [
+    "alignment.error_model": [
         ("Model.prior", "-UNLIKELY", "UNLIKELY"),
         ("basis_of", "torch.where(some, high - low, 1.0)", "high - low"),
         ("log_depth", "if basis.of_depth else -1.0", "if basis.of_depth else 1.0"),
@@ -47,7 +59,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_laplace", "- volume", ""),
         ("_laplace", "- 0.5 * xi.square().sum(-1)", ""),
     ],
-    "scatter": [
+    "alignment.residual_noise": [
         ("variance", "points.used & points.near", "points.used"),
         ("variance", "torch.where(some, flat, SCATTER)", "flat"),
         ("variance", "(slope[..., None] * rough).square() + off", "(slope[..., None] * rough).square()"),
@@ -63,7 +75,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_held", "SHARE * sums", "0.5 * sums"),
         ("_in_places", "mass + NOTHING", "mass + 1e-9"),
     ],
-    "metric": [
+    "alignment.align": [
         ("anchor", "(x > 0) if kind", "(x == x) if kind"),
         ("anchor", "hw or (x.shape[-2], x.shape[-1])", "(x.shape[-2], x.shape[-1])"),
         ("anchor", 'of_depth=kind != "inverse"', "of_depth=True"),
@@ -79,7 +91,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_answered", "~(sigma_rel <= max_sigma_rel)", "(sigma_rel <= 0)"),
         ("_ordered", "cummin(-1)", "cummax(-1)"),
     ],
-    "evidence": [
+    "validation.evidence": [
         ("references", "samples.usable & ((samples.flag", "samples.usable | ((samples.flag"),
         ("references", "& ~returned", ""),
         ("extent", "off_row[:, None] * down + off_column * across", "down + across"),
@@ -97,7 +109,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_filled", "there & (count >=", "(count >="),
         ("_spread", "level & inside", "inside"),
     ],
-    "causes": [
+    "validation.faults": [
         ("UNITS", '"mm read as m": 1e-3', '"mm read as m": 1e-2'),
         ("turned", "torch.rot90(depth, quarters,", "torch.rot90(depth, -quarters,"),
         ("_inverse", "torch.where(depth > 0, 1 / torch.where(depth > 0, depth, 1.0), 0.0)", "depth"),
@@ -111,7 +123,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_undone", "/ ray_lengths(", "* ray_lengths("),
         ("watch", "tracks.valid.sum(-1) >= FOUND * textured", "tracks.valid.sum(-1) >= 0"),
     ],
-    "verdict": [
+    "validation.validate": [
         ("decided", "torch.where(wrong & fine, State.CANNOT_KNOW, state)", "state"),
         ("decided", "k.sure & (k.misfit.abs() < FOR)", "(k.misfit.abs() < FOR)"),
         ("decided", "torch.where(wrong, most, ", "torch.where(wrong, least, "),
@@ -128,8 +140,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_surfaces", "evidence.nearest_surface(known)", "known"),
         ("judged", "(loose.square() + tolerance**2).sqrt()", "torch.full_like(loose, tolerance)"),
     ],
-    "evaluate.detection": [("auroc", "0.5 * (count - 1).double()", "0")],
-    "transform.judge_depth": [
+    "metrics.detection": [("auroc", "0.5 * (count - 1).double()", "0")],
+    "transforms.validate_depth": [
         ("JudgeDepth.__init__", "not map_unit > 0", "not map_unit"),
         ("JudgeDepth.forward", "stack([verdict, seen])", "stack([seen, seen])"),
         ("JudgeDepth._map", "planes[:, 0] * self.map_unit", "planes[:, 0]"),

@@ -1,13 +1,25 @@
 """Poses: minimal solver, search, least squares, near and far tracks."""
 
 TESTS: dict[str, list[str]] = {
-    "geometry.least_squares": ["tests/test_least_squares.py", "tests/test_speed.py", "tests/test_contract.py"],
-    "geometry.near_far": ["tests/test_near_far.py", "tests/test_map_pose.py", "tests/test_contract.py"],
-    "geometry.most_probable": ["tests/test_most_probable.py", "tests/test_map_pose.py", "tests/test_contract.py"],
-    "geometry.ransac": ["tests/test_ransac.py", "tests/test_pose.py", "tests/test_contract.py"],
-    "geometry.p3p": ["tests/test_p3p.py", "tests/test_contract.py"],
-    "geometry.covariance": ["tests/test_covariance.py", "tests/test_pose.py", "tests/test_contract.py"],
-    "stages.pose": ["tests/test_pose.py", "tests/test_map_pose.py", "tests/test_contract.py"],
+    "geometry.least_squares": [
+        "tests/geometry/test_least_squares.py",
+        "tests/pipeline/test_speed.py",
+        "tests/test_contract.py",
+    ],
+    "geometry.reprojection_problem": [
+        "tests/geometry/test_reprojection_problem.py",
+        "tests/stages/test_map_pose.py",
+        "tests/test_contract.py",
+    ],
+    "geometry.map_estimate": [
+        "tests/geometry/test_map_estimate.py",
+        "tests/stages/test_map_pose.py",
+        "tests/test_contract.py",
+    ],
+    "geometry.ransac": ["tests/geometry/test_ransac.py", "tests/stages/test_pose.py", "tests/test_contract.py"],
+    "geometry.p3p": ["tests/geometry/test_p3p.py", "tests/test_contract.py"],
+    "geometry.covariance": ["tests/geometry/test_covariance.py", "tests/stages/test_pose.py", "tests/test_contract.py"],
+    "stages.pose": ["tests/stages/test_pose.py", "tests/stages/test_map_pose.py", "tests/test_contract.py"],
 }
 
 FAULTS: dict[str, list[tuple[str, ...]]] = {
@@ -55,7 +67,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
             "return choose(better, proposal, T), found",
         ),
     ],
-    "geometry.near_far": [
+    "geometry.reprojection_problem": [
         ("equations", "g + precision * towards", "g - precision * towards"),
         ("equations", "g + precision * towards", "g"),
         ("equations", "else cost + turn_precision", "else cost - turn_precision"),
@@ -99,7 +111,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("moved", "at.turn + xi[:, 6:]", "at.turn - xi[:, 6:]"),
         ("moved", "at.turn + xi[:, 6:]", "at.turn"),
     ],
-    "geometry.most_probable": [
+    "geometry.map_estimate": [
         ("pose_covariance", "A, M = A + known, M + known", "A, M = A + known, M"),
         ("pose_covariance", "A, M = A + known, M + known", "A, M = A + known, M + 0.5 * known"),
         ("pose_covariance", "weight * weight * (omega * omega * scatter)", "weight * (omega * omega * scatter)"),

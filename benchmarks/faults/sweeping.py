@@ -1,16 +1,24 @@
 """A depth for every pixel: the sweep, the surface that views show together, and what compiled code is handed."""
 
 TESTS: dict[str, list[str]] = {
-    "geometry.sweep": ["tests/test_sweep.py", "tests/test_complete.py"],
-    "geometry.neighbours": ["tests/test_sweep.py", "tests/test_contract.py", "tests/test_pyramid.py"],
-    "dense": ["tests/test_stereo.py", "tests/test_dense.py", "tests/test_complete.py"],
-    "stereo": ["tests/test_stereo.py", "tests/test_dense.py", "tests/test_complete.py"],
-    "transform.maps": ["tests/test_dense_loader.py"],
-    "native": ["tests/test_native.py"],
+    "geometry.plane_sweep": ["tests/geometry/test_plane_sweep.py", "tests/cli/test_complete.py"],
+    "geometry.windows": [
+        "tests/geometry/test_plane_sweep.py",
+        "tests/test_contract.py",
+        "tests/geometry/test_pyramid.py",
+    ],
+    "pipeline.dense": ["tests/pipeline/test_surface.py", "tests/pipeline/test_dense.py", "tests/cli/test_complete.py"],
+    "pipeline.surface": [
+        "tests/pipeline/test_surface.py",
+        "tests/pipeline/test_dense.py",
+        "tests/cli/test_complete.py",
+    ],
+    "transforms.maps": ["tests/transforms/test_dense_loader.py"],
+    "ops.loader": ["tests/ops/test_compiled.py"],
 }
 
 FAULTS: dict[str, list[tuple[str, ...]]] = {
-    "geometry.sweep": [
+    "geometry.plane_sweep": [
         ("Travel.at", "torch.where(z > 1e-3, 1 / z, 1e9)", "1 / z"),
         ("Travel.cell", "margin + 0.5", "margin"),
         ("seen_at", "z + (p * y - o * x)", "z - (p * y - o * x)"),
@@ -33,7 +41,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("hidden", '"amax"', '"amin"'),
         ("hidden", "+ tolerance[:, None]", "- tolerance[:, None]"),
     ],
-    "geometry.neighbours": [
+    "geometry.windows": [
         ("bands", "min(top + rows, h)", "min(top + rows, h - 1)"),
         (
             "bands",
@@ -48,7 +56,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("smooth", "torch.maximum((before - q).abs(), (after - q).abs())", "(before - q).abs()"),
         ("smooth", "1 + 2 * count", "1 + count"),
     ],
-    "dense": [
+    "pipeline.dense": [
         ("pixels", "(columns + 0.5) * scale[1] - 0.5", "columns * scale[1]"),
         ("resized", 'mode="area"', 'mode="nearest"'),
         ("map_hw", "longer <= size", "longer < size", "of that size already, the factor is 1"),
@@ -72,7 +80,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_joined_with", "told.keep & ~usable", "told.keep & usable"),
         ("_joined_with", "told.gate.masked_fill(usable, Gate.ANSWER)", "told.gate"),
     ],
-    "stereo": [
+    "pipeline.surface": [
         ("best_planes", "(best.plane + best.shift) * step", "best.plane * step"),
         ("best_planes", ">= RIVAL * each", ">= 0 * each"),
         ("_idle", "sweep.PATHS * sweep.UNSEEN", "sweep.UNSEEN"),
@@ -89,14 +97,14 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("pose_variance", "fit.shutter.cov", "fit.cov"),
         ("pose_variance", "-(gx * x + gy * y) * inv_z", "(gx * x + gy * y) * inv_z"),
     ],
-    "transform.maps": [
+    "transforms.maps": [
         ("Maps.swept", "self.sensed(read.anchor, method), found", "found, found"),
         ("Maps.swept", '"calibration": self.calibration, ', ""),
         ("as_keys", "torch.where(found.keep, found.depth, 0.0)", "found.depth"),
         ("as_keys", '"gate_map": found.gate', '"gate_map": found.source'),
         ("as_samples", 'if name != "gate_map"', 'if name != "sigma_map"'),
     ],
-    "native": [
+    "ops.loader": [
         ("cache", "if own:", "if not own:"),
         ("library", "torch.__version__, ", ""),
         ("library", "processor(), ", ""),

@@ -3,7 +3,7 @@
     calibration = dhtorch.calibration.load("map")
     score = functools.partial(rank_by_error, recalibration=calibration.probability)
 
-Fit one with :func:`dhtorch.evaluate.score_calibration.fit`, on scenes with truth, and keep it with :func:`save`.
+Fit one with :func:`dhtorch.calibration.score_calibration.fit`, on scenes with truth, and keep it with :func:`save`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from dhtorch.evaluate.score_calibration import Calibration, from_json
+from dhtorch.calibration.score_calibration import Calibration, from_json
 
 #: What a file that is kept must say of its origin.
 PROVENANCE = ("method", "scenes")

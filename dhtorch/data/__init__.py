@@ -2,7 +2,7 @@
 
 ``open(path)`` recognises a capture by its content and returns its :class:`Recording`, a lazy sequence of frames. A
 format is one module with ``recognise(root)`` and ``read(root, *, options)``, and one line in the table below. Focal
-stacks show one view without depth of their own: ``dhtorch.studies.focal`` reads them.
+stacks show one view without depth of their own: ``dhtorch.experiments.focal`` reads them.
 """
 
 from __future__ import annotations
@@ -15,13 +15,25 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from dhtorch import console
-from dhtorch.data import arkitscenes, ca1m, driving, frames_dir, lerobot, record3d, rectified, rh20t, rlds, stray, tum
 from dhtorch.data import intrinsics as told
-from dhtorch.data.doors import inside
-from dhtorch.data.files import FormatError
+from dhtorch.data.io.decode import FormatError
+from dhtorch.data.io.safe_open import inside
+from dhtorch.data.readers import (
+    arkitscenes,
+    ca1m,
+    driving,
+    frames_dir,
+    lerobot,
+    record3d,
+    rectified,
+    rh20t,
+    rlds,
+    stray,
+    tum,
+)
 from dhtorch.data.recording import Recording, Recordings
 from dhtorch.data.scene import Given, Scene, Scenes, scenes_of
+from dhtorch.runtime import console
 
 __all__ = [
     "FORMATS",

@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dhtorch.data.files import FormatError, to_array
+from dhtorch.data.io.decode import FormatError, to_array
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
-from dhtorch.geometry.lookup import round_half_up
+from dhtorch.geometry.patches import round_half_up
 from dhtorch.records import Camera, Pose
 
 #: How far the determinant of a stored rotation may be from 1 before it is taken for damage instead of rounding.

@@ -22,14 +22,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dhtorch.console import many
-from dhtorch.data import files
 from dhtorch.data.codecs.exr import read_exr
 from dhtorch.data.codecs.npy import read_npz
 from dhtorch.data.codecs.pfm import read_pfm
 from dhtorch.data.codecs.tiff import read_tiff
-from dhtorch.data.files import MAX_PIXELS, FormatError
+from dhtorch.data.io import decode as files
+from dhtorch.data.io.decode import MAX_PIXELS, FormatError
 from dhtorch.data.recording import Recording
+from dhtorch.runtime.console import many
 
 #: Name of a unit → metres.
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dhtorch.data.files import FormatError, to_array
+from dhtorch.data.io.decode import FormatError, to_array
 
 #: Of every reader whose captures may lack a K; nothing said to another reader is no option of its.
 OPTIONS = ("intrinsics", "K", "fov")

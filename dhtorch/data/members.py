@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 from dhtorch.data.codecs.zips import check_directory
-from dhtorch.data.doors import opened
-from dhtorch.data.files import MAX_BYTES, FormatError, read_bytes
+from dhtorch.data.io.decode import MAX_BYTES, FormatError, read_bytes
+from dhtorch.data.io.safe_open import opened
 
 MAX_MEMBERS = 2_000_000
 _LOCAL_HEADER = 30  # bytes before the name

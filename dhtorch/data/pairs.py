@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import torch
 
-from dhtorch.console import many
 from dhtorch.data.recording import Recording
 from dhtorch.data.rig import Rig
 from dhtorch.data.scene import Given, Scene
+from dhtorch.runtime.console import many
 
 #: From this many frames on, neighbouring anchors are nearly the same picture: take every other one.
 _MANY = 25

@@ -15,9 +15,9 @@ from typing import ClassVar, TypeVar, overload
 import torch
 from torch import Tensor
 
-from dhtorch.console import many
-from dhtorch.data.doors import inside
+from dhtorch.data.io.safe_open import inside
 from dhtorch.records import Frame, Pose
+from dhtorch.runtime.console import many
 
 T = TypeVar("T")
 

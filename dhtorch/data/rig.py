@@ -14,11 +14,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dhtorch.console import many
-from dhtorch.data.files import FormatError
+from dhtorch.data import open_all
+from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording, Recordings, TruthRecording
 from dhtorch.data.scene import Scene, Scenes
 from dhtorch.records import Frame, Pose
+from dhtorch.runtime.console import many
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -122,8 +123,6 @@ def open_rig(
     Raises:
         FormatError: as there, or no scene with two cameras.
     """
-    from dhtorch.data import open_all  # noqa: PLC0415  (which knows all readers, this one's users among them)
-
     found = open_all(root, format, follow_links=follow_links, **options)
     names = found.names if isinstance(found, Recordings) else [r.name for r in found]
     groups: dict[str, list[int]] = {}

@@ -13,12 +13,13 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from dhtorch.console import many
-from dhtorch.data.files import FormatError
+from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording
 from dhtorch.geometry import camera as cameras
-from dhtorch.geometry import lookup, se3
+from dhtorch.geometry import patches as lookup
+from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame, Pose
+from dhtorch.runtime.console import many
 
 PERCENTILES = (1, 5, 25, 50, 75, 95, 99)
 

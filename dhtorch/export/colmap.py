@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from dhtorch import storage
 from dhtorch.export.arrays import bytes_of_colour, quaternion, rows
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Pose
+from dhtorch.runtime import storage
 
 
 @dataclass(frozen=True)

@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from dhtorch import storage
 from dhtorch.codes import Source
 from dhtorch.export.arrays import array, quaternion
 from dhtorch.geometry import se3
 from dhtorch.geometry.camera import to_matrix
 from dhtorch.records import Camera, Pose
+from dhtorch.runtime import storage
 
 #: The last step: 65535 is *no return* to readers of several sets.
 LAST = 65534

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from dhtorch import storage
 from dhtorch.export.arrays import array, bytes_of_colour, finite, rows
+from dhtorch.runtime import storage
 
 _FLOAT, _UINT = 5126, 5125
 _POINTS, _TRIANGLES = 0, 4

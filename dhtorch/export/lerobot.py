@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dhtorch import storage
+from dhtorch.runtime import storage
 
 Feature = dict[str, Any]  # as in meta/info.json
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from dhtorch import storage
 from dhtorch.export.arrays import array, bytes_of_colour, finite, rows
+from dhtorch.runtime import storage
 
 _WORDS = {"f4": "float", "u1": "uchar", "i4": "int"}
 

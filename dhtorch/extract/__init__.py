@@ -3,7 +3,7 @@
 dhtorch extract data=lerobot data.root=PATH data.gap=5 out=features workers=8
 
 Every recording is an episode, every frame a row: ``plan`` numbers the rows, ``rows`` makes one (with
-:class:`dhtorch.transform.ExtendDepth`), ``engines`` say where, ``columns`` and ``shards`` write Parquet files, and
+:class:`dhtorch.transforms.ExtendDepth`), ``engines`` say where, ``columns`` and ``shards`` write Parquet files, and
 ``features`` reads them for a data loader.
 """
 
@@ -17,17 +17,19 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from dhtorch import archive, lock, storage
-from dhtorch.console import many
-from dhtorch.data.files import need
+from dhtorch.data.io.decode import need
 from dhtorch.data.scene import Scene, scenes_of
 from dhtorch.extract import columns, engines, plan, shards
 from dhtorch.extract.dataset import Rows, maps_hw
 from dhtorch.extract.features import Features, JoinedDataset
-from dhtorch.method import Method
-from dhtorch.transform import CHANNELS, Maps, grid, maps
-from dhtorch.transform.extend_depth import ON_ERROR
-from dhtorch.transform.tokens import FITS
+from dhtorch.pipeline.method import Method
+from dhtorch.runtime import file_lock as lock
+from dhtorch.runtime import results as archive
+from dhtorch.runtime import storage
+from dhtorch.runtime.console import many
+from dhtorch.transforms import CHANNELS, Maps, grid, maps
+from dhtorch.transforms.extend_depth import ON_ERROR
+from dhtorch.transforms.tokens import FITS
 
 __all__ = ["ExtractOptions", "Features", "JoinedDataset", "run"]
 

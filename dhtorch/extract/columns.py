@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dhtorch.codes import Flag, Gate, Hole, PoseCode, Source, names
-from dhtorch.data.files import need
-from dhtorch.transform import CHANNELS, SampleProblem, maps
+from dhtorch.data.io.decode import need
+from dhtorch.transforms import CHANNELS, SampleProblem, maps
 
 Row = dict[str, Any]  # column → number, text or array
 
@@ -86,7 +86,7 @@ def columns(n: int, patches: int, *, half: bool = False, map_hw: tuple[int, int]
 
 
 def _maps(hw: tuple[int, int]) -> dict[str, Column]:
-    """Columns of every pixel, over the field of the picture (:func:`dhtorch.dense.pixels`)."""
+    """Columns of every pixel, over the field of the picture (:func:`dhtorch.pipeline.dense.pixels`)."""
     f, byte, none = "float32", "uint8", "0 = none, where a DepthMap has NaN"
     return {
         "depth_map": Column(f, hw, "m", f"z of every pixel, by sensor or sweep; {none}"),

@@ -18,10 +18,10 @@ from dhtorch.extract.columns import PLACE, Column, Row
 from dhtorch.extract.plan import Plan, offers, steps_back
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
-from dhtorch.method import Method
-from dhtorch.offers import choosing
+from dhtorch.pipeline.method import Method
+from dhtorch.pipeline.view_report import choosing
 from dhtorch.records import Camera, Frame
-from dhtorch.transform import ExtendDepth, Maps, SampleError
+from dhtorch.transforms import ExtendDepth, Maps, SampleError
 
 #: Readers give metres, and the camera of these very pixels: there is no unit that could be wrong.
 _TRUSTED = {"depth_unit": "m", "layout": "chw", "max_depth": np.inf, "min_depth": 0.0, "max_offset": np.inf}
@@ -56,7 +56,7 @@ class Rows(Dataset[Extracted]):
             None = the scene's own.
         past: among earlier frames alone; else also among later ones of the same recording.
         beside: also among the frames of the episode's other cameras at the same instant; with a ``gap`` of auto.
-        options: of :class:`dhtorch.transform.ExtendDepth`.
+        options: of :class:`dhtorch.transforms.ExtendDepth`.
     """
 
     def __init__(

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from torch.utils.data import DataLoader
 
-from dhtorch.data.files import need, set_opencv_threads
+from dhtorch.data.io.decode import need, set_opencv_threads
 from dhtorch.extract import columns
 from dhtorch.extract.dataset import Extracted, Rows
-from dhtorch.leash import follow_parent
-from dhtorch.transform import SampleError, one_thread
+from dhtorch.runtime.parent_watch import follow_parent
+from dhtorch.transforms import SampleError, one_thread
 
 #: Rows of one Ray task: what is done again where a node is lost.
 TASK_ROWS = 16

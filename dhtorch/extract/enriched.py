@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dhtorch import dense
 from dhtorch.codes import Gate, PoseCode, Source, names
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
@@ -21,8 +20,9 @@ from dhtorch.extract.columns import PLACE, Column, Row
 from dhtorch.extract.dataset import Opened, Rows, readable
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
+from dhtorch.pipeline import dense
 from dhtorch.records import Frame
-from dhtorch.transform import SampleError
+from dhtorch.transforms import SampleError
 
 #: Steps of sigma in one of depth.
 SIGMA_STEPS: Final = 8

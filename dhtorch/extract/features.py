@@ -13,11 +13,11 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from dhtorch.data.codecs.parquet import parquet_header, read_columns
-from dhtorch.data.doors import last_change
-from dhtorch.data.files import FormatError
+from dhtorch.data.io.decode import FormatError
+from dhtorch.data.io.safe_open import last_change
 from dhtorch.extract.columns import PLACE
 from dhtorch.extract.shards import described, shard_files
-from dhtorch.transform.leaves import find
+from dhtorch.transforms.sample_access import find
 
 #: Row groups that a process keeps in memory.
 _HELD = 4
@@ -26,7 +26,7 @@ _HELD = 4
 class Features(Sequence[dict[str, Tensor]]):
     """The rows of an extraction, sorted by episode and frame; read when asked for.
 
-    A row is a dict with the keys and shapes that :class:`dhtorch.transform.ExtendDepth` adds to a sample, so a model
+    A row is a dict with the keys and shapes that :class:`dhtorch.transforms.ExtendDepth` adds to a sample, so a model
     need not know whether its features were made before or in the loader. Halves become floats again.
 
     Args:

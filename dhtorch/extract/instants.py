@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from dhtorch.data.files import need
+from dhtorch.data.io.decode import need
 from dhtorch.extract.columns import Row
 from dhtorch.extract.origin import GROUP_ROWS
 

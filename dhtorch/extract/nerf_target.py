@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from dhtorch import storage
 from dhtorch.data.codecs.tiff import decode_tiff
 from dhtorch.export import nerfstudio, png
 from dhtorch.extract.enriched import View
 from dhtorch.extract.instants import rows_of
 from dhtorch.extract.targets import Row, Tally
+from dhtorch.runtime import storage
 
 
 class NerfTarget:

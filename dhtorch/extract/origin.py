@@ -9,9 +9,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from dhtorch.data import doors, files
-from dhtorch.data.files import FormatError, need
-from dhtorch.data.lerobot_meta import Episodes, Meta, read_episodes, read_meta
+from dhtorch.data.io import decode as files
+from dhtorch.data.io import safe_open as doors
+from dhtorch.data.io.decode import FormatError, need
+from dhtorch.data.readers.lerobot_meta import Episodes, Meta, read_episodes, read_meta
 from dhtorch.data.recording import Recording
 from dhtorch.export import lerobot as out
 

@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from dhtorch import storage
 from dhtorch.codes import Source, names
-from dhtorch.data.files import need
+from dhtorch.data.io.decode import need
 from dhtorch.export import lerobot
 from dhtorch.export.lerobot import Feature, Moments
 from dhtorch.extract.enriched import SIGMA_STEPS, View, blank
 from dhtorch.extract.instants import Ahead, groups, rows_of, together
 from dhtorch.extract.origin import Origin, RobotSet
 from dhtorch.extract.targets import Row, Tally
+from dhtorch.runtime import storage
 
 #: Metadata of an episode: what its rows amount to.
 OWN = b"dhtorch.episode"

@@ -13,10 +13,11 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from dhtorch import archive, storage
-from dhtorch.data.files import FormatError, need
+from dhtorch.data.io.decode import FormatError, need
 from dhtorch.extract.columns import Column, Row, schema, table
 from dhtorch.extract.plan import Shard
+from dhtorch.runtime import results as archive
+from dhtorch.runtime import storage
 
 #: Key of the metadata that all shards share, and of those of one shard.
 SHARED, OWN = b"dhtorch", b"dhtorch.shard"

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from dhtorch.data import files
-from dhtorch.data.files import need
+from dhtorch.data.io import decode as files
+from dhtorch.data.io.decode import need
+from dhtorch.data.readers.rlds_steps import Steps
 from dhtorch.data.recording import Recording
-from dhtorch.data.rlds_steps import Steps
 from dhtorch.export import lerobot as out
 from dhtorch.extract.enriched import camera_feature
 from dhtorch.extract.origin import GROUP_ROWS

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from dhtorch.export.lerobot import Moments
-from dhtorch.geometry.conventions import CONVENTIONS
+from dhtorch.geometry.pose_conventions import CONVENTIONS
 
 Row = dict[str, Any]
 

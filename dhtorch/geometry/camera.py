@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 
 from dhtorch.geometry import se3
+from dhtorch.geometry.checks import check, surely_all
+from dhtorch.geometry.linalg import inverse
 from dhtorch.geometry.se3 import Pose
-from dhtorch.geometry.shapes import check, surely_all
-from dhtorch.geometry.small import inverse
-from dhtorch.tree import Record, record
+from dhtorch.pytree import Record, record
 
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
@@ -104,7 +104,7 @@ def project(
     kornia's ``project_points`` takes half as long again, since it asks for a matrix; the lens is kornia's.
 
     Gradient: to points, intrinsics and distortion. Checked against ``cv2.projectPoints`` and
-    ``kornia.geometry.camera.PinholeCamera`` (``tests/test_camera.py``).
+    ``kornia.geometry.camera.PinholeCamera`` (``tests/geometry/test_camera.py``).
     """
     check("camera.project", f=(camera.f, "B 2"), xyz=(xyz, "B N 3"))
     z = xyz[..., 2:]
@@ -153,7 +153,7 @@ def undistort(camera: Camera, uv: Tensor, *, iterations: int = 12) -> Tensor:
 
     Gradient: one Newton step from the detached solution, which is the implicit derivative, to ``uv``, intrinsics and
     distortion. Checked against ``cv2.undistortPoints`` and ``kornia.geometry.calibration.undistort_points``
-    (``tests/test_camera.py``).
+    (``tests/geometry/test_camera.py``).
     """
     check("camera.undistort", f=(camera.f, "B 2"), uv=(uv, "B N 2"))
     if camera.distortion is None:

@@ -8,9 +8,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dhtorch.geometry.checks import check
 from dhtorch.geometry.least_squares import solve_spd
-from dhtorch.geometry.shapes import check
-from dhtorch.geometry.small import upper
+from dhtorch.geometry.linalg import upper
 
 
 def from_normal(

@@ -16,10 +16,10 @@ from torch import Tensor
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.camera import Camera
-from dhtorch.geometry.exact import steady
+from dhtorch.geometry.checks import check
+from dhtorch.geometry.determinism import steady
+from dhtorch.geometry.linalg import quadratic, upper
 from dhtorch.geometry.se3 import Pose
-from dhtorch.geometry.shapes import check
-from dhtorch.geometry.small import quadratic, upper
 
 #: Points of all pairs that :func:`depths` works on at once: torch does not split so few over threads.
 POINTS = 1 << 15
@@ -57,7 +57,7 @@ def triangulate(
 
     Gradient: to pixels, both cameras and the pose; smooth except at the epipole.
     Checked against ``cv2.triangulatePoints`` and ``kornia.geometry.epipolar.triangulate_points``
-    (``tests/test_epipolar.py``).
+    (``tests/geometry/test_epipolar.py``).
     Source: R. Hartley, A. Zisserman, "Multiple View Geometry", section 12.3, with one noise-free view.
     """
     check("triangulate", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), f0=(camera_0.f, "B 2"), f1=(camera_1.f, "B 2"))
@@ -149,7 +149,7 @@ def point_jacobians(
     """d(pixel) / d(point) (B, N, 2, 3) and d(pixel) / d(left pose perturbation) (B, N, 2, 6), ideal pinhole.
 
     |z| is kept away from zero, where kornia's ``dx_project_points_z1`` has no finite gradient. Checked against
-    ``torch.func.jacrev`` (``tests/test_epipolar.py``).
+    ``torch.func.jacrev`` (``tests/geometry/test_epipolar.py``).
     """
     check("point_jacobians", f=(camera.f, "B 2"), xyz=(xyz, "B N 3"))
     x, y, z = xyz.unbind(-1)

@@ -14,13 +14,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dhtorch.geometry.shapes import check
+from dhtorch.geometry.checks import check
 
 
 def grey(image: Tensor) -> Tensor:
     """Grey values (B, 1, H, W) in [0, 1] of pictures (B, C, H, W), C 1 or 3, float in [0, 1] or uint8; BT.601.
 
-    kornia's: bit for bit those of :func:`dhtorch.geometry.lookup.luma` in float32 and float64, which is twice as fast
+    kornia's: bit for bit those of :func:`dhtorch.geometry.patches.luma` in float32 and float64, which is twice as fast
     on patches and reads channels along any axis. Bytes become float32, divided first.
 
     Gradient: to the picture.

@@ -18,9 +18,9 @@ from torch import Tensor
 from torch.autograd.forward_ad import unpack_dual
 from torch.utils import _pytree as pytree
 
+from dhtorch.geometry.checks import check, surely_all
+from dhtorch.geometry.linalg import product
 from dhtorch.geometry.se3 import Pose
-from dhtorch.geometry.shapes import check, surely_all
-from dhtorch.geometry.small import product
 
 #: Points nearer to the camera plane than this (m), or behind it, are not in front.
 MIN_DEPTH = 1e-6
@@ -61,7 +61,7 @@ def linearise(
         ValueError: wrong shapes.
 
     Gradient: to pose, f, c, xyz and uv. The Jacobian is checked against ``torch.func.jacrev``
-    (``tests/test_least_squares.py``).
+    (``tests/geometry/test_least_squares.py``).
     """
     check("linearise", R=(T.R, "B 3 3"), f=(f, "B 2"), c=(c, "B 2"), xyz=(xyz, "B 3 N"), uv=(uv, "B 2 N"))
     plane, w, z = _seen(T, xyz)

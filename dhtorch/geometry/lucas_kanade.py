@@ -11,8 +11,8 @@ C[o] = sum_p g(p) J(p + o), o an offset in whole pixels. This *map* C is compute
 a depthwise convolution whose channels are the points. After that a step touches eight numbers per point, and no pixel.
 Coarse levels only provide a start: there the points of a small *cell* of the image share one search.
 
-The same without maps, one point at a time: :func:`dhtorch.geometry.reference.search`; one level of it in compiled code:
-:mod:`dhtorch.native`.
+The same without maps, one point at a time: ``search`` of ``tests/support/reference.py``; one level of it in compiled
+code: :mod:`dhtorch.ops.loader`.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dhtorch import native
-from dhtorch.geometry.exact import CHUNK, LANES
-from dhtorch.geometry.lookup import QUANTISATION
+from dhtorch.geometry.checks import all_finite, is_static
+from dhtorch.geometry.determinism import CHUNK, LANES
+from dhtorch.geometry.linalg import adjugate, determinant, eigenvalues
+from dhtorch.geometry.patches import QUANTISATION
 from dhtorch.geometry.pyramid import GRAD_X, GRAD_Y, GREY, Pyramid
-from dhtorch.geometry.shapes import all_finite, is_static
-from dhtorch.geometry.small import adjugate, determinant, eigenvalues
+from dhtorch.ops import loader as native
 
 #: Width of a cell, px of its level, and the finest level with cells. Coarse levels only say where the next one starts:
 #: there the points of a cell share one search. Cells are nested, so that they share its start as well.
@@ -253,7 +253,8 @@ def _descend(pair: _Pair, radii: tuple[int, ...], x: Tensor, d: Tensor, batch: T
 
 
 def _compiled(pair: _Pair, radii: tuple[int, ...], x: Tensor, d: Tensor, batch: Tensor, known: Tensor):
-    """:func:`_descend` in compiled code (:mod:`dhtorch.native`), the same up to the rounding of sums over a window."""
+    """:func:`_descend` in compiled code (:mod:`dhtorch.ops.loader`), the same up to the rounding of sums over a
+    window."""
     o = pair.o
     found, A = d.new_empty(2, d.shape[-1]), d.new_empty(3, d.shape[-1])
     held, textured = torch.empty_like(known), torch.empty_like(known)

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 from torch.linalg import cross
 
-from dhtorch.geometry.shapes import check
-from dhtorch.geometry.small import cofactors
+from dhtorch.geometry.checks import check
+from dhtorch.geometry.linalg import cofactors
 
 #: Triples flatter than this (height over longest side) count as collinear.
 MIN_HEIGHT = 1e-3
@@ -50,7 +50,7 @@ def p3p(
     Gradient: none (choosing among roots); refine the pose instead. Ranges are solved in float64.
     Source: the pencil of conics of M. Persson, K. Nordberg, "Lambda Twist" (ECCV 2018), with another way to find the
     degenerate member; its planes as in J. Richter-Gebert, "Perspectives on Projective Geometry" (2011). Checked
-    against synthetic truth and ``poselib.p3p`` (``tests/test_p3p.py``).
+    against synthetic truth and ``poselib.p3p`` (``tests/geometry/test_p3p.py``).
 
     Example:
         >>> import torch

@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dhtorch import native
 from dhtorch.geometry import filters
-from dhtorch.geometry.lookup import windows
-from dhtorch.geometry.neighbours import bands
-from dhtorch.geometry.shapes import check
+from dhtorch.geometry.checks import check
+from dhtorch.geometry.patches import windows
+from dhtorch.geometry.windows import bands
+from dhtorch.ops import loader as native
 
 #: Padding beyond half a window: how far from a pixel of the image (or of ``MARGIN`` around it) a search may look.
 REACH = 8
@@ -142,7 +142,7 @@ def build_pyramid(
     Each level is the one below, smoothed by the binomial filter (1 4 6 4 1) / 16 and taken at even pixels; gradients
     are Scharr's, per pixel. Outside the image the grey value is mirrored about the border pixel and the gradient is
     zero (a mirrored gradient would hold a window back at the border). As in ``cv2.buildOpticalFlowPyramid``
-    (``tests/test_statements.py``), a level that would be no larger than the window is not made.
+    (``tests/docs/test_statements.py``), a level that would be no larger than the window is not made.
 
     Args:
         gradients: without them the pyramid takes a third of the memory; windows can be searched in it, not for it.
@@ -154,7 +154,7 @@ def build_pyramid(
         ValueError: not an image batch, ``levels`` < 1, a window that is even or < 3, or an image no larger than it.
 
     Gradient: to the image.
-    Twin: :func:`dhtorch.geometry.reference.levels`.
+    Twin: ``levels`` of ``tests/support/reference.py``.
     """
     sizes = check("build_pyramid", image=(image, "B C H W"))
     if sizes["C"] not in (1, 3):
@@ -192,7 +192,7 @@ def _fill(level: Tensor, pad: int, image: Tensor, below: Tensor | None) -> None:
 
 
 def _half(level: Tensor, pad: int, part: slice) -> Tensor:
-    """Rows ``part`` of the half-size image of a padded one, as ``cv2.pyrDown`` (``tests/test_pyramid.py``).
+    """Rows ``part`` of the half-size image of a padded one, as ``cv2.pyrDown`` (``tests/geometry/test_pyramid.py``).
 
     kornia's ``pyrdown`` samples at other places, and takes four to ten times as long. Rows first, because their slices
     are contiguous; then even and odd columns are taken apart once.

@@ -9,11 +9,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dhtorch.geometry.checks import check
 from dhtorch.geometry.covariance import median
 from dhtorch.geometry.least_squares import MIN_DEPTH
 from dhtorch.geometry.p3p import p3p_of_planes
 from dhtorch.geometry.se3 import Pose
-from dhtorch.geometry.shapes import check
 
 #: A point set counts as a line when its spread across is below this share of its spread along.
 MIN_SPREAD = 1e-3

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from dhtorch.geometry.exact import steady
-from dhtorch.geometry.shapes import check
-from dhtorch.tree import Record, record
+from dhtorch.geometry.checks import check
+from dhtorch.geometry.determinism import steady
+from dhtorch.pytree import Record, record
 
 if TYPE_CHECKING:
     from kornia.geometry.liegroup import Se3
@@ -121,8 +121,8 @@ def exp(xi: Tensor) -> Pose:
     """Exponential map: (B, 6) rotation vector (rad) then translation part (m) → Pose.
 
     Closed form with series below 0.1 rad, so that value and gradient are exact at zero as well. Equal to
-    ``kornia.geometry.liegroup.Se3.exp`` of the reordered vector (``tests/test_se3.py``); written out because it sits in
-    the inner loop of every refinement, where kornia's takes more than twice as long.
+    ``kornia.geometry.liegroup.Se3.exp`` of the reordered vector (``tests/geometry/test_se3.py``); written out because
+    it sits in the inner loop of every refinement, where kornia's takes more than twice as long.
     """
     check("se3.exp", xi=(xi, "B 6"))
     omega, upsilon = xi[..., :3], xi[..., 3:]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dhtorch.geometry.shapes import check
+from dhtorch.geometry.checks import check
 
 BITS = 21
 #: Places from -REACH to REACH - 1 have a number.

@@ -13,8 +13,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dhtorch.geometry.shapes import check
-from dhtorch.tree import Record, record
+from dhtorch.geometry.checks import check
+from dhtorch.pytree import Record, record
 
 #: A disc of diameter c spreads as a Gaussian of this share of c as standard deviation (equal second moments).
 GAUSSIAN_OF_DISC = 0.25

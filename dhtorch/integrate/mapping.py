@@ -13,15 +13,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dhtorch import archive, export, integrate
+from dhtorch import export, integrate
 from dhtorch.codes import Source, names, words
-from dhtorch.console import many
-from dhtorch.data import files as data_files
+from dhtorch.data.io import decode as data_files
 from dhtorch.data.pairs import Pair
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene, scenes_of
-from dhtorch.drawing import at_cutoff
-from dhtorch.evaluate import bootstrap
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.integrate import recording as recordings
@@ -30,9 +27,13 @@ from dhtorch.integrate.picture import draw_map
 from dhtorch.integrate.recording import PairEstimate, Places
 from dhtorch.integrate.scales import REACH, TOLD_BY, coarse, union
 from dhtorch.integrate.sweeps import Shelf, Sweep
-from dhtorch.method import Method
-from dhtorch.pair import merge
+from dhtorch.metrics import bootstrap
+from dhtorch.pipeline.method import Method
+from dhtorch.pipeline.pair import merge
 from dhtorch.records import Camera, Frame
+from dhtorch.runtime import results as archive
+from dhtorch.runtime.console import many
+from dhtorch.viz.plots import at_cutoff
 
 Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
 Row = dict[str, Any]

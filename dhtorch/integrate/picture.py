@@ -10,14 +10,14 @@ import torch
 from torch import Tensor
 
 from dhtorch.codes import Source, names, words
-from dhtorch.console import many
-from dhtorch.drawing import Canvas, Key, Stroke, colours, headed, save
-from dhtorch.drawing.colours import INK, of_source
 from dhtorch.geometry import se3
 from dhtorch.geometry.camera import project
 from dhtorch.integrate.surface import Surface
 from dhtorch.integrate.volume import SOURCES, splat
 from dhtorch.records import Camera, Pose
+from dhtorch.runtime.console import many
+from dhtorch.viz.plots import Canvas, Key, Stroke, colours, headed, save
+from dhtorch.viz.plots.colours import INK, of_source
 
 #: Lengths that a scale bar may have, m.
 LENGTHS = tuple(m * 10.0**e for e in range(-3, 4) for m in (1, 2, 5))

@@ -21,17 +21,17 @@ from dhtorch.codes import Source
 from dhtorch.data.pairs import Pair, between
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Given, Scene
-from dhtorch.dense import pixels
-from dhtorch.evaluate.holdout import range_split
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3, sparse_grid
-from dhtorch.geometry.lookup import nearest
+from dhtorch.geometry.patches import nearest
 from dhtorch.integrate.sweeps import Shelf, Sweep, Swept, edges
 from dhtorch.integrate.volume import SOURCES, View, Volume, confirmed, fuse, reserve, splat
-from dhtorch.method import Method
-from dhtorch.offers import Picked, choosing, picked
+from dhtorch.metrics.holdout import range_split
+from dhtorch.pipeline.dense import pixels
+from dhtorch.pipeline.method import Method
+from dhtorch.pipeline.view_report import Picked, choosing, picked
+from dhtorch.pytree import stack
 from dhtorch.records import Camera, Estimate, Frame, Pose, PoseFit, Samples, Tracks
-from dhtorch.tree import stack
 
 POSES = ("device", "anchored")
 

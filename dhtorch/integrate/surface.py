@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dhtorch.geometry import sparse_grid
 from dhtorch.integrate.volume import INSIDE, SIDE, SOURCES, Volume
-from dhtorch.tree import Record, collate, record
+from dhtorch.pytree import Record, collate, record
 
 #: Largest step of the distance across a surface, in truncations: a view's rim is a step of up to two.
 MAX_STEP = 1.5

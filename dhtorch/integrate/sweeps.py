@@ -16,10 +16,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dhtorch import dense
+from dhtorch.calibration.score_calibration import Calibration
 from dhtorch.codes import Source
-from dhtorch.evaluate.score_calibration import Calibration
-from dhtorch.method import Method, Trace
+from dhtorch.pipeline import dense
+from dhtorch.pipeline.method import Method
+from dhtorch.pipeline.spec import Trace
 from dhtorch.records import DepthMap, Estimate, Frame
 
 
@@ -32,7 +33,7 @@ class Sweep:
 
     @classmethod
     def asked(cls, given: bool | Mapping[str, Any] | None, name: str = "dense") -> Sweep | None:
-        """What settings ask for, see :func:`dhtorch.dense.options`."""
+        """What settings ask for, see :func:`dhtorch.pipeline.dense.options`."""
         options = dense.options(given, name)
         return None if options is None else cls(options)
 
@@ -42,7 +43,7 @@ class Sweep:
         """The sparse answers, as ``method(anchor, others)`` gives them; ``trace`` also has ``dense``, the maps.
 
         Args:
-            method, anchor, others: as :func:`dhtorch.dense.complete` takes them.
+            method, anchor, others: as :func:`dhtorch.pipeline.dense.complete` takes them.
             trace: receives what the method tells.
             track: another function in the method's seat 4; None = its own.
             told: ``seed``, ``fit`` and ``hint``.

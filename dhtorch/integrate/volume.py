@@ -17,10 +17,10 @@ from torch import Tensor
 from dhtorch.codes import Source
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import sparse_grid
-from dhtorch.geometry.lookup import round_half_up
-from dhtorch.geometry.shapes import check
+from dhtorch.geometry.checks import check
+from dhtorch.geometry.patches import round_half_up
+from dhtorch.pytree import Record, record
 from dhtorch.records import Camera, Pose
-from dhtorch.tree import Record, record
 
 #: Voxels along a block's side, and in it.
 SIDE = 8

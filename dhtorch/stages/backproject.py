@@ -12,10 +12,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dhtorch import native
 from dhtorch.codes import Flag, Hole
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry.lookup import (
+from dhtorch.geometry.checks import all_finite, check, is_transformed
+from dhtorch.geometry.patches import (
     fits,
     in_a_row,
     luma,
@@ -26,8 +26,8 @@ from dhtorch.geometry.lookup import (
     summarise,
     whole_is_faster,
 )
-from dhtorch.geometry.neighbours import bands, extreme, window_sum
-from dhtorch.geometry.shapes import all_finite, check, is_transformed
+from dhtorch.geometry.windows import bands, extreme, window_sum
+from dhtorch.ops import loader as native
 from dhtorch.records import Frame, Samples
 
 #: Search radius in a sparse depth map, px: the truth test reads sparse returns in 7×7 windows, so do the samples.

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.codes import Gate, first_reason
-from dhtorch.geometry.shapes import check
+from dhtorch.geometry.checks import check
 from dhtorch.records import Estimate
 
 #: Least share of a variance that is put down to the point's own track, whatever the pose's part.

@@ -12,11 +12,11 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from dhtorch import native
 from dhtorch.codes import ROUTE_OF_HOLE, Flag, Hole, first_reason
-from dhtorch.geometry.lookup import pixels, summarise
-from dhtorch.geometry.shapes import check, is_transformed
-from dhtorch.geometry.small import eigenvalues
+from dhtorch.geometry.checks import check, is_transformed
+from dhtorch.geometry.linalg import eigenvalues
+from dhtorch.geometry.patches import pixels, summarise
+from dhtorch.ops import loader as native
 from dhtorch.records import Frame, Samples
 
 
@@ -87,8 +87,8 @@ def min_eigenvalue(
     """Smaller eigenvalue (B, N) of the mean gradient matrix around pixels: Shi–Tomasi trackability.
 
     Equal to ``cv2.cornerMinEigenVal(grey, block, 3)`` at the nearest pixel wherever the block and the 3×3 Sobel
-    filter stay inside the image (``tests/test_holes.py``); nearer to the border the block is moved inside. kornia's
-    ``gftt_response`` filters the whole picture, through another window.
+    filter stay inside the image (``tests/stages/test_holes.py``); nearer to the border the block is moved inside.
+    kornia's ``gftt_response`` filters the whole picture, through another window.
 
     Gradient: to the image; at equal eigenvalues the subgradient without the split is taken.
     """

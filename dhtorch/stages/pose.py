@@ -10,12 +10,13 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from dhtorch import native
 from dhtorch.codes import PoseCode, first_reason
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry import covariance, near_far, ransac, se3
-from dhtorch.geometry.exact import PRODUCT_LANES, SUM_LANES, filled
-from dhtorch.geometry.graphless import spared
+from dhtorch.geometry import covariance, ransac, se3
+from dhtorch.geometry import reprojection_problem as near_far
+from dhtorch.geometry.checks import all_finite, check, surely_all
+from dhtorch.geometry.determinism import PRODUCT_LANES, SUM_LANES, filled
+from dhtorch.geometry.inference_mode import spared
 from dhtorch.geometry.least_squares import (
     MIN_DEPTH,
     Normal,
@@ -31,12 +32,12 @@ from dhtorch.geometry.least_squares import (
     solve_spd,
     trial_step,
 )
-from dhtorch.geometry.most_probable import FitOptions, most_probable, pose_covariance
-from dhtorch.geometry.near_far import Problem
-from dhtorch.geometry.shapes import all_finite, check, surely_all
-from dhtorch.geometry.small import upper
+from dhtorch.geometry.linalg import upper
+from dhtorch.geometry.map_estimate import FitOptions, most_probable, pose_covariance
+from dhtorch.geometry.reprojection_problem import Problem
+from dhtorch.ops import loader as native
+from dhtorch.pytree import in_pieces
 from dhtorch.records import Camera, Pose, PoseFit, Samples, Shutter, Tracks
-from dhtorch.tree import in_pieces
 
 #: Pairs solved together: few enough for their temporaries to stay in cache.
 PAIRS = 16
@@ -100,7 +101,7 @@ def pnp_ransac(
     rms_px, sigma_px and t_snr are detached.
     Cost: linear in B, H and N. Float64 in the minimal solver and the last step, the inputs' dtype elsewhere.
     Source: paper, "LiDAR-anchored relative pose", with P3P in place of EPnP. Checked against
-    ``cv2.solvePnPRansac`` and ``poselib.estimate_absolute_pose`` (``tests/test_pose.py``).
+    ``cv2.solvePnPRansac`` and ``poselib.estimate_absolute_pose`` (``tests/stages/test_pose.py``).
 
     Example:
         >>> import torch
@@ -263,7 +264,7 @@ def _robust_pose(
 
 
 def _compiled(given: tuple[Tensor, ...], o: _Options) -> tuple[Pose, Tensor]:
-    """:func:`_robust_pose` in compiled code (:mod:`dhtorch.native`), the same up to the rounding of sums."""
+    """:func:`_robust_pose` in compiled code (:mod:`dhtorch.ops.loader`), the same up to the rounding of sums."""
     points, usable, f, c, draws = given
     B = len(points)
     R = points.new_empty(B, 3, 3, dtype=torch.float64)
@@ -339,9 +340,10 @@ def map_pose(
 ) -> PoseFit:
     """The most probable pose under all tracks: near ones hold the scale, far ones, without depth, the rotation.
 
-    One least-squares problem per pair (:mod:`dhtorch.geometry.near_far`). A near residual is weighed by the noise of
-    its track and of its depth; a far track has an inverse depth of its own, which is eliminated. First the near tracks
-    alone are solved from the pose of ``start``, then all of them. The second answer is kept unless it fits the near
+    One least-squares problem per pair (:mod:`dhtorch.geometry.reprojection_problem`). A near residual is weighed by the
+    noise of its track and of its depth; a far track has an inverse depth of its own, which is eliminated. First the
+    near tracks alone are solved from the pose of ``start``, then all of them. The second answer is kept unless it fits
+    the near
     tracks clearly worse: far tracks are many, and what is not a rigid scene seen by two pinhole cameras speaks through
     them first. The scale of the noise is estimated from the residuals, near and far apart. Where it explains much of
     the residuals, rows of the image get a rotation each, as a rolling shutter gives them.
@@ -377,7 +379,7 @@ def map_pose(
     Gradient: R, t and turn to near ``xyz``, ``uv_0``, ``uv_1`` and both cameras, through one last step from the
     detached optimum: exact to first order. Noise and its scale, cov and codes are detached.
     Cost: linear in B and N. Float64 in the last step and the covariance, the inputs' dtype elsewhere.
-    Source: see :mod:`dhtorch.geometry.near_far`.
+    Source: see :mod:`dhtorch.geometry.reprojection_problem`.
 
     Example:
         >>> import torch

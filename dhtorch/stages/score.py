@@ -13,11 +13,11 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from dhtorch import storage
 from dhtorch.codes import Gate
-from dhtorch.geometry.exact import steady
-from dhtorch.geometry.shapes import check
+from dhtorch.geometry.checks import check
+from dhtorch.geometry.determinism import steady
 from dhtorch.records import Estimate, PoseFit, Samples, Tracks
+from dhtorch.runtime import storage
 
 #: The pose's part of a variance is subtracted from the whole; no own part is believed to be a smaller share of it.
 OWN_SHARE = 1e-6

@@ -14,14 +14,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dhtorch.geometry import affine
+from dhtorch.geometry import affine_alignment as affine
 from dhtorch.geometry import lucas_kanade as lk
-from dhtorch.geometry.exact import filled
-from dhtorch.geometry.graphless import spared
+from dhtorch.geometry.checks import check, perhaps_any
+from dhtorch.geometry.coarse_flow import Flow, inverse, is_turned, turned, upright
+from dhtorch.geometry.determinism import filled
+from dhtorch.geometry.inference_mode import spared
+from dhtorch.geometry.linalg import product
 from dhtorch.geometry.pyramid import Pyramid, Pyramids, build_pyramid
-from dhtorch.geometry.shapes import check, perhaps_any
-from dhtorch.geometry.small import product
-from dhtorch.geometry.start import Flow, inverse, is_turned, turned, upright
 from dhtorch.records import NO_HINT, TrackHint, Tracks
 
 #: A search from a coarse flow begins on the first level (the second at least) whose windows are so many times as wide
@@ -66,9 +66,9 @@ def lucas_kanade(
         epsilon_px: a shorter step has converged; on coarse levels, which only provide a start, four times that.
         normalise: ``none``; ``bias`` removes the means of both windows; ``gain_bias`` also their ratio of contrast.
         min_eigenvalue: of A / window² (grey values in [0, 1]); a window with less has too little texture.
-        start: ``(image_0, image_1, *, linear) -> Flow``, such as :func:`dhtorch.geometry.start.coarse_flow`: asked for
-            the coarse motion of the whole picture, there and back, where the hint has none. Turn, zoom and gain of a
-            pair are undone in image 1 before it is searched. None = the search starts at ``uv_0``.
+        start: ``(image_0, image_1, *, linear) -> Flow``, such as :func:`dhtorch.geometry.coarse_flow.coarse_flow`:
+            asked for the coarse motion of the whole picture, there and back, where the hint has none. Turn, zoom and
+            gain of a pair are undone in image 1 before it is searched. None = the search starts at ``uv_0``.
 
     Returns:
         Tracks in the dtype of ``uv_0``: ``uv_1`` (B, N, 2) px; ``error`` (B, N) px, the round trip (the way there where
@@ -87,8 +87,8 @@ def lucas_kanade(
     step (:func:`refine`); all other fields are detached.
 
     Source: Lucas and Kanade 1981; Bouguet 2000 (pyramid); Baker and Matthews 2004 (inverse composition); checked
-    against ``cv2.calcOpticalFlowPyrLK`` (``tests/test_track.py``).
-    Twin: :func:`dhtorch.geometry.reference.lucas_kanade`, one point at a time.
+    against ``cv2.calcOpticalFlowPyrLK`` (``tests/stages/test_track.py``).
+    Twin: ``lucas_kanade`` of ``tests/support/reference.py``, one point at a time.
 
     Example:
         >>> import torch
@@ -320,7 +320,8 @@ def lucas_kanade_affine(
         track: the search that finds the windows, any tracker; it is told the ``levels`` and shares the pyramid.
         window: of the registration; the search has its own.
         levels: of the search, where it follows hints.
-        iterations, epsilon_px, max_shift_px: of the registration, see :func:`dhtorch.geometry.affine.register`.
+        iterations, epsilon_px, max_shift_px: of the registration, see
+            :func:`dhtorch.geometry.affine_alignment.register`.
         start: as in :func:`lucas_kanade`; ``track`` finds its answer in the hint, and the registration begins with its
             turn and zoom.
 

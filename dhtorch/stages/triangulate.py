@@ -11,10 +11,10 @@ from torch import Tensor
 from dhtorch.codes import Gate, Hole, PoseCode, first_reason
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import epipolar
+from dhtorch.geometry.checks import all_finite, check
 from dhtorch.geometry.covariance import median, noise_shape
-from dhtorch.geometry.near_far import straighten
-from dhtorch.geometry.reach import within_reach
-from dhtorch.geometry.shapes import all_finite, check
+from dhtorch.geometry.free_space import within_reach
+from dhtorch.geometry.reprojection_problem import straighten
 from dhtorch.records import Camera, Estimate, PoseFit, Samples, Tracks
 
 #: Least trackability that a grey difference is divided by.
@@ -75,7 +75,7 @@ def two_view(
         max_far_noise: spread of the far tracks' residuals, of a ray with z = 1, above which the near returns are taken
             to move on their own and no point of the pair is answered; None asks nothing.
         max_in_reach: share of the answers that may lie where the sensor would have seen them
-            (:func:`dhtorch.geometry.reach.within_reach`); with more, none is given. None asks nothing.
+            (:func:`dhtorch.geometry.free_space.within_reach`); with more, none is given. None asks nothing.
         fitted_noise: take the scale of the tracks' noise from the pose's residuals (``fit.sigma_px``), and from the
             tracks' covariances only its shape; else the covariances as they are.
         isotropic: share of that shape which does not depend on the patch, see ``covariance.noise_shape``.

@@ -14,9 +14,9 @@ from functools import partial
 import torch
 from torch import Generator, Tensor
 
+from dhtorch.geometry.checks import check
 from dhtorch.geometry.filters import gaussian
-from dhtorch.geometry.lookup import magnified
-from dhtorch.geometry.shapes import check
+from dhtorch.geometry.patches import magnified
 
 #: Scales of a map that is otherwise right, and the shift of one, m.
 SCALES, SHIFT = (0.8, 1.25), 0.15

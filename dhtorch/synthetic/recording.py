@@ -17,12 +17,12 @@ from typing import Any, ClassVar
 import torch
 from torch import Generator, Tensor
 
-from dhtorch.console import many
 from dhtorch.data.recording import TruthRecording, numbers
 from dhtorch.data.scene import Scene
 from dhtorch.geometry import se3
 from dhtorch.geometry.camera import Camera, resize
 from dhtorch.records import Frame, Pose
+from dhtorch.runtime.console import many
 from dhtorch.synthetic.paths import PATHS, hand_held
 from dhtorch.synthetic.raycast import DARK, MIRROR, ORDINARY, WINDOW, world_rays
 from dhtorch.synthetic.room import furnished_room

@@ -18,9 +18,9 @@ from random import Random
 import numpy as np
 import torch
 
+from dhtorch.data.readers.rh20t_robot import ARMS
+from dhtorch.data.readers.rh20t_set import open_set
 from dhtorch.data.recording import Recordings
-from dhtorch.data.rh20t_robot import ARMS
-from dhtorch.data.rh20t_set import open_set
 from dhtorch.records import Pose
 from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.testing.rh20t import write_rh20t

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dhtorch.geometry.lookup import LUMA
+from dhtorch.geometry.patches import LUMA
 from dhtorch.geometry.se3 import Pose
 from dhtorch.synthetic.raycast import MOVING, Solid, Solids, Surface, Triple, dot
 from dhtorch.synthetic.textures import SIZE, paint

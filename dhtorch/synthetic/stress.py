@@ -19,7 +19,7 @@ from torch import Tensor
 
 from dhtorch.data.scene import Scene
 from dhtorch.geometry.camera import Camera, depth_pixels
-from dhtorch.geometry.lookup import round_half_up
+from dhtorch.geometry.patches import round_half_up
 from dhtorch.records import Frame, Pose, Tracks
 from dhtorch.synthetic.guests import along, in_hand, on_turntable, visited_room
 from dhtorch.synthetic.paths import hand_held, rotation

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from dhtorch.geometry.shapes import check
+from dhtorch.geometry.checks import check
 from dhtorch.geometry.thin_lens import Lens, spot_gain
 
 #: Largest number of layers; beyond it a layer's spot differs by more than ``step_px`` from the exact one.

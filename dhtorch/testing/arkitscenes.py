@@ -9,7 +9,17 @@ import numpy as np
 
 from dhtorch.geometry import camera as cameras
 from dhtorch.records import Camera, Frame
-from dhtorch.testing.parts import K_matrix, depth_codes, pixels, png, pose_matrix, quaternion, seconds, text_row, write
+from dhtorch.testing.parts import (
+    K_matrix,
+    depth_codes,
+    pixels,
+    png,
+    pose_matrix,
+    quaternion,
+    seconds,
+    text_row,
+    write,
+)
 
 
 def write_arkitscenes(

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from dhtorch.data.files import need
+from dhtorch.data.io.decode import need
 from dhtorch.export.tiff import float_tiff
 from dhtorch.records import Frame
 from dhtorch.testing.lossless import write_lossless

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dhtorch.data.files import need
+from dhtorch.data.io.decode import need
 
 _H264 = {"qp": "0", "preset": "ultrafast"}
 # No B-frames: with them the muxer refuses films of two pictures, at some sizes always and at others now and then.

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dhtorch.data.files import need
+from dhtorch.data.io.decode import need
 
 _TICKS = 600  # per second: 24, 25, 30 and 60 Hz are whole numbers of them
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from dhtorch.data.files import need
+from dhtorch.data.io.decode import need
 from dhtorch.geometry import camera as cameras
 from dhtorch.records import Frame
 from dhtorch.testing.mp4 import write_video

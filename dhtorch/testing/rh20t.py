@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from dhtorch.data.rh20t_robot import ARMS
+from dhtorch.data.readers.rh20t_robot import ARMS
 from dhtorch.records import Frame
 from dhtorch.testing.lossless import write_lossless
 from dhtorch.testing.parts import K_matrix, depth_codes, pixels, pose_matrix, quaternion, seconds, write

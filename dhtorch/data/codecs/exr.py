@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dhtorch.data.files import MAX_PIXELS, FormatError, need, read_bytes
+from dhtorch.data.io.decode import MAX_PIXELS, FormatError, need, read_bytes
 
 _MAGIC = b"\x76\x2f\x31\x01"
 _TILED, _DEEP, _PARTS = 0x200, 0x800, 0x1000  # bits of the version field

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dhtorch.data.doors import check_file, opened, unreadable
-from dhtorch.data.files import MAX_BYTES, FormatError, need
+from dhtorch.data.io.decode import MAX_BYTES, FormatError, need
+from dhtorch.data.io.safe_open import check_file, opened, unreadable
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _FILTERS = {"gzip", "lzf", "shuffle", "fletcher32"}  # come with the library

@@ -10,7 +10,7 @@ import struct
 from pathlib import Path
 from types import ModuleType
 
-from dhtorch.data.files import FormatError, need
+from dhtorch.data.io.decode import FormatError, need
 
 _END = b"bvx$"
 

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
-from dhtorch.data.doors import allow
-from dhtorch.data.files import MAX_TEXT_BYTES, FormatError
+from dhtorch.data.io.decode import MAX_TEXT_BYTES, FormatError
+from dhtorch.data.io.safe_open import allow
 
 #: The first box of a film.
 FIRST: Final = (b"ftyp", b"styp", b"moov", b"moof", b"mdat", b"wide", b"free", b"skip", b"uuid", b"pnot")

@@ -18,8 +18,8 @@ from typing import NamedTuple
 import numpy as np
 
 from dhtorch.data.codecs.zips import check_directory
-from dhtorch.data.doors import allow
-from dhtorch.data.files import MAX_BYTES, FormatError, read_bytes
+from dhtorch.data.io.decode import MAX_BYTES, FormatError, read_bytes
+from dhtorch.data.io.safe_open import allow
 
 #: Bytes in which a header ends.
 _HEAD = 12_288

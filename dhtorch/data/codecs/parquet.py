@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dhtorch.data.codecs import thrift
-from dhtorch.data.doors import GROWTH, MAX_MEMORY, last_change, opened, unreadable
-from dhtorch.data.files import MAX_BYTES, MAX_TEXT_BYTES, FormatError, need
+from dhtorch.data.io.decode import MAX_BYTES, MAX_TEXT_BYTES, FormatError, need
+from dhtorch.data.io.safe_open import GROWTH, MAX_MEMORY, last_change, opened, unreadable
 
 MAX_ROWS = 50_000_000
 _MAX_UNPACKED = MAX_MEMORY // 4  # bytes of columns asked for, where the file is smaller: decoding makes some copies

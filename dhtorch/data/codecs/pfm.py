@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dhtorch.data.files import MAX_PIXELS, FormatError, read_bytes
+from dhtorch.data.io.decode import MAX_PIXELS, FormatError, read_bytes
 
 
 def read_pfm(file: Path, hw: tuple[int, int] | None = None) -> np.ndarray:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dhtorch.data.files import MAX_PIXELS, FormatError, read_bytes
+from dhtorch.data.io.decode import MAX_PIXELS, FormatError, read_bytes
 
 _HEAD = re.compile(rb"P5\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s")
 

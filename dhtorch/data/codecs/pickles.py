@@ -17,9 +17,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from dhtorch.data import doors, files
 from dhtorch.data.codecs.npy import npy_header
-from dhtorch.data.files import FormatError
+from dhtorch.data.io import decode as files
+from dhtorch.data.io import safe_open as doors
+from dhtorch.data.io.decode import FormatError
 from dhtorch.data.pickled_arrays import CALLS, NAMES, SCALARS, Name, Shell, built, filled, scalar
 
 MAX_PICKLE_BYTES: Final = 128_000_000

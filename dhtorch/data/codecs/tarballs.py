@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from dhtorch.data.doors import opened, unreadable
-from dhtorch.data.files import MAX_BYTES, FormatError
+from dhtorch.data.io.decode import MAX_BYTES, FormatError
+from dhtorch.data.io.safe_open import opened, unreadable
 
 _BLOCK = 512
 _MAX_NAME_BYTES = 1_000_000  # of a long name or a pax header

@@ -18,8 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dhtorch.data.doors import opened, unreadable
-from dhtorch.data.files import MAX_BYTES, FormatError
+from dhtorch.data.io.decode import MAX_BYTES, FormatError
+from dhtorch.data.io.safe_open import opened, unreadable
 
 MAX_RECORDS = 10_000_000
 MAX_FIELDS = 2_000_000  # of one record: names, pictures, runs of numbers

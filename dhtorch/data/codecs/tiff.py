@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dhtorch.data.doors import allow
-from dhtorch.data.files import DEFLATE, MAX_PIXELS, FormatError, need, read_bytes
+from dhtorch.data.io.decode import DEFLATE, MAX_PIXELS, FormatError, need, read_bytes
+from dhtorch.data.io.safe_open import allow
 
 _SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8}  # bytes of a tag's value by type
 _KINDS = {1: "u", 2: "i", 3: "f"}  # sample format

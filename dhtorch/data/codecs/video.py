@@ -20,8 +20,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dhtorch.data.codecs.mp4 import FIRST, check_samples
-from dhtorch.data.doors import last_change, opened
-from dhtorch.data.files import FormatError, need
+from dhtorch.data.io.decode import FormatError, need
+from dhtorch.data.io.safe_open import last_change, opened
 
 MAX_VIDEO_PIXELS = 36_000_000  # 8K; a decoder holds up to 17 pictures
 _MAX_FRAMES = 10_000_000

@@ -6,8 +6,8 @@ import struct
 from pathlib import Path
 from typing import BinaryIO
 
-from dhtorch.data.doors import allow
-from dhtorch.data.files import FormatError
+from dhtorch.data.io.decode import FormatError
+from dhtorch.data.io.safe_open import allow
 
 _END, _LONG_PLACE, _LONG_END = b"PK\x05\x06", b"PK\x06\x07", b"PK\x06\x06"
 _END_BYTES, _PLACE_BYTES, _LONG_BYTES = 22, 20, 56

@@ -1,0 +1,220 @@
+"""Monotone functions fitted to points: a table by isotonic regression, and the two-parameter sigmoid it has to beat.
+
+Both are callables on tensors of any shape, so a fitted one can stand in a scoring seat: they follow the dtype and
+device of their argument, have gradients, and what they say about one element does not depend on the others.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dhtorch.geometry.checks import check
+from dhtorch.geometry.determinism import steady
+from dhtorch.pytree import Record, record
+
+#: Rise given to the two end blocks of a table, where isotonic regression is flat, so that no order is lost there.
+TILT = 1e-3
+
+#: Pull of the sigmoid towards the identity beside a log loss of total weight 1: keeps separable data finite and is
+#: otherwise too small to see.
+RIDGE = 1e-6
+
+#: A probability is kept this far from 0 and 1 before its logit is taken.
+EDGE = 1e-6
+
+
+@record
+class Table(Record):
+    """A monotone function by its corners: straight between them, constant beyond."""
+
+    x: Tensor  # (k,) strictly rising
+    y: Tensor  # (k,) rising or falling
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """The function at ``x`` (any shape), elementwise; NaN stays NaN."""
+        corners, values = self.x.to(x), self.y.to(x)
+        if corners.numel() == 1:
+            return values[0] + 0 * x
+        right = torch.searchsorted(corners, x.detach().contiguous(), right=True).clamp(1, corners.numel() - 1)
+        x0, x1, y0, y1 = corners[right - 1], corners[right], values[right - 1], values[right]
+        width = x1 - x0  # zero where a short float cannot tell two corners apart
+        share = (x - x0) / torch.where(width > 0, width, torch.ones_like(width))
+        return y0 + share.clamp(0, 1) * (y1 - y0)
+
+
+@record
+class Sigmoid(Record):
+    """p ↦ σ(slope · logit(p) + offset): temperature scaling with an offset, after Platt."""
+
+    slope: Tensor  # ()
+    offset: Tensor  # ()
+
+    def __call__(self, p: Tensor) -> Tensor:
+        """The function at ``p`` (any shape), elementwise; arguments outside (0, 1) count as its ends."""
+        return steady(torch.sigmoid, self.slope.to(p) * _logit(p) + self.offset.to(p))
+
+
+def isotonic(
+    x: Tensor,  # (n,)
+    y: Tensor,  # (n,)
+    weight: Tensor | None = None,  # (n,) ≥ 0
+    *,
+    rising: bool = True,
+    min_share: float = 0.0,
+    ends: tuple[float, float] | None = None,
+) -> Table:
+    """The monotone function with the least weighted square error, made continuous.
+
+    Pool-adjacent-violators gives blocks of equal value. The table runs straight from the middle of one block to the
+    middle of the next, so that unequal arguments keep unequal values; the outermost blocks get a slope too small to
+    matter for the same reason.
+
+    Args:
+        x, y: points; points of equal x share one value.
+        weight: of each; None = equal.
+        rising: the function rises; otherwise it falls.
+        min_share: blocks with a smaller share of the weight are joined to a neighbour: one or two lucky points at an
+            end would otherwise promise certainty.
+        ends: where the table begins and ends; None = at the smallest and largest x.
+
+    Raises:
+        ValueError: unequal lengths, or no point with weight.
+
+    Source: M. Ayer et al., "An empirical distribution function for sampling with incomplete information", 1955;
+    A. Oron, N. Flournoy, "Centered isotonic regression", 2017 (the middles of blocks).
+    """
+    check("isotonic", x=(x, "n"), y=(y, "n"), weight=(weight, "n"))
+    x, y = x.detach().double(), y.detach().double()
+    weight = torch.ones_like(x) if weight is None else weight.detach().double()
+    x, y, weight = (v[weight > 0] for v in (x, y, weight))
+    if not x.numel():
+        raise ValueError("isotonic: found no point with weight, expected at least one")
+    at, group = x.unique(return_inverse=True)
+    mass = torch.zeros_like(at).index_add(0, group, weight)
+    mean = torch.zeros_like(at).index_add(0, group, weight * y) / mass
+    sign = 1.0 if rising else -1.0
+    blocks = _joined(_blocks((sign * mean).tolist(), mass.tolist(), at.tolist()), min_share * float(mass.sum()))
+    middle = [block[2] for block in blocks]
+    value = [sign * block[0] for block in blocks]
+    low, high = (float(at[0]), float(at[-1])) if ends is None else ends
+    return _table(middle, value, min(low, middle[0]), max(high, middle[-1]))
+
+
+def pool_adjacent_violators(
+    y: Tensor,  # (n,) in the order of the argument
+    weight: Tensor,  # (n,) > 0
+) -> Tensor:
+    """The rising sequence (n,) nearest to ``y`` in weighted square error, float64.
+
+    Raises:
+        ValueError: unequal lengths.
+    """
+    check("pool_adjacent_violators", y=(y, "n"), weight=(weight, "n"))
+    blocks = _blocks(y.tolist(), weight.tolist(), [0.0] * y.numel())
+    value = torch.tensor([block[0] for block in blocks], dtype=torch.float64)
+    return value.repeat_interleave(torch.tensor([block[3] for block in blocks], dtype=torch.long))
+
+
+def platt(
+    p: Tensor,  # (n,) in [0, 1]
+    good: Tensor,  # (n,) bool
+    weight: Tensor | None = None,  # (n,) ≥ 0
+    *,
+    steps: int = 100,
+) -> Sigmoid:
+    """The sigmoid of logit(p) with the least weighted log loss: the simple control beside :func:`isotonic`.
+
+    Args:
+        p: claimed probability, or a score in [0, 1].
+        good: what happened.
+        weight: of each; None = equal.
+        steps: of Newton's method, halved where they overshoot.
+
+    Returns:
+        Sigmoid; the identity without points.
+
+    Raises:
+        ValueError: unequal lengths.
+
+    Source: J. Platt, "Probabilistic outputs for support vector machines", 1999; C. Guo et al., "On calibration of
+    modern neural networks", 2017.
+    """
+    check("platt", p=(p, "n"), good=(good, "n"), weight=(weight, "n"))
+    weight = torch.ones_like(p) if weight is None else weight
+    share = weight.double() / weight.double().sum().clamp_min(torch.finfo(torch.float64).tiny)
+    feature = torch.stack((_logit(p.detach().double()), torch.ones_like(p, dtype=torch.float64)), -1)
+    sign = 2 * good.double() - 1
+    identity = torch.tensor([1.0, 0.0], dtype=torch.float64, device=p.device)
+
+    def loss(theta: Tensor) -> Tensor:
+        pull = RIDGE / 2 * (theta - identity).square().sum()
+        return (share * torch.nn.functional.softplus(-sign * (feature @ theta))).sum() + pull
+
+    theta = identity
+    for _ in range(steps):
+        claimed = torch.sigmoid(feature @ theta)
+        gradient = feature.mT @ (share * (claimed - good.double())) + RIDGE * (theta - identity)
+        curvature = (feature * (share * claimed * (1 - claimed))[:, None]).mT @ feature
+        step = torch.linalg.solve(curvature + RIDGE * torch.eye(2).to(curvature), gradient)
+        before, length = loss(theta), 1.0
+        while length > 1e-6 and loss(theta - length * step) > before:
+            length /= 2
+        theta = theta - length * step
+        if float(step.abs().max()) < 1e-10:
+            break
+    return Sigmoid(theta[0], theta[1])
+
+
+#: A block: value, weight, weighted mean of its arguments, number of entries.
+_Block = tuple[float, float, float, int]
+
+
+def _merged(a: _Block, b: _Block) -> _Block:
+    mass = a[1] + b[1]
+    return (a[0] * a[1] + b[0] * b[1]) / mass, mass, (a[2] * a[1] + b[2] * b[1]) / mass, a[3] + b[3]
+
+
+def _blocks(y: list[float], weight: list[float], at: list[float]) -> list[_Block]:
+    """Pool-adjacent-violators in one pass: a stack of blocks whose values rise strictly."""
+    stack: list[_Block] = []
+    for value, mass, place in zip(y, weight, at, strict=True):
+        block = (value, mass, place, 1)
+        while stack and stack[-1][0] >= block[0]:
+            block = _merged(stack.pop(), block)
+        stack.append(block)
+    return stack
+
+
+def _joined(blocks: list[_Block], least: float) -> list[_Block]:
+    """Neighbours joined until every block weighs ``least``; values still rise, being means of rising values."""
+    joined: list[_Block] = []
+    for block in blocks:
+        light = bool(joined) and joined[-1][1] < least
+        joined.append(_merged(joined.pop(), block) if light else block)
+    while len(joined) > 1 and joined[-1][1] < least:
+        last = joined.pop()
+        joined.append(_merged(joined.pop(), last))
+    return joined
+
+
+def _table(x: list[float], y: list[float], low: float, high: float) -> Table:
+    """Corners at the middles of blocks and at both ends, the end blocks tilted inwards."""
+    corners = list(zip(x, y, strict=True))
+    if len(x) > 1:
+        left, right = low < x[0], high > x[-1]
+        corners[0] = (x[0], y[0] + left * _tilt(y[1] - y[0]))
+        corners[-1] = (x[-1], y[-1] - right * _tilt(y[-1] - y[-2]))
+        corners = [(low, y[0])] * left + corners + [(high, y[-1])] * right
+    at, value = zip(*corners, strict=True)
+    return Table(torch.tensor(at, dtype=torch.float64), torch.tensor(value, dtype=torch.float64))
+
+
+def _tilt(step: float) -> float:
+    """A small part of the step to the next block, in its direction."""
+    return max(-TILT, min(TILT, step / 4))
+
+
+def _logit(p: Tensor) -> Tensor:
+    p = p.clamp(EDGE, 1 - EDGE)
+    return steady(torch.log, p) - steady(torch.log, 1 - p)

@@ -1,0 +1,270 @@
+"""What scores and sigmas turned out to be worth on some scenes, so that they can be believed on others.
+
+A calibration is fitted on scenes with truth and travels as a small text: two tables of the score (probability of a
+good answer, error to expect), a sigmoid as the simple control, a correction of sigma, and thresholds chosen by the
+plug-in control, beside a note of where all that comes from.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from dhtorch.calibration.monotone import Sigmoid, Table, isotonic, platt
+from dhtorch.metrics import control
+from dhtorch.metrics.errors import Points
+from dhtorch.metrics.reliability import GOOD, pool
+from dhtorch.metrics.risk import capped
+from dhtorch.records import DepthMap
+from dhtorch.runtime import storage
+
+SCHEMA = 1
+
+Answers = TypeVar("Answers", Points, DepthMap)
+
+#: Share of the fitting scenes' weight on which a step of a table must rest.
+MIN_SHARE = 0.02
+
+#: Probability that a normal variable lies within one standard deviation.
+ONE_SIGMA = 0.6826894921370859
+
+#: Share asked within two: less than a normal variable's 95 %, because errors have heavier tails and a few gross ones
+#: would widen every sigma. A little more than nine in ten, so that nine in ten may be promised in other rooms.
+TWO_SIGMA = 0.91
+
+#: Targets, in per cent, for which thresholds are kept.
+TARGETS = (5, 10, 20)
+
+
+#: Floors of sigma tried, as shares of the depth.
+FLOORS = (0.0, *(1e-4 * 10 ** (k / 10) for k in range(31)))
+
+
+@dataclass(frozen=True)
+class SigmaModel:
+    """A stated sigma made honest: scaled, and never below a share of the depth."""
+
+    scale: float  # noise that was stated too small, or shared
+    floor: float  # what no stated noise knows: lens, calibration, the place that a patch stands for
+
+    def __call__(self, sigma: Tensor, depth: Tensor) -> Tensor:
+        """sqrt((scale · sigma)² + (floor · depth)²), in the unit of both."""
+        return ((self.scale * sigma).square() + (self.floor * depth).square()).sqrt()
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What a score and a sigma mean, as measured on the scenes named in ``provenance``."""
+
+    probability: Table  # score → P(relative error < 10 %)
+    expected_error: Table  # score → mean capped relative error
+    sigmoid: Sigmoid  # score in [0, 1] → P(relative error < 10 %), the simple control
+    sigma: SigmaModel | None  # None = no sigma was stated
+    thresholds: Mapping[int, float | None]  # per cent of mean error → threshold on the score; None = none fits
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def apply(self, scene: Answers) -> Answers:
+        """The same answers, of a scene or every pixel of a map, with calibrated score and sigma."""
+        score = torch.where(scene.keep, self.probability(scene.score), 0.0).to(scene.score)
+        return scene.replace(score=score, sigma=self.sigma(scene.sigma, scene.depth) if self.sigma else scene.sigma)
+
+    def min_score(self, percent: int) -> float | None:
+        """The threshold for a mean error of ``percent``, on the calibrated score; None = answer nothing.
+
+        Raises:
+            KeyError: no threshold was fitted for that target.
+        """
+        threshold = self.thresholds[percent]
+        return None if threshold is None else float(self.probability(torch.tensor(threshold, dtype=torch.float64)))
+
+    def to_json(self) -> str:
+        """The calibration as strict JSON."""
+        content = {
+            "schema": SCHEMA,
+            "good_error": GOOD,
+            "probability": _corners(self.probability),
+            "expected_error": _corners(self.expected_error),
+            "sigmoid": {"slope": float(self.sigmoid.slope), "offset": float(self.sigmoid.offset)},
+            "sigma": None if self.sigma is None else {"scale": self.sigma.scale, "floor": self.sigma.floor},
+            "thresholds": {str(k): v for k, v in self.thresholds.items()},
+            "provenance": dict(self.provenance),
+        }
+        return storage.dumps(content, indent=1) + "\n"
+
+
+def fit(
+    scenes: Sequence[Points],
+    *,
+    min_share: float = MIN_SHARE,
+    targets: Sequence[int] = TARGETS,
+    choose: Callable[[Sequence[Points], float], control.Control] = control.plug_in,
+    provenance: Mapping[str, Any] | None = None,
+) -> Calibration:
+    """Learn from scenes with truth what their scores and sigmas are worth; every scene has the same weight.
+
+    Args:
+        scenes: candidates with answers, scores and, where stated, sigmas; any depth source.
+        min_share: share of the weight on which a step of a table must rest.
+        targets: mean errors, in per cent, for which thresholds are chosen.
+        choose: the control that chooses them, such as :func:`dhtorch.metrics.control.most_scenes`.
+        provenance: where the scenes come from, as JSON can hold it; ``n_scenes`` and ``n_answers`` are added. A file
+            that is shipped names ``method`` and ``scenes``.
+
+    Raises:
+        ValueError: no answer in any scene.
+    """
+    score, good, weight = pool(scenes)
+    if not score.numel():
+        raise ValueError("fit: found no answer in any scene, expected some")
+    loss = capped(torch.cat([s.answered().error for s in scenes]))
+    ends = (0.0, 1.0) if bool(((score >= 0) & (score <= 1)).all()) else None
+    note = {**(provenance or {}), "n_scenes": sum(bool(s.keep.any()) for s in scenes), "n_answers": score.numel()}
+    return Calibration(
+        probability=isotonic(score, good.double(), weight, min_share=min_share, ends=ends),
+        expected_error=isotonic(score, loss, weight, rising=False, min_share=min_share, ends=ends),
+        sigmoid=platt(score, good, weight),
+        sigma=fit_sigma(scenes),
+        thresholds={percent: choose(scenes, percent / 100).threshold for percent in targets},
+        provenance=note,
+    )
+
+
+def fit_sigma(scenes: Sequence[Points]) -> SigmaModel | None:
+    """The correction after which 68 % of the answers lie within one sigma and no fewer than nine in ten within two.
+
+    Scenes have the same weight. For every floor the scale follows from the first share; of all these pairs the one is
+    taken under which the errors are most probable (Student's t with three degrees of freedom, which gross errors do not
+    rule). Where fewer than nine in ten then lie within two sigmas, scale and floor are widened until they do.
+
+    Returns:
+        SigmaModel; None where no sigma is stated.
+    """
+    errors, sigmas, weights = [], [], []
+    for scene in scenes:
+        answered = scene.answered()
+        stated = answered.sigma.isfinite() & (answered.sigma > 0)
+        error = ((answered.depth - answered.true_depth).abs() / answered.depth)[stated]
+        errors.append(error)
+        sigmas.append((answered.sigma / answered.depth)[stated])
+        weights.append(torch.full_like(error, 1 / max(error.numel(), 1)))
+    if not sum(e.numel() for e in errors):
+        return None
+    error, sigma, weight = torch.cat(errors), torch.cat(sigmas), torch.cat(weights)
+    best, least = SigmaModel(1.0, 0.0), math.inf
+    for floor in FLOORS:
+        scale = _quantile((error.square() - floor * floor) / sigma.square(), weight, ONE_SIGMA).clamp_min(0).sqrt()
+        model = SigmaModel(float(scale), floor)
+        spread = model(sigma, torch.ones_like(sigma)).clamp_min(torch.finfo(sigma.dtype).tiny)
+        cost = float((weight * (2 * torch.log1p((error / spread).square() / 3) + spread.log())).sum())
+        best, least = (model, cost) if cost < least else (best, least)
+    spread = best(sigma, torch.ones_like(sigma)).clamp_min(torch.finfo(sigma.dtype).tiny)
+    wider = max(1.0, float(_quantile(error / spread, weight, TWO_SIGMA)) / 2)
+    return SigmaModel(best.scale * wider, best.floor * wider)
+
+
+def _quantile(x: Tensor, weight: Tensor, share: float) -> Tensor:
+    """The smallest value below or at which that share of the weight lies."""
+    order = x.argsort()
+    below = weight[order].cumsum(0) / weight.sum()
+    k = torch.searchsorted(below, torch.tensor(share, dtype=below.dtype, device=below.device))
+    return x[order][k.clamp(max=x.numel() - 1)]
+
+
+def from_json(text: str, where: str = "calibration") -> Calibration:
+    """Read what :meth:`Calibration.to_json` wrote.
+
+    Args:
+        text: the file's content.
+        where: its name, for the message.
+
+    Raises:
+        ValueError: not strict JSON, or a field is missing, unknown or out of range; the message names file and field.
+    """
+    try:
+        content = storage.loads(text)
+    except ValueError as error:
+        raise ValueError(f"{where}: found no strict JSON ({error}), expected a calibration") from error
+    known = ("schema", "good_error", "probability", "expected_error", "sigmoid", "sigma", "thresholds")
+    _fields(content, (*known, "provenance"), where)
+    for name, value in (("schema", SCHEMA), ("good_error", GOOD)):
+        _expect(content[name] == value, f"{where}.{name}", content[name], str(value))
+    _fields(content["sigmoid"], ("slope", "offset"), f"{where}.sigmoid")
+    slope, offset = (_number(content["sigmoid"][k], f"{where}.sigmoid.{k}") for k in ("slope", "offset"))
+    _expect(isinstance(content["provenance"], dict), f"{where}.provenance", content["provenance"], "an object")
+    return Calibration(
+        probability=_read_table(content["probability"], f"{where}.probability", rising=True),
+        expected_error=_read_table(content["expected_error"], f"{where}.expected_error", rising=False),
+        sigmoid=Sigmoid(torch.tensor(slope, dtype=torch.float64), torch.tensor(offset, dtype=torch.float64)),
+        sigma=None if content["sigma"] is None else _read_sigma(content["sigma"], f"{where}.sigma"),
+        thresholds=_read_thresholds(content["thresholds"], f"{where}.thresholds"),
+        provenance=content["provenance"],
+    )
+
+
+def _corners(table: Table) -> dict[str, list[float]]:
+    return {"score": table.x.tolist(), "value": table.y.tolist()}
+
+
+def _read_table(content: Any, where: str, *, rising: bool) -> Table:
+    _fields(content, ("score", "value"), where)
+    columns: dict[str, Tensor] = {}
+    for name in ("score", "value"):
+        _expect(isinstance(content[name], list) and content[name] != [], f"{where}.{name}", content[name], "a list")
+        numbers = [_number(v, f"{where}.{name}.{k}") for k, v in enumerate(content[name])]
+        columns[name] = torch.tensor(numbers, dtype=torch.float64)
+    x, y = content["score"], content["value"]
+    _expect(len(x) == len(y), f"{where}.value", f"{len(y)} numbers", f"{len(x)}, one for each score")
+    _expect(all(a < b for a, b in pairwise(x)), f"{where}.score", x, "rising numbers")
+    ordered = all((a <= b) if rising else (a >= b) for a, b in pairwise(y))
+    _expect(ordered and all(0 <= v <= 1 for v in y), f"{where}.value", y, f"{_direction(rising)} numbers from 0 to 1")
+    return Table(columns["score"], columns["value"])
+
+
+def _read_sigma(content: Any, where: str) -> SigmaModel:
+    _fields(content, ("scale", "floor"), where)
+    for name in ("scale", "floor"):
+        _expect(_number(content[name], f"{where}.{name}") >= 0, f"{where}.{name}", content[name], "no negative number")
+    return SigmaModel(float(content["scale"]), float(content["floor"]))
+
+
+def _read_thresholds(content: Any, where: str) -> dict[int, float | None]:
+    _expect(isinstance(content, dict), where, content, "an object")
+    found: dict[int, float | None] = {}
+    for name, value in content.items():
+        _expect(
+            name.isdecimal() and len(name) <= 2 and int(name) > 0, f"{where}.{name}", name, "a whole number of per cent"
+        )
+        found[int(name)] = None if value is None else _number(value, f"{where}.{name}")
+    return found
+
+
+def _direction(rising: bool) -> str:
+    return "rising" if rising else "falling"
+
+
+def _fields(content: Any, names: Sequence[str], where: str) -> None:
+    _expect(isinstance(content, dict), where, content, "an object")
+    for name in names:
+        _expect(name in content, f"{where}.{name}", "nothing", "a value")
+    for name in content:
+        _expect(name in names, f"{where}.{name}", "an unknown field", ", ".join(names))
+
+
+def _number(value: Any, where: str) -> float:
+    plain = isinstance(value, int | float) and not isinstance(value, bool)
+    fine = plain and abs(value) <= sys.float_info.max
+    _expect(fine, where, value, "a finite number")
+    return float(value)
+
+
+def _expect(condition: bool, where: str, found: Any, expected: str) -> None:
+    if not condition:
+        shown = found if isinstance(found, str) else storage.dumps(found)
+        raise ValueError(f"{where}: found {shown if len(shown) <= 60 else shown[:57] + '...'}, expected {expected}")

@@ -1,0 +1,169 @@
+"""How ``dhtorch complete`` names and stores frames, and what it puts beside them for a reader of :mod:`dhtorch.data`.
+
+- ``frames``: ``images/`` and ``depth/`` by frame number, ``K.txt``, ``poses.txt``; steps of 1 mm, of 5 mm where the
+  sensor is a LiDAR of a car. Read by ``frames_dir``.
+- ``tum``: ``rgb/`` and ``depth/`` by time stamp, ``groundtruth.txt``; steps of 0.2 mm, so that it ends at 13.1 m.
+- ``stray``: ``depth/`` and ``confidence/`` (2 the sensor, 1 swept, 0 silent) by frame number, the capture's own tables
+  and video; steps of 1 mm.
+- ``png``: the maps alone, as ``frames``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from dhtorch import export
+from dhtorch.codes import Source
+from dhtorch.data.recording import Recording
+from dhtorch.export.frames import LAST, SIGMA_STEPS
+from dhtorch.geometry.camera import from_matrix
+from dhtorch.records import Camera
+from dhtorch.runtime import storage
+
+#: What the meta file of a frame holds.
+Row = Mapping[str, Any]
+
+#: Step of depth where a sensor sees farther than steps of a millimetre reach.
+SPARSE_UNIT = 0.005
+
+#: What a Stray capture says of a depth, by codes.Source.
+CONFIDENCE = {Source.NONE: 0, Source.SENSOR: 2, Source.RECOVERED: 1, Source.SWEPT: 1, Source.ANCHORED: 1}
+
+#: Files of a Stray capture that hold for whatever depth it has.
+STRAY_FILES = ("odometry.csv", "camera_matrix.csv", "rgb.mp4")
+
+#: Kind of file → how its name ends; pictures otherwise.
+ENDINGS = {"meta": ".json", "arrays": ".npz"}
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Names, places and the step of depth."""
+
+    name: str
+    unit: float  # m
+    pictures: str | None = None  # folder of the pictures
+    stamped: bool = False  # named by time instead of number
+    confidence: bool = False
+    arrays: bool = False
+
+    @property
+    def folders(self) -> list[str]:
+        """Of the files of every frame, the last one written last."""
+        others = {"confidence": self.confidence, "arrays": self.arrays}
+        chosen = [kind for kind, wanted in others.items() if wanted]
+        return ["depth", "sigma", "source", *([self.pictures] if self.pictures else []), *chosen, "meta"]
+
+    @property
+    def sigma_unit(self) -> float:
+        """m, a step of sigma."""
+        return self.unit / SIGMA_STEPS
+
+    @property
+    def reach(self) -> float:
+        """m, the largest depth that it holds."""
+        return self.unit * LAST
+
+    def stem(self, recording: Recording, i: int) -> str:
+        """Name of the files of a frame."""
+        if self.stamped and recording.times is not None:
+            return f"{float(recording.times[i]):.6f}"
+        return f"{int(recording.number[i]):06d}"
+
+    def file(self, folder: Path, kind: str, stem: str) -> Path:
+        """A file of a frame."""
+        return folder / kind / f"{stem}{ENDINGS.get(kind, '.png')}"
+
+    def close(self, folder: Path, recording: Recording, frames: Sequence[int], rows: Sequence[Row]) -> None:
+        """Write what makes the frames (positions, with their meta files) a recording."""
+        poses = None if recording.poses is None else recording.poses[torch.tensor(frames)]
+        if self.name == "frames" and poses is not None:
+            export.write_numbered(folder, _camera(rows[0]), poses, unit=self.unit, fps=_rate(recording))
+        elif self.name == "tum":
+            stamps = [self.stem(recording, i) for i in frames]
+            export.write_stamped(folder, _camera(rows[0]), stamps, poses)
+        elif self.name == "stray" and recording.root is not None:
+            for name in STRAY_FILES:
+                storage.copy_file(recording.root / name, folder / name)
+
+
+LAYOUTS = {
+    "frames": Layout("frames", 0.001, pictures="images"),
+    "tum": Layout("tum", 0.0002, pictures="rgb", stamped=True),
+    "stray": Layout("stray", 0.001, confidence=True),
+    "png": Layout("png", 0.001),
+}
+
+#: Format of a recording → its own layout; ``frames`` for all others.
+OWN = {"tum": "tum", "stray": "stray"}
+
+
+def layout_of(recording: Recording, wanted: str, unit: float | None, *, same: bool, arrays: bool = False) -> Layout:
+    """The layout for the maps of a recording.
+
+    Args:
+        recording: whose frames are completed.
+        wanted: a name of ``LAYOUTS``, or ``auto``: the recording's own, else ``frames``, else ``png``.
+        unit: m, a step of depth. None = the layout's own.
+        same: whether the maps are of the pictures' size.
+        arrays: whether there are arrays, too.
+
+    Raises:
+        ValueError: a layout that cannot hold this recording, or another unit than its reader takes.
+    """
+    names = [OWN.get(recording.format, "frames"), "frames", "png"] if wanted == "auto" else [wanted]
+    missing = {name: _missing(name, recording, same) for name in names}
+    if missing[names[-1]]:
+        raise ValueError(f"format={wanted}: {recording.name} {missing[names[-1]]}; format=auto takes what fits")
+    layout = LAYOUTS[next(name for name in names if not missing[name])]
+    if layout.name == "stray" and unit not in (None, layout.unit):
+        raise ValueError(f"unit: found {unit}, expected {layout.unit} m, the only one of format=stray")
+    if recording.sparse and layout.name in ("frames", "png"):
+        layout = replace(layout, unit=SPARSE_UNIT)
+    return replace(layout, unit=layout.unit if unit is None else unit, arrays=arrays)
+
+
+def confident(source: np.ndarray) -> np.ndarray:
+    """Confidence uint8 of a Stray capture of codes.Source, any shape."""
+    table = np.zeros(max(CONFIDENCE) + 1, np.uint8)
+    table[list(CONFIDENCE)] = list(CONFIDENCE.values())
+    return table[source]
+
+
+def own_cameras(rows: Sequence[Row]) -> bool:
+    """Whether the camera differs from frame to frame, so that one K cannot speak for all."""
+    return any((row["K"], row["distortion"]) != (rows[0]["K"], rows[0]["distortion"]) for row in rows)
+
+
+def _missing(name: str, recording: Recording, same: bool) -> str | None:
+    """What a recording lacks for a layout, in words."""
+    if name == "frames":
+        poses = recording.poses
+        known = poses is not None and bool(poses.t.isfinite().all() and poses.R.isfinite().all())
+        return None if known else "has no pose for every frame"
+    if name == "tum" and recording.times is None:
+        return "has no time stamps"
+    if name == "tum" and not same:
+        return "has pictures larger than its maps (size)"
+    if name == "stray" and recording.format != "stray":
+        return f"is {recording.format}, no Stray Scanner capture"
+    return None
+
+
+def _camera(row: Row) -> Camera:
+    """Of the map of a frame."""
+    lens = None if row["distortion"] is None else torch.tensor([row["distortion"]])
+    return from_matrix(torch.tensor([row["K"]]), lens)
+
+
+def _rate(recording: Recording) -> float | None:
+    """Frames per second where the numbers and this rate give the very time stamps."""
+    rate, times = recording.rate_hz, recording.times
+    steady = rate is not None and times is not None and torch.allclose(recording.number.double() / rate, times)
+    return rate if steady else None

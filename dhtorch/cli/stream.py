@@ -1,0 +1,87 @@
+"""``dhtorch stream``: a recording pushed frame after frame, and how fast and how often it is answered."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from dhtorch.data.io import decode as files
+from dhtorch.data.scene import Scene, scenes_of
+from dhtorch.metrics.holdout import range_split
+from dhtorch.pipeline.method import Method
+from dhtorch.pipeline.spec import Trace
+from dhtorch.pipeline.stream import Stream
+from dhtorch.runtime import storage
+from dhtorch.runtime.console import many
+
+Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
+Row = dict[str, Any]
+
+
+def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:
+    """Stream every scene of the settings, write ``stream.json``, and say what came of it; returns the exit code.
+
+    Raises:
+        ValueError, OSError: bad options or data, as the readers and the method raise them.
+    """
+    if settings["most"] is not None and (not isinstance(settings["most"], int) or settings["most"] < 1):
+        raise ValueError(f"most: found {settings['most']!r}, expected a whole number of at least 1")
+    if settings["dtype"] not in ("float32", "float64"):
+        raise ValueError(f"dtype: found {settings['dtype']!r}, expected float32 or float64")
+    if settings["threads"] is not None:
+        torch.set_num_threads(settings["threads"])
+        files.set_opencv_threads(settings["threads"])
+    found = [streamed(scene, parts["method"], settings, progress=progress) for scene in scenes_of(parts["data"])]
+    path = storage.write_json(Path(settings["output"]) / "stream.json", {"scenes": found})
+    print("\n".join(_said(scene) for scene in found))
+    print(f"wrote\n  {path}")
+    return 0
+
+
+def streamed(scene: Scene, method: Method, settings: Mapping[str, Any], *, progress: Progress) -> Row:
+    """One scene: a row for every frame, and what they come to.
+
+    Raises:
+        ValueError: as the method and the stream raise it.
+    """
+    recording, hint = scene.recording, scene.hint
+    stream = Stream(method, steps=settings["steps"], seed=settings["seed"], hint=hint)
+    n = len(recording) if settings["most"] is None else min(settings["most"], len(recording))
+    rows: list[Row] = []
+    for k in progress(range(n), f"{scene.name}: frames", n):
+        frame = recording[k].to(getattr(torch, settings["dtype"])).to(settings["device"])
+        frame = range_split(frame, settings["cutoff"])
+        cuts = len(stream.cuts)
+        trace: Trace = {}
+        began = time.perf_counter()
+        estimate = stream.push(frame, trace=trace)
+        row: Row = {"frame": int(recording.number[k]), "ms": 1e3 * (time.perf_counter() - began)}
+        row["cut"] = len(stream.cuts) > cuts
+        row["back"] = sorted(trace["back"][:, 0].tolist()) if "back" in trace else []
+        hole = ~(trace["samples"] if "samples" in trace else method.look_at(frame, estimate.uv[0])).usable
+        row |= {"n_holes": int(hole.sum()), "n_recovered": int((estimate.keep & hole).sum())}
+        rows.append(row)
+    seconds = sum(row["ms"] for row in rows) / 1e3
+    holes = sum(row["n_holes"] for row in rows)
+    return {
+        "scene": scene.name,
+        "n_frames": n,
+        "frames_per_second": n / seconds,
+        "ms_median": statistics.median(row["ms"] for row in rows),
+        "recovered": sum(row["n_recovered"] for row in rows) / holes if holes else None,
+        "cuts": stream.cuts,
+        "mib": stream.nbytes / 2**20,
+        "frames": rows,
+    }
+
+
+def _said(scene: Row) -> str:
+    share = "no sample lacks a return" if scene["recovered"] is None else f"{scene['recovered']:.1%} of holes answered"
+    cuts = f"; cuts at {', '.join(map(str, scene['cuts']))}" if scene["cuts"] else ""
+    speed = f"{scene['frames_per_second']:.2f} frames/s"
+    return f"{scene['scene']}: {many(scene['n_frames'], 'frame')}, {speed}, {share}, {scene['mib']:.0f} MiB held{cuts}"

@@ -1,0 +1,139 @@
+"""``dhtorch view``: a result or a recording as something to look at, computed again and shown by the viewer."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from dhtorch.cli.job import PLACE
+from dhtorch.data import FormatError
+from dhtorch.data.scene import scenes_of
+from dhtorch.experiments.exhibits import look
+from dhtorch.experiments.protocol import Progress, Settings
+from dhtorch.integrate.sweeps import Sweep
+from dhtorch.runtime import results as archive
+from dhtorch.runtime.console import many
+from dhtorch.viz.viewer import again, html, points, rrd
+from dhtorch.viz.viewer.exhibit import Exhibit
+
+
+def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:
+    """Show what the settings ask for; returns the exit code.
+
+    With ``result``, a result file, its folder or a PLY file, the job's own data, method, pairs, hold-out and seed are
+    used and computed again; where its data are not to be found, its ``points.ply`` is shown. Without, the recording and
+    method of the settings. ``html`` and ``save`` name files; with neither, Rerun's viewer opens, or, where there is no
+    screen, ``view.rrd`` is written (``view.html`` where Rerun is not installed).
+
+    Raises:
+        ValueError, OSError, ImportError: bad options or data, as the readers and writers raise them.
+    """
+    page, recording = settings["html"], settings["save"]
+    for name, endings in ((page, html.ENDINGS), (recording, rrd.ENDINGS)):
+        if name is not None and (Path(name).is_dir() or Path(name).suffix.lower() not in endings):
+            raise ValueError(f"{name}: expected the name of a file that ends in {endings[0]}")
+    if settings["threads"] is not None:
+        torch.set_num_threads(settings["threads"])
+    target = None if settings["result"] is None else Path(settings["result"])
+    if target is not None and target.suffix == ".ply":
+        scene = points.read(target)
+    elif target is not None:
+        scene = _archived(target, settings, progress)
+    else:
+        scene = _looked(parts, settings, lambda _name: settings["holdout"]["cutoff"], progress)
+    folder = Path(settings["output"]) if target is None else target if target.is_dir() else target.parent
+    for line in _show(scene, page, recording, folder):
+        print(line)
+    return 0
+
+
+def _archived(target: Path, settings: Mapping[str, Any], progress: Progress) -> Exhibit:
+    """The scene of a result: computed again, or its points alone."""
+    result = archive.read(target)
+    folder = target if target.is_dir() else target.parent
+    config, name = result["config"], settings["scene"]
+    own = {**settings, **{k: config[k] for k in ("seed", "dtype") if k in config}}
+    try:
+        parts = again.parts(result, settings["root"] or _remembered(folder))
+        scene = _looked(parts, own, partial(again.cutoff, result), progress)
+    except (OSError, FormatError) as error:
+        scenes = result["data"]["scenes"]
+        ply = folder / str(_chosen(scenes, name, str)) / "points.ply"
+        if not ply.is_file():
+            raise ValueError(f"{error}; root=PATH says where the data are") from error
+        print(f"{error}; showing the points of {ply} alone (root=PATH says where the data are)", file=sys.stderr)
+        return replace(points.read(ply), name=str(_chosen(scenes, name, str)))
+    facts = {"experiment": result["experiment"], "data": result["data"]["name"], "made": result["meta"]["utc"]}
+    return replace(scene, facts={**facts, **scene.facts})
+
+
+def _remembered(folder: Path) -> str | None:
+    """Where the data of a result lay when it was made, if they are there still."""
+    note = folder / PLACE
+    root = note.read_text(encoding="utf-8", errors="replace").strip() if note.is_file() else ""
+    return root if root and Path(root).exists() else None
+
+
+def _looked(
+    parts: Mapping[str, Any], settings: Mapping[str, Any], cutoff: Callable[[str], float | None], progress: Progress
+) -> Exhibit:
+    """The chosen scene of a recording or several, computed; ``cutoff`` says by its name what is held back."""
+    chosen = _chosen(scenes_of(parts["data"]), settings["scene"], lambda scene: scene.name)
+    dtype = getattr(torch, str(settings["dtype"]), None)
+    if dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"dtype: found {settings['dtype']!r}, expected float32 or float64")
+    if not isinstance(settings["most"], int) or settings["most"] < 1:
+        raise ValueError(f"most: found {settings['most']!r}, expected a whole number of at least 1")
+    common = Settings(cutoff=cutoff(chosen.name), seed=settings["seed"], device=settings["device"], dtype=dtype)
+    options: dict[str, Any] = {"most": settings["most"], "sweep": Sweep.asked(settings["dense"]), "progress": progress}
+    shown = look(chosen, parts["method"], parts["pairs"], common, **options)
+    limit = common.cutoff_of(chosen)
+    hidden = limit is not None and limit != float("inf")
+    facts = {"samples": f"{parts['method'].n} in each pair"}
+    facts["sensor"] = f"returns beyond {limit:g} m were held back" if hidden else "all returns were used"
+    return replace(shown, facts={**facts, **shown.facts})
+
+
+def _chosen(items: Sequence[Any], wanted: str | int | None, name: Any) -> Any:
+    """The first item, or the one of that name or number."""
+    if wanted is None:
+        return items[0]
+    known = [name(item) for item in items]
+    if str(wanted) in known:
+        return items[known.index(str(wanted))]
+    if isinstance(wanted, int) and 0 <= wanted < len(known):
+        return items[wanted]
+    raise ValueError(f"scene: found {wanted!r}, expected a number below {len(known)} or one of {', '.join(known[:12])}")
+
+
+def _show(scene: Exhibit, page: str | None, save: str | None, folder: Path) -> list[str]:
+    """Write or open what is asked for; lines that say where."""
+    said = []
+    if page is None and save is None:
+        if importlib.util.find_spec("rerun") is None:
+            page = str(folder / "view.html")
+            said.append("Rerun is not installed (pip install 'dhtorch[view]'): made a page instead")
+        elif not _has_screen():
+            save = str(folder / "view.rrd")
+        else:
+            rrd.spawn(scene)
+            said.append(f"{scene.name}: {many(len(scene.shots), 'pair')} in Rerun's viewer")
+    if page is not None:
+        path = html.write(Path(page), scene)
+        said.append(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB): open it in any browser")
+    if save is not None:
+        path = rrd.save(Path(save), scene)
+        said.append(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB): rerun {path}")
+    return said
+
+
+def _has_screen() -> bool:
+    return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

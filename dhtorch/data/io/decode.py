@@ -1,0 +1,384 @@
+"""Decoding: the only place where bytes become arrays.
+
+Every function returns plain numpy arrays or Python values and checks lengths and headers *before* a decoder sees the
+bytes. Whatever is wrong with a file is a :class:`FormatError`: one line with the file, the field, what was found and
+what was expected.
+
+Bytes come through the doors of :mod:`dhtorch.data.io.safe_open`.
+
+Alphabet: ``hw`` (height, width); depth and disparity maps are (h, w) float32.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import re
+import struct
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from dhtorch.data.io.safe_open import FormatError, allow, opened, unreadable
+
+#: No camera of ours comes near this; a header that claims more is damaged or hostile.
+MAX_PIXELS = 64_000_000
+MAX_BYTES = 256_000_000  # of an array or a file
+MAX_TEXT_BYTES = 64_000_000  # of a table or a JSON document
+#: Numbers that an error message shows.
+LISTED = 64
+
+#: Bytes that Python's own objects take, at most: of a line and a word of a table; of an object, a list, a text and an
+#: entry of a JSON document.
+_LINE, _WORD = 250, 64
+_JSON = {"{": 240, "[": 64, '"': 32, ",": 40}
+
+_LINE_ENDS = "\n\r\v\f\x1c\x1d\x1e\x85\u2028\u2029"
+
+#: Deflate makes at most 1032 bytes of one, a JPEG at most a square of pixels of one bit.
+DEFLATE = 1032
+_JPEG_PIXELS = 8 * 1024
+_MAX_SCANS, _MAX_SCANNED = 1000, 20 * MAX_PIXELS  # of a JPEG: passes over the picture, and pixels of all of them
+
+
+class ImageHeader(NamedTuple):
+    """What an image file says about itself."""
+
+    hw: tuple[int, int]
+    channels: int
+    bits: int  # per channel
+    kind: str  # "png" or "jpeg"
+
+
+def need(*libraries: str, extra: str = "data") -> ModuleType:
+    """The first of ``libraries`` that is installed: decoders of rare formats are not a dependency of the package.
+
+    Raises:
+        ImportError: none is; the message names the extra that brings one.
+    """
+    for library in libraries:
+        try:
+            return importlib.import_module(library)
+        except ImportError:
+            continue
+    names = " or ".join(libraries)
+    raise ImportError(f"this format needs {names}, which is not installed: pip install 'dhtorch[{extra}]'")
+
+
+def set_opencv_threads(threads: int) -> None:
+    """Threads of OpenCV in this process; torch has its own count, and a data-loader worker should have one of each."""
+    cv2.setNumThreads(threads)
+
+
+# ---------------------------------------------------------------------------------------------------------- images
+
+
+def read_image(file: Path, hw: tuple[int, int] | None = None) -> np.ndarray:
+    """Image (C, H, W) uint8, RGB or grey, as stored: an orientation tag is not applied, K belongs to these pixels.
+
+    Raises:
+        FormatError: missing, truncated or unknown file; not 8 bits; another size than ``hw``.
+    """
+    return decode_image(read_bytes(file), file, hw)
+
+
+def decode_image(data: bytes, file: Path, hw: tuple[int, int] | None = None) -> np.ndarray:
+    """As :func:`read_image`, of bytes that lie in an archive; ``file`` names them in errors."""
+    header = _checked_header(file, data, hw)
+    if header.bits != 8:
+        raise FormatError(file, "bits per channel", header.bits, 8)
+    flag = cv2.IMREAD_GRAYSCALE if header.channels == 1 else cv2.IMREAD_COLOR
+    image = _decode(file, data, flag | cv2.IMREAD_IGNORE_ORIENTATION, header.hw)
+    if image.ndim == 2:
+        return image[None]
+    return np.ascontiguousarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB).transpose(2, 0, 1))
+
+
+def read_depth_png(
+    file: Path,
+    units_per_metre: float,
+    hw: tuple[int, int] | None = None,
+    invalid: Sequence[int] = (0,),
+) -> np.ndarray:
+    """Depth (h, w) in m from a 16-bit one-channel PNG; 0 where the code is one of ``invalid`` (0 always is).
+
+    Raises:
+        FormatError: missing, truncated or unknown file; not one channel of 16 bits; another size than ``hw``.
+    """
+    return decode_depth_png(read_bytes(file), file, units_per_metre, hw, invalid)
+
+
+def decode_depth_png(
+    data: bytes,
+    file: Path,
+    units_per_metre: float,
+    hw: tuple[int, int] | None = None,
+    invalid: Sequence[int] = (0,),
+) -> np.ndarray:
+    """As :func:`read_depth_png`, of bytes that lie in an archive; ``file`` names them in errors."""
+    header = _checked_header(file, data, hw)
+    if (header.kind, header.channels, header.bits) != ("png", 1, 16):
+        found = f"{header.kind} with {header.channels} channels of {header.bits} bits"
+        raise FormatError(file, "depth", found, "png with 1 channel of 16 bits")
+    code = _decode(file, data, cv2.IMREAD_UNCHANGED, header.hw)
+    return to_metres(code, units_per_metre, invalid)
+
+
+def to_metres(code: np.ndarray, units_per_metre: float, invalid: Sequence[int] = (0,)) -> np.ndarray:
+    """Depth float32 in m of codes of any shape; 0 where the code is one of ``invalid``."""
+    depth = code.astype(np.float32) / np.float32(units_per_metre)
+    for value in invalid:
+        depth[code == value] = 0
+    return depth
+
+
+def image_header(file: Path) -> ImageHeader:
+    """Size and type of a PNG or JPEG file without decoding it.
+
+    Raises:
+        FormatError: missing, truncated or unknown file, or more than ``MAX_PIXELS`` pixels.
+    """
+    return decode_image_header(read_bytes(file), file)
+
+
+def decode_image_header(data: bytes, file: Path) -> ImageHeader:
+    """As :func:`image_header`, of bytes that lie in an archive; ``file`` names them in errors."""
+    return _parse_header(file, data)
+
+
+def _checked_header(file: Path, data: bytes, hw: tuple[int, int] | None) -> ImageHeader:
+    header = _parse_header(file, data)
+    if hw is not None and header.hw != tuple(hw):
+        raise FormatError(file, "size", _size(header.hw), _size(hw))
+    whole = _png_is_whole(data) if header.kind == "png" else data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda")
+    if not whole:
+        raise FormatError(file, "data", f"a truncated or damaged {header.kind} file of {len(data)} bytes", "all of it")
+    scans = data.count(b"\xff\xda") if header.kind == "jpeg" else 1
+    if scans > _MAX_SCANS or (scans > 1 and scans * header.hw[0] * header.hw[1] > _MAX_SCANNED):
+        raise FormatError(file, "scans", f"{scans} passes over {_size(header.hw)} pixels", "a picture of few passes")
+    return header
+
+
+def _parse_header(file: Path, data: bytes) -> ImageHeader:
+    if data.startswith(b"\x89PNG\r\n\x1a\n") and len(data) >= 33 and data[12:16] == b"IHDR":
+        w, h, bits, colour = struct.unpack(">IIBB", data[16:26])
+        header = ImageHeader((h, w), {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}.get(colour, 0), 8 if colour == 3 else bits, "png")
+    elif data.startswith(b"\xff\xd8"):
+        header = _jpeg_header(file, data)
+    else:
+        raise FormatError(file, "content", f"{data[:8]!r}", "a PNG or JPEG image")
+    if not 0 < header.hw[0] * header.hw[1] <= MAX_PIXELS:
+        raise FormatError(file, "size", _size(header.hw), f"1 to {MAX_PIXELS} pixels")
+    if header.hw[0] * header.hw[1] > len(data) * (_JPEG_PIXELS if header.kind == "jpeg" else 8 * DEFLATE):
+        raise FormatError(file, "size", f"{_size(header.hw)} in {len(data)} bytes", "as many bytes as pixels need")
+    return header
+
+
+def _jpeg_header(file: Path, data: bytes) -> ImageHeader:
+    at = 2
+    while at + 9 < len(data) and data[at] == 0xFF:
+        marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            bits, h, w, channels = struct.unpack(">BHHB", data[at + 4 : at + 10])
+            return ImageHeader((h, w), channels, bits, "jpeg")
+        at += 1 if marker == 0xFF else 2 + length
+    raise FormatError(file, "content", f"a JPEG of {len(data)} bytes without a frame header", "a whole JPEG image")
+
+
+def _png_is_whole(data: bytes) -> bool:
+    """Walk the chunks: every length fits, every check sum holds, the last one is IEND."""
+    at = 8
+    while at + 12 <= len(data):
+        length = int.from_bytes(data[at : at + 4], "big")
+        end = at + 12 + length
+        if end > len(data) or zlib.crc32(data[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
+            return False
+        if data[at + 4 : at + 8] == b"IEND":
+            return True
+        at = end
+    return False
+
+
+def _decode(file: Path, data: bytes, flags: int, hw: tuple[int, int]) -> np.ndarray:
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error as error:
+        raise FormatError(file, "data", error.err, "a decodable image") from None
+    if image is None or image.shape[:2] != tuple(hw):
+        raise FormatError(file, "data", "pixels that do not decode", f"an image of {_size(hw)}")
+    return image
+
+
+# ------------------------------------------------------------------------------------------------------------ text
+
+
+def read_table(file: Path, columns: int | None = None) -> np.ndarray:
+    """Numbers (rows, columns) float64 of a white-space separated table; ``#`` starts a comment. NaN may occur.
+
+    Raises:
+        FormatError: missing file, something that is no number, or a row of another length.
+    """
+    rows = read_rows(file)
+    width = columns or (len(rows[0][1]) if rows else 0)
+    values = np.empty((len(rows), width))
+    for i, (line, words) in enumerate(rows):
+        if len(words) != width:
+            raise FormatError(file, f"line {line}", f"{len(words)} columns", f"{width} numbers")
+        try:
+            values[i] = [float(word) for word in words]
+        except ValueError:
+            raise FormatError(file, f"line {line}", " ".join(words), f"{width} numbers") from None
+    return values
+
+
+def read_rows(file: Path) -> list[tuple[int, list[str]]]:
+    """(line number, words) of every line of a text file that is neither blank nor a ``#`` comment."""
+    lines = enumerate(read_lines(file), 1)
+    return [(i, line.split()) for i, line in lines if line.strip() and not line.lstrip().startswith("#")]
+
+
+def read_lines(file: Path) -> list[str]:
+    """The lines of a text file, which may be taken apart into words.
+
+    Raises:
+        FormatError: no such text, or more lines and words than memory is allowed for.
+    """
+    text = read_text(file)
+    lines, words = (sum(map(text.count, marks)) for marks in (_LINE_ENDS, " ,\t"))
+    allow(file, "text", _LINE * lines + _WORD * words, f"{lines} lines with {words} gaps between words")
+    return text.splitlines()
+
+
+def read_json(file: Path) -> dict[str, Any]:
+    """A JSON object.
+
+    Raises:
+        FormatError: missing file, no JSON, or something else than an object on top.
+    """
+    value = decode_json(read_text(file), file)
+    if not isinstance(value, dict):
+        raise FormatError(file, "JSON", type(value).__name__, "an object")
+    return value
+
+
+def decode_json(text: str | bytes, file: Path) -> Any:
+    """Any JSON value; ``file`` names the text in errors.
+
+    Raises:
+        FormatError: no JSON, or more values than memory is allowed for.
+    """
+    raw = text.encode("utf-8", "replace") if isinstance(text, str) else text
+    counts = {mark: raw.count(mark.encode()) for mark in _JSON}
+    allow(file, "JSON", sum(_JSON[mark] * n for mark, n in counts.items()), f"{counts[',']} entries")
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:  # ValueError: bytes that are no text, too
+        raise FormatError(file, "JSON", error, "a JSON document") from None
+
+
+def get(value: Any, path: str, kind: type | tuple[type, ...], file: Path) -> Any:
+    """The entry ``"a.b.c"`` of nested JSON objects, of type ``kind``.
+
+    Raises:
+        FormatError: absent or of another type.
+    """
+    for part in path.split("."):
+        if not isinstance(value, dict) or part not in value:
+            raise FormatError(file, path, "nothing", _kind_name(kind))
+        value = value[part]
+    if not isinstance(value, kind) or isinstance(value, bool):
+        raise FormatError(file, path, repr(value), _kind_name(kind))
+    return value
+
+
+def to_array(value: Any, shape: tuple[int, ...], file: Path, field: str) -> np.ndarray:
+    """Numbers of a given shape, float64 and finite, from JSON lists, options or a table.
+
+    Raises:
+        FormatError: not numbers, another shape, or not finite.
+    """
+    expected = f"{'x'.join(map(str, shape))} finite numbers" if shape else "a finite number"
+    if value is None:
+        raise FormatError(file, field, "nothing", expected)
+    if isinstance(value, np.ndarray) and value.shape != shape:  # before a large one grows eightfold
+        raise FormatError(file, field, f"an array of shape {value.shape}", expected)
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise FormatError(file, field, repr(value), expected) from None
+    if array.shape != shape or not np.isfinite(array).all():
+        found = array.tolist() if array.size <= LISTED else f"numbers of shape {array.shape}"
+        raise FormatError(file, field, found, expected)
+    return array
+
+
+def to_positive(value: object, file: Path, field: str) -> float:
+    """A positive number that may sensibly scale something, 1e-6 to 1e6.
+
+    Raises:
+        FormatError: anything else.
+    """
+    number = float(to_array(value, (), file, field))
+    if not 1e-6 <= number <= 1e6:
+        raise FormatError(file, field, number, "a positive number, 1e-6 to 1e6")
+    return number
+
+
+def read_text(file: Path) -> str:
+    """The UTF-8 text of a file of at most ``MAX_TEXT_BYTES``."""
+    try:
+        data = read_bytes(file, MAX_TEXT_BYTES)
+        allow(file, "text", len(data) * (2 if data.isascii() else 5), f"{len(data)} bytes")
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise FormatError(file, "text", error.reason, "UTF-8") from None
+
+
+def read_bytes(file: Path, limit: int = MAX_BYTES) -> bytes:
+    """All bytes of a file, at least one and at most ``limit``.
+
+    Raises:
+        FormatError: the file is missing, unreadable, no regular file, outside the capture, empty or too large.
+    """
+    with opened(file) as stream:
+        size = os.fstat(stream.fileno()).st_size
+        if not 0 < size <= limit:
+            raise FormatError(file, "file size", f"{size} bytes", f"1 to {limit} bytes")
+        try:
+            return stream.read(limit)
+        except OSError as error:
+            raise unreadable(file, error) from None
+
+
+def natural(name: Path | str) -> tuple[object, ...]:
+    """Key of an order in which 1, 2 and 10 follow one another, with or without leading zeros."""
+    parts = re.split(r"(\d+)", str(name))
+    return tuple((not part.isdecimal(), int(part[:_DIGITS]) if part.isdecimal() else part) for part in parts)
+
+
+#: Digits of a number in a file's name that count.
+_DIGITS = 300
+
+
+def left_out(names: Sequence[int | str], why: str) -> list[str]:
+    """A line for a recording's report about frames that are not in it; none for none."""
+    if not names:
+        return []
+    shown = ", ".join(map(str, names[:6])) + (" …" if len(names) > 6 else "")
+    return [f"frame {shown}: {why}: left out" if len(names) == 1 else f"{len(names)} frames ({shown}): {why}: left out"]
+
+
+def _kind_name(kind: type | tuple[type, ...]) -> str:
+    kinds = kind if isinstance(kind, tuple) else (kind,)
+    words: dict[type, str] = {dict: "an object", list: "a list", str: "a text"}
+    return " or ".join(dict.fromkeys(words.get(k, "a number") for k in kinds))
+
+
+def _size(hw: tuple[int, int]) -> str:
+    return f"{hw[1]}x{hw[0]}"

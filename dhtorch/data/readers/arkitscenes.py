@@ -1,0 +1,369 @@
+"""ARKitScenes: an iPad's colour, LiDAR depth and confidence, poses, and depth rendered from a laser scan.
+
+A capture is a folder of *assets*, each a folder of files ``<video id>_<seconds>.png`` with a clock of its own:
+``lowres_wide``, ``vga_wide`` and ``wide`` (also called ``color``) are one camera at three sizes, ``lowres_depth`` and
+``confidence`` the LiDAR, ``highres_depth`` the laser scan; ``<asset>_intrinsics`` holds ``.pincam`` lines
+``width height fx fy cx cy``. ``lowres_wide.traj`` has ``seconds rx ry rz tx ty tz``, *world-to-camera*, at a sixth of
+the frame rate. The world's z axis points up; pictures are stored as the sensor lies, often sideways.
+
+The three downloads of one capture (``raw``, ``3dod``, ``upsampling``) complete each other: what ``root`` lacks is
+looked for in the same capture's folder of the other two, where they lie beside one another as they were downloaded.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dhtorch.data import convert
+from dhtorch.data.clocks import nearest, poses_at
+from dhtorch.data.io import decode as files
+from dhtorch.data.io.decode import FormatError
+from dhtorch.data.laser import judged
+from dhtorch.data.recording import MeasuredRecording, Recording
+from dhtorch.geometry.camera import resize
+from dhtorch.records import Camera, Frame
+from dhtorch.runtime.console import many
+
+#: Colour assets and their folders, in the order in which one is chosen.
+IMAGES = {"lowres_wide": ("lowres_wide",), "vga_wide": ("vga_wide",), "wide": ("wide", "color")}
+
+_SUBSETS, _SPLITS = ("raw", "3dod", "upsampling"), ("Training", "Validation")
+_STAMP = re.compile(r"[^/]*_(\d{1,10}(?:\.\d{1,9})?)\.(png|pincam)")
+_UNITS_PER_METRE = 1000.0
+
+#: File names carry milliseconds: stamps this close are one instant.
+_SAME = 0.0011  # s
+#: A pose and an image this close have the same stamp once both are rounded to milliseconds.
+_ROUNDING = 0.00051  # s
+#: A mean direction of gravity shorter than this in the plane of the picture names no side of it.
+_MIN_SIDEWAYS = 0.1
+
+
+def recognise(root: Path) -> str | None:
+    """What makes ``root`` a recording of this format, in words; None if nothing does."""
+    assets = [name for names in IMAGES.values() for name in names] + ["lowres_depth", "highres_depth"]
+    found = [name for name in assets if any((place / name).is_dir() for place in _places(root)[:2])]
+    telling = {"lowres_wide", "vga_wide", "lowres_depth", "highres_depth"}
+    return f"ARKitScenes assets {', '.join(found)}" if len(found) > 1 and telling & {*found} else None
+
+
+def read(
+    root: str | Path,
+    *,
+    image: str | None = None,
+    poses: bool = True,
+    interpolate: bool = True,
+    upright: bool = True,
+    truth: bool = True,
+    max_difference: float = 0.010,
+    max_pose_difference: float = 0.005,
+    max_pose_gap: float = 0.15,
+    max_truth_gap: float = 0.080,
+    max_disagreement: float = 0.05,
+) -> list[Recording]:
+    """Open one capture.
+
+    The depth is ``lowres_depth`` with its confidence. Nothing is ever taken over from an earlier frame: an image
+    without a partner in time is left out and reported.
+
+    Args:
+        root: the capture's folder, named by its video id, or its ``<video id>_frames``.
+        image: ``lowres_wide`` | ``vga_wide`` | ``wide``. None = the first of these that is there.
+        poses: read the trajectory and leave out images it does not cover. False keeps every image with depth. A
+            capture without a trajectory (some have none) keeps every image too, and says so.
+        interpolate: images between two poses get one: position linear, rotation on the shortest way. False keeps only
+            images with a pose of their own.
+        upright: turn image, depth, confidence, intrinsics and pose together so that the sky is on top. The poses
+            decide (the table's ``sky_direction`` is unreliable and never read); without them nothing is turned.
+        truth: take ``highres_depth`` for the truth, where there is any; the recording then has ``truth(i)``.
+        max_difference: s, from image to depth, and to borrowed intrinsics. A little more than half a period at 60 Hz.
+        max_pose_difference: s, from an image to a pose of its own.
+        max_pose_gap: s, between two poses that are interpolated. They come at about 10 Hz: one lost pose is a gap.
+        max_truth_gap: s, from image to laser depth.
+        max_disagreement: median relative difference of laser and LiDAR over the pixels they share, beyond which a
+            laser depth map is rejected. This limit is our choice: the paper gives only what its accepted maps reached.
+
+    Returns:
+        One recording at the stamps of the images, with ``truth(i)`` where there is laser depth. Not every capture may
+        ship intrinsics of ``wide`` (unconfirmed): those of another size of the same camera, nearest in time, then
+        serve, scaled exactly, and the report says so.
+
+    Raises:
+        FormatError: a missing asset, nothing that associates, or a damaged file.
+    """
+    root = Path(root)
+    limits = {"max_difference": max_difference, "max_pose_difference": max_pose_difference}
+    limits |= {"max_pose_gap": max_pose_gap, "max_truth_gap": max_truth_gap, "max_disagreement": max_disagreement}
+    for option, limit in limits.items():
+        files.to_positive(limit, root, f"option {option}")
+    places = _places(root)
+    name, pictures = _pictures(root, places, image)
+    links, report = _links(root, places, name, pictures.times, max_difference)
+    has = {what: link.at >= 0 for what, link in links.items()}
+    trajectory = _find(places, "lowres_wide.traj") if poses else None
+    if poses and trajectory is None:
+        report.append("no lowres_wide.traj: frames have no pose, and stay as stored")
+    c2w = np.eye(4)[None]
+    if trajectory is not None:
+        gap = max_pose_gap if interpolate else 0.0
+        c2w, has["a pose"] = _read_poses(trajectory, pictures.times, max_pose_difference, gap)
+    kept = _kept(root, name, has, report)
+    turns, c2w = 0, c2w[kept] if trajectory else c2w
+    if upright and trajectory:
+        turns = _turns(c2w, report)
+    load = _loader(name, pictures, links, kept, turns)
+    times = pictures.times[kept]
+    fields: dict[str, Any] = {"name": _video_id(root), "format": "arkitscenes", "root": root, "load": load}
+    fields |= {"number": torch.from_numpy(kept), "times": torch.from_numpy(times)}
+    fields |= {"rate_hz": float(1 / np.median(np.diff(times))) if len(times) > 1 else None}
+    if trajectory:
+        fields["poses"] = convert.to_poses(convert.turn_pose(c2w, turns), trajectory)
+    laser = _stamped(places, ("highres_depth",), "png") if truth else None
+    if laser is None:
+        return [Recording(**fields, report=tuple(report))]
+    load_truth = _truth_loader(places, laser, times, load, max_truth_gap, max_disagreement)
+    if (without := load_truth.depths.count(None)) > 0:
+        report.append(f"{many(without, 'frame')} without laser depth within {max_truth_gap} s: no truth")
+    return [MeasuredRecording(**fields, load_truth=load_truth, report=tuple(report))]
+
+
+# ---------------------------------------------------------------------------------------------------------- one frame
+
+
+@dataclass(frozen=True, eq=False)
+class _Load:
+    """Position → frame."""
+
+    images: tuple[Path, ...]
+    pincams: tuple[Path, ...]
+    borrowed: bool  # the pincams belong to another size of the same camera
+    depths: tuple[Path, ...]
+    depth_pincams: tuple[Path, ...] | None  # None = the camera of the image, scaled
+    confs: tuple[Path, ...] | None
+    turns: int
+
+    def __call__(self, i: int) -> Frame:
+        hw, camera = self.view(i)
+        image = torch.from_numpy(files.read_image(self.images[i], hw))
+        depth, depth_camera = self.sensor(i)
+        depth_hw = (depth.shape[0], depth.shape[1])
+        conf = None if self.confs is None else torch.from_numpy(_confidence(self.confs[i], depth_hw))
+        return Frame(
+            image=convert.turn_picture(image, self.turns)[None],
+            depth=convert.turn_picture(depth, self.turns)[None],
+            camera=convert.turn_camera(camera, hw, self.turns),
+            depth_camera=depth_camera and convert.turn_camera(depth_camera, depth_hw, self.turns),
+            conf=None if conf is None else convert.turn_picture(conf, self.turns)[None],
+        )
+
+    def view(self, i: int) -> tuple[tuple[int, int], Camera]:
+        """Size and camera of image ``i`` as stored."""
+        hw, camera = _pincam(self.pincams[i])
+        if not self.borrowed:
+            return hw, camera
+        own = files.image_header(self.images[i]).hw
+        return own, resize(camera, hw, own)
+
+    def sensor(self, i: int) -> tuple[Tensor, Camera | None]:
+        """LiDAR depth of frame ``i`` as stored, and its camera."""
+        hw, camera = (None, None) if self.depth_pincams is None else _pincam(self.depth_pincams[i])
+        return torch.from_numpy(files.read_depth_png(self.depths[i], _UNITS_PER_METRE, hw)), camera
+
+
+@dataclass(frozen=True, eq=False)
+class _LoadTruth:
+    """Position → laser depth at the pixels of the image, and how far it is from the LiDAR."""
+
+    load: _Load
+    depths: tuple[Path | None, ...]
+    pincams: tuple[Path | None, ...]  # None = the camera of the image, scaled
+    max_disagreement: float
+
+    def __call__(self, i: int) -> tuple[Tensor, float]:
+        (hw, camera), file, pincam = self.load.view(i), self.depths[i], self.pincams[i]
+        depth, off = torch.zeros(hw), float("nan")
+        if file is not None:
+            laser_hw, laser_camera = (None, None) if pincam is None else _pincam(pincam)
+            laser = torch.from_numpy(files.read_depth_png(file, _UNITS_PER_METRE, laser_hw))
+            sensor, sensor_camera = self.load.sensor(i)
+            laser_camera = laser_camera or resize(camera, hw, (laser.shape[0], laser.shape[1]))
+            sensor_camera = sensor_camera or resize(camera, hw, (sensor.shape[0], sensor.shape[1]))
+            depth, off = judged(laser, laser_camera, sensor, sensor_camera, camera, hw, self.max_disagreement)
+        return convert.turn_picture(depth, self.load.turns), off
+
+
+def _pincam(file: Path) -> tuple[tuple[int, int], Camera]:
+    """Size of the picture that the intrinsics belong to, and its camera."""
+    rows = files.read_table(file, 6)
+    w, h, fx, fy, cx, cy = files.to_array(rows[0] if len(rows) == 1 else None, (6,), file, "intrinsics").tolist()
+    if min(w, h) < 1 or w * h > files.MAX_PIXELS or w % 1 or h % 1:
+        raise FormatError(file, "width and height", f"{w:g} {h:g}", "the size of a picture")
+    hw = (int(h), int(w))
+    return hw, convert.to_camera(convert.matrix_of(fx, fy, cx, cy), hw, file, "intrinsics")
+
+
+def _confidence(file: Path, hw: tuple[int, int]) -> np.ndarray:
+    """Levels (h, w) uint8, 0 low to 2 high."""
+    level = files.read_image(file, hw)
+    if level.shape[0] != 1 or level.max() > 2:
+        found = f"{level.shape[0]} channels up to {level.max()}"
+        raise FormatError(file, "confidence", found, "1 channel of 0, 1 or 2")
+    return level[0]
+
+
+# --------------------------------------------------------------------------------------------- what is there, and when
+
+
+class _Stamped(NamedTuple):
+    """Files of one asset."""
+
+    times: np.ndarray  # (n,) s, strictly increasing
+    files: tuple[Path, ...]
+
+
+class _Link(NamedTuple):
+    """For each image the file of another asset that belongs to it."""
+
+    stamped: _Stamped
+    at: np.ndarray  # index of the file, −1 = none
+
+
+def _video_id(root: Path) -> str:
+    return root.resolve().name.removesuffix("_frames")
+
+
+def _places(root: Path) -> list[Path]:
+    """Folders that may hold assets of the capture: its own two, then those of the other downloads."""
+    frames, own = f"{_video_id(root)}_frames", root.resolve()
+    capture = own.parent if own.name == frames and own.parent.name == _video_id(root) else own
+    places, split = [root, root / frames], capture.parent
+    if split.name in _SPLITS and split.parent.name in _SUBSETS:
+        others = [split.parent.parent / subset / split.name / capture.name for subset in _SUBSETS]
+        places += [place for other in others if other != capture for place in (other, other / frames)]
+    return places
+
+
+def _find(places: Sequence[Path], *names: str) -> Path | None:
+    """The first of ``names`` that exists, own folders first."""
+    return next((place / name for place in places for name in names if (place / name).exists()), None)
+
+
+def _stamped(places: Sequence[Path], names: Sequence[str], suffix: str) -> _Stamped | None:
+    """Files of an asset by the number in their names (in the order of letters 100.0 comes before 99.9)."""
+    folder = _find(places, *names)
+    listed: dict[float, Path] = {}
+    for entry in sorted(folder.iterdir()) if folder is not None and folder.is_dir() else ():
+        if (match := _STAMP.fullmatch(entry.name)) and match[2] == suffix:
+            listed.setdefault(float(match[1]), entry)
+    times = sorted(listed)
+    return _Stamped(np.array(times), tuple(listed[t] for t in times)) if times else None
+
+
+def _pictures(root: Path, places: Sequence[Path], image: str | None) -> tuple[str, _Stamped]:
+    if image not in (None, *IMAGES):
+        raise FormatError(root, "option image", image, f"one of {', '.join(IMAGES)}")
+    for name in (image,) if image else IMAGES:
+        if (pictures := _stamped(places, IMAGES[name], "png")) is not None:
+            return name, pictures
+    raise FormatError(root, image or "images", "none", "<video id>_<seconds>.png in a folder of that name")
+
+
+def _links(
+    root: Path, places: Sequence[Path], name: str, times: np.ndarray, max_difference: float
+) -> tuple[dict[str, _Link], list[str]]:
+    """What belongs to each image, named as the report needs it, and remarks."""
+    report = []
+    depths = _stamped(places, ("lowres_depth",), "png")
+    if depths is None:
+        raise FormatError(root, "lowres_depth", "none", "<video id>_<seconds>.png in a folder of that name")
+    depth = nearest(times, depths.times, max_difference)
+    links = {"depth": _Link(depths, depth)}
+    if (confs := _stamped(places, ("confidence",), "png")) is None:
+        report.append("no confidence: every return counts alike")
+    else:
+        links["confidence"] = _Link(confs, np.where(depth < 0, -1, nearest(depths.times[depth], confs.times, _SAME)))
+    own = _stamped(places, [f"{folder}_intrinsics" for folder in IMAGES[name]], "pincam")
+    small = _stamped(places, ("lowres_wide_intrinsics",), "pincam")
+    pincams = own or _stamped(places, ("vga_wide_intrinsics",), "pincam") or small
+    if pincams is None:
+        raise FormatError(root, f"{name}_intrinsics", "none, nor any to scale", "<video id>_<seconds>.pincam")
+    if own is not None:
+        links["intrinsics"] = _Link(own, nearest(times, own.times, _SAME))
+    else:
+        report.append(f"no {name}_intrinsics: {pincams.files[0].parent.name}, scaled")
+        links["borrowed intrinsics"] = _Link(pincams, nearest(times, pincams.times, max_difference))
+    if small is not None and name != "lowres_wide":
+        links["intrinsics of the depth"] = _Link(small, nearest(times, small.times, max_difference))
+    return links, report
+
+
+def _kept(root: Path, name: str, has: dict[str, np.ndarray], report: list[str]) -> np.ndarray:
+    """Numbers of the images that have everything; how many lack what goes into the report."""
+    keep = np.ones_like(has["depth"])
+    for what, mask in has.items():
+        if (lost := int((keep & ~mask).sum())) > 0:
+            report.append(f"{many(lost, 'image')} without {what}: left out")
+        keep &= mask
+    if not keep.any():
+        raise FormatError(root, f"frames of {name}", "; ".join(report), "images with depth, intrinsics and pose")
+    return np.flatnonzero(keep)
+
+
+def _loader(name: str, pictures: _Stamped, links: dict[str, _Link], kept: np.ndarray, turns: int) -> _Load:
+    chosen = {what: tuple(link.stamped.files[j] for j in link.at[kept]) for what, link in links.items()}
+    return _Load(
+        images=tuple(pictures.files[i] for i in kept),
+        pincams=chosen.get("intrinsics") or chosen["borrowed intrinsics"],
+        borrowed="intrinsics" not in chosen,
+        depths=chosen["depth"],
+        depth_pincams=chosen.get("intrinsics of the depth"),
+        confs=chosen.get("confidence"),
+        turns=turns,
+    )
+
+
+def _truth_loader(
+    places: Sequence[Path], laser: _Stamped, times: np.ndarray, load: _Load, max_gap: float, max_disagreement: float
+) -> _LoadTruth:
+    at = nearest(times, laser.times, max_gap)
+    depths = tuple(laser.files[j] if j >= 0 else None for j in at)
+    pincams: tuple[Path | None, ...] = (None,) * len(at)
+    if (wide := _stamped(places, ("wide_intrinsics", "color_intrinsics"), "pincam")) is not None:
+        own = nearest(laser.times[at], wide.times, _SAME)
+        pincams = tuple(wide.files[k] if j >= 0 and k >= 0 else None for j, k in zip(at, own, strict=True))
+    return _LoadTruth(load, depths, pincams, max_disagreement)
+
+
+def _read_poses(file: Path, times: np.ndarray, max_difference: float, max_gap: float) -> tuple[np.ndarray, np.ndarray]:
+    """Camera-to-world matrices (n, 4, 4) at ``times``, and which of them are covered."""
+    rows = files.read_table(file, 7)
+    rows = rows[np.isfinite(rows).all(-1)]
+    rows = rows[np.unique(rows[:, 0], return_index=True)[1]]
+    if len(rows) == 0:
+        raise FormatError(file, "poses", "no usable row", "rows of stamp, rotation vector and translation")
+    q = convert.to_quaternions(rows[:, 1:4])
+    R = convert.to_c2w(q, rows[:, 4:], file, "rotation")[:, :3, :3]  # world to camera
+    centre = -np.einsum("nji,nj->ni", R, rows[:, 4:])
+    inverse = q * [-1, -1, -1, 1]
+    limits = {"same": _ROUNDING, "max_difference": max_difference, "max_gap": max_gap}
+    q_at, t_at, covered = poses_at(times, rows[:, 0], inverse, centre, **limits)
+    return convert.to_c2w(q_at, t_at, file, "rotation"), covered
+
+
+def _turns(c2w: np.ndarray, report: list[str]) -> int:
+    """Quarter turns clockwise that bring the sky to the top in the mean over the frames."""
+    x, y, _ = c2w[:, 2, :3].mean(0)  # the world's up in the axes of the camera
+    if max(abs(x), abs(y)) < _MIN_SIDEWAYS:
+        report.append("the camera looks straight up or down: pictures stay as stored")
+        return 0
+    if abs(x) > abs(y):
+        return 1 if x < 0 else 3
+    return 0 if y < 0 else 2

@@ -1,0 +1,236 @@
+"""CA-1M (Cubify Anything): ARKitScenes captures with a laser pose and laser depth for every frame.
+
+One WebDataset archive ``ca1m-<split>-<video id>.tar`` per capture, with members ``<video id>/<nanoseconds>.<what>``:
+``wide/image`` (PNG), ``wide/depth`` (16 bits, mm, the iPad's LiDAR), ``wide/depth/confidence`` (TIFF), ``gt/depth``
+(16 bits, mm, rendered from the laser scan, 0 = not registered), ``wide/image/K``, ``wide/depth/K``, ``gt/depth/K``
+(JSON, 3×3) and ``gt/RT`` (JSON, 4×4). The archive is read in place.
+
+Pictures are upright already, so sizes may be transposed; K and pose belong to them as they are. ``T_gravity`` and the
+boxes (``instances``) are not read: no stage asks for them. Extensions are ignored, the content says what a member is.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dhtorch.data import convert
+from dhtorch.data.codecs import tarballs, tiff
+from dhtorch.data.io import decode as files
+from dhtorch.data.io.decode import FormatError
+from dhtorch.data.laser import judged
+from dhtorch.data.recording import MeasuredRecording, Recording, Recordings
+from dhtorch.geometry.camera import resize
+from dhtorch.records import Camera, Frame
+from dhtorch.runtime.console import many
+
+_MEMBER = re.compile(r"(?:\./)?(\d{1,15})/(\d{1,18})\.([a-z_/]{1,80})\.[a-z]{1,8}", re.IGNORECASE)
+_NEEDED = ("wide/image", "wide/image/k", "wide/depth", "gt/rt")
+_OPTIONAL = ("wide/depth/k", "wide/depth/confidence")  # where some frames have it, all must
+_TRUTH = ("gt/depth", "gt/depth/k")
+_KNOWN = {*_NEEDED, *_OPTIONAL, *_TRUTH}
+_UNITS_PER_METRE = 1000.0
+
+
+def recognise(root: Path) -> str | None:
+    """What makes ``root`` a recording of this format, in words; None if nothing does."""
+    if root.is_dir():
+        archives = sorted(root.glob("ca1m-*.tar"))
+        return f"{len(archives)} CA-1M archives" if archives else None
+    if root.suffix != ".tar":
+        return None
+    try:
+        names = [member.name for member in islice(tarballs.members(root), 32)]
+    except FormatError:
+        return None
+    found = {match[3].lower() for name in names if (match := _MEMBER.fullmatch(name))}
+    return "a tar archive of <video>/<time>.wide and .gt members" if found & _KNOWN else None
+
+
+def read(
+    root: str | Path,
+    *,
+    confidence: str | None = "unit",
+    truth: bool = True,
+    max_disagreement: float = 0.05,
+) -> Recordings:
+    """Open an archive, or a folder of them.
+
+    Args:
+        root: ``ca1m-*.tar``, or the folder that holds such archives.
+        confidence: how the confidence is stored. The authors say a value in [0, 1] (no file was at hand: unconfirmed).
+            ``"unit"``: that; below 0.25 counts as low, from 0.75 on as high. ``"level"``: 0, 1 or 2. None: not read.
+        truth: take ``gt/depth`` for the truth; the recording then has ``truth(i)``.
+        max_disagreement: median relative difference of laser and LiDAR over the pixels they share, beyond which a
+            laser depth map is rejected.
+
+    Returns:
+        One recording for each archive, opened when that one is asked for, at the capture's own frame rate. A frame that
+        lacks its image, its depth, its intrinsics or its pose is left out and reported; so is one without confidence,
+        or without intrinsics of the depth, where others have them (without any, the depth shares the camera of the
+        image, scaled).
+
+    Raises:
+        FormatError: no archive; of a single one also no complete frame, a damaged archive or member.
+    """
+    root = Path(root)
+    files.to_positive(max_disagreement, root, "option max_disagreement")
+    if confidence not in ("unit", "level", None):
+        raise FormatError(root, "option confidence", confidence, "unit, level or None")
+    archives = sorted(root.glob("ca1m-*.tar")) if root.is_dir() else [root]
+    if not archives:
+        raise FormatError(root, "archives", "none", "ca1m-<split>-<video id>.tar")
+    skip = {"wide/depth/confidence"} if confidence is None else set()
+    skip |= set() if truth else {"gt/depth"}
+    return Recordings(
+        [archive.stem for archive in archives], _Make(tuple(archives), skip, confidence, max_disagreement)
+    )
+
+
+@dataclass(frozen=True)
+class _Make:
+    """Position → recording."""
+
+    archives: tuple[Path, ...]
+    skip: set[str]
+    confidence: str | None
+    max_disagreement: float
+
+    def __call__(self, i: int) -> Recording:
+        archive = self.archives[i]
+        return _recording(archive, _index(archive, self.skip), self.confidence, self.max_disagreement)
+
+
+@dataclass(frozen=True, eq=False)
+class _Load:
+    """Position → frame."""
+
+    archive: Path
+    stamps: tuple[str, ...]  # <video id>/<nanoseconds>
+    spans: dict[str, np.ndarray]  # what → (n, 2) offset and size of the member, −1 = none
+    confidence: str | None
+
+    def __call__(self, i: int) -> Frame:
+        image = torch.from_numpy(files.decode_image(*self.member(i, "wide/image")))
+        depth = self.depth(i, "wide/depth")
+        hw = (depth.shape[0], depth.shape[1])
+        conf = None
+        if "wide/depth/confidence" in self.spans:
+            conf = torch.from_numpy(_levels(*self.member(i, "wide/depth/confidence"), hw, self.confidence))[None]
+        return Frame(
+            image=image[None],
+            depth=depth[None],
+            camera=self.camera(i, "wide/image/k", (image.shape[1], image.shape[2])),
+            depth_camera=self.camera(i, "wide/depth/k", hw) if "wide/depth/k" in self.spans else None,
+            conf=conf,
+        )
+
+    def member(self, i: int, what: str) -> tuple[bytes, Path]:
+        """Bytes of a member and the name it has in errors."""
+        offset, size = self.spans[what][i].tolist()
+        return tarballs.read_member(self.archive, offset, size), self.archive / f"{self.stamps[i]}.{what}"
+
+    def depth(self, i: int, what: str) -> Tensor:
+        """Depth (h, w) m."""
+        return torch.from_numpy(files.decode_depth_png(*self.member(i, what), _UNITS_PER_METRE))
+
+    def camera(self, i: int, what: str, hw: tuple[int, int]) -> Camera:
+        """Intrinsics of a picture of size ``hw``."""
+        data, file = self.member(i, what)
+        return convert.to_camera(_matrix(data, file, 3), hw, file, "K")
+
+
+@dataclass(frozen=True, eq=False)
+class _LoadTruth:
+    """Position → laser depth at the pixels of the image, and how far it is from the LiDAR."""
+
+    load: _Load
+    max_disagreement: float
+
+    def __call__(self, i: int) -> tuple[Tensor, float]:
+        load = self.load
+        hw = files.decode_image_header(*load.member(i, "wide/image")).hw
+        if load.spans["gt/depth"][i, 0] < 0:
+            return torch.zeros(hw), float("nan")
+        camera = load.camera(i, "wide/image/k", hw)
+        maps, seen_by = [], []
+        for what in ("gt/depth", "wide/depth"):
+            depth = load.depth(i, what)
+            own, size = load.spans.get(f"{what}/k"), (depth.shape[0], depth.shape[1])
+            has = own is not None and own[i, 0] >= 0
+            seen_by.append(load.camera(i, f"{what}/k", size) if has else resize(camera, hw, size))
+            maps.append(depth)
+        return judged(maps[0], seen_by[0], maps[1], seen_by[1], camera, hw, self.max_disagreement)
+
+
+def _index(archive: Path, skip: set[str]) -> dict[tuple[int, str], dict[str, tuple[int, int]]]:
+    """(time in ns, its member prefix) → what → (offset, size); times in their order."""
+    frames: dict[tuple[int, str], dict[str, tuple[int, int]]] = {}
+    for member in tarballs.members(archive):
+        match = _MEMBER.fullmatch(member.name)
+        if match and (what := match[3].lower()) in _KNOWN - skip:
+            frame = frames.setdefault((int(match[2]), f"{match[1]}/{match[2]}"), {})
+            frame[what] = member.offset, member.size
+    return dict(sorted(frames.items()))
+
+
+def _recording(
+    archive: Path,
+    frames: dict[tuple[int, str], dict[str, tuple[int, int]]],
+    confidence: str | None,
+    max_disagreement: float,
+) -> Recording:
+    there = set().union(*frames.values())
+    needed = [*_NEEDED, *(what for what in _OPTIONAL if what in there)]
+    report = []
+    keys = list(frames)
+    for what in needed:
+        kept = [key for key in keys if what in frames[key]]
+        if len(kept) < len(keys):
+            report.append(f"{many(len(keys) - len(kept), 'frame')} without {what}: left out")
+        keys = kept
+    if not keys:
+        raise FormatError(archive, "frames", "; ".join(report) or "none", f"members {', '.join(needed)}")
+    if confidence and "wide/depth/confidence" not in there:
+        report.append("no confidence: every return counts alike")
+    spans = {
+        what: np.array([frames[key].get(what, (-1, 0)) for key in keys], dtype=np.int64)
+        for what in {*needed, *_TRUTH} & there
+    }
+    load = _Load(archive, tuple(stamp for _, stamp in keys), spans, confidence)
+    c2w = np.stack([_matrix(*load.member(i, "gt/rt"), 4) for i in range(len(keys))])
+    times = np.array([time for time, _ in keys]) / 1e9
+    place = {key: number for number, key in enumerate(frames)}
+    fields: dict[str, Any] = {"name": archive.stem, "format": "ca1m", "load": load, "root": archive}
+    fields |= {"number": torch.tensor([place[key] for key in keys]), "times": torch.from_numpy(times)}
+    fields |= {"poses": convert.to_poses(c2w, archive, "gt/RT")}
+    fields |= {"rate_hz": float(1 / np.median(np.diff(times))) if len(times) > 1 else None}
+    if "gt/depth" not in spans:
+        return Recording(**fields, report=tuple(report))
+    if (without := int((spans["gt/depth"][:, 0] < 0).sum())) > 0:
+        report.append(f"{many(without, 'frame')} without gt/depth: no truth")
+    return MeasuredRecording(**fields, load_truth=_LoadTruth(load, max_disagreement), report=tuple(report))
+
+
+def _matrix(data: bytes, file: Path, n: int) -> np.ndarray:
+    """n×n numbers of a JSON document: rows, or all of them in one list."""
+    value = files.decode_json(data, file)
+    flat = isinstance(value, list) and len(value) == n * n
+    return files.to_array(value, (n * n,) if flat else (n, n), file, "matrix").reshape(n, n)
+
+
+def _levels(data: bytes, file: Path, hw: tuple[int, int], stored: str | None) -> np.ndarray:
+    """Confidence (h, w) uint8, 0 low to 2 high."""
+    value = tiff.decode_tiff(data, file, hw).astype(np.float64)
+    top = 2 if stored == "level" else 1
+    if not ((value >= 0) & (value <= top)).all():
+        expected = f"0 to {top} (option confidence: unit or level)"
+        raise FormatError(file, "confidence", f"{np.nanmin(value):g} to {np.nanmax(value):g}", expected)
+    return np.floor(value * (2 / top) + 0.5).astype(np.uint8)

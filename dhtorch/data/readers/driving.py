@@ -1,0 +1,217 @@
+"""A car with several cameras and a LiDAR, in the DGP scene layout: one recording per camera.
+
+``scene_*.json`` lists *samples* (instants), each with its data: an image per camera and one LiDAR sweep, every one with
+its own sensor-to-world pose (quaternion and translation) and stamp; ``calibration/<key>.json`` has the intrinsics by
+sensor name; ``point_cloud/…npz`` holds the points in the LiDAR's own frame, one row each.
+
+The depth map of an image is the sweep of its instant, taken to the world with the sweep's pose and into the camera with
+the image's: sparse, z-buffered, nothing filled in. Things that moved between the two stamps are misplaced by that much.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from dhtorch.data import convert
+from dhtorch.data.codecs import npy
+from dhtorch.data.io import decode as files
+from dhtorch.data.io.decode import FormatError
+from dhtorch.data.recording import Recording
+from dhtorch.geometry import se3
+from dhtorch.records import Camera, Frame, Pose
+
+
+def recognise(root: Path) -> str | None:
+    """What makes ``root`` a recording of this format, in words; None if nothing does."""
+    if (root / "calibration").is_dir() and any(root.glob("scene_*.json")):
+        return "scene_*.json and calibration/"
+    return None
+
+
+def read(
+    root: str | Path,
+    *,
+    cameras: Sequence[str] | None = None,
+    crop_bottom: float = 0.0,
+    hide_px: int = 8,
+) -> list[Recording]:
+    """Open a scene folder, one recording for each camera whose images are there.
+
+    Args:
+        root: the folder of the scene.
+        cameras: names of the cameras to open. None = all that have images on disk; the others are reported.
+        crop_bottom: share of the image height to cut off below, from image and depth (the car's own bonnet moves with
+            the camera and would vote for standing still). K does not change.
+        hide_px: a return is hidden by one more than 10 % nearer within so many pixels: the LiDAR sits elsewhere than
+            the camera and sees behind things. 0 = only by one in the same pixel. Larger values also thin out the far
+            road, which grows by 10 % in few rows.
+
+    Raises:
+        FormatError: a missing or damaged file, no image, an unknown camera, or values no camera or pose can have.
+    """
+    root = Path(root)
+    if not 0 <= crop_bottom < 1:
+        raise FormatError(root, "option crop_bottom", crop_bottom, "a share of the height, 0 to less than 1")
+    scenes = sorted(root.glob("scene_*.json")) if root.is_dir() else []
+    if len(scenes) != 1:
+        raise FormatError(root, "scene_*.json", f"{len(scenes)} such files", "exactly one")
+    shots = _shots(scenes[0])
+    present = sorted({name for name, list_ in shots.items() if any((root / s.image).is_file() for s in list_)})
+    unknown = sorted(set(cameras or ()) - set(present))
+    if unknown or not present:
+        raise FormatError(root, "cameras", ", ".join(unknown or ["no image"]), f"images of {', '.join(shots)}")
+    report = [f"{name}: no image on disk: left out" for name in shots if name not in present]
+    options = {"crop_bottom": crop_bottom, "hide_px": hide_px}
+    return [_recording(scenes[0], name, shots[name], report, **options) for name in cameras or present]
+
+
+@dataclass(frozen=True, eq=False)
+class _Shot:
+    """One image with the sweep of its instant, as the scene file describes them."""
+
+    number: int
+    stamp: float  # s
+    image: str
+    sweep: str
+    fields: tuple[str, ...]  # meaning of the columns of the sweep
+    c2w: np.ndarray  # (4, 4) of the image
+    lidar_to_world: np.ndarray  # (4, 4) of the sweep
+    calibration: str
+    hw: tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class _Load:
+    """Position → frame."""
+
+    root: Path
+    shots: tuple[_Shot, ...]
+    T_world_from_lidar: Pose
+    T_world_from_cam: Pose
+    cameras: tuple[Camera, ...]
+    crop_bottom: float
+    hide_px: int
+
+    def __call__(self, i: int) -> Frame:
+        shot, camera = self.shots[i], self.cameras[i]
+        image = torch.from_numpy(files.read_image(self.root / shot.image, shot.hw))
+        T = se3.relative(self.T_world_from_lidar[i : i + 1], self.T_world_from_cam[i : i + 1])
+        xyz = se3.apply(T, torch.from_numpy(_sweep(self.root / shot.sweep, shot.fields))[None])
+        depth = convert.splat(xyz[0], camera, shot.hw, self.hide_px)
+        rows = shot.hw[0] - round(self.crop_bottom * shot.hw[0])
+        return Frame(image[None, :, :rows].contiguous(), depth[None, :rows].contiguous(), camera)
+
+
+def _recording(scene: Path, name: str, shots: list[_Shot], report: list[str], **options: Any) -> Recording:
+    root = scene.parent
+    whole = [s for s in shots if (root / s.image).is_file() and (root / s.sweep).is_file()]
+    if not whole:
+        raise FormatError(root, name, "no instant with image and sweep on disk", "at least one")
+    report = report + [
+        f"{name}: instant {s.number} lacks its image or its sweep: left out" for s in shots if s not in whole
+    ]
+    poses, lidar = (
+        convert.to_poses(np.stack([getattr(s, key) for s in whole]), scene, f"{name} {key}")
+        for key in ("c2w", "lidar_to_world")
+    )
+    cameras = tuple(_camera(root / "calibration" / f"{s.calibration}.json", name, s.hw) for s in whole)
+    times = torch.tensor([s.stamp for s in whole], dtype=torch.float64)
+    return Recording(
+        name=f"{root.resolve().name}/{name}",
+        format="driving",
+        load=_Load(root, tuple(whole), lidar, poses, cameras, **options),
+        number=torch.tensor([s.number for s in whole]),
+        root=root,
+        times=times,
+        poses=poses,
+        rate_hz=float(1 / times.diff().median()) if len(whole) > 1 else None,
+        sparse=True,
+        report=tuple(report),
+        camera_name=name,
+    )
+
+
+def _shots(scene: Path) -> dict[str, list[_Shot]]:
+    """Camera name → its shots in the order of the samples."""
+    top = files.read_json(scene)
+    data = {files.get(d, "key", str, scene): d for d in files.get(top, "data", list, scene)}
+    shots: dict[str, list[_Shot]] = {}
+    for number, sample in enumerate(files.get(top, "samples", list, scene)):
+        calibration = files.get(sample, "calibration_key", str, scene)
+        keys = [key for key in files.get(sample, "datum_keys", list, scene) if isinstance(key, str)]
+        members = [data[key] for key in keys if key in data]
+        kinds = [files.get(d, "datum", dict, scene) for d in members]
+        sweeps = [k["point_cloud"] for k in kinds if "point_cloud" in k]
+        if len(sweeps) != 1:
+            raise FormatError(scene, f"samples.{number}", f"{len(sweeps)} LiDAR sweeps", "one")
+        for member, kind in zip(members, kinds, strict=True):
+            if "image" in kind:
+                name = files.get(member, "id.name", str, scene)
+                shot = _shot(scene, member, kind["image"], sweeps[0], number=number, calibration=calibration)
+                same = shots.setdefault(name, [])
+                if same and same[-1].number == number:
+                    raise FormatError(scene, f"samples.{number}", f"two images of {name}", "one of each camera")
+                same.append(shot)
+    if not shots:
+        raise FormatError(scene, "samples", "no image", "instants with camera images")
+    return shots
+
+
+def _shot(
+    scene: Path, member: dict[str, Any], image: dict[str, Any], sweep: dict[str, Any], *, number: int, calibration: str
+) -> _Shot:
+    stamp = files.get(member, "id.timestamp", str, scene)
+    try:
+        seconds = datetime.fromisoformat(stamp).timestamp()
+    except (ValueError, OverflowError):
+        raise FormatError(scene, "id.timestamp", stamp, "an ISO 8601 time") from None
+    return _Shot(
+        number=number,
+        stamp=seconds,
+        image=_inside(files.get(image, "filename", str, scene), scene),
+        sweep=_inside(files.get(sweep, "filename", str, scene), scene),
+        fields=tuple(map(str, files.get(sweep, "point_format", list, scene))),
+        c2w=_pose(image, scene),
+        lidar_to_world=_pose(sweep, scene),
+        calibration=_inside(calibration, scene),
+        hw=(files.get(image, "height", int, scene), files.get(image, "width", int, scene)),
+    )
+
+
+def _pose(datum: dict[str, Any], scene: Path) -> np.ndarray:
+    rotation, translation = (files.get(datum, f"pose.{part}", dict, scene) for part in ("rotation", "translation"))
+    q = files.to_array([rotation.get(k) for k in ("qx", "qy", "qz", "qw")], (4,), scene, "pose.rotation")
+    t = files.to_array([translation.get(k) for k in "xyz"], (3,), scene, "pose.translation")
+    return convert.to_c2w(q[None], t[None], scene, "pose.rotation")[0]
+
+
+def _camera(file: Path, name: str, hw: tuple[int, int]) -> Camera:
+    calibration = files.read_json(file)
+    names, intrinsics = (files.get(calibration, key, list, file) for key in ("names", "intrinsics"))
+    if name not in names or len(names) != len(intrinsics):
+        raise FormatError(file, "names", ", ".join(map(str, names)), f"{name} among as many names as intrinsics")
+    entry = intrinsics[names.index(name)]
+    fx, fy, cx, cy, skew = (files.get(entry, key, (int, float), file) for key in ("fx", "fy", "cx", "cy", "skew"))
+    return convert.to_camera([[fx, skew, cx], [0, fy, cy], [0, 0, 1]], hw, file, f"{name} intrinsics")
+
+
+def _sweep(file: Path, fields: tuple[str, ...]) -> np.ndarray:
+    """Points (M, 3) m in the LiDAR's frame."""
+    data = npy.read_npz(file, "data")
+    if not {"X", "Y", "Z"} <= set(fields) or data.ndim != 2 or data.shape[1] != len(fields):
+        raise FormatError(file, "data", f"shape {data.shape}", f"points with columns {', '.join(fields)}")
+    return np.ascontiguousarray(data[:, [fields.index(axis) for axis in "XYZ"]], dtype=np.float64)
+
+
+def _inside(name: str, scene: Path) -> str:
+    """A relative file name that stays in the scene's folder."""
+    if not name or Path(name).is_absolute() or ".." in Path(name).parts:
+        raise FormatError(scene, "filename", name, "a file inside the scene's folder")
+    return name

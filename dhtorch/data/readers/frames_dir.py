@@ -1,0 +1,288 @@
+"""Folders of numbered RGB-D frames, in three layouts.
+
+- *named*: ``frame-XXXXXX.color.{jpg,png}``, ``.depth.png``, ``.pose.txt`` (4×4) side by side, as 7-Scenes and its
+  descendants, with or without ``camera-intrinsics.txt`` (3×3).
+- *counted*: ``images/*`` (or ``color/``, ``rgb/``), ``depth/*.png`` or ``.pgm``, and where there are poses
+  ``poses.txt`` or ``pose.txt``: a line a frame, a 4×4 by rows or tx ty tz qx qy qz qw. ``K.txt`` (3×3).
+- *single*: ``rgb.{jpg,png}``, ``raw_depth.png`` and ``intrinsics.txt`` (3×3), one frame without a pose.
+
+Poses are camera-to-world with our axes. The intrinsics file holds for colour and depth unless ``K`` says otherwise:
+7-Scenes' depth (f = 585) is not registered to its colour (f = 525), and its file gives the depth camera's. A side-car
+``meta.json`` (keys ``K``, ``K_depth``, ``dist``, ``depth_scale``, ``invalid``, ``fps``) is read where present; options
+win over it, and it wins over the intrinsics file.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from dhtorch.data import convert
+from dhtorch.data import intrinsics as told
+from dhtorch.data.codecs import pgm
+from dhtorch.data.io import decode as files
+from dhtorch.data.io.decode import FormatError
+from dhtorch.data.recording import Recording
+from dhtorch.records import Camera, Frame, Pose
+
+_PART = re.compile(r"frame-(\d+)\.(color|depth|pose)\.(?:png|jpg|jpeg|txt)")
+_IMAGE = re.compile(r"(.+)\.(?:png|jpg|jpeg|pgm)")
+_FOLDERS = ("images", "color", "rgb")  # of pictures that are counted
+_POSES = ("poses.txt", "pose.txt")
+_INTRINSICS = ("K.txt", "camera-intrinsics.txt", "intrinsics.txt")
+
+
+def recognise(root: Path) -> str | None:
+    """What makes ``root`` a recording of this format, in words; None if nothing does."""
+    pictures, poses = _folder(root), _first(root, _POSES)
+    if pictures is not None and any(map(_IMAGE.fullmatch, _names(root / "depth"))):
+        return f"{pictures.name}/ and depth/" + (f" and {poses.name}" if poses else "")
+    if _single(root) is not None:
+        return "rgb, raw_depth.png and intrinsics.txt"
+    if root.is_dir() and any(_PART.fullmatch(file.name) for file in root.iterdir()):
+        return "frame-XXXXXX.{color,depth,pose} files"
+    return None
+
+
+def read(
+    root: str | Path,
+    *,
+    intrinsics: told.Intrinsics | None = None,
+    K: Sequence[float] | None = None,
+    fov: float | None = None,
+    K_depth: Sequence[float] | None = None,
+    distortion: Sequence[float] | None = None,
+    units_per_metre: float | None = None,
+    invalid: Sequence[int] | None = None,
+    fps: float | None = None,
+    register: bool = True,
+) -> list[Recording]:
+    """Open a folder of numbered frames as one recording.
+
+    Args:
+        root: the folder.
+        intrinsics: four numbers as ``K``, or one as ``fov``.
+        K: fx, fy, cx, cy of the colour image. None = ``meta.json``, else the intrinsics file.
+        fov: degrees from side to side of the colour image; a guessed K for where none is known.
+        K_depth: the same of a depth map that is not registered to colour. None = ``meta.json``, else as colour.
+        distortion: of the colour image, OpenCV's order. None = ``meta.json``, else none.
+        units_per_metre: of the depth codes. None = ``meta.json``, else 1000 (millimetres).
+        invalid: depth codes that mean *no return* beside 0. None = ``meta.json``, else 65535.
+        fps: frame rate, for time stamps. None = ``meta.json`` if it has a number, else no time stamps.
+        register: warp depth that has its own intrinsics to the colour image (one z-buffer, holes stay). The places of
+            the two cameras are taken to coincide, since these sets give no extrinsics. False keeps the depth map and
+            sets ``Frame.depth_camera``.
+
+    Returns:
+        One recording. In the named layout a frame without depth, pose or colour is left out and reported.
+
+    Raises:
+        FormatError: no frame, counts that disagree, a damaged file, or values that no camera or pose can have.
+    """
+    root = Path(root)
+    side = root / "meta.json"
+    meta = files.read_json(side) if side.is_file() else {}
+    frames, poses, report = _frames(root)
+    hw = files.image_header(frames[0].image).hw
+    depth_hw = _depth_hw(frames[0].depth)
+    said = told.stated(root, hw, intrinsics, K, fov)
+    if said.feature is not None:
+        raise FormatError(root, "option intrinsics", said.feature, "fx fy cx cy, or degrees: there are no features")
+    own = _intrinsics(root, "K", said.K, meta)
+    if own is None:
+        raise told.missing(root, None, "a file K.txt, intrinsics.txt or meta.json")
+    colour = convert.to_camera(own[0], hw, *own[1:], distortion if distortion is not None else meta.get("dist"))
+    # Depth has a camera of its own only where someone says so: most sets of this layout are registered.
+    of_depth = _intrinsics(root, "K_depth", K_depth, meta) if K_depth is not None or "K_depth" in meta else None
+    units = units_per_metre if units_per_metre is not None else meta.get("depth_scale", 1000.0)
+    rate = _rate(fps if fps is not None else meta.get("fps"), side)
+    number = torch.tensor([frame.number for frame in frames])
+    load = _Load(
+        frames=tuple(frames),
+        hw=hw,
+        depth_hw=depth_hw,
+        camera=colour,
+        depth_camera=convert.to_camera(of_depth[0], depth_hw, *of_depth[1:]) if of_depth else None,
+        units_per_metre=files.to_positive(units, side, "depth_scale"),
+        invalid=_codes(invalid if invalid is not None else meta.get("invalid", (0, 65535)), side),
+        register=register,
+    )
+    return [
+        Recording(
+            name=root.resolve().name,
+            format="frames_dir",
+            load=load,
+            number=number,
+            root=root,
+            times=None if rate is None else number.double() / rate,
+            poses=poses,
+            rate_hz=rate,
+            report=(*report, *said.report),
+        )
+    ]
+
+
+@dataclass(frozen=True)
+class _Files:
+    """The two pictures of one frame and its place in the capture."""
+
+    number: int
+    image: Path
+    depth: Path
+
+
+@dataclass(frozen=True, eq=False)
+class _Load:
+    """Position → frame."""
+
+    frames: tuple[_Files, ...]
+    hw: tuple[int, int]
+    depth_hw: tuple[int, int]
+    camera: Camera
+    depth_camera: Camera | None
+    units_per_metre: float
+    invalid: tuple[int, ...]
+    register: bool
+
+    def __call__(self, i: int) -> Frame:
+        frame = self.frames[i]
+        image = torch.from_numpy(files.read_image(frame.image, self.hw))
+        depth = torch.from_numpy(self._depth(frame.depth))
+        depth_camera = self.depth_camera
+        if depth_camera is not None and self.register:
+            depth, depth_camera = convert.register_depth(depth, depth_camera, self.camera, self.hw), None
+        return Frame(image[None], depth[None], self.camera, depth_camera)
+
+    def _depth(self, file: Path) -> np.ndarray:
+        if file.suffix == ".pgm":
+            return files.to_metres(pgm.read_pgm(file, self.depth_hw), self.units_per_metre, self.invalid)
+        return files.read_depth_png(file, self.units_per_metre, self.depth_hw, self.invalid)
+
+
+def _names(folder: Path) -> list[str]:
+    return [file.name for file in folder.iterdir()] if folder.is_dir() else []
+
+
+def _first(root: Path, names: Sequence[str]) -> Path | None:
+    return next((root / name for name in names if (root / name).is_file()), None)
+
+
+def _folder(root: Path) -> Path | None:
+    """The folder of counted pictures."""
+    return next((root / name for name in _FOLDERS if any(map(_IMAGE.fullmatch, _names(root / name)))), None)
+
+
+def _single(root: Path) -> _Files | None:
+    image = _first(root, ("rgb.png", "rgb.jpg", "rgb.jpeg"))
+    depth, K = root / "raw_depth.png", root / "intrinsics.txt"
+    return _Files(0, image, depth) if image is not None and depth.is_file() and K.is_file() else None
+
+
+def _depth_hw(file: Path) -> tuple[int, int]:
+    if file.suffix != ".pgm":
+        return files.image_header(file).hw
+    h, w = pgm.read_pgm(file).shape
+    return h, w
+
+
+def _frames(root: Path) -> tuple[list[_Files], Pose | None, list[str]]:
+    """The frames of whatever layout this is, their poses where there are any, and what was left out."""
+    if (pictures := _folder(root)) is not None or (root / "images").is_dir():
+        return _counted_frames(root, pictures or root / "images")
+    single = _single(root)
+    return ([single], None, ["no poses in this layout"]) if single is not None else _named_frames(root)
+
+
+def _named_frames(root: Path) -> tuple[list[_Files], Pose, list[str]]:
+    parts: dict[int, dict[str, Path]] = {}
+    for file in root.iterdir() if root.is_dir() else ():
+        if match := _PART.fullmatch(file.name):
+            parts.setdefault(int(match[1]), {})[match[2]] = file
+    frames, poses, report = [], list[np.ndarray](), []
+    for number, found in sorted(parts.items()):
+        missing = [part for part in ("color", "depth", "pose") if part not in found]
+        matrix = files.read_table(found["pose"], 4) if not missing else None
+        if matrix is None:
+            report.append(f"frame {number}: no {' and no '.join(missing)}: left out")
+        elif not np.isfinite(matrix).all():
+            report.append(f"frame {number}: its pose is not finite (tracking lost): left out")
+        else:
+            if matrix.shape != (4, 4):
+                raise FormatError(found["pose"], "pose", f"{len(matrix)} rows", "4 rows of 4 numbers")
+            poses.append(matrix)
+            frames.append(_Files(number, found["color"], found["depth"]))
+    if not frames:
+        found_instead = f"none complete among {len(parts)}" if parts else "none"
+        raise FormatError(root, "frames", found_instead, "frame-XXXXXX.color.{jpg,png}, .depth.png and .pose.txt")
+    try:
+        return frames, convert.to_poses(np.stack(poses), root), report
+    except FormatError:  # once more, one by one, to name the file
+        for frame, matrix in zip(frames, poses, strict=True):
+            convert.to_poses(matrix[None], frame.image.with_name(f"{frame.image.name.split('.')[0]}.pose.txt"))
+        raise
+
+
+def _counted_frames(root: Path, folder: Path) -> tuple[list[_Files], Pose | None, list[str]]:
+    images, depths = _pictures(folder), _pictures(root / "depth")
+    file = _first(root, _POSES)
+    rows = None if file is None else files.read_table(file)
+    if not images:
+        raise FormatError(folder, "frames", "no image", "at least one .png or .jpg")
+    # Rows carry no name: unless all counts agree nobody knows which row belongs to which picture.
+    counts = {"depth": len(depths)} | ({} if file is None or rows is None else {file.name: len(rows)})
+    for field, count in counts.items():
+        if count != len(images):
+            raise FormatError(root, f"{field} count", count, f"{len(images)}, one for each file of {folder.name}/")
+    if images.keys() != depths.keys():
+        odd = min(images.keys() ^ depths.keys())
+        raise FormatError(root, "file names", f"{odd} in one of {folder.name}/ and depth/", "the same names in both")
+    stems = sorted(images, key=files.natural)
+    digits = [re.search(r"(\d+)\D*$", stem) for stem in stems]
+    values = [int(m[1]) for m in digits if m]
+    counted = len(values) == len(stems) and all(a < b for a, b in itertools.pairwise(values))
+    numbers = values if counted else range(len(stems))
+    frames = [_Files(number, images[stem], depths[stem]) for number, stem in zip(numbers, stems, strict=True)]
+    if file is None or rows is None:
+        return frames, None, ["no poses.txt: no poses"]
+    return frames, _poses(rows, file), []
+
+
+def _poses(rows: np.ndarray, file: Path) -> Pose:
+    if rows.shape[1] not in (7, 16):
+        raise FormatError(file, "columns", rows.shape[1], "16 (4x4 by rows) or 7 (tx ty tz qx qy qz qw) numbers")
+    if rows.shape[1] == 7:
+        return convert.to_poses(convert.to_c2w(rows[:, 3:], rows[:, :3], file, "pose"), file)
+    return convert.to_poses(rows.reshape(-1, 4, 4), file)
+
+
+def _pictures(folder: Path) -> dict[str, Path]:
+    return {m[1]: file for file in sorted(folder.glob("*")) if (m := _IMAGE.fullmatch(file.name))}
+
+
+def _intrinsics(
+    root: Path, key: str, option: Sequence[float] | None, meta: dict[str, object]
+) -> tuple[object, Path, str] | None:
+    """K with the file and the field it comes from: the option, else the side-car, else the layout's own file."""
+    if option is not None:
+        return convert.matrix_of(*files.to_array(option, (4,), root, f"option {key}")), root, f"option {key}"
+    if key in meta:
+        return meta[key], root / "meta.json", key
+    file = _first(root, _INTRINSICS)
+    return (files.read_table(file, 3), file, "K") if file else None
+
+
+def _rate(value: object, file: Path) -> float | None:
+    """Frames per second where a number is given; a remark in words is no rate."""
+    return None if value is None or isinstance(value, str) else files.to_positive(value, file, "fps")
+
+
+def _codes(value: object, file: Path) -> tuple[int, ...]:
+    if not isinstance(value, Sequence) or not all(isinstance(code, int) for code in value):
+        raise FormatError(file, "invalid", value, "a list of depth codes")
+    return tuple(value)

@@ -1,0 +1,330 @@
+"""LeRobot data sets, v3 and v2.x, read from their parquet tables and videos; one recording per episode and camera.
+
+``meta/info.json`` names the features. In v3 a table or a video holds many episodes and ``meta/episodes`` says where
+each one starts; in v2 each episode has files of its own, listed in ``meta/episodes.jsonl``. A row of an episode is a
+frame; its picture is the video frame at the episode's start plus the row's time stamp, or lies in the table.
+
+The format has no place for intrinsics and poses. K comes from option ``K``, else from a feature, else from the side-car
+``meta/intrinsics.json``: ``{camera key: {"K": 3×3, "dist": […], "K_depth": 3×3}}``, the last two as needed. Nor is
+there one for *no return* in a depth video: see :mod:`dhtorch.data.readers.lerobot_depth`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dhtorch.data import convert
+from dhtorch.data import intrinsics as told
+from dhtorch.data.codecs.parquet import read_cell
+from dhtorch.data.codecs.video import read_video_frame, video_times
+from dhtorch.data.io import decode as files
+from dhtorch.data.io.decode import FormatError
+from dhtorch.data.readers.lerobot_depth import decode_codes, decode_picture, depth_of
+from dhtorch.data.readers.lerobot_meta import (
+    Episode,
+    Episodes,
+    Feature,
+    Meta,
+    colour_keys,
+    inside,
+    read_episodes,
+    read_meta,
+)
+from dhtorch.data.readers.lerobot_rows import episode_rows, read_table
+from dhtorch.data.recording import Recording, Recordings
+from dhtorch.records import Camera, Frame
+
+_UNITS = {"m": 1.0, "mm": 1000.0}
+
+
+def recognise(root: Path) -> str | None:
+    """What makes ``root`` a recording of this format, in words; None if nothing does."""
+    meta = root / "meta"
+    if (meta / "info.json").is_file() and ((meta / "episodes").is_dir() or (meta / "episodes.jsonl").is_file()):
+        return "meta/info.json and meta/episodes" + ("" if (meta / "episodes").is_dir() else ".jsonl")
+    return None
+
+
+def read(
+    root: str | Path,
+    *,
+    episode: int | Sequence[int] | None = None,
+    camera: str | Sequence[str] | None = None,
+    depth: str | None = None,
+    K: Sequence[float] | None = None,
+    fov: float | None = None,
+    K_depth: Sequence[float] | None = None,
+    distortion: Sequence[float] | None = None,
+    intrinsics: told.Intrinsics | None = None,
+    pose: str | None = None,
+    depth_unit: str | None = None,
+    depth_range: Sequence[float] | None = None,
+    tolerance: float = 1e-4,
+) -> Recordings:
+    """Open a data set folder, one recording for each episode and camera.
+
+    Args:
+        root: the folder that holds ``meta/``.
+        episode: number or numbers of the episodes. None = all.
+        camera: key or keys of colour features, such as ``observation.images.front``. None = all.
+        depth: key of the depth feature. None = the one named like the camera (``…front_depth``, ``…depth.front``), or
+            the only one where there is one camera; without any the depth is empty and the report says so.
+        K: fx, fy, cx, cy of the image. None = feature ``intrinsics``, else ``meta/intrinsics.json``.
+        fov: degrees from side to side of the image; a guessed K for where none is known.
+        K_depth: the same of a depth map that is not registered to colour. None = the side-car's, else as colour.
+        distortion: of the image, OpenCV's order. None = the side-car's, else none.
+        intrinsics: key of a feature with 4 (fx fy cx cy) or 9 numbers a frame; or four numbers as ``K``, or one as
+            ``fov``. None = ``<camera>.intrinsics``, ``observation.camera.<name>.intrinsics``,
+            ``observation.<name>.intrinsics`` or ``observation.intrinsics.<name>`` where there is one.
+        pose: key of a feature with the camera-to-world pose: 16 numbers (4×4 by rows) or 7 (x y z qx qy qz qw). None =
+            ``<camera>.pose``, ``observation.camera.<name>.pose`` or ``observation.<name>.T_world_from_cam`` where there
+            is one, else no poses.
+        depth_unit: ``"m"`` or ``"mm"`` of depth stored as pictures or arrays. None = ``depth_unit`` of the feature's
+            info, else mm for whole numbers and m for others, as LeRobot takes them.
+        depth_range: m, nearest and farthest return to keep; for depth videos that were not coded without loss, whose
+            lost zeros blur. None = all.
+        tolerance: s, largest distance of a video frame from its row's time.
+
+    Returns:
+        Recordings named ``<data set>/episode_<number>/<camera>``, times from the start of the episode. Rows that are
+        missing or out of order are left out and reported. A table is read when one of its episodes is asked for.
+
+    Raises:
+        FormatError: an unknown key or episode, or damaged metadata; of a single episode also no K, a damaged table, or
+            values no camera or pose can have.
+    """
+    root = Path(root)
+    meta = read_meta(root)
+    if depth_unit not in (None, *_UNITS):
+        raise FormatError(root, "option depth_unit", depth_unit, "m or mm")
+    span = (
+        (0.0, np.inf) if depth_range is None else tuple(files.to_array(depth_range, (2,), root, "option depth_range"))
+    )
+    keys = colour_keys(meta, camera)
+    wanted = None if episode is None else [episode] if isinstance(episode, int) else [int(e) for e in episode]
+    episodes = read_episodes(meta, wanted)
+    keys = keys if camera is not None else _filmed(keys, episodes)
+    rigs = [
+        _Rig(
+            meta,
+            key,
+            depth,
+            told.stated(meta.root, meta.features[key].hw, intrinsics, K, fov),
+            K_depth,
+            distortion,
+            pose,
+            depth_unit,
+            span,
+            tolerance,
+        )
+        for key in keys
+    ]
+    columns = sorted({c for rig in rigs for c in (rig.K_key, rig.pose_key) if c})
+    names = [rig.name(number) for number in episodes.numbers for rig in rigs]
+    return Recordings(names, _Make(episodes, tuple(rigs), tuple(columns)))
+
+
+def _filmed(keys: list[str], episodes: Episodes) -> list[str]:
+    """Keys of the cameras that there are: a feature that is only declared is none."""
+    videos = episodes[0].videos
+    return [key for key in keys if key not in videos or videos[key][0].is_file()] or keys
+
+
+@dataclass(frozen=True, eq=False)
+class _Make:
+    """Position → recording: the cameras of the first episode, then those of the second, …"""
+
+    episodes: Episodes
+    rigs: tuple[_Rig, ...]
+    columns: tuple[str, ...]  # of the tables, beside those that place a row
+
+    def __call__(self, i: int) -> Recording:
+        episode = self.episodes[i // len(self.rigs)]
+        return self.rigs[i % len(self.rigs)].recording(episode, read_table(episode.data, self.columns))
+
+
+@dataclass(frozen=True, eq=False)
+class _Load:
+    """Position → frame."""
+
+    data: Path
+    root: Path
+    rows: np.ndarray  # (n,) place in the table
+    times: np.ndarray  # (n,) s from the start of the episode
+    image: Feature
+    depth: Feature | None
+    videos: dict[str, tuple[Path, float]]
+    cameras: Camera  # (n), or (1) for all
+    depth_camera: Camera | None
+    unit: str | None
+    span: tuple[float, float]
+    tolerance: float
+
+    def __call__(self, i: int) -> Frame:
+        camera = self.cameras[i : i + 1] if self.cameras.f.shape[0] > 1 else self.cameras
+        depth = torch.zeros(self.image.hw) if self.depth is None else self._depth(i, self.depth)
+        return Frame(self._image(i)[None], depth[None], camera, self.depth_camera)
+
+    def _image(self, i: int) -> Tensor:
+        if self.image.dtype == "video":
+            return torch.from_numpy(self._video(i, self.image, "rgb24")).permute(2, 0, 1).contiguous()
+        data, file = self._bytes(i, self.image.key)
+        return torch.from_numpy(files.decode_image(data, file, self.image.hw))
+
+    def _depth(self, i: int, feature: Feature) -> Tensor:
+        if feature.dtype == "video":
+            return self._within(decode_codes(feature, self._video(i, feature, "luma"), self.videos[feature.key][0]))
+        if feature.dtype == "image":
+            data, file = self._bytes(i, feature.key)
+            values = decode_picture(data, file, feature.hw)
+        else:
+            values, file = np.asarray(read_cell(self.data, feature.key, int(self.rows[i]))), self.data
+            if values.size != feature.hw[0] * feature.hw[1] or values.dtype.kind not in "fiu":
+                raise FormatError(file, feature.key, f"shape {values.shape}", f"{feature.hw} numbers")
+        unit = self.unit or feature.info.get("depth_unit") or ("m" if values.dtype.kind == "f" else "mm")
+        if not isinstance(unit, str) or unit not in _UNITS:
+            raise FormatError(self.data, f"{feature.key} depth_unit", unit, "m or mm")
+        return self._within(values.reshape(feature.hw).astype(np.float64) / _UNITS[unit])
+
+    def _within(self, depth: np.ndarray) -> Tensor:
+        low, high = self.span
+        keep = np.isfinite(depth) & (depth > 0) & (depth >= low) & (depth <= min(high, 1e6))
+        return torch.from_numpy(np.where(keep, depth, 0).astype(np.float32))
+
+    def _video(self, i: int, feature: Feature, pixels: str) -> np.ndarray:
+        file, start = self.videos[feature.key]
+        times, want = video_times(file), start + float(self.times[i])
+        if start == 0 and len(times):
+            want += float(times[0])  # a film of its own begins with the episode, whatever its clock says
+        at = int(np.abs(times - want).argmin()) if len(times) else -1
+        if at < 0 or abs(times[at] - want) > self.tolerance:
+            found = f"nearest frame at {times[at]:.6f} s" if at >= 0 else "no frame"
+            raise FormatError(file, f"time {want:.6f} s", found, f"one within {self.tolerance} s")
+        return read_video_frame(file, at, feature.hw, pixels=pixels)
+
+    def _bytes(self, i: int, key: str) -> tuple[bytes, Path]:
+        """A picture kept in the table, or beside it under the path in the table."""
+        cell = read_cell(self.data, key, int(self.rows[i]))
+        if not isinstance(cell, dict):
+            raise FormatError(self.data, key, type(cell).__name__, "a picture: bytes and path")
+        data, path = cell.get("bytes"), cell.get("path")
+        if isinstance(data, bytes) and data:
+            return data, self.data
+        if not isinstance(path, str):
+            raise FormatError(self.data, key, "neither bytes nor path", "a picture")
+        file = inside(self.root, path, self.data, key)
+        return files.read_bytes(file), file
+
+
+@dataclass(frozen=True, eq=False)
+class _Rig:
+    """One camera of the data set and the options."""
+
+    meta: Meta
+    key: str
+    depth_key: str | None
+    stated: told.Stated
+    K_depth: Sequence[float] | None
+    distortion: Sequence[float] | None
+    pose: str | None
+    unit: str | None
+    span: tuple[float, float]
+    tolerance: float
+
+    @property
+    def image(self) -> Feature:
+        return self.meta.features[self.key]
+
+    @property
+    def K_key(self) -> str | None:
+        """The feature that holds K, if that is where it comes from."""
+        return None if self.stated.K is not None else self._column(self.stated.feature, "intrinsics")
+
+    @property
+    def pose_key(self) -> str | None:
+        found = self._column(self.pose, "pose")
+        ours = f"observation.{self.key.split('.')[-1]}.T_world_from_cam"
+        return ours if found is None and ours in self.meta.features else found
+
+    def _column(self, option: str | None, what: str) -> str | None:
+        if option is not None:
+            if option not in self.meta.features:
+                raise FormatError(self.meta.root, f"option {what}", option, f"one of {', '.join(self.meta.features)}")
+            return option
+        camera = self.key.split(".")[-1]
+        above = f"observation.camera.{camera}", f"observation.{camera}"
+        names = (f"{self.key}.{what}", *(f"{name}.{what}" for name in above), f"observation.{what}.{camera}")
+        return next((name for name in names if name in self.meta.features), None)
+
+    def name(self, episode: int) -> str:
+        """Of the recording."""
+        return f"{self.meta.name}/episode_{episode:06d}/{self.key.split('.')[-1]}"
+
+    def recording(self, episode: Episode, table: dict[str, np.ndarray]) -> Recording:
+        meta, image = self.meta, self.image
+        rows, numbers, times, report = episode_rows(meta, episode, table)
+        report += self.stated.report
+        depth = depth_of(meta, self.key, self.depth_key)
+        if depth is None:
+            report.append(f"{self.key}: no depth feature: depth is empty")
+        cameras, depth_camera = self._cameras(table, rows, depth)
+        poses = None
+        if self.pose_key is not None:
+            poses = convert.to_poses_of(table[self.pose_key][rows], episode.data, self.pose_key)
+        load = _Load(
+            data=episode.data,
+            root=meta.root,
+            rows=rows,
+            times=times,
+            image=image,
+            depth=depth,
+            videos={f.key: episode.videos[f.key] for f in (image, depth) if f is not None and f.dtype == "video"},
+            cameras=cameras,
+            depth_camera=depth_camera,
+            unit=self.unit,
+            span=self.span,
+            tolerance=self.tolerance,
+        )
+        return Recording(
+            name=self.name(episode.number),
+            format="lerobot",
+            load=load,
+            number=torch.from_numpy(numbers),
+            root=meta.root,
+            times=torch.from_numpy(times),
+            poses=poses,
+            rate_hz=meta.fps,
+            report=tuple(report),
+            episode=episode.number,
+            camera_name=self.key,
+        )
+
+    def _cameras(
+        self, table: dict[str, np.ndarray], rows: np.ndarray, depth: Feature | None
+    ) -> tuple[Camera, Camera | None]:
+        root, hw = self.meta.root, self.image.hw
+        side = root / "meta" / "intrinsics.json"
+        entry = files.read_json(side).get(self.key, {}) if side.is_file() else {}
+        if not isinstance(entry, dict):
+            raise FormatError(side, self.key, type(entry).__name__, "an object with K")
+        lens = self.distortion if self.distortion is not None else entry.get("dist")
+        of_depth = None
+        if depth is not None and (self.K_depth is not None or entry.get("K_depth") is not None):
+            value = convert.K_of(self.K_depth, root, "option K_depth") if self.K_depth is not None else entry["K_depth"]
+            of_depth = convert.to_camera(value, depth.hw, side, "K_depth")
+        if self.stated.K is not None:
+            K = convert.matrix_of(*self.stated.K)
+            return convert.to_camera(K, hw, root, "option K", lens), of_depth
+        if self.K_key is not None:
+            values = table[self.K_key][rows]
+            return convert.to_cameras(values, hw, root / "data", self.K_key, lens), of_depth
+        if "K" not in entry:
+            others = "data.intrinsics=FEATURE", "meta/intrinsics.json"
+            raise told.missing(root, self.key, *others, depth=depth is not None)
+        return convert.to_camera(entry["K"], hw, side, f"{self.key} K", lens), of_depth

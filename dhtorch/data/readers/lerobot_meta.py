@@ -1,0 +1,269 @@
+"""What a LeRobot data set says about itself: features, episodes, and where the rows and videos of an episode lie."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dhtorch.data.codecs.parquet import read_columns
+from dhtorch.data.io import decode as files
+from dhtorch.data.io.decode import FormatError
+
+_MAX_EPISODES = 10_000_000
+_PARTS = ("chunk_index", "file_index")
+_V2_DATA = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
+_V2_VIDEO = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
+_V3_DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+_V3_VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+
+
+@dataclass(frozen=True)
+class Feature:
+    """One column or video."""
+
+    key: str
+    dtype: str  # "video", "image", or a numpy name
+    shape: tuple[int, ...]
+    info: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def hw(self) -> tuple[int, int]:
+        """(height, width) of a picture, channels first or last."""
+        h_w = (
+            self.shape[1:] if len(self.shape) == 3 and self.shape[0] in (1, 3) and self.shape[2] > 4 else self.shape[:2]
+        )
+        return h_w[0], h_w[1]
+
+    @property
+    def is_depth(self) -> bool:
+        """Marked as depth, by the flag of today or of old; a plain array by its name."""
+        marked = self.info.get("is_depth_map") is True or self.info.get("video.is_depth_map") is True
+        return marked or (self.dtype not in ("video", "image") and len(self.shape) >= 2 and "depth" in self.key)
+
+
+@dataclass(frozen=True)
+class Episode:
+    """Place of one episode."""
+
+    number: int
+    length: int | None  # frames, as the metadata have it
+    data: Path
+    videos: dict[str, tuple[Path, float]]  # key → file and the time (s) in it at which the episode starts
+
+
+@dataclass(frozen=True)
+class Meta:
+    """``meta/info.json``, checked."""
+
+    root: Path
+    name: str  # of the data set
+    version: int  # 2 or 3
+    fps: float
+    features: dict[str, Feature]
+    chunks_size: int
+    data_path: str
+    video_path: str
+
+    @property
+    def videos(self) -> list[str]:
+        """Keys of the features that lie in videos."""
+        return [key for key, feature in self.features.items() if feature.dtype == "video"]
+
+
+@dataclass(frozen=True, eq=False)
+class Episodes:
+    """The episodes asked for, in that order. There may be tens of thousands: places are made out one at a time."""
+
+    meta: Meta
+    numbers: np.ndarray  # (n,)
+    columns: dict[str, np.ndarray]  # (n,) each: ``length``, and in v3 the places under their names in meta/episodes
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def __getitem__(self, i: int) -> Episode:
+        meta, number = self.meta, int(self.numbers[i])
+        row = {name: values[i].item() for name, values in self.columns.items()}
+
+        def index(prefix: str) -> dict[str, Any]:
+            if meta.version == 2:
+                return {"episode_chunk": number // meta.chunks_size, "episode_index": number}
+            return {part: row[f"{prefix}/{part}"] for part in _PARTS}
+
+        videos = {
+            key: (
+                _path(meta, "video_path", {**index(f"videos/{key}"), "video_key": key}),
+                row.get(f"videos/{key}/from_timestamp", 0.0),
+            )
+            for key in meta.videos
+        }
+        return Episode(number, row.get("length"), _path(meta, "data_path", index("data")), videos)
+
+
+def read_meta(root: Path) -> Meta:
+    """The data set's own description.
+
+    Raises:
+        FormatError: missing or damaged ``meta/info.json``, or a version other than 2.x and 3.x.
+    """
+    file = root / "meta" / "info.json"
+    info = files.read_json(file)
+    text = files.get(info, "codebase_version", str, file)
+    version = re.fullmatch(r"v?([23])\.\d{1,3}", text)
+    if not version:
+        raise FormatError(file, "codebase_version", text, "v2.x or v3.x")
+    number = int(version[1])
+    chunks = info.get("chunks_size", 1000)
+    if type(chunks) is not int or not 0 < chunks < 10**9:
+        raise FormatError(file, "chunks_size", chunks, "a positive number")
+    templates = {"data_path": (_V2_DATA, _V3_DATA), "video_path": (_V2_VIDEO, _V3_VIDEO)}
+    paths = {key: info.get(key) or defaults[number - 2] for key, defaults in templates.items()}
+    for key, value in paths.items():
+        if not isinstance(value, str):
+            raise FormatError(file, key, type(value).__name__, "a path")
+    features = files.get(info, "features", dict, file)
+    return Meta(
+        root=root,
+        name=root.resolve().name,
+        version=number,
+        fps=files.to_positive(info.get("fps"), file, "fps"),
+        features={key: _feature(key, value, file) for key, value in features.items()},
+        chunks_size=chunks,
+        data_path=paths["data_path"],
+        video_path=paths["video_path"],
+    )
+
+
+def read_episodes(meta: Meta, wanted: Sequence[int] | None) -> Episodes:
+    """The wanted episodes (None = all, by number); of two with one number the first counts.
+
+    Raises:
+        FormatError: missing or damaged tables, a path that cannot be, or an episode that is not there.
+    """
+    columns = _columns_v3(meta) if meta.version == 3 else _columns_v2(meta)
+    numbers, rows = np.unique(columns.pop("episode_index"), return_index=True)
+    place = dict(zip(numbers.tolist(), rows.tolist(), strict=True))
+    chosen = numbers.tolist() if wanted is None else list(wanted)
+    missing = [n for n in chosen if n not in place]
+    if missing or not chosen:
+        found = f"{len(chosen) - len(missing)} of those asked for"
+        raise FormatError(meta.root / "meta", "episodes", found, missing or "at least one")
+    rows = np.array([place[n] for n in chosen])
+    episodes = Episodes(meta, np.array(chosen), {name: values[rows] for name, values in columns.items()})
+    _ = episodes[0]  # paths that cannot be are found now
+    return episodes
+
+
+def _columns_v3(meta: Meta) -> dict[str, np.ndarray]:
+    tables = sorted((meta.root / "meta" / "episodes").glob("*/*.parquet"))
+    if not tables:
+        raise FormatError(meta.root / "meta" / "episodes", "tables", "none", "chunk-000/file-000.parquet")
+    places = ["data", *(f"videos/{key}" for key in meta.videos)]
+    counts = ["episode_index", *(f"{place}/{part}" for place in places for part in _PARTS)]
+    starts = [f"videos/{key}/from_timestamp" for key in meta.videos]
+    found: list[dict[str, np.ndarray]] = []
+    for table in tables:
+        spans = ["dataset_from_index", "dataset_to_index"]
+        read = read_columns(table, [*counts, *starts], optional=spans)
+        columns = {name: _counts(read[name], table, name) for name in counts}
+        columns |= {name: _numbers(read[name], table, name, np.isfinite) for name in starts}
+        if {*spans} <= {*read}:
+            first, end = (_counts(read[name], table, name, 2**53) for name in spans)
+            columns["length"] = end - first
+        found.append(columns)
+    shared = set.intersection(*({*columns} for columns in found))
+    return {name: np.concatenate([columns[name] for columns in found]) for name in shared}
+
+
+def _columns_v2(meta: Meta) -> dict[str, np.ndarray]:
+    table = meta.root / "meta" / "episodes.jsonl"
+    rows = []
+    for line, text in enumerate(files.read_lines(table), 1):
+        if text.strip():
+            row = files.decode_json(text, table)
+            rows.append([files.get(row, key, int, table) for key in ("episode_index", "length")])
+            if not all(0 <= value < _MAX_EPISODES for value in rows[-1]):
+                raise FormatError(table, f"line {line}", rows[-1], f"counts below {_MAX_EPISODES}")
+    numbers = np.array(rows, dtype=np.int64).reshape(-1, 2)
+    return {"episode_index": numbers[:, 0], "length": numbers[:, 1]}
+
+
+def colour_keys(meta: Meta, asked: str | Sequence[str] | None = None) -> list[str]:
+    """Keys of the colour features asked for; None = all.
+
+    Raises:
+        FormatError: none, or one that is not there.
+    """
+    pictures = [key for key, f in meta.features.items() if f.dtype in ("video", "image") and not f.is_depth]
+    colour = [key for key in pictures if "codes" not in meta.features[key].info]  # maps of codes, as we write them
+    keys = colour if asked is None else [asked] if isinstance(asked, str) else list(asked)
+    unknown = [key for key in keys if key not in colour]
+    if unknown or not keys:
+        raise FormatError(
+            meta.root / "meta" / "info.json", "cameras", ", ".join(unknown) or "none", f"some of {', '.join(colour)}"
+        )
+    return keys
+
+
+def inside(root: Path, name: str, file: Path, field: str) -> Path:
+    """A file below ``root``.
+
+    Raises:
+        FormatError: an absolute name, or one that leads out.
+    """
+    if not name or "\x00" in name or len(name) > 1000 or Path(name).is_absolute() or ".." in Path(name).parts:
+        raise FormatError(file, field, name, "a file inside the data set")
+    return root / name
+
+
+def _path(meta: Meta, key: str, values: dict[str, Any]) -> Path:
+    """A path template filled in. Python's own ``format`` would also follow attributes and pad to any width."""
+    file, template = meta.root / "meta" / "info.json", getattr(meta, key)
+
+    def fill(match: re.Match[str]) -> str:
+        name, width = match[1], match[2]
+        if name not in values or (width and isinstance(values[name], str)):
+            raise FormatError(file, key, match[0], f"one of {', '.join(values)}")
+        return str(values[name]).zfill(int(width or 0))
+
+    name = re.sub(r"\{(\w{1,40})(?::0(\d)d)?\}", fill, template[:500])
+    if "{" in name or "}" in name:
+        raise FormatError(file, key, template, "a path with fields such as {file_index:03d}")
+    return inside(meta.root, name, file, key)
+
+
+def _feature(key: str, value: Any, file: Path) -> Feature:
+    dtype = files.get(value, "dtype", str, file)
+    shape = value.get("shape") or ()
+    if (
+        not isinstance(shape, list | tuple)
+        or len(shape) > 8
+        or any(type(n) is not int or not 0 <= n < 2**31 for n in shape)
+    ):
+        raise FormatError(file, f"features.{key}.shape", shape, "a few counts")
+    if dtype in ("video", "image") and (len(shape) not in (2, 3) or not 0 < math.prod(shape) <= 4 * files.MAX_PIXELS):
+        raise FormatError(file, f"features.{key}.shape", shape, "height, width and channels")
+    info = value.get("info") or value.get("video_info") or {}
+    if not isinstance(info, dict) or any(c in key for c in "/\\\x00") or key in ("", ".", ".."):
+        raise FormatError(file, f"features.{key}", type(info).__name__, "an object under a plain name")
+    return Feature(key, dtype, tuple(shape), info)
+
+
+def _counts(values: Any, file: Path, field: str, limit: int = _MAX_EPISODES) -> np.ndarray:
+    return _numbers(values, file, field, lambda x: (x >= 0) & (x < limit) & (x == np.floor(x))).astype(np.int64)
+
+
+def _numbers(values: Any, file: Path, field: str, sound: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """A column (n,) as float64, all of its values sound."""
+    if not isinstance(values, np.ndarray) or values.ndim != 1 or values.dtype.kind not in "fiu":
+        raise FormatError(file, field, "no numbers", "one number a row")
+    column = values.astype(np.float64)
+    if not (good := sound(column)).all():
+        raise FormatError(file, field, column[~good][0], "a count, or a time in s")
+    return column

@@ -1,0 +1,352 @@
+"""Record3D: RGB-D recordings of an iPhone or iPad, in the three layouts that the app exports.
+
+- ``.r3d``: a zip archive (or its folder) with ``metadata``, ``rgbd/<i>.jpg``, ``.depth`` and ``.conf``, the latter two
+  compressed with LZFSE: float32 metres and confidence 0, 1 or 2.
+- *EXR + RGB*: a folder with ``metadata.json``, ``rgb/<i>.jpg`` and ``depth/<i>.exr``.
+- *RGBD mp4*: one video, read by :mod:`dhtorch.data.readers.record3d_video`.
+
+Picture, depth, pose and intrinsics of a frame share the number ``<i>``, which starts at 0 and bears no zeros in front.
+Poses are camera-to-world with ARKit's axes (x right, y up, z backward) of the picture *as stored*, portrait or
+landscape, so nothing is turned here. Colour and depth are registered. Taken to be so, since nothing official says it:
+depth that is not finite or not positive is *no return*; time stamps count from the first one; ``initPose`` means
+nothing.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from dhtorch.data import convert
+from dhtorch.data.codecs import exr as codec_exr
+from dhtorch.data.codecs import lzfse
+from dhtorch.data.io import decode as files
+from dhtorch.data.io.decode import FormatError
+from dhtorch.data.members import Member, folder_members, member, zip_members
+from dhtorch.data.readers import record3d_video
+from dhtorch.data.recording import Recording
+from dhtorch.records import Frame
+
+_PART = re.compile(r"(?:rgbd|rgb|depth)/(0|[1-9]\d{0,8})\.(jpg|depth|conf|exr)")
+#: Portrait sizes of depth maps, by their pixels: LiDAR, front camera, front camera of later devices.
+_DEPTH_SIZES = {256 * 192: (256, 192), 640 * 480: (640, 480), 960 * 720: (960, 720)}
+_JPEG = (b"\xff\xd8", b"\xff\xd9")
+
+
+def recognise(root: Path) -> str | None:
+    """What makes ``root`` a recording of this format, in words; None if nothing does."""
+    if root.is_file():
+        if root.suffix.lower() == ".r3d":
+            return ".r3d archive"
+        return record3d_video.recognise(root)
+    inner = _enclosed(root)
+    if (inner / "metadata.json").is_file() and (inner / "rgb").is_dir() and any((inner / "depth").glob("*.exr")):
+        return "metadata.json, rgb/ and depth/*.exr"
+    if (root / "metadata").is_file() and any((root / "rgbd").glob("*.depth")):
+        return "metadata and rgbd/*.depth, an unpacked .r3d"
+    return None
+
+
+def read(
+    root: str | Path,
+    *,
+    poses: bool = True,
+    per_frame: bool = True,
+    exr_channel: str | None = None,
+    verify: bool = False,
+    depth_range: Sequence[float] | None = None,
+    max_step: float = 0.05,
+) -> list[Recording]:
+    """Open one capture.
+
+    Args:
+        root: the ``.r3d`` file or its folder, the folder of the EXR + RGB export or the one around it, or the mp4.
+        poses: take the device's poses. Captures of the front camera have none: theirs are all the identity.
+        per_frame: take the intrinsics of each frame where the app wrote them, since autofocus and stabilisation move
+            them; False = those of frame 0 for all.
+        exr_channel: that holds depth. None = R, else the only one (R is what the exports at hand have; unconfirmed).
+        verify: decode every frame once while opening, and leave out those that do not decode. Without it only frames
+            whose first or last bytes look wrong are tried.
+        depth_range: m, nearest and furthest depth that the mp4's colours stand for. None = as the file says, else 0, 3.
+        max_step: m, largest difference between neighbouring pixels of the mp4's depth: beyond it the codec has mixed
+            colours.
+
+    Returns:
+        One recording; depth has its own resolution. A frame that lacks a part, a usable pose or its intrinsics is left
+        out and reported; so is one whose bytes are damaged, as far as ``verify`` looks. Damage found later is an error
+        of that frame.
+
+    Raises:
+        FormatError: no frame, or metadata that are damaged.
+        ImportError: the decoder of depth is not installed.
+    """
+    root = Path(root)
+    if root.is_file() and root.suffix.lower() != ".r3d":
+        return record3d_video.read(root, depth_range=depth_range, max_step=max_step)
+    if root.is_file():
+        members, inner, name = zip_members(root), root, root.stem
+    elif root.is_dir():
+        inner, name = _enclosed(root), root.resolve().name
+        members = folder_members(inner)
+    else:
+        raise FormatError(root, "path", "no such file or folder", "a Record3D capture")
+    table = member(members, "metadata.json" if "metadata.json" in members else "metadata", inner)
+    meta = _metadata(table, per_frame)
+    shots, report = _shots(members, inner)
+    shots, late = _covered(shots, meta)
+    c2w, lost, said = _poses([shot.number for shot in shots], meta, poses)
+    kept = [shot for shot in shots if shot.number not in lost]
+    report += late + said + files.left_out(sorted(lost), "its pose is not usable (tracking lost)")
+    if not kept:
+        raise FormatError(inner, "frames", "; ".join(report) or "none", "frames with picture, depth and metadata")
+    load = _Load(tuple(kept), meta, *_sizes(kept, meta), exr_channel)
+    good = [i for i, shot in enumerate(kept) if not (verify or _suspect(shot)) or _decodes(load, i)]
+    report += files.left_out([shot.number for i, shot in enumerate(kept) if i not in set(good)], "damaged")
+    if not good:
+        raise FormatError(inner, "frames", "; ".join(report), "frames that decode")
+    number = torch.tensor([kept[i].number for i in good])
+    times, said = _times(number, meta)
+    return [
+        Recording(
+            name=name,
+            format="record3d",
+            load=replace(load, shots=tuple(kept[i] for i in good)),
+            number=number,
+            root=root,
+            times=times,
+            poses=None if c2w is None else convert.to_poses(c2w[good], table.path),
+            rate_hz=meta.fps,
+            report=tuple(report + said),
+        )
+    ]
+
+
+@dataclass(frozen=True)
+class _Shot:
+    """The parts of one frame."""
+
+    number: int
+    image: Member
+    depth: Member
+    conf: Member | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Metadata:
+    """What the table of a capture says; rows belong to frame numbers."""
+
+    file: Path
+    hw: tuple[int, int]  # of the picture that K belongs to
+    depth_hw: tuple[int, int] | None
+    fps: float | None
+    K: np.ndarray  # (1 or n, 4) fx fy cx cy
+    poses: np.ndarray | None  # (n, 7) qx qy qz qw px py pz
+    stamps: np.ndarray | None  # (n,) s
+
+
+@dataclass(frozen=True, eq=False)
+class _Load:
+    """Position → frame."""
+
+    shots: tuple[_Shot, ...]
+    meta: _Metadata
+    hw: tuple[int, int]
+    depth_hw: tuple[int, int]
+    exr_channel: str | None
+
+    def __call__(self, i: int) -> Frame:
+        shot, meta = self.shots[i], self.meta
+        image = files.decode_image(shot.image.read(), shot.image.path, self.hw)
+        row = meta.K[shot.number if len(meta.K) > 1 else 0]
+        K = convert.resize_matrix(convert.matrix_of(*row), meta.hw, self.hw)
+        return Frame(
+            image=torch.from_numpy(image)[None],
+            depth=torch.from_numpy(self._depth(shot.depth))[None],
+            camera=convert.to_camera(K, self.hw, meta.file, f"intrinsics of frame {shot.number}"),
+            conf=None if shot.conf is None else torch.from_numpy(self._conf(shot.conf))[None],
+        )
+
+    def _depth(self, part: Member) -> np.ndarray:
+        if part.path.suffix == ".exr":
+            depth = codec_exr.decode_exr(part.read(), part.path, self.exr_channel, self.depth_hw)
+        else:
+            h, w = self.depth_hw
+            depth = np.frombuffer(lzfse.unpack(part.read(), 4 * h * w, part.path, "depth"), "<f4").reshape(h, w)
+        with np.errstate(invalid="ignore"):
+            return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+
+    def _conf(self, part: Member) -> np.ndarray:
+        h, w = self.depth_hw
+        conf = np.frombuffer(lzfse.unpack(part.read(), h * w, part.path, "confidence"), np.uint8)
+        if conf.max() > 2:
+            raise FormatError(part.path, "confidence", int(conf.max()), "0, 1 or 2")
+        return conf.reshape(h, w).copy()
+
+
+def _enclosed(root: Path) -> Path:
+    """The folder of the EXR export: the app puts it into one of that name."""
+    return root / "EXR_RGBD" if (root / "EXR_RGBD").is_dir() else root
+
+
+# --------------------------------------------------------------------------------------------------------- metadata
+
+
+def _metadata(table: Member, per_frame: bool) -> _Metadata:
+    file = table.path
+    value = files.decode_json(table.read(), file)
+    if not isinstance(value, dict):
+        raise FormatError(file, "JSON", type(value).__name__, "an object")
+    hw = _size(value, "h", "w", file)
+    if hw is None:
+        raise FormatError(file, "w, h", "nothing", "the size of the pictures")
+    coefficients = _rows(value, "perFrameIntrinsicCoeffs", 4, file) if per_frame else None
+    if coefficients is None:
+        K = files.to_array(value.get("K"), (9,), file, "K").reshape(3, 3).T  # column after column
+        if K[2].tolist() != [0, 0, 1] or K[0, 1] != 0 or K[1, 0] != 0:
+            raise FormatError(file, "K", K.T.ravel().tolist(), "fx 0 0 0 fy 0 cx cy 1")
+        coefficients = np.array([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]]])
+    elif not np.isfinite(coefficients).all():
+        raise FormatError(file, "perFrameIntrinsicCoeffs", "a number that is not finite", "fx fy cx cy of each frame")
+    fps = value.get("fps")
+    stamps = _rows(value, "frameTimestamps", 1, file)
+    return _Metadata(
+        file=file,
+        hw=hw,
+        depth_hw=_size(value, "dh", "dw", file),
+        fps=None if fps is None else files.to_positive(fps, file, "fps"),
+        K=coefficients,
+        poses=_rows(value, "poses", 7, file),
+        stamps=None if stamps is None else stamps[:, 0],
+    )
+
+
+def _size(value: Mapping[str, Any], high: str, wide: str, file: Path) -> tuple[int, int] | None:
+    """(height, width), or None where the table does not say."""
+    if value.get(high) is None and value.get(wide) is None:
+        return None
+    h, w = (files.to_positive(value.get(key), file, key) for key in (high, wide))
+    if h != int(h) or w != int(w) or h * w > files.MAX_PIXELS:
+        raise FormatError(file, f"{wide}, {high}", f"{w:g}x{h:g}", f"whole numbers, 1 to {files.MAX_PIXELS} pixels")
+    return int(h), int(w)
+
+
+def _rows(value: Mapping[str, Any], key: str, width: int, file: Path) -> np.ndarray | None:
+    """(n, width) numbers, NaN allowed; None where the table has no such key or nothing in it."""
+    rows = value.get(key)
+    if rows is None or rows == []:
+        return None
+    try:
+        array = np.asarray(rows, dtype=np.float64).reshape(len(rows), width)
+    except (TypeError, ValueError, OverflowError):
+        raise FormatError(file, key, rows, f"{width} numbers for each frame") from None
+    return array
+
+
+# ------------------------------------------------------------------------------------------------------------ frames
+
+
+def _shots(members: Mapping[str, Member], root: Path) -> tuple[list[_Shot], list[str]]:
+    """Frames with picture and depth (and confidence, if any frame has it) in numerical order; what is missing."""
+    parts: dict[int, dict[str, Member]] = {}
+    for name, part in members.items():
+        if match := _PART.fullmatch(name):
+            parts.setdefault(int(match[1]), {})["depth" if match[2] == "exr" else match[2]] = part
+    if not parts:
+        raise FormatError(root, "frames", "none", "rgbd/<i>.jpg and .depth, or rgb/<i>.jpg and depth/<i>.exr")
+    wanted = ["jpg", "depth"] + (["conf"] if any("conf" in found for found in parts.values()) else [])
+    words = {"jpg": "picture", "depth": "depth", "conf": "confidence"}
+    shots, missing = [], dict[str, list[int]]()
+    for number, found in sorted(parts.items()):
+        lacks = " and no ".join(words[part] for part in wanted if part not in found)
+        if lacks:
+            missing.setdefault(f"no {lacks}", []).append(number)
+        else:
+            shots.append(_Shot(number, found["jpg"], found["depth"], found.get("conf")))
+    gap = sorted(set(range(min(parts), max(parts))) - set(parts)) if max(parts) - min(parts) < 10 * len(parts) else []
+    missing |= {"no file": gap} if gap else {}
+    return shots, [line for why, numbers in missing.items() for line in files.left_out(numbers, why)]
+
+
+def _covered(shots: list[_Shot], meta: _Metadata) -> tuple[list[_Shot], list[str]]:
+    """Frames that every list of the table reaches."""
+    lengths = [len(rows) for rows in (meta.poses, meta.stamps) if rows is not None]
+    lengths += [len(meta.K)] if len(meta.K) > 1 else []
+    known = [shot for shot in shots if shot.number < min(lengths, default=shot.number + 1)]
+    late = [shot.number for shot in shots if shot not in known] if len(known) < len(shots) else []
+    return known, files.left_out(late, f"beyond the metadata's {min(lengths, default=0)} rows")
+
+
+def _poses(numbers: list[int], meta: _Metadata, wanted: bool) -> tuple[np.ndarray | None, set[int], list[str]]:
+    """(camera-to-world of the usable frames, numbers of the others, what to report)."""
+    if meta.poses is None or not wanted or not numbers:
+        return None, set(), []
+    if (np.abs(meta.poses - [0, 0, 0, 1, 0, 0, 0]) <= 1e-9).all():  # front camera: no tracking
+        return None, set(), ["every pose is the identity: the device had none"]
+    rows = meta.poses[numbers]
+    with np.errstate(invalid="ignore", over="ignore"):
+        usable = np.isfinite(rows).all(-1) & (np.linalg.norm(rows[:, :4], axis=-1) > 1e-6)
+    lost = {number for number, good in zip(numbers, usable, strict=True) if not good}
+    c2w = convert.to_c2w(rows[usable, :4], rows[usable, 4:], meta.file, "poses")
+    return convert.cv_from_gl(c2w), lost, []
+
+
+def _times(number: torch.Tensor, meta: _Metadata) -> tuple[torch.Tensor | None, list[str]]:
+    """Seconds since the first stamp of the capture; frame number over rate where the stamps are no clock."""
+    counted = None if meta.fps is None else number.double() / meta.fps
+    if meta.stamps is None:
+        return counted, []
+    times = torch.from_numpy(meta.stamps - meta.stamps[0])[number]
+    if bool(torch.isfinite(times).all()) and bool((times.diff() > 0).all()):
+        return times, []
+    instead = "the frame rate counts instead" if counted is not None else "there are no times"
+    return counted, [f"time stamps do not increase: {instead}"]
+
+
+def _sizes(shots: list[_Shot], meta: _Metadata) -> tuple[tuple[int, int], tuple[int, int]]:
+    """(height, width) of picture and depth map, from the first frame that is whole enough to say."""
+    first: FormatError | None = None
+    for shot in shots:
+        try:
+            return _sizes_of(shot, meta)
+        except FormatError as error:
+            first = first or error
+    raise first or FormatError(meta.file, "frames", "none", "at least one")
+
+
+def _sizes_of(shot: _Shot, meta: _Metadata) -> tuple[tuple[int, int], tuple[int, int]]:
+    hw = files.decode_image_header(shot.image.read(), shot.image.path).hw
+    if shot.depth.path.suffix == ".exr":
+        return hw, codec_exr.decode_exr_header(shot.depth.read(), shot.depth.path).hw
+    if meta.depth_hw is not None:
+        return hw, meta.depth_hw
+    data = shot.depth.read()
+    count = lzfse.unpacked_size(data, shot.depth.path, "depth") if data.startswith(b"bvx") else len(data)
+    if count / 4 not in _DEPTH_SIZES:
+        expected = "dw and dh in the metadata, or 4 for each of " + ", ".join(map(str, _DEPTH_SIZES))
+        raise FormatError(shot.depth.path, "depth", f"{count} bytes", expected)
+    h, w = _DEPTH_SIZES[count // 4]
+    return hw, ((h, w) if meta.hw[0] > meta.hw[1] else (w, h))
+
+
+def _suspect(shot: _Shot) -> bool:
+    """Whether a part begins or ends as no whole one does."""
+    ends = shot.image.ends(2)
+    return (ends is not None and ends != _JPEG) or any(
+        part.path.suffix != ".exr" and (ends := part.ends(4)) is not None and ends[0][:3] + ends[1] != b"bvxbvx$"
+        for part in (shot.depth, shot.conf)
+        if part is not None
+    )
+
+
+def _decodes(load: _Load, i: int) -> bool:
+    try:
+        load(i)
+    except FormatError:
+        return False
+    return True

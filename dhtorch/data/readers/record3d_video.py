@@ -1,0 +1,142 @@
+"""Record3D's RGBD mp4: depth as hue in the left half of every picture, colour in the right half.
+
+A pixel's hue (full saturation, full value) runs once round the circle from the nearest to the furthest depth, 0 to 3 m
+unless the file says otherwise. Both ends are red, so they cannot be told apart and are dropped, as are pixels next to
+a jump: there the codec has blended two hues into a third one. Intrinsics stand as JSON near the end of the file, behind
+the pictures, or in a ``metadata.json`` beside it; they belong to one half. There is no confidence and no pose.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from dhtorch.data import convert
+from dhtorch.data.codecs import video
+from dhtorch.data.io import decode as files
+from dhtorch.data.io import safe_open as doors
+from dhtorch.data.io.decode import FormatError
+from dhtorch.data.recording import Recording
+from dhtorch.records import Camera, Frame
+
+_MARK = b'{"intrinsicMatrix"'
+_TAIL = 1 << 20  # bytes at the end of the file in which the intrinsics are looked for
+_RANGE = (0.0, 3.0)  # m
+_SHARE = (0.1 / 3, 2.8 / 3)  # of the range: what the app's own viewer keeps
+_MIN_CHROMA = 0.25  # of full: every coded pixel has full colour, grey has no hue
+
+
+def recognise(file: Path) -> str | None:
+    """What makes ``file`` an RGBD mp4, in words; None if nothing does."""
+    if file.suffix.lower() != ".mp4":
+        return None
+    if _MARK in _tail(file):
+        return "an mp4 with an intrinsicMatrix at its end"
+    side = file.parent / "metadata.json"
+    if side.is_file() and _MARK.strip(b'{"') in files.read_bytes(side, files.MAX_TEXT_BYTES):
+        return "an mp4 beside a metadata.json with an intrinsicMatrix"
+    return None
+
+
+def read(file: Path, *, depth_range: Sequence[float] | None = None, max_step: float = 0.05) -> list[Recording]:
+    """Open one video; see :func:`dhtorch.data.readers.record3d.read`."""
+    meta, source = _metadata(file)
+    header = video.video_header(file)
+    hw = (header.hw[0], header.hw[1] // 2)
+    K = files.to_array(meta.get("intrinsicMatrix", meta.get("K")), (9,), source, "intrinsicMatrix").reshape(3, 3).T
+    limits = depth_range if depth_range is not None else meta.get("rangeOfEncodedDepth", _RANGE)
+    near, far = files.to_array(limits, (2,), source, "rangeOfEncodedDepth")
+    if not 0 <= near < far <= 1e4 or header.hw[1] % 2:
+        found = f"{near} to {far} m in a picture {header.hw[1]} wide"
+        raise FormatError(source, "rangeOfEncodedDepth", found, "two increasing depths, two halves")
+    camera = convert.to_camera(K, hw, source, "intrinsicMatrix")
+    load = _Load(file, header.hw, camera, float(near), float(far), files.to_positive(max_step, file, "option max_step"))
+    number = torch.arange(header.n)
+    return [
+        Recording(
+            name=file.stem,
+            format="record3d",
+            load=load,
+            number=number,
+            root=file,
+            times=None if header.rate_hz is None else number.double() / header.rate_hz,
+            rate_hz=header.rate_hz,
+            report=("no poses in this layout",),
+        )
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class _Load:
+    """Position → frame."""
+
+    file: Path
+    hw: tuple[int, int]  # of the whole picture
+    camera: Camera
+    near: float  # m
+    far: float
+    max_step: float
+
+    def __call__(self, i: int) -> Frame:
+        # Nearest: hues must not be blended on the way from the half-size colour planes to the full size.
+        picture = video.read_video_frame(self.file, i, self.hw, nearest=True)
+        half = self.hw[1] // 2
+        image = np.ascontiguousarray(picture[:, half:].transpose(2, 0, 1))
+        depth = hue_depth(picture[:, :half], self.near, self.far, self.max_step)
+        return Frame(torch.from_numpy(image)[None], torch.from_numpy(depth)[None], self.camera)
+
+
+def hue_depth(
+    rgb: np.ndarray,  # (h, w, 3) uint8
+    near: float,  # m, of hue 0
+    far: float,  # m, of a full turn
+    max_step: float,  # m
+) -> np.ndarray:
+    """Depth (h, w) m float32 of hues; 0 near the two ends of the range, beside a jump, and where there is no hue."""
+    x = rgb.astype(np.float32)
+    r, g, b = x[..., 0], x[..., 1], x[..., 2]
+    top, chroma = x.max(-1), np.ptp(x, -1)
+    c = np.maximum(chroma, 1)
+    sixth = np.where(top == r, (g - b) / c % 6, np.where(top == g, (b - r) / c + 2, (r - g) / c + 4))
+    hue = sixth / 6
+    depth = near + hue * (far - near)
+    usable = (hue >= _SHARE[0]) & (hue < _SHARE[1]) & (chroma >= 255 * _MIN_CHROMA)
+    jump = np.maximum(_around(depth, np.maximum) - depth, depth - _around(depth, np.minimum)) > max_step
+    return np.where(usable & ~jump, depth, 0).astype(np.float32)
+
+
+def _around(x: np.ndarray, extreme: np.ufunc) -> np.ndarray:
+    """Largest or smallest value (``np.maximum``, ``np.minimum``) in the 3×3 window of every pixel."""
+    x = np.pad(x, 1, mode="edge")
+    x = extreme(extreme(x[:-2], x[1:-1]), x[2:])
+    return np.asarray(extreme(extreme(x[:, :-2], x[:, 1:-1]), x[:, 2:]))
+
+
+def _metadata(file: Path) -> tuple[dict[str, Any], Path]:
+    """The JSON object with the intrinsics, and where it stood."""
+    tail = _tail(file)
+    at = tail.rfind(_MARK)
+    if at < 0:
+        side = file.parent / "metadata.json"
+        if not side.is_file():
+            raise FormatError(file, "intrinsicMatrix", "neither in the file nor in a metadata.json", "one of them")
+        return files.read_json(side), side
+    try:  # other bytes follow
+        return json.JSONDecoder().raw_decode(tail[at:].decode("utf-8", errors="replace"))[0], file
+    except (ValueError, RecursionError) as error:
+        raise FormatError(file, "intrinsicMatrix", error, "a JSON object") from None
+
+
+def _tail(file: Path) -> bytes:
+    try:
+        with doors.opened(file) as stream:
+            stream.seek(-min(_TAIL, stream.seek(0, 2)), 2)
+            return stream.read()
+    except OSError as error:
+        raise FormatError(file, "file", error, "a readable file") from None

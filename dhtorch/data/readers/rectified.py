@@ -1,0 +1,152 @@
+"""Rectified pairs with a disparity map: two images whose rows coincide, the right one displaced along x alone.
+
+- *calib.txt* layout (Middlebury 2014, ETH3D two-view): ``im0.png``, ``im1.png``, ``disp0.pfm`` (or ``disp0GT.pfm``; the
+  right view's ``disp1…`` where there is one) and ``calib.txt`` with ``cam0=[…]``, ``cam1=[…]``, ``doffs``,
+  ``baseline`` in mm.
+- *npz* layout (scikit-image's motorcycle): ``*_left.png``, ``*_right.png``, ``*_disp.npz`` and a side-car ``meta.json``
+  with ``K_left``, ``K_right``, ``baseline_m``, ``doffs``; nothing else says how to turn this disparity into metres.
+
+Depth is ``f · baseline / (disparity + doffs)`` with ``doffs`` the difference of the principal points.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from dhtorch.data import convert
+from dhtorch.data.codecs import npy, pfm
+from dhtorch.data.io import decode as files
+from dhtorch.data.io.decode import FormatError
+from dhtorch.data.recording import Recording, numbers
+from dhtorch.records import Camera, Frame, Pose
+
+#: px; a smaller difference of directions has never been measured, its depth would be any number.
+_MIN_DISPARITY = 1e-3
+
+
+def recognise(root: Path) -> str | None:
+    """What makes ``root`` a recording of this format, in words; None if nothing does."""
+    if (root / "calib.txt").is_file() and (root / "im0.png").is_file():
+        return "calib.txt and im0.png"
+    if root.is_dir() and any(root.glob("*_disp.npz")) and any(root.glob("*_left.png")):
+        return "*_left.png and *_disp.npz"
+    return None
+
+
+def read(root: str | Path) -> list[Recording]:
+    """Open a pair as a recording of two frames: 0 = left, with depth; 1 = right, without (all 0) unless it is there.
+
+    The world is the left camera; each view has its own intrinsics; there are no time stamps.
+
+    Raises:
+        FormatError: a missing or damaged file, or a calibration that cannot be one.
+    """
+    root = Path(root)
+    pair = _calib_pair(root) if (root / "calib.txt").is_file() else _npz_pair(root)
+    eye = torch.eye(3, dtype=torch.float64).expand(2, 3, 3).clone()
+    t = torch.tensor([[0.0, 0.0, 0.0], [pair.baseline, 0.0, 0.0]], dtype=torch.float64)
+    return [
+        Recording(
+            name=root.resolve().name,
+            format="rectified",
+            load=pair,
+            number=numbers(2),
+            root=root,
+            poses=Pose(eye, t),
+        )
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """0 → left frame, 1 → right frame."""
+
+    images: tuple[Path, Path]
+    disparities: tuple[Path | None, Path | None]
+    cameras: tuple[Camera, Camera]
+    hw: tuple[int, int]
+    baseline: float  # m
+    doffs: float  # px
+
+    def __call__(self, i: int) -> Frame:
+        image = torch.from_numpy(files.read_image(self.images[i], self.hw))
+        camera, file = self.cameras[i], self.disparities[i]
+        depth = np.zeros(self.hw, np.float32)
+        if file is not None:
+            disparity = _disparity(file, self.hw).astype(np.float64) + self.doffs
+            usable = np.isfinite(disparity) & (disparity > _MIN_DISPARITY)
+            f = camera.f[0, 0].double().item()
+            depth = np.where(usable, f * self.baseline / np.where(usable, disparity, 1), 0).astype(np.float32)
+        return Frame(image[None], torch.from_numpy(depth)[None], camera)
+
+
+def _calib_pair(root: Path) -> _Pair:
+    file = root / "calib.txt"
+    entries = dict(re.findall(r"^\s*(\w+)\s*=\s*(.*?)\s*$", files.read_text(file), re.MULTILINE))
+    images = (root / "im0.png", root / "im1.png")
+    hw = files.image_header(images[0]).hw
+    size = (_number(entries, "height", file), _number(entries, "width", file))
+    if size != hw:
+        raise FormatError(file, "width and height", f"{size[1]:g}x{size[0]:g}", f"{hw[1]}x{hw[0]}, as im0.png")
+    first, second = (_first(root, f"disp{i}.pfm", f"disp{i}GT.pfm") for i in (0, 1))
+    if first is None:
+        raise FormatError(root / "disp0.pfm", "file", "no such file", "a disparity map disp0.pfm or disp0GT.pfm")
+    cameras = [convert.to_camera(_matrix(entries, f"cam{i}", file), hw, file, f"cam{i}") for i in (0, 1)]
+    baseline, doffs = _number(entries, "baseline", file) / 1000, _number(entries, "doffs", file)
+    return _checked(_Pair(images, (first, second), (cameras[0], cameras[1]), hw, baseline, doffs), file)
+
+
+def _npz_pair(root: Path) -> _Pair:
+    names = {}
+    for kind in ("left.png", "right.png", "disp.npz"):
+        found = sorted(root.glob(f"*_{kind}")) if root.is_dir() else []
+        if len(found) != 1:
+            raise FormatError(root, f"*_{kind}", f"{len(found)} such files", "exactly one")
+        names[kind] = found[0]
+    file = root / "meta.json"
+    meta = files.read_json(file)
+    hw = files.image_header(names["left.png"]).hw
+    cameras = [convert.to_camera(meta.get(key), hw, file, key) for key in ("K_left", "K_right")]
+    baseline, doffs = (float(files.to_array(meta.get(key), (), file, key)) for key in ("baseline_m", "doffs"))
+    images = (names["left.png"], names["right.png"])
+    return _checked(_Pair(images, (names["disp.npz"], None), (cameras[0], cameras[1]), hw, baseline, doffs), file)
+
+
+def _checked(pair: _Pair, file: Path) -> _Pair:
+    """The right view of a rectified pair keeps rows and scale, and ``doffs`` is no free number."""
+    if not 0 < pair.baseline <= convert.MAX_COORDINATE:
+        raise FormatError(file, "baseline", pair.baseline, "a positive length")
+    left, right = pair.cameras
+    if not torch.equal(left.f, right.f):
+        raise FormatError(file, "focal length", f"{left.f.tolist()} and {right.f.tolist()}", "equal ones")
+    shift = float(right.c[0, 0] - left.c[0, 0])
+    if abs(shift - pair.doffs) > 0.5:
+        raise FormatError(file, "doffs", pair.doffs, f"{shift:g}, the difference of the principal points")
+    return pair
+
+
+def _disparity(file: Path, hw: tuple[int, int]) -> np.ndarray:
+    if file.suffix == ".pfm":
+        return pfm.read_pfm(file, hw)
+    disparity = npy.read_npz(file, "arr_0")
+    if disparity.shape != hw:
+        raise FormatError(file, "arr_0", f"shape {disparity.shape}", f"{hw}, as the image")
+    return disparity
+
+
+def _matrix(entries: dict[str, str], key: str, file: Path) -> list[list[str]]:
+    """``[a b c; d e f; g h i]``, as Matlab writes it."""
+    return [row.split() for row in entries.get(key, "").strip("[]").split(";")]
+
+
+def _number(entries: dict[str, str], key: str, file: Path) -> float:
+    return float(files.to_array(entries.get(key), (), file, key))
+
+
+def _first(root: Path, *names: str) -> Path | None:
+    return next((root / name for name in names if (root / name).is_file()), None)

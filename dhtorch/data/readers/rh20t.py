@@ -1,0 +1,332 @@
+"""RH20T: a robot at work, seen by many cameras, each at its own clock; one recording per camera.
+
+A scene folder holds ``metadata.json`` and, for each camera, ``cam_<serial>/`` with ``color.mp4``, ``depth.mp4`` (often
+in a parallel tree) and ``timestamps.npy``; beside the scenes lies ``calib/<stamp>/`` with ``intrinsics.npy`` (for
+1280×720), ``extrinsics.npy`` (world → camera; the world is the calibration marker) and ``tcp.npy``. The ``.npy`` files
+are pickles: they are read as data (:mod:`dhtorch.data.codecs.pickles`), no code in them runs.
+
+A depth picture is twice as high as the image, the low bytes above the high bytes, in millimetres. A camera on the hand
+moves: its pose follows the tool centre point (:mod:`dhtorch.data.readers.rh20t_robot`). ``streams`` gives the robot's
+side. Scenes named ``…_human`` show a person at the same task; which arrays they lack is unconfirmed, so nothing but
+videos, time stamps and the calibration is needed of any scene.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dhtorch.data import convert
+from dhtorch.data.clocks import nearest
+from dhtorch.data.codecs.pickles import read_npy
+from dhtorch.data.codecs.video import read_video_frame, video_header
+from dhtorch.data.io import decode as files
+from dhtorch.data.io.decode import FormatError
+from dhtorch.data.readers.rh20t_robot import (
+    ARMS,
+    Arm,
+    Stream,
+    calibration_tcp,
+    hand_poses,
+    seconds,
+    streams,
+    tcp_base,
+)
+from dhtorch.data.recording import Recording
+from dhtorch.geometry import camera as cameras
+from dhtorch.records import Camera, Frame, Pose
+from dhtorch.runtime.console import many
+
+__all__ = ["Stream", "read", "recognise", "streams"]
+
+_RATE_HZ = 10.0
+
+
+def recognise(root: Path) -> str | None:
+    """What makes ``root`` a recording of this format, in words; None if nothing does."""
+    if (root / "metadata.json").is_file() and any(root.glob("cam_*/timestamps.npy")):
+        return "metadata.json and cam_<serial>/timestamps.npy"
+    return None
+
+
+def read(
+    root: str | Path,
+    *,
+    serials: Sequence[str] | None = None,
+    depth_root: str | None = None,
+    calibration: str | None = None,
+    calibrated_hw: Sequence[int] = (720, 1280),
+    configuration: int | None = None,
+    in_hand: Sequence[str] | None = None,
+    max_difference: float = 0.02,
+    max_gap: float = 0.5,
+    outlier: float = 0.0,
+) -> list[Recording]:
+    """Open a scene, one recording for each camera that has images and a calibration.
+
+    Args:
+        root: the folder of the scene.
+        serials: cameras to open. None = all; those that cannot be opened are then left out and reported.
+        depth_root: the folder of the same scene in the parallel tree of depth videos. None = ``root``.
+        calibration: the folder that holds the calibrations by stamp. None = ``calib`` beside the scene.
+        calibrated_hw: height and width that ``intrinsics.npy`` belongs to; K is scaled to the video by the exact rule.
+        configuration: 1 to 7, the robot. None = from ``cfg_000N`` in the folder's name.
+        in_hand: serials of the cameras on the hand, the one that the published mount belongs to first. None = those of
+            the configuration.
+        max_difference: s, largest distance in time of a colour and a depth picture that belong together.
+        max_gap: s, longest gap of the tcp stream that the pose of a camera on the hand is interpolated across.
+        outlier: m, a return that differs by more from the median of the returns within two pixels is dropped; 0 = off.
+            Whether the depth videos are lossless is unconfirmed; a lossy high byte is off by multiples of 0.256 m.
+
+    Returns:
+        Recordings named ``<scene>/<serial>``, colour and depth paired by time. Without ``depth.mp4`` the depth is empty
+        and the report says so. Poses are absent where a camera on the hand cannot be followed.
+
+    Raises:
+        FormatError: no camera, no calibration (``calib`` −1), a damaged file, or values no camera or pose can have.
+    """
+    root = Path(root)
+    meta = files.read_json(root / "metadata.json")
+    stamp = meta.get("calib", -1)
+    if isinstance(stamp, bool) or not isinstance(stamp, int | str) or not re.fullmatch(r"\d{10,16}", str(stamp)):
+        raise FormatError(root / "metadata.json", "calib", stamp, "the stamp of a calibration (-1 = there is none)")
+    beside = root.parent.parent if root.parent.name == "action" else root.parent
+    folder = (Path(calibration) if calibration is not None else beside / "calib") / str(stamp)
+    hw = files.to_array(calibrated_hw, (2,), root, "option calibrated_hw")
+    rig = _Rig(
+        root=root,
+        depth_root=Path(depth_root) if depth_root is not None else root,
+        folder=folder,
+        K=_by_serial(folder / "intrinsics.npy"),
+        E=_by_serial(folder / "extrinsics.npy"),
+        hw=(int(hw[0]), int(hw[1])),
+        arm=_arm(root, configuration, in_hand),
+        max_difference=max_difference,
+        max_gap=max_gap,
+        outlier=outlier,
+    )
+    present = sorted(d.name[4:] for d in root.glob("cam_*") if d.is_dir())
+    if unknown := sorted(set(serials or ()) - set(present)):
+        raise FormatError(root, "option serials", ", ".join(unknown), f"some of {', '.join(present)}")
+    lacking = {} if serials else {s: why for s in present if (why := rig.lacks(s))}
+    opened = [s for s in serials or present if s not in lacking]
+    if not opened:
+        raise FormatError(root, "cameras", ", ".join(lacking.values()) or "none", "one with images and calibration")
+    left_out = tuple(f"camera {s}: {why}: left out" for s, why in lacking.items())
+    bad = meta.get("bad_calib_view", ())
+    doubted = {str(s) for s in bad} if isinstance(bad, list) else set()
+    return [rig.recording(s, left_out, s in doubted) for s in opened]
+
+
+@dataclass(frozen=True, eq=False)
+class _Load:
+    """Position → frame."""
+
+    colour: Path
+    depth: Path | None
+    places: tuple[tuple[int, int], ...]  # number of the colour frame, number of the depth frame
+    camera: Camera
+    hw: tuple[int, int]
+    depth_hw: tuple[int, int]
+    outlier: float
+
+    def __call__(self, i: int) -> Frame:
+        k, j = self.places[i]
+        image = torch.from_numpy(read_video_frame(self.colour, k, self.hw)).permute(2, 0, 1).contiguous()
+        return Frame(image[None], self._depth(j)[None], self.camera)
+
+    def _depth(self, j: int) -> Tensor:
+        h, w = self.depth_hw
+        if self.depth is None:
+            return torch.zeros(h, w)
+        planes = read_video_frame(self.depth, j, (2 * h, w), pixels="gray")
+        depth = torch.from_numpy(planes[:h].astype(np.float32) + planes[h:].astype(np.float32) * 256) / 1000
+        return _without_outliers(depth, self.outlier) if self.outlier > 0 else depth
+
+
+@dataclass(frozen=True, eq=False)
+class _Rig:
+    """All that the cameras of a scene share."""
+
+    root: Path
+    depth_root: Path
+    folder: Path
+    K: dict[str, Any]
+    E: dict[str, Any]
+    hw: tuple[int, int]
+    arm: Arm | None
+    max_difference: float
+    max_gap: float
+    outlier: float
+
+    def lacks(self, serial: str) -> str | None:
+        """Why a camera cannot be opened."""
+        for name in ("color.mp4", "timestamps.npy"):
+            if not (self.root / f"cam_{serial}" / name).is_file():
+                return f"no {name}"
+        return None if serial in self.K and serial in self.E else f"no calibration in {self.folder.name}"
+
+    def recording(self, serial: str, report: tuple[str, ...], doubted: bool) -> Recording:
+        home = self.root / f"cam_{serial}"
+        colour, depth = home / "color.mp4", self.depth_root / f"cam_{serial}" / "depth.mp4"
+        notes = list(report) + ([f"camera {serial}: metadata doubts its calibration"] if doubted else [])
+        header = video_header(colour)
+        size = header.hw
+        depth_size = size
+        if depth.is_file():
+            high, wide = video_header(depth).hw
+            depth_size = (high // 2, wide)
+            if high % 2 or depth_size[0] * size[1] != depth_size[1] * size[0]:
+                raise FormatError(
+                    depth, "size", f"{wide}x{high}", f"twice as high as an image like {size[1]}x{size[0]}"
+                )
+        else:
+            notes.append(f"camera {serial}: no depth.mp4: depth is empty")
+        places, times = self._places(home / "timestamps.npy", header.n, depth if depth.is_file() else None, notes)
+        poses, covered = self._poses(serial, times, notes)
+        kept = np.flatnonzero(covered)
+        places = tuple(places[k] for k in kept)
+        return Recording(
+            name=f"{self.root.resolve().name}/{serial}",
+            format="rh20t",
+            load=_Load(
+                colour=colour,
+                depth=depth if depth.is_file() else None,
+                places=places,
+                camera=self._camera(serial, size),
+                hw=size,
+                depth_hw=depth_size,
+                outlier=self.outlier,
+            ),
+            number=torch.tensor([k for k, _ in places]),
+            root=self.root,
+            times=torch.from_numpy(times[kept]),
+            poses=poses,
+            rate_hz=header.rate_hz or _RATE_HZ,
+            report=tuple(notes),
+        )
+
+    def _camera(self, serial: str, hw: tuple[int, int]) -> Camera:
+        file = self.folder / "intrinsics.npy"
+        value = self.K.get(serial)
+        K = value if isinstance(value, np.ndarray) else None
+        if K is None or K.shape not in ((3, 3), (3, 4)) or K.dtype.kind not in "fiu" or (K[:, 3:] != 0).any():
+            found = type(value).__name__ if K is None else f"an array of shape {K.shape}"
+            raise FormatError(file, serial, found, "3x3 intrinsics, or 3x4 with zeros behind")
+        if hw[0] * self.hw[1] != hw[1] * self.hw[0]:
+            raise FormatError(file, "image size", f"{hw[1]}x{hw[0]}", f"the shape of {self.hw[1]}x{self.hw[0]}")
+        full = convert.to_camera(K[:, :3].astype(np.float64), self.hw, file, serial)
+        return cameras.resize(full.to(torch.float64), self.hw, hw).to(torch.float32)
+
+    def _extrinsics(self, serial: str) -> np.ndarray:
+        """World → camera: the first of a camera's matrices."""
+        file = self.folder / "extrinsics.npy"
+        value = self.E.get(serial)
+        first = value[0] if isinstance(value, list | np.ndarray) and len(value) else None
+        if not isinstance(first, np.ndarray) or first.shape != (4, 4) or first.dtype.kind != "f":
+            raise FormatError(file, serial, type(first).__name__, "a list of 4x4 matrices")
+        convert.to_poses(first[None].astype(np.float64), file, serial)
+        return first.astype(np.float64)
+
+    def _places(
+        self, file: Path, n_colour: int, depth: Path | None, notes: list[str]
+    ) -> tuple[tuple[tuple[int, int], ...], np.ndarray]:
+        """(colour frame, depth frame) and the time of every pair, in the order of time."""
+        lists = read_npy(file)
+        colour = _stamps(lists, "color", n_colour, file, notes)
+        if depth is None:
+            return tuple((k, -1) for k, _ in colour), np.array([t for _, t in colour])
+        other = _stamps(lists, "depth", video_header(depth).n, file, notes)
+        at = nearest(np.array([t for _, t in colour]), np.array([t for _, t in other]), self.max_difference)
+        pairs = [(k, other[j][0], t) for (k, t), j in zip(colour, at, strict=True) if j >= 0]
+        if len(pairs) < len(colour):
+            notes.append(
+                f"{many(len(colour) - len(pairs), 'image')} without depth within {self.max_difference} s: left out"
+            )
+        if not pairs:
+            raise FormatError(file, "time stamps", f"no depth within {self.max_difference} s of any image", "pairs")
+        return tuple((k, j) for k, j, _ in pairs), np.array([t for _, _, t in pairs])
+
+    def _poses(self, serial: str, times: np.ndarray, notes: list[str]) -> tuple[Pose | None, np.ndarray]:
+        """Poses of the covered times, and which are covered."""
+        every = np.ones(len(times), dtype=bool)
+        file = self.folder / "extrinsics.npy"
+        E = self._extrinsics(serial)
+        if self.arm is None or serial not in self.arm.in_hand:
+            if self.arm is None:
+                notes.append("unknown configuration: every camera is taken to stand still (option configuration)")
+            return convert.to_poses(np.repeat(np.linalg.inv(E)[None], len(times), 0), file, serial), every
+        lacking = [f for f in (self.folder / "tcp.npy", self.root / "transformed" / "tcp_base.npy") if not f.is_file()]
+        if lacking or self.arm.in_hand[0] not in self.E:
+            what = lacking[0].name if lacking else f"extrinsics of {self.arm.in_hand[0]}"
+            notes.append(f"camera {serial} is on the hand and there is no {what}: no poses")
+            return None, every
+        stream = tcp_base(self.root)
+        if not len(stream.times):
+            raise FormatError(self.root / "transformed" / "tcp_base.npy", "entries", "none that is usable", "poses")
+        tcp, covered = stream.at(times, self.max_gap)
+        if not covered.any():
+            raise FormatError(
+                self.root / "transformed" / "tcp_base.npy", "time stamps", "none near an image", "overlap"
+            )
+        if not covered.all():
+            notes.append(
+                f"camera {serial}: {many(int((~covered).sum()), 'frame')} in a gap of the tcp stream: left out"
+            )
+        T = calibration_tcp(self.folder / "tcp.npy", self.arm)
+        hand = self._extrinsics(self.arm.in_hand[0])
+        c2w = hand_poses(self.arm, E, hand, T, tcp[covered], file)
+        return convert.to_poses(c2w, file, serial), covered
+
+
+def _arm(root: Path, configuration: int | None, in_hand: Sequence[str] | None) -> Arm | None:
+    if configuration is not None and configuration not in ARMS:
+        raise FormatError(root, "option configuration", configuration, "1 to 7")
+    named = re.search(r"cfg_0*([1-7])(?!\d)", root.resolve().name)
+    number = configuration or (int(named[1]) if named else None)
+    if number is None:
+        return None
+    return ARMS[number]._replace(in_hand=tuple(in_hand)) if in_hand is not None else ARMS[number]
+
+
+def _by_serial(file: Path) -> dict[str, Any]:
+    value = read_npy(file)
+    if not isinstance(value, dict):
+        raise FormatError(file, "content", type(value).__name__, "a dict by camera serial")
+    return {str(key): entry for key, entry in value.items()}
+
+
+def _stamps(lists: Any, kind: str, n: int, file: Path, notes: list[str]) -> list[tuple[int, float]]:
+    """(frame number, s) of the frames that are in the video, in increasing time."""
+    stamps = lists.get(kind) if isinstance(lists, dict) else None
+    if isinstance(stamps, np.ndarray):
+        stamps = stamps.tolist()
+    if not isinstance(stamps, list) or not stamps:
+        raise FormatError(file, kind, type(stamps).__name__, "a list of Unix milliseconds")
+    if len(stamps) != n:
+        notes.append(
+            f"{many(len(stamps), f'{kind} stamp')} for {many(n, 'frame')}: the first {min(n, len(stamps))} are used"
+        )
+    kept: list[tuple[int, float]] = []
+    for k, stamp in enumerate(stamps[:n]):
+        t = seconds(stamp, file, kind)
+        if not kept or t > kept[-1][1]:
+            kept.append((k, t))
+    if (lost := min(n, len(stamps)) - len(kept)) > 0:
+        notes.append(f"{many(lost, f'{kind} frame')} whose stamp is not later than the one before: left out")
+    return kept
+
+
+def _without_outliers(depth: Tensor, limit: float) -> Tensor:
+    """Returns further than ``limit`` from the median of the returns in their 5×5 neighbourhood become no return."""
+    empty = torch.where(depth > 0, depth, torch.full_like(depth, torch.nan))
+    around = torch.nn.functional.pad(empty, (2, 2, 2, 2), value=torch.nan).unfold(0, 5, 1).unfold(1, 5, 1)
+    middle = around.reshape(*depth.shape, 25).nanmedian(-1).values
+    return torch.where((depth - middle).abs() > limit, torch.zeros_like(depth), depth)

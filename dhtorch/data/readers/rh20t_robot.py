@@ -1,0 +1,250 @@
+"""The robot's side of an RH20T scene: its streams at their own clocks, and the camera that the hand carries.
+
+Alphabet: ``E`` world → camera (the world is the calibration marker); ``T`` tool centre point (tcp) → robot base; ``X``
+tcp → camera, constant for a camera on the hand. Poses in files are x y z qw qx qy qz, metres, scalar first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dhtorch.data import convert
+from dhtorch.data.codecs.pickles import read_npy
+from dhtorch.data.io import decode as files
+from dhtorch.data.io.decode import FormatError
+
+_LATEST_MS = 4_102_444_800_000  # the year 2100
+_TURN = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+class Arm(NamedTuple):
+    """One of the seven robot set-ups, from the configuration file of the data set's own tools."""
+
+    robot: str
+    in_hand: tuple[str, ...]  # serials of the cameras on the hand; X belongs to the first
+    X: np.ndarray  # (4, 4)
+    align_tcp: np.ndarray  # (4, 4) published tcp axes → the robot's own
+    align_base: np.ndarray  # (4, 4) published base axes → the robot's own
+
+
+def _arm(robot: str, in_hand: str, X: str, tcp: float = 0, base: float = 0) -> Arm:
+    """``X``: quarter turns about z, then x y z; ``tcp``, ``base``: quarter turns about z."""
+    turns, *t = map(float, X.split())
+    matrix = _quarter_turns(turns)
+    matrix[:3, 3] = t
+    return Arm(robot, tuple(in_hand.split()), matrix, _quarter_turns(tcp), _quarter_turns(base))
+
+
+def _quarter_turns(n: float) -> np.ndarray:
+    matrix = np.eye(4)
+    c, s = np.round([np.cos(n * np.pi / 2), np.sin(n * np.pi / 2)])
+    matrix[:2, :2] = [[c, -s], [s, c]]
+    return matrix
+
+
+ARMS = {
+    1: _arm("flexiv", "043322070878", "1 0 .077 .2665"),
+    2: _arm("flexiv", "104422070042", "1 0 .077 .2915"),
+    3: _arm("ur5", "045322071843", "0 .027 .0775 .240", tcp=1, base=2),
+    4: _arm("ur5", "045322071843", "0 .027 .0775 .210", tcp=1, base=2),
+    5: _arm("franka", "104422070042 135122079702", "3 .033 -.05 .09", tcp=2),
+    6: _arm("kuka", "135122075425 135122070361", "1 .035 .055 .20"),
+    7: _arm("kuka", "135122075425 135122070361", "1 .035 .055 .20"),
+}
+
+
+class Stream(NamedTuple):
+    """One quantity at its own clock."""
+
+    times: np.ndarray  # (m,) s, increasing
+    values: np.ndarray  # (m, d) as stored
+    pose: bool = False  # values are x y z qw qx qy qz
+
+    def at(self, times: np.ndarray, max_gap: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
+        """Values (n, d) at other ``times`` (n,), and which of these the stream covers, (n,) bool.
+
+        Between two entries at most ``max_gap`` s apart: linear, rotations along the shortest arc at constant speed. The
+        nearest entry where that is less than a millisecond away. Elsewhere not covered, and the value is the nearest.
+        """
+        after = np.searchsorted(self.times, times).clip(min(1, len(self.times) - 1), len(self.times) - 1)
+        before = (after - 1).clip(0)
+        a, b, span = self.values[before], self.values[after], self.times[after] - self.times[before]
+        share = ((times - self.times[before]) / np.where(span > 0, span, 1)).clip(0, 1)
+        inside = (times >= self.times[0]) & (times <= self.times[-1]) & (span <= max_gap)
+        share = np.where(inside, share, np.round(share))
+        values = a + share[:, None] * (b - a)
+        if self.pose:
+            q_a, q_b = (x[:, 3:] / np.linalg.norm(x[:, 3:], axis=-1, keepdims=True) for x in (a, b))
+            values[:, 3:] = convert.slerp(q_a, q_b, share)
+        near = np.minimum(np.abs(times - self.times[before]), np.abs(times - self.times[after])) < 1e-3
+        return values, inside | near
+
+
+#: Lists of entries by camera: the fields of an entry that are streams, what these are called, and their length (None =
+#: as stored). The name of a list that holds for all cameras ends in ``_base``.
+_FIELDS: dict[str, dict[str, tuple[str, int | None]]] = {
+    "tcp": {"tcp": ("tcp", 7)},
+    "tcp_base": {"tcp": ("tcp_base", 7), "robot_ft": ("robot_ft", None)},
+    "force_torque": {"zeroed": ("force_torque", 6), "raw": ("force_torque_raw", 6)},
+    "force_torque_base": {"zeroed": ("force_torque_base", 6), "raw": ("force_torque_base_raw", 6)},
+}
+
+
+def streams(root: str | Path) -> dict[str, Stream]:
+    """What the robot recorded in one scene folder.
+
+    Returns:
+        ``tcp_base`` (m, 7) in the robot's base frame and ``tcp/<serial>`` (m, 7) in that camera's frame;
+        ``force_torque_base`` and ``force_torque/<serial>`` (m, 6) of the sensor at the wrist, its zero taken off, and
+        ``force_torque_base_raw``, ``force_torque_raw/<serial>`` without; ``robot_ft``, what the robot itself says;
+        ``joint`` (m, d) rad, with velocities where the set-up has them; ``gripper_command`` and ``gripper_info``
+        (m, d) as stored, element 0 the width, by its use in mm (unconfirmed). Entries of all cameras' clocks are
+        merged, except in streams of one camera. What a scene lacks is absent: where a human shows the task
+        (``_human``), perhaps all (unconfirmed). ``high_freq_data``, whose layout nobody describes, is not read.
+
+    Raises:
+        FormatError: a damaged file.
+    """
+    folder = Path(root) / "transformed"
+    found: dict[str, Stream] = {}
+    for kind, fields in _FIELDS.items():
+        if (file := folder / f"{kind}.npy").is_file():
+            for field, (name, width) in fields.items():
+                found |= _by_field(file, field, name, width)
+    if (file := folder / "joint.npy").is_file():
+        found["joint"] = _stream(file, _stamped(file, None))
+    if (file := folder / "gripper.npy").is_file():
+        found |= {part: _stream(file, _stamped(file, part)) for part in ("gripper_command", "gripper_info")}
+    return {name: stream for name, stream in found.items() if len(stream.times)}
+
+
+def tcp_base(root: Path) -> Stream:
+    """The tcp in the base frame, entries of all cameras' clocks merged; entries that are all zero or NaN left out.
+
+    Raises:
+        FormatError: missing or damaged file.
+    """
+    return _by_field(root / "transformed" / "tcp_base.npy", "tcp", "tcp_base", 7)["tcp_base"]
+
+
+def hand_poses(
+    arm: Arm,
+    serial_E: np.ndarray,  # (4, 4) of the camera asked for, when calibrated
+    hand_E: np.ndarray,  # (4, 4) of the first camera on the hand, when calibrated
+    tcp_calibration: np.ndarray,  # (4, 4) T when calibrated
+    tcp: np.ndarray,  # (n, 7) published tcp in the base frame
+    file: Path,
+) -> np.ndarray:
+    """Camera-to-world (n, 4, 4) of a camera on the hand while the tcp moves.
+
+    At calibration the marker gave E of every camera; from the first one on the hand and X follows where the base is,
+    E⁻¹ X T⁻¹ maps base to world. A camera on the hand keeps its place relative to the tcp.
+    """
+    world_from_base = np.linalg.inv(hand_E) @ arm.X @ np.linalg.inv(tcp_calibration)
+    cam_from_tcp = serial_E @ np.linalg.inv(hand_E) @ arm.X
+    published = convert.to_c2w(tcp[:, [4, 5, 6, 3]], tcp[:, :3], file, "tcp")
+    T = arm.align_base @ published @ np.linalg.inv(arm.align_tcp)
+    return world_from_base @ T @ np.linalg.inv(cam_from_tcp)
+
+
+def calibration_tcp(file: Path, arm: Arm) -> np.ndarray:
+    """T (4, 4) at calibration, from ``tcp.npy`` of the calibration folder in the robot's own notation.
+
+    Flexiv and UR5 store a quaternion; KUKA mm and Euler angles (about x, y, z in this order, fixed axes); Franka a
+    rotation vector and a tool that looks the other way.
+
+    Raises:
+        FormatError: missing or damaged file, or a number of values that this robot does not write.
+    """
+    value = read_npy(file)
+    size = {"flexiv": 7, "ur5": 7}.get(arm.robot, 6)
+    pose = files.to_array(value, (size,), file, "tcp")
+    if size == 7:
+        return convert.to_c2w(pose[None, [4, 5, 6, 3]], pose[None, :3], file, "tcp")[0]
+    turns = (
+        [pose[3:]] if arm.robot == "franka" else [axis * angle for axis, angle in zip(np.eye(3), pose[3:], strict=True)]
+    )
+    T = np.eye(4)
+    for q in convert.to_quaternions(np.stack(turns)):
+        T = convert.to_c2w(q[None], np.zeros((1, 3)), file, "tcp")[0] @ T
+    T[:3, 3] = pose[:3] if arm.robot == "franka" else pose[:3] / 1000
+    return T @ _TURN if arm.robot == "franka" else T
+
+
+def seconds(value: Any, file: Path, field: str) -> float:
+    """Unix milliseconds → s.
+
+    Raises:
+        FormatError: no number, or a time outside 1970 to 2100.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < _LATEST_MS:
+        raise FormatError(file, field, value if isinstance(value, float) else type(value).__name__, "Unix milliseconds")
+    return value / 1000
+
+
+# ---------------------------------------------------------------------------------------------------------- entries
+
+
+def _stream(file: Path, entries: Iterator[tuple[float, np.ndarray]], pose: bool = False) -> Stream:
+    """Entries in any order, those with one stamp once."""
+    merged = dict(entries)
+    if len({len(value) for value in merged.values()}) > 1:
+        raise FormatError(file, "entries", "vectors of several lengths", "one length")
+    times = np.array(sorted(merged), dtype=np.float64)
+    return Stream(times, np.stack([merged[t] for t in times.tolist()]) if merged else np.zeros((0, 0)), pose)
+
+
+def _by_field(file: Path, field: str, name: str, width: int | None) -> dict[str, Stream]:
+    """One field of all entries as one stream, or as one for each camera."""
+    by_camera = _mapping(read_npy(file), file, "content")
+    every = {name: list(by_camera.values())}
+    groups = every if file.stem.endswith("_base") else {f"{name}/{s}": [entries] for s, entries in by_camera.items()}
+    pose = field == "tcp"
+    return {key: _stream(file, _entries(file, lists, field, width), pose) for key, lists in groups.items()}
+
+
+def _entries(file: Path, lists: list[Any], field: str, width: int | None) -> Iterator[tuple[float, np.ndarray]]:
+    """(s, values) of the entries that have the field; numbers that are not finite, and poses of zeros, are none."""
+    for entries in lists:
+        if not isinstance(entries, list):
+            raise FormatError(file, "entries", type(entries).__name__, "a list for each camera")
+        for entry in entries:
+            if not isinstance(entry, dict) or "timestamp" not in entry:
+                raise FormatError(file, "entries", "something else", "objects with a timestamp")
+            time, value = seconds(entry["timestamp"], file, "timestamp"), entry.get(field)
+            if value is None:
+                continue
+            value = _vector(value, file, field)
+            if width is not None and len(value) != width:
+                raise FormatError(file, field, f"{len(value)} numbers", width)
+            if np.isfinite(value).all() and (field != "tcp" or np.linalg.norm(value[3:]) > 1e-6):
+                yield time, value
+
+
+def _stamped(file: Path, part: str | None) -> Iterator[tuple[float, np.ndarray]]:
+    for serial, entries in _mapping(read_npy(file), file, "content").items():
+        for stamp, entry in _mapping(entries, file, serial, texts=False).items():
+            value = entry.get(part) if part and isinstance(entry, dict) else entry
+            yield seconds(stamp, file, "timestamp"), _vector(value, file, part or "entry")
+
+
+def _vector(value: Any, file: Path, field: str) -> np.ndarray:
+    flat = value if isinstance(value, np.ndarray) else np.array(value) if _numbers(value) else None
+    if flat is None or flat.dtype.kind not in "fiu" or flat.ndim != 1 or len(flat) > 64:
+        raise FormatError(file, field, type(value).__name__, "a vector of numbers")
+    return flat.astype(np.float64)
+
+
+def _numbers(value: Any) -> bool:
+    return isinstance(value, list | tuple) and all(isinstance(x, int | float) for x in value)
+
+
+def _mapping(value: Any, file: Path, field: str, texts: bool = True) -> dict[Any, Any]:
+    """A dict; its keys as texts, since a serial may be stored as a number."""
+    if not isinstance(value, dict):
+        raise FormatError(file, field, type(value).__name__, "a dict")
+    return {str(key): entry for key, entry in value.items()} if texts else value

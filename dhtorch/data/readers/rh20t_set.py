@@ -1,0 +1,87 @@
+"""Many RH20T scenes as one set: one recording for each scene, seen by the camera that the robot carries."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dhtorch.data.io import decode as files
+from dhtorch.data.io.decode import FormatError
+from dhtorch.data.readers import rh20t
+from dhtorch.data.readers.rh20t_robot import ARMS
+from dhtorch.data.recording import Recording, Recordings
+
+_SCENE = re.compile(r"task_\d+_user_\d+_scene_\d+_cfg_0*([1-7])")
+
+
+def open_set(
+    root: str | Path,
+    *,
+    camera: str = "hand",
+    depth_root: str | None = None,
+    limit: int | None = None,
+    max_difference: float = 0.02,
+    max_gap: float = 0.5,
+    outlier: float = 0.0,
+) -> Recordings:
+    """The scenes below a folder that a robot moved in, each opened when it is asked for.
+
+    A scene is a folder named ``task_…_user_…_scene_…_cfg_…`` in ``root`` or one level below (``RH20T_cfg1``, …).
+    Left out: demonstrations by a person (``_human``), scenes without a calibration, scenes without the camera asked
+    for.
+
+    Args:
+        root: folder of the set.
+        camera: ``hand`` = the first camera on the hand that the scene has, or a serial.
+        depth_root: the parallel tree of depth videos; None = ``root``.
+        limit: the first so many scenes, by name; None = all.
+        max_difference, max_gap, outlier: as :func:`dhtorch.data.readers.rh20t.read`.
+
+    Returns:
+        Recordings named ``<scene>/<serial>``.
+
+    Raises:
+        FormatError: no such folder, or no scene in it.
+    """
+    base = Path(root)
+    if not base.is_dir():
+        raise FormatError(base, "path", "no such folder", "a folder of RH20T scenes")
+    found = list(_scenes(base, camera))[:limit]
+    if not found:
+        wanted = f"task_…_cfg_… folders with a calibration and the camera {camera!r}"
+        raise FormatError(base, "scenes", "none", wanted)
+    options = {"max_difference": max_difference, "max_gap": max_gap, "outlier": outlier}
+    names = [f"{folder.name}/{serial}" for folder, serial in found]
+    depth = None if depth_root is None else Path(depth_root)
+    return Recordings(names, _Open(base, tuple(found), depth, options))
+
+
+@dataclass(frozen=True)
+class _Open:
+    """Position → recording."""
+
+    root: Path
+    found: tuple[tuple[Path, str], ...]  # folder of the scene, serial of the camera
+    depth_root: Path | None
+    options: dict[str, Any]
+
+    def __call__(self, i: int) -> Recording:
+        scene, serial = self.found[i]
+        depth = None if self.depth_root is None else str(self.depth_root / scene.relative_to(self.root))
+        return rh20t.read(scene, serials=[serial], depth_root=depth, **self.options)[0]
+
+
+def _scenes(root: Path, camera: str) -> Iterator[tuple[Path, str]]:
+    folders = sorted({f for pattern in ("task_*", "*/task_*") for f in root.glob(pattern)}, key=lambda f: f.name)
+    for folder in folders:
+        named = _SCENE.fullmatch(folder.name)
+        if named is None or not (folder / "metadata.json").is_file():
+            continue
+        wanted = ARMS[int(named[1])].in_hand if camera == "hand" else (camera,)
+        serial = next((s for s in wanted if (folder / f"cam_{s}" / "color.mp4").is_file()), None)
+        calibrated = files.read_json(folder / "metadata.json").get("calib", -1) not in (-1, "-1")
+        if serial is not None and calibrated:
+            yield folder, serial

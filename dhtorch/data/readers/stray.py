@@ -1,0 +1,355 @@
+"""Stray Scanner captures: a phone's video, LiDAR depth, confidence and odometry, one folder each.
+
+``rgb.mp4`` (1920×1440, HEVC or H.264), ``depth/000000.png`` (16 bits, mm; ``.npy`` in very old captures),
+``confidence/000000.png`` (0, 1, 2), ``odometry.csv`` with a row for every stored frame, and ``camera_matrix.csv``: K of
+the *last* frame. Newer captures have K in every row, which counts. Poses are camera-to-world with our axes in a world
+with y up. Pictures are kept as the sensor gave them, also where the phone was held upright: poses and K belong to them.
+Colour and depth are registered, so depth has the same K at its own size. ``imu.csv`` is not read.
+
+The ``n``-th row belongs to the ``n``-th picture *stored* in the video, shown or not: the app stamps the first one
+before time 0, where an edit list may hide it. If the video still has one picture less than there are rows, either the
+first one was lost or the last. Nobody has documented which; the edges of depth and picture decide.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from dhtorch.data import convert
+from dhtorch.data.codecs import pickles
+from dhtorch.data.codecs.video import read_video_frame, video_header
+from dhtorch.data.io import decode as files
+from dhtorch.data.io.decode import FormatError
+from dhtorch.data.recording import Recording
+from dhtorch.geometry import camera as cameras
+from dhtorch.records import Frame
+from dhtorch.runtime.console import many
+
+_COLUMNS = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
+_OWN_K = ("fx", "fy", "cx", "cy")
+_HW = (1440, 1920)  # of the pictures, where there is no video to ask
+_UNITS_PER_METRE = 1000.0
+_TRIALS = 6  # frames that are decoded to find out which picture was lost
+
+
+def recognise(root: Path) -> str | None:
+    """What makes ``root`` a recording of this format, in words; None if nothing does."""
+    if (root / "depth").is_dir() and all((root / name).is_file() for name in ("odometry.csv", "camera_matrix.csv")):
+        return "odometry.csv, camera_matrix.csv and depth/"
+    return None
+
+
+def read(
+    root: str | Path,
+    *,
+    images: bool = True,
+    poses: bool = True,
+    per_frame: bool = True,
+    lost_first: bool | None = None,
+    K_hw: Sequence[int] | None = None,
+) -> list[Recording]:
+    """Open one capture.
+
+    Args:
+        root: its folder.
+        images: read ``rgb.mp4``. False for a capture whose video is missing: the image of every frame then has no
+            pixels, (1, 3, 0, 0), so that nothing can mistake it for a dark one.
+        poses: take the device's poses.
+        per_frame: take the intrinsics of each frame where the capture has them; False = ``camera_matrix.csv`` for all.
+        lost_first: where the video has one picture less than there are rows: True = the first was lost, False = the
+            last. None = compare the edges of a few frames, the only case in which opening decodes pictures.
+        K_hw: (height, width) of the pictures that K belongs to. None = the video's own, else 1440, 1920.
+
+    Returns:
+        One recording at the times of the odometry (s since the phone was started; the video's own are a 60 Hz grid).
+        Rows without depth, confidence (if any frame has it), picture or usable pose are left out and reported.
+
+    Raises:
+        FormatError: no frame, no ``rgb.mp4`` (unless ``images`` is False), or a damaged file.
+        ImportError: no decoder of videos is installed.
+    """
+    root = Path(root)
+    rows, report = _odometry(root / "odometry.csv")
+    video = root / "rgb.mp4" if images else None
+    if video is not None and not video.is_file():
+        raise FormatError(
+            video, "file", "no such file", "the pictures (images=False reads depth alone, for what needs none)"
+        )
+    hw = video_header(video, all_frames=True).hw if video is not None else _size(K_hw, root) or _HW
+    shots, missing = _shots(root, rows, poses)
+    report += missing
+    if (root / "distortion").is_dir():
+        report.append("distortion/ holds lens tables of each frame: they are not applied")
+    if not shots:
+        raise FormatError(root, "frames", "; ".join(report) or "none", "rows with depth and pose")
+    load = _Load(root, tuple(shots), video, hw, _intrinsics(root, hw, K_hw, per_frame), _depth_hw(shots))
+    if video is not None:
+        load, said = _with_pictures(load, len(rows), lost_first)
+        report += said
+    kept = load.shots
+    times = torch.tensor([shot.row.time for shot in kept], dtype=torch.float64)
+    steady = bool((times.diff() > 0).all())
+    c2w = np.stack([shot.row.c2w for shot in kept]) if poses else None
+    return [
+        Recording(
+            name=root.resolve().name,
+            format="stray",
+            load=load,
+            number=torch.tensor([shot.row.number for shot in kept]),
+            root=root,
+            times=times if steady else None,
+            poses=None if c2w is None else convert.to_poses(c2w, root / "odometry.csv"),
+            rate_hz=float(1 / times.diff().median()) if steady and len(kept) > 1 else None,
+            report=tuple(report + ([] if steady else ["time stamps do not increase: there are no times"])),
+        )
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class _Row:
+    """One row of the odometry."""
+
+    place: int  # in the table
+    number: int  # in the names of the files
+    time: float  # s
+    c2w: np.ndarray  # (4, 4); NaN where tracking was lost
+    K: np.ndarray | None  # fx fy cx cy
+
+
+@dataclass(frozen=True, eq=False)
+class _Shot:
+    """A row with its files."""
+
+    row: _Row
+    depth: Path
+    conf: Path | None
+    picture: int = -1  # in the video
+
+
+@dataclass(frozen=True)
+class _Intrinsics:
+    """fx fy cx cy for pictures of one size, per row or for all."""
+
+    file: Path
+    K: np.ndarray  # (3, 3)
+    hw: tuple[int, int]  # of the pictures that all K belong to
+    per_frame: bool
+
+    def of(self, row: _Row, hw: tuple[int, int]) -> np.ndarray:
+        K = convert.matrix_of(*row.K) if self.per_frame and row.K is not None else self.K
+        return convert.resize_matrix(K, self.hw, hw)
+
+
+@dataclass(frozen=True, eq=False)
+class _Load:
+    """Position → frame."""
+
+    root: Path
+    shots: tuple[_Shot, ...]
+    video: Path | None
+    hw: tuple[int, int]
+    intrinsics: _Intrinsics
+    depth_hw: tuple[int, int]
+
+    def __call__(self, i: int) -> Frame:
+        shot = self.shots[i]
+        K = self.intrinsics.of(shot.row, self.hw)
+        camera = convert.to_camera(K, self.hw, self.intrinsics.file, f"intrinsics of frame {shot.row.number}")
+        image = np.zeros((3, 0, 0), np.uint8) if self.video is None else self.picture(shot.picture).transpose(2, 0, 1)
+        return Frame(
+            image=torch.from_numpy(np.ascontiguousarray(image))[None],
+            depth=torch.from_numpy(self.depth(shot))[None],
+            camera=camera,
+            depth_camera=cameras.resize(camera, self.hw, self.depth_hw) if self.video is None else None,
+            conf=None if shot.conf is None else torch.from_numpy(self._conf(shot.conf))[None],
+        )
+
+    def picture(self, number: int) -> np.ndarray:
+        """(H, W, 3) uint8."""
+        assert self.video is not None
+        return read_video_frame(self.video, number, self.hw, all_frames=True)
+
+    def depth(self, shot: _Shot) -> np.ndarray:
+        """(h, w) m."""
+        if shot.depth.suffix == ".png":
+            return files.read_depth_png(shot.depth, _UNITS_PER_METRE, self.depth_hw)
+        code = pickles.read_npy(shot.depth)
+        if not isinstance(code, np.ndarray) or code.dtype != np.uint16 or code.shape != self.depth_hw:
+            found = f"{getattr(code, 'dtype', type(code).__name__)} of shape {getattr(code, 'shape', None)}"
+            raise FormatError(shot.depth, "depth", found, f"uint16 of shape {self.depth_hw}")
+        return code.astype(np.float32) / np.float32(_UNITS_PER_METRE)
+
+    def _conf(self, file: Path) -> np.ndarray:
+        conf = files.read_image(file, self.depth_hw)[0]  # some writers store three equal channels
+        if conf.max() > 2:
+            raise FormatError(file, "confidence", int(conf.max()), "0, 1 or 2")
+        return np.ascontiguousarray(conf)
+
+
+# ------------------------------------------------------------------------------------------------------------- tables
+
+
+def _odometry(file: Path) -> tuple[list[_Row], list[str]]:
+    """The rows, by the names in the header: other columns may come and cells may be empty."""
+    try:
+        lines = [[cell.strip() for cell in line] for line in csv.reader(files.read_lines(file))]
+    except csv.Error as error:
+        raise FormatError(file, "table", error, "comma-separated columns") from None
+    lines = [line for line in lines if any(line)]
+    head = lines[0] if lines else []
+    if not set(_COLUMNS) <= set(head):
+        raise FormatError(file, "header", ", ".join(head) or "nothing", ", ".join(_COLUMNS))
+    body, report = lines[1:], list[str]()
+    if body and len(body[-1]) < len(head):
+        body, report = body[:-1], ["the last row of odometry.csv is cut off: left out"]
+    rows: list[_Row] = []
+    for place, line in enumerate(body):
+        if len(line) != len(head):
+            raise FormatError(file, f"row {place}", f"{len(line)} columns", f"{len(head)}, as the header")
+        row = _row(place, dict(zip(head, line, strict=True)), file)
+        if rows and row.number <= rows[-1].number:
+            raise FormatError(file, f"row {place} frame", row.number, f"a number beyond {rows[-1].number}")
+        rows.append(row)
+    return rows, report
+
+
+def _row(place: int, cells: dict[str, str], file: Path) -> _Row:
+    number = cells["frame"]
+    if not (number.isascii() and number.isdigit() and len(number) <= 9):
+        raise FormatError(file, f"row {place} frame", number, "a frame number")
+    value = {name: _number(cells[name], file, f"row {place} {name}") for name in _COLUMNS[:1] + _COLUMNS[2:]}
+    if not np.isfinite(value["timestamp"]):
+        raise FormatError(file, f"row {place} timestamp", cells["timestamp"], "a time in s")
+    t, q = (np.array([[value[name] for name in names]]) for names in (_COLUMNS[2:5], _COLUMNS[5:9]))
+    with np.errstate(over="ignore"):
+        usable = np.isfinite(t).all() and 1e-6 < np.linalg.norm(q) < np.inf
+    c2w = convert.to_c2w(q, t, file)[0] if usable else np.full((4, 4), np.nan)
+    own = [_number(cells.get(name, ""), file, f"row {place} {name}") for name in _OWN_K]
+    return _Row(place, int(number), value["timestamp"], c2w, np.array(own) if np.isfinite(own).all() else None)
+
+
+def _number(cell: str, file: Path, field: str) -> float:
+    try:
+        return float(cell) if cell else float("nan")
+    except ValueError:
+        raise FormatError(file, field, cell, "a number") from None
+
+
+def _intrinsics(root: Path, hw: tuple[int, int], K_hw: Sequence[int] | None, per_frame: bool) -> _Intrinsics:
+    file = root / "camera_matrix.csv"
+    lines = [line.replace(",", " ").split() for line in files.read_lines(file) if line.strip()]
+    return _Intrinsics(file, files.to_array(lines, (3, 3), file, "K"), _size(K_hw, root) or hw, per_frame)
+
+
+def _size(value: Sequence[int] | None, root: Path) -> tuple[int, int] | None:
+    if value is None:
+        return None
+    h, w = files.to_array(value, (2,), root, "option K_hw")
+    return int(files.to_positive(h, root, "option K_hw")), int(files.to_positive(w, root, "option K_hw"))
+
+
+# ------------------------------------------------------------------------------------------------------------- frames
+
+
+def _shots(root: Path, rows: list[_Row], poses: bool) -> tuple[list[_Shot], list[str]]:
+    """Rows whose files are there, and a line for each reason why others are not."""
+    depth = {file.stem: file for kind in ("npy", "png") for file in sorted((root / "depth").glob(f"*.{kind}"))}
+    conf = {file.stem: file for file in sorted((root / "confidence").glob("*.png"))}
+    shots, missing = [], dict[str, list[int]]()
+    for row in rows:
+        name = f"{row.number:06d}"
+        if name not in depth:
+            missing.setdefault("no depth", []).append(row.number)
+        elif conf and name not in conf:
+            missing.setdefault("no confidence", []).append(row.number)
+        elif poses and not np.isfinite(row.c2w).all():
+            missing.setdefault("its pose is not usable (tracking lost)", []).append(row.number)
+        else:
+            shots.append(_Shot(row, depth[name], conf.get(name)))
+    extra = sorted(depth.keys() - {f"{row.number:06d}" for row in rows})
+    report = [line for why, numbers in missing.items() for line in files.left_out(numbers, why)]
+    return shots, report + files.left_out(extra, "no row in odometry.csv")
+
+
+def _depth_hw(shots: list[_Shot]) -> tuple[int, int]:
+    """Size of the depth maps; a damaged first one must not speak for all, an old one has no header to ask."""
+    error = None
+    for shot in shots:
+        try:
+            if shot.depth.suffix == ".png":
+                return files.image_header(shot.depth).hw
+            h, w = np.shape(pickles.read_npy(shot.depth))
+            return int(h), int(w)
+        except ValueError as found:
+            error = error or found
+    raise error if isinstance(error, FormatError) else FormatError(shots[0].depth, "depth", error, "a depth map")
+
+
+# ---------------------------------------------------------------------------------------------- rows and the pictures
+
+
+def _with_pictures(load: _Load, n_rows: int, lost_first: bool | None) -> tuple[_Load, list[str]]:
+    """The shots that have a picture, with its number."""
+    assert load.video is not None
+    n = video_header(load.video, all_frames=True).n
+    report, shift = [], 0
+    if n == n_rows - 1:
+        first = _first_is_lost(load, n) if lost_first is None else lost_first
+        shift = 1 if first else 0
+        why = "the edges of depth and picture say so" if lost_first is None else "option lost_first"
+        report.append(f"rgb.mp4 lacks its {'first' if first else 'last'} picture ({why})")
+    elif n != n_rows:
+        report.append(f"rgb.mp4 has {many(n, 'picture')} for {many(n_rows, 'row')}: the shorter counts")
+    shots = [_Shot(s.row, s.depth, s.conf, s.row.place - shift) for s in load.shots if 0 <= s.row.place - shift < n]
+    if not shots:
+        raise FormatError(load.video, "frames", f"{n} pictures", "at least one with depth and pose")
+    lost = sorted({s.row.number for s in load.shots} - {s.row.number for s in shots})
+    return _Load(load.root, tuple(shots), load.video, load.hw, load.intrinsics, load.depth_hw), [
+        *report,
+        *files.left_out(lost, "no picture"),
+    ]
+
+
+def _first_is_lost(load: _Load, n: int) -> bool:
+    """Whether row i fits picture i − 1 better than picture i, by where depth and brightness have their edges."""
+    inner = [shot for shot in load.shots if 1 <= shot.row.place < n]
+    score = np.zeros(2)
+    for shot in inner[:: max(1, len(inner) // _TRIALS)]:
+        try:
+            depth = load.depth(shot)
+            edges = _edges(np.log(np.where(depth > 0, depth, np.inf)))
+            pictures = [load.picture(shot.row.place - shift) for shift in (0, 1)]
+        except FormatError:
+            continue
+        score += [_likeness(edges, _edges(_shrink(picture, load.depth_hw))) for picture in pictures]
+    return bool(score[1] >= score[0])
+
+
+def _edges(x: np.ndarray) -> np.ndarray:
+    """(h, w) size of the gradient, limited so that one silhouette does not outweigh all the rest."""
+    with np.errstate(invalid="ignore"):
+        size = np.hypot(*np.gradient(x))
+    size = np.where(np.isfinite(size), size, 0)
+    return np.minimum(size, 4 * size.mean() + 1e-12)
+
+
+def _likeness(a: np.ndarray, b: np.ndarray) -> float:
+    """Correlation of two edge maps."""
+    a, b = a - a.mean(), b - b.mean()
+    return float((a * b).sum() / max(float(np.sqrt((a * a).sum() * (b * b).sum())), 1e-12))
+
+
+def _shrink(picture: np.ndarray, hw: tuple[int, int]) -> np.ndarray:
+    """(h, w) mean brightness of the blocks of a picture that fit ``hw``."""
+    step = [max(1, big // small) for big, small in zip(picture.shape, hw, strict=False)]
+    grey = picture.mean(-1, dtype=np.float32)[: step[0] * hw[0], : step[1] * hw[1]]
+    rows, columns = np.arange(0, grey.shape[0], step[0]), np.arange(0, grey.shape[1], step[1])
+    blocks = np.add.reduceat(np.add.reduceat(grey, rows, 0), columns, 1) / (step[0] * step[1])
+    at = [np.arange(small) * size // small for small, size in zip(hw, blocks.shape, strict=True)]
+    return np.asarray(blocks[np.ix_(*at)])

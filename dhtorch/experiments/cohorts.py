@@ -1,0 +1,123 @@
+"""What answers are held against beyond the range split, and where poses come from beyond seat 5."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dhtorch.data.recording import TruthRecording
+from dhtorch.data.scene import Scene
+from dhtorch.experiments.baselines.device_pose import given_pose
+from dhtorch.experiments.protocol import Batch, Method, Variant
+from dhtorch.geometry import se3
+from dhtorch.metrics import holdout
+from dhtorch.pipeline.spec import Trace
+from dhtorch.records import Frame, Pose, PoseFit, Samples
+
+
+def everything(frame: Frame, _cutoff: float | None) -> Frame:
+    """Hides nothing: the sensor may say all it knows."""
+    return frame
+
+
+class PoseHalf:
+    """Seat 3 of the hold-out: classifies, then takes the returns of set B away, so that only set A fixes the pose."""
+
+    def __init__(self, classify: Any, seed: int, min_trackability: float) -> None:
+        self.classify, self.seed, self.min_trackability = classify, seed, min_trackability
+
+    def __call__(self, frame: Frame, samples: Samples) -> Samples:
+        """Samples with the returns of set A alone."""
+        whole: Samples = self.classify(frame, samples)
+        _, second = holdout.half(whole, self.seed, min_trackability=self.min_trackability)
+        return holdout.without_returns(whole, second)
+
+
+class HeldOut:
+    """The cohorts of the hold-out: set B, and, naively, those inliers of set A that RANSAC itself chose."""
+
+    def __init__(self, method: Method, seed: int) -> None:
+        self.method, self.seed = method, seed
+
+    def variant(self, **more: Any) -> Variant:
+        """The method with set B hidden from it; views chosen by the returns of both sets would know B."""
+        half = PoseHalf(self.method.classify, self.seed, self.method.min_trackability)
+        return Variant(self.method.replace(classify=half), two_frames=True, **more)
+
+    def whole(self, batch: Batch, uv: Tensor) -> Samples:
+        """The samples with every return."""
+        return self.method.look_at(batch.anchor, uv)
+
+    def heldout(self, batch: Batch, trace: Trace) -> holdout.Truth:
+        """Set B: trackable samples whose return never took part in the pose."""
+        whole, truth = self._truth(batch, trace)
+        _, second = holdout.half(whole, self.seed, min_trackability=self.method.min_trackability)
+        return _only(truth, second)
+
+    def cyclic(self, batch: Batch, trace: Trace) -> holdout.Truth:
+        """The inliers of the pose: what RANSAC optimised."""
+        _, truth = self._truth(batch, trace)
+        return _only(truth, trace["fit"].inlier)
+
+    def _truth(self, batch: Batch, trace: Trace) -> tuple[Samples, holdout.Truth]:
+        whole = self.whole(batch, trace["samples"].uv)
+        found = holdout.truth_at(batch.anchor, whole.uv)
+        return whole, holdout.candidates(whole, found, 0.0)
+
+
+def real_holes(batch: Batch, trace: Trace) -> holdout.Truth:
+    """The sensor's own drop-outs, held against independent truth; nothing where there is none."""
+    samples: Samples = trace["samples"]
+    found = holdout.truth_at(batch.exact, samples.uv)
+    if has_truth(batch.scene) is not None:
+        return found.replace(code=torch.full_like(found.code, holdout.Rule.NO_RETURN))
+    kinds = batch.kinds(samples.uv)
+    if kinds is not None:
+        odd = torch.isin(kinds, torch.tensor([*batch.odd], dtype=kinds.dtype).to(kinds.device))
+        found = found.replace(code=torch.where(odd, holdout.Rule.EXCLUDED, found.code))
+    return holdout.drop_outs(batch.anchor, samples, found)
+
+
+def trajectory(batch: Batch, *, raw: bool = False) -> Pose | None:
+    """Relative pose of each pair from the device's trajectory; None where the capture has none.
+
+    Args:
+        batch: pairs of one scene.
+        raw: as the device writes it. A trajectory in OpenGL axes is then used as if its axes were OpenCV's, the
+            mistake that the conversion mends; one in OpenCV axes is the same either way.
+    """
+    first, second = batch.anchor.T_world_from_cam, batch.others[-1].T_world_from_cam
+    if first is None or second is None:
+        return None
+    T = se3.relative(first, second)
+    if not raw or batch.scene.recording.pose_axes != "gl":
+        return T
+    flip = T.R.new_tensor([1.0, -1.0, -1.0])
+    return Pose(flip[:, None] * T.R * flip, flip * T.t)
+
+
+def device_fit(batch: Batch, n: int, *, raw: bool = False) -> PoseFit:
+    """The device's trajectory in the shape of seat 5's answer; not ok where there is none."""
+    T, like = trajectory(batch, raw=raw), batch.anchor.camera.f
+    if T is None:
+        eye = se3.identity(like.shape[0], like)
+        T = Pose(eye.R * torch.nan, eye.t)
+    return given_pose(T.to(like.dtype), n)
+
+
+def has_trajectory(scene: Scene) -> str | None:
+    """Why the device's trajectory cannot be used; None where it can."""
+    return "no device trajectory" if scene.recording.poses is None else None
+
+
+def has_truth(scene: Scene) -> str | None:
+    """Why nothing but the sensor can be asked; None where an independent instrument was there."""
+    return None if isinstance(scene.recording, TruthRecording) else "no independent truth"
+
+
+def _only(truth: holdout.Truth, mask: Tensor) -> holdout.Truth:
+    """The candidates among the masked samples; the others were not held back."""
+    near = torch.full_like(truth.code, holdout.Rule.NEAR)
+    return truth.replace(code=torch.where(mask, truth.code, near))

@@ -1,0 +1,396 @@
+"""Question: can every far pixel have a depth that is as good as a sparse answer, and say where it is not?
+
+Expectation (written before the run): a sweep under the sparse method's motions answers at least half of the hidden
+pixels, with or without texture; where sparse answers as well its median error is at most 1.15 times theirs; on the
+samples of the sparse method it answers as many at 5 % mean risk; its score orders errors half as badly as chance at
+most; sigma is right to .07 in other rooms; semi-global matching under the same motion is no better; nothing is answered
+where the camera only turns, and one answer in twenty at most is wrong by a fifth.
+What would refute it: any of these numbers missed.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dhtorch.codes import Gate, Source
+from dhtorch.data.pairs import around
+from dhtorch.data.scene import Given, scenes_of
+from dhtorch.experiments import compare_methods as compare
+from dhtorch.experiments import protocol
+from dhtorch.experiments.baselines import filling, stereo
+from dhtorch.experiments.compare.exact_rooms import within_one
+from dhtorch.experiments.outcome import join
+from dhtorch.experiments.protocol import Batch, Outcome, Pairs, Progress, Protocol, Settings, Variant
+from dhtorch.experiments.rows import Row
+from dhtorch.geometry import camera as cam
+from dhtorch.geometry import se3
+from dhtorch.geometry.patches import nearest
+from dhtorch.metrics import bootstrap, errors, holdout, risk
+from dhtorch.metrics.errors import Points
+from dhtorch.pipeline import dense
+from dhtorch.pipeline.method import Method
+from dhtorch.pipeline.spec import Trace
+from dhtorch.records import DepthMap, Estimate, Frame, Pose, Samples
+
+QUESTION = "Can every far pixel have a depth as good as a sparse answer, and say where it is not?"
+EXPECTATION = (
+    "Every number of the list of bars is met; scenes are the unit, promises are kept in rooms not learnt from."
+)
+
+#: Number → (bar, whether it holds).
+BARS: dict[str, tuple[float, Callable[[float, float], bool]]] = {
+    "dense.answered": (0.50, lambda value, bar: value >= bar),
+    "dense.error_ratio_to_sparse": (1.15, lambda value, bar: value <= bar),
+    "dense.coverage_ratio_at_5_indoor": (1.0, lambda value, bar: value >= bar),
+    "dense.ause_ratio": (0.5, lambda value, bar: value <= bar),
+    "dense.within_sigma": (0.68, lambda value, bar: abs(value - bar) <= 0.07),
+    "dense.within_2sigma": (0.90, lambda value, bar: value >= bar),
+    "dense.error_ratio_to_sgbm": (1.0, lambda value, bar: value <= bar),
+    "dense.rotation_answered": (0.005, lambda value, bar: value <= bar),
+    "dense.wrong_share": (0.05, lambda value, bar: value <= bar),
+    "dense.room_within_1": (0.90, lambda value, bar: value >= bar),
+}
+
+#: Variants: all pixels of the map; the map read where the sparse method looks; the map of one other view, as peers of
+#: two views have no more.
+DENSE, AT_SAMPLES, ONE_VIEW = "dense", "dense, at samples", "dense, one view"
+PEERS = ("sgbm", "sgbm, own calibration", "dis flow", "bilateral")
+
+#: Cohorts: pairs that can be rectified, and all.
+RECTIFIABLE, FULL = "rectifiable", "full"
+
+
+@dataclass(frozen=True)
+class Looked:
+    """What was found out about one anchor, once for all variants."""
+
+    anchor: Frame
+    trace: Trace  # of the sparse method
+    asked: dense.Asked
+    maps: Mapping[int, DepthMap]  # by the number of other views
+    grid: Samples  # pixels of the map that are judged
+    other: Frame  # the view that is worth most
+    T_1_from_0: Pose  # NaN where there is none
+    ms: Mapping[str, float]
+
+
+class Looking:
+    """Answers of all variants about one anchor: the sparse method runs once, and the sweep once for each number of
+    views."""
+
+    def __init__(self, options: Mapping[str, Any], stride: int) -> None:
+        self.options, self.stride = dict(options), stride
+        self._last: Looked | None = None
+
+    def ask(
+        self, say: Callable[[Looked], tuple[Samples, Estimate]], method: Method, *views: Frame, **told: Any
+    ) -> Estimate:
+        """One variant's answer, as the protocol asks for it."""
+        trace = told.pop("trace")
+        anchor, others = views
+        if self._last is None or self._last.anchor is not anchor:
+            self._last = self._look(method, anchor, others, told)
+        looked = self._last
+        trace |= looked.trace
+        samples, estimate = say(looked)
+        trace |= {"samples": samples, "ms": dict(looked.ms), "rectifiable": rectifiable(looked)}
+        return estimate
+
+    def _look(self, method: Method, anchor: Frame, others: Frame, told: Mapping[str, Any]) -> Looked:
+        trace: Trace = {}
+        method = method.replace(track=told["track"])
+        began = time.perf_counter()
+        joined = method(anchor, others, seed=told["seed"], hint=told["hint"], trace=trace)
+        asked = dense.views_asked(joined, others, trace)
+        ms = {"sparse": 1e3 * (time.perf_counter() - began)}
+        maps = {}
+        for partners in (self.options.get("partners", 3), 1):
+            began = time.perf_counter()
+            maps[partners] = dense.swept(anchor, asked, method=method, **{**self.options, "partners": partners})
+            ms[f"sweep_{partners}"] = 1e3 * (time.perf_counter() - began)
+        hw = next(iter(maps.values())).depth.shape[-2:]
+        place = dense.pixels(anchor, (hw[0], hw[1])).unflatten(0, hw)
+        half = self.stride // 2
+        grid = method.backproject(anchor, place[half :: self.stride, half :: self.stride].reshape(-1, 2))
+        index, _ = dense.worthiest(asked, 1)
+        at = index[0], torch.arange(len(index[0]), device=index.device)
+        fit = asked.fits[at]
+        lost = ~fit.ok
+        R = torch.where(lost[:, None, None], torch.nan, fit.T_1_from_0.R)
+        t = torch.where(lost[:, None], torch.nan, fit.T_1_from_0.t)
+        return Looked(
+            anchor=anchor,
+            trace={**trace, "sparse": joined},
+            asked=asked,
+            maps=maps,
+            grid=grid,
+            other=asked.frames[at],
+            T_1_from_0=Pose(R, t),
+            ms=ms,
+        )
+
+
+def run(
+    scenes: Sequence[Given],
+    chosen: Mapping[str, Method],
+    pairs: Pairs,
+    settings: Settings,
+    *,
+    method: Method | None = None,
+    sweep: Mapping[str, Any] | None = None,
+    stride: int = 4,
+    anchors: int | None = None,
+    peers: bool = True,
+    indoor: Sequence[str] = (),
+    rotations: Sequence[Given] = (),
+    rooms: Sequence[int] = (0, 1, 2),
+    progress: Progress = protocol.quiet,
+) -> Outcome:
+    """Dense maps beside the sparse answers that they stand on, and beside dense peers under the same motion.
+
+    Rows of the variants ``sparse`` and ``dense, at samples`` are about the method's own samples (with texture, as
+    everywhere else), all others about pixels of the map, with texture or without. The summary holds ``dense.answered``
+    (median over scenes), ``dense.error_ratio_to_sparse`` (geometric mean over scenes of the ratio of median errors,
+    samples that both answer), ``dense.coverage_at_5_indoor`` and ``sparse.coverage_at_5_indoor`` (means over scenes of
+    some rooms, on the samples) with their ratio ``dense.coverage_ratio_at_5_indoor``, ``dense.pixels_at_5_indoor``
+    (on all pixels), ``dense.ause_ratio`` (median over scenes), ``dense.within_sigma`` and the other promises of
+    :func:`dhtorch.experiments.compare_methods.promises`, ``dense.wrong_share`` (mean over scenes),
+    ``dense.error_ratio_to_sgbm`` (one other view each, pairs that can be rectified, equal coverage; geometric mean),
+    ``dense.error_ratio_to_<peer>`` alike, ``dense.rotation_answered`` and ``dense.room_within_1``.
+
+    Args:
+        scenes, chosen, pairs, settings, progress: as :func:`dhtorch.experiments.protocol.run`; of ``pairs`` the anchors
+            count.
+        method: the sparse method; None = the job's.
+        sweep: options of :func:`dhtorch.pipeline.dense.swept`.
+        stride: every so many pixels of the map, both ways, are judged.
+        anchors: so many of a scene's, evenly spread; None = all.
+        peers: ask the peers as well.
+        indoor: rooms of the coverages at 5 %.
+        rotations: further scenes in which the camera only turns.
+        rooms: seeds of built-in rooms whose exact depth and motion are known.
+
+    Raises:
+        ValueError: an option out of range; else as the main job.
+    """
+    _check(stride=stride, **({} if anchors is None else {"anchors": anchors}))
+    sparse = method or next(iter(chosen.values()))
+    options = dict(sweep or {})
+    every = list(scenes_of(scenes))
+    every += [scene for scene in scenes_of(rotations) if scene.name not in {known.name for known in every}]
+    looking = Looking(options, stride)
+    variants = _variants(sparse, looking, settings.seed, peers)
+    some = partial(protocol.spread, pairs, anchors)
+    parts = []
+    for turning in (False, True):
+        asked = [scene for scene in every if (scene.role == "rotation") == turning]
+        cohorts: dict[str, protocol.Cohort] = {RECTIFIABLE: partial(_far, only=True), FULL: _far}
+        whole = Protocol(variants, cohorts=cohorts, min_candidates=0 if turning else protocol.MIN_CANDIDATES)
+        parts.append(protocol.run(asked, whole, some, settings, progress=progress))
+    outcome = join(parts)
+    outcome.summary |= _summary(outcome, {scene.name: scene.place for scene in every}, indoor, peers)
+    outcome.summary["dense.rotation_answered"] = turned(outcome)
+    if rooms:
+        outcome.summary |= within_one(rooms, sparse, options)
+    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, peers))
+
+
+def verdict(outcome: Outcome, peers: bool = True) -> tuple[bool | None, str]:
+    """Hold the summary against the bars, and name what is missed or could not be measured."""
+    missed, undefined, n_held = [], [], 0
+    for name, (bar, holds) in BARS.items():
+        value = outcome.summary.get(name, {}).get("value")
+        if value is None:
+            undefined.append(name)
+        elif holds(value, bar):
+            n_held += 1
+        else:
+            missed.append(f"{name} {value:.3f} (bar {bar:g})")
+    notes = [f"not measured: {', '.join(undefined)}"] if undefined else []
+    crossed = (
+        sorted(s for s, row in outcome.scenes("sgbm", RECTIFIABLE).items() if not row.get("n_candidates"))
+        if peers
+        else []
+    )
+    notes += [f"no pair can be rectified: {', '.join(crossed)}"] if crossed else []
+    said = "; ".join([f"{n_held} of {n_held + len(missed)} bars met", *missed, *notes])
+    return (None if undefined and not missed else not missed), said
+
+
+def rectifiable(looked: Looked) -> Tensor:
+    """Whether both epipoles lie outside their pictures, (B,) bool."""
+    views = tuple((view.camera, view.hw) for view in (looked.anchor, looked.other))
+    inside = stereo.epipole_inside(views, looked.T_1_from_0)
+    return ~inside & looked.T_1_from_0.t.isfinite().all(-1)
+
+
+def read(found: DepthMap, samples: Samples, frame: Frame) -> Estimate:
+    """The map of a frame at samples of it: swept depths of the nearest pixel, else its reason for silence."""
+    h, w = found.depth.shape[-2:]
+    place = cam.depth_pixels(frame.camera, frame.hw, None, (h, w), samples.uv)
+    depth, sigma, score, source, gate = (
+        nearest(x.to(found.depth), place)[0] for x in (found.depth, found.sigma, found.score, found.source, found.gate)
+    )
+    keep = source == Source.SWEPT
+    gate = torch.where(gate == Gate.ANSWER, Gate.NO_TRACK, gate)
+    return Estimate.silent(samples, Gate.NO_TRACK, n_views=2).replace(
+        depth=torch.where(keep, depth, torch.nan),
+        sigma=torch.where(keep, sigma, torch.nan),
+        score=torch.where(keep, score, 0.0),
+        gate=torch.where(keep, Gate.ANSWER, gate).to(torch.int32),
+    )
+
+
+def _variants(method: Method, looking: Looking, seed: int, peers: bool) -> dict[str, Variant]:
+    most = looking.options.get("partners", 3)
+
+    def at(k: int) -> Callable[[Looked], tuple[Samples, Estimate]]:
+        return lambda x: (x.grid, read(x.maps[k], x.grid, x.anchor))
+
+    says: dict[str, Callable[[Looked], tuple[Samples, Estimate]]] = {
+        "sparse": lambda x: (x.trace["samples"], x.trace["sparse"]),
+        AT_SAMPLES: lambda x: (x.trace["samples"], read(x.maps[most], x.trace["samples"], x.anchor)),
+        ONE_VIEW: at(1),
+        DENSE: at(most),
+    }
+    if peers:
+        says |= {
+            "sgbm": lambda x: (x.grid, _matched(x, x.T_1_from_0)),
+            "dis flow": lambda x: (x.grid, stereo.flow(x.anchor, x.other, x.T_1_from_0, x.grid)),
+            "bilateral": lambda x: (x.grid, filling.bilateral(x.anchor, x.grid)),
+        }
+    variants = {
+        name: Variant(method, ask=partial(looking.ask, say), seed=seed, offers=around) for name, say in says.items()
+    }
+    if peers:
+        own = partial(looking.ask, _own_calibration)
+        variants["sgbm, own calibration"] = Variant(method, ask=own, seed=seed, offers=around, needs=_is_rectified)
+    return variants
+
+
+def _matched(looked: Looked, T_1_from_0: Pose) -> Estimate:
+    near = looked.trace["samples"]
+    reach = torch.where(near.usable, near.depth, 0.0).amax(-1)
+    reach = torch.where(reach > 0, 0.7 * reach, 1.0)
+    return stereo.semi_global(looked.anchor, looked.other, T_1_from_0, looked.grid, nearest_m=reach)
+
+
+def _own_calibration(looked: Looked) -> tuple[Samples, Estimate]:
+    """What the pictures give under the motion that their data set states."""
+    a, b = looked.anchor.T_world_from_cam, looked.other.T_world_from_cam
+    assert a is not None and b is not None
+    T = se3.compose(se3.invert(b), a).map(lambda x: x.to(looked.grid.uv))
+    return looked.grid, _matched(looked, T)
+
+
+def _is_rectified(scene: Any) -> str | None:
+    return None if scene.recording.format == "rectified" else "not a rectified pair"
+
+
+def _far(batch: Batch, trace: Trace, *, only: bool = False) -> holdout.Truth:
+    """Hidden returns that pass the truth test; of the method's own samples those with texture, of pixels all."""
+    samples: Samples = trace["samples"]
+    truth = protocol.held_back(batch, trace)
+    everywhere = samples.uv.shape[1] != trace["sparse"].uv.shape[1]
+    code = truth.code
+    if everywhere:
+        code = torch.where(code == holdout.Rule.TEXTURE, holdout.Rule.CANDIDATE, code)
+    if only:
+        code = torch.where(trace["rectifiable"][:, None], code, holdout.Rule.EXCLUDED)
+    return truth.replace(code=code)
+
+
+def _summary(outcome: Outcome, rooms: Mapping[str, str], indoor: Sequence[str], peers: bool) -> Row:
+    found = {name: _points(outcome, name) for name in ("sparse", AT_SAMPLES, DENSE)}
+    rows: dict[str, Row] = {scene: {} for scene in found[DENSE]}
+    summary: Row = {}
+    for number, value in compare.promises({s: [p] for s, p in found[DENSE].items()}, rooms, rows, 2000, 0).items():
+        summary[f"dense.{number}"] = value.entry(errors.unit(number))
+    for scene, points in found[DENSE].items():
+        rows[scene] |= {"ause_ratio": risk.ause(points)}
+        rows[scene]["error_ratio_to_sparse"] = _ratio(found[AT_SAMPLES][scene], found["sparse"][scene])
+    measured = {scene: errors.measure(points) for scene, points in found[DENSE].items()}
+    summary["dense.answered"] = _over([m["coverage"] for m in measured.values()], "median")
+    summary["dense.wrong_share"] = _over([m["wrong_share"] for m in measured.values()], "mean")
+    summary["dense.ause_ratio"] = _over([row["ause_ratio"] for row in rows.values()], "median")
+    ratios = [row["error_ratio_to_sparse"] for row in rows.values()]
+    summary["dense.error_ratio_to_sparse"] = _over(ratios, "geometric_mean")
+    summary |= _indoor(found, {scene for scene in rows if rooms[scene] in indoor})
+    for peer in PEERS if peers else ():
+        ours, theirs = (_points(outcome, name, RECTIFIABLE) for name in (ONE_VIEW, peer))
+        both = [scene for scene in ours if scene in theirs]
+        cut = compare.equal_coverage({s: [ours[s]] for s in both}, {s: [theirs[s]] for s in both})
+        equal, _ = compare.ratio_over_seeds(*cut, lambda p: errors.measure(p)["median_rel"])
+        name = f"error_ratio_to_{peer.replace(', ', '_').replace(' ', '_')}"
+        for scene, ratio in equal.items():
+            rows[scene][name] = ratio
+        summary[f"dense.{name}"] = _over(list(equal.values()), "geometric_mean")
+    for scene, row in outcome.scenes(DENSE).items():
+        row["dense"] = rows.get(scene, {})
+    return summary
+
+
+def _indoor(found: Mapping[str, Mapping[str, Points]], scenes: set[str]) -> Row:
+    """Coverage at 5 % mean risk on scenes of some rooms."""
+    reached = {
+        name: [risk.measure(points)["coverage_at_5"] for scene, points in of.items() if scene in scenes]
+        for name, of in found.items()
+    }
+    summary: Row = {
+        "dense.coverage_at_5_indoor": _over(reached[AT_SAMPLES], "mean"),
+        "sparse.coverage_at_5_indoor": _over(reached["sparse"], "mean"),
+        "dense.pixels_at_5_indoor": _over(reached[DENSE], "mean"),
+    }
+    ours, theirs = (summary[f"{name}.coverage_at_5_indoor"]["value"] for name in ("dense", "sparse"))
+    summary["dense.coverage_ratio_at_5_indoor"] = bootstrap.single(
+        ours / theirs if ours is not None and theirs else None, len(scenes)
+    )
+    return summary
+
+
+def _ratio(ours: Points, theirs: Points) -> float | None:
+    """Ratio of the median errors where both answer."""
+    both = ours.keep & theirs.keep
+    if int(both.sum()) < compare.MIN_ANSWERS:
+        return None
+    a, b = (float(p.error[both].median()) for p in (ours, theirs))
+    return max(a, compare.SMALLEST) / max(b, compare.SMALLEST)
+
+
+def _points(outcome: Outcome, variant: str, cohort: str = FULL) -> dict[str, Points]:
+    """Scene → candidates; of scenes without a role that have some."""
+    apart = {row["scene"] for row in outcome.rows if row.get("role")}
+    return {
+        scene: points
+        for (scene, name, kind), points in outcome.points.items()
+        if (name, kind) == (variant, cohort) and scene not in apart and points.keep.numel()
+    }
+
+
+def turned(outcome: Outcome) -> Row:
+    """Share of the pixels without a return that are answered where the camera only turns, pooled over its scenes."""
+    turning = {row["scene"] for row in outcome.rows if row.get("role") == "rotation"}
+    asked = [
+        row
+        for row in outcome.rows
+        if row["scene"] in turning and row["pair"] is not None and (row["method"], row["truth"]) == (DENSE, FULL)
+    ]
+    holes = sum(row["n_holes"] for row in asked)
+    return bootstrap.single(sum(row["n_recovered"] for row in asked) / holes if holes else None, len(turning))
+
+
+def _over(values: Sequence[float | None], statistic: str) -> Row:
+    return bootstrap.interval(values, statistic=statistic).entry("1")
+
+
+def _check(**options: int) -> None:
+    for name, value in options.items():
+        if not isinstance(value, int) or value < 1:
+            raise ValueError(f"experiment.{name}: found {value!r}, expected a whole number of at least 1")

@@ -1,0 +1,257 @@
+"""Question: what do feed-forward networks give on the same points, once somebody tells them the scale?
+
+DUSt3R and VGGT answer with dense depth up to scale. Beside our metric answers they get (a) the scale of an oracle: the
+median ratio to the truth over pixels of the anchor that no sample reads, one scale for each pair, as in the paper; and
+(b), beyond the paper, the scale of the sensor: the same ratio over the near returns that our method sees too. Only (b)
+is metric. The inputs are not equal (networks see no depth, ours sees near depth), and neither is silence: ours
+abstains, so the networks are also scored on exactly the candidates that ours answered. The control ``constant`` says
+the same depth everywhere: its error is what an oracle's scale is worth without any network.
+
+Expectation (written before the run): with the oracle's scale, VGGT has the smaller median error on most scenes, also on
+the candidates that ours answered (the paper: 2.5 % against 6.7 %).
+What would refute it: a larger median error of VGGT on half of the scenes or more. Without VGGT nothing is decided.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dhtorch.data.scene import Given
+from dhtorch.experiments import memory, protocol
+from dhtorch.experiments.baselines.device_pose import given_pose
+from dhtorch.experiments.baselines.relative import RelativeDepth, read, to_estimate
+from dhtorch.experiments.protocol import (
+    Batch,
+    Method,
+    Outcome,
+    Pairs,
+    Progress,
+    Protocol,
+    Settings,
+    Variant,
+    quiet,
+)
+from dhtorch.experiments.rows import Row, median, summarise
+from dhtorch.geometry import camera as cam
+from dhtorch.geometry.patches import round_half_up
+from dhtorch.metrics import errors, holdout
+from dhtorch.pipeline.spec import Trace
+from dhtorch.pytree import Record, record
+from dhtorch.records import Estimate, Frame, Pose
+
+QUESTION = "What do feed-forward networks give on the same points, once somebody tells them the scale?"
+EXPECTATION = (
+    "With an oracle's scale VGGT has a smaller median error than ours on most scenes, on the points ours answers."
+)
+
+#: Where a network's scale may come from, and whether the answer is then metric.
+SCALES = {"oracle": "no", "near": "yes"}
+
+#: The network that the verdict is about.
+JUDGED = "vggt"
+
+#: Fewest pixels that fix a scale.
+MIN_PIXELS = 20
+
+Network = Callable[[Frame, Frame], RelativeDepth]
+
+
+@record
+class Scale(Record):
+    """Metres per unit of a network."""
+
+    factor: Tensor  # (B,); NaN where nothing fixes it
+    n_pixels: Tensor  # (B,) pixels it rests on
+
+
+def run(
+    scenes: Sequence[Given],
+    chosen: Mapping[str, Method],
+    pairs: Pairs,
+    settings: Settings,
+    *,
+    models: Mapping[str, Callable[..., Network]] | None = None,
+    scales: Sequence[str] = ("oracle", "near"),
+    scale_pixels: int = 4096,
+    progress: Progress = quiet,
+) -> Outcome:
+    """Run the chosen method and the networks on the same pairs, samples and candidates.
+
+    Args:
+        scenes, chosen, pairs, settings, progress: as :func:`dhtorch.experiments.pair.run`; of the methods, the
+            first one is compared with.
+        models: name → builder of a network (``device=`` → pair of frames → :class:`RelativeDepth`). A partial whose
+            option ``weights`` is None is left out; ``constant`` has none.
+        scales: ``oracle``, ``near`` or both; a network's variants are called ``<name>_<scale>``.
+        scale_pixels: pixels drawn to fix a scale; those without a return, or read by a sample, do not count.
+
+    Returns:
+        Outcome. Rows of networks say ``scale``, ``metric``, ``parameters``, ``device`` and, as all scene rows,
+        ``seconds_per_video``; ``on_ours`` are their numbers on the candidates that ours answered. Having no pose of
+        ours, they have no ``pnp_ok``.
+
+    Raises:
+        ImportError: a package is missing; the message says what to install.
+        ValueError: no network at all, or an unknown scale.
+    """
+    for scale in scales:
+        if scale not in SCALES:
+            raise ValueError(f"experiment.scales: found {scale!r}, expected some of {', '.join(SCALES)}")
+    wanted = {k: build for k, build in (models or {}).items() if _has_weights(build)}
+    if not wanted:
+        names = ", ".join(f"experiment.models.{k}.weights" for k in models or ())
+        raise ValueError(f"experiment.models: found no weights, expected local files or folders in {names or 'it'}")
+    networks = {k: build(device=settings.device) for k, build in wanted.items()}
+    ours, method = next(iter(chosen.items()))
+    variants = {ours: Variant(method)}
+    labels: dict[str, Row] = {ours: {"scale": "sensor", "metric": "yes", **memory.weights(method)}}
+    for name, network in networks.items():
+        once = Once(network)
+        for scale in scales:
+            asked = partial(ask, network=once, scale_pixels=scale_pixels)
+            given = partial(_given, scale=scale, seed=settings.seed)
+            variants[f"{name}_{scale}"] = Variant(method, ask=asked, given=given)
+            labels[f"{name}_{scale}"] = {"scale": scale, "metric": SCALES[scale], **_described(network)}
+    whole = Protocol(variants, columns=_columns)
+    outcome = protocol.run(scenes, whole, pairs, settings, progress=progress)
+    _complete(outcome, ours, labels, settings.device)
+    outcome.summary = summarise(outcome.rows, list(variants), list(whole.cohorts))
+    return outcome.decide(QUESTION, EXPECTATION, *judge(outcome, ours, f"{JUDGED}_oracle"))
+
+
+class Once:
+    """A network that is asked once about the same pictures, for all its scales; keeps the milliseconds it took."""
+
+    def __init__(self, network: Network) -> None:
+        self.network = network
+        self._pictures: tuple[Tensor, Tensor] | None = None
+        self._found: tuple[RelativeDepth, float] | None = None
+
+    def __call__(self, frame_0: Frame, frame_1: Frame) -> tuple[RelativeDepth, float]:
+        """The answer, and the time it took when it was first given."""
+        known = self._pictures
+        if self._found is None or known is None or known[0] is not frame_0.image or known[1] is not frame_1.image:
+            start = time.perf_counter()
+            answer = self.network(frame_0, frame_1)
+            self._found = answer, 1e3 * (time.perf_counter() - start)
+            self._pictures = frame_0.image, frame_1.image
+        return self._found
+
+
+def ask(
+    method: Method,
+    near: Frame,
+    other: Frame,
+    *,
+    network: Once,
+    scale_pixels: int,
+    known: Frame,
+    seed: int,
+    trace: Trace,
+    **_told: Any,
+) -> Estimate:
+    """A network in the place of a method: our samples, its depth, a scale from ``known``."""
+    like = near.camera.f
+    samples = method.look(near)
+    relative, ms = network(near, other)
+    scale = fit_scale(relative, known, samples.uv, n_pixels=scale_pixels, seed=seed)
+    nowhere = Pose(
+        torch.full_like(like, torch.nan)[:, :1, None].expand(-1, 3, 3), like.new_full((len(like), 3), torch.nan)
+    )
+    trace.update(samples=samples, fit=given_pose(nowhere, method.n), scale=scale, ms={"network": ms})
+    return to_estimate(relative, samples.uv, scale.factor)
+
+
+def fit_scale(relative: RelativeDepth, known: Frame, samples_uv: Tensor, *, n_pixels: int, seed: int) -> Scale:
+    """Metres per unit: median ratio of known to relative depth over pixels that no sample reads.
+
+    Image pixels are drawn from the seed, the same for all pairs. One whose pixel of the depth map lies within the
+    reach of a sample's (that pixel itself; in a sparse map twice the radius in which a return is searched) is turned
+    away, so that no candidate's truth takes part.
+
+    Args:
+        relative: of B pairs.
+        known: the anchors with the depth that fixes the scale.
+        samples_uv: (B, N, 2) px.
+        n_pixels: pixels drawn.
+        seed: of the pixels.
+    """
+    h, w = known.hw
+    draws = torch.rand(n_pixels, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    uv = (draws * torch.tensor([w, h]) - 0.5).to(samples_uv).expand(samples_uv.shape[0], -1, -1)
+    true_depth = holdout.truth_at(known, uv, truth="raw").depth
+    reach = uv.new_zeros(1, 1) if known.sparse is None else (holdout.CLOSE_SPARSE - 1) * known.sparse[:, None]
+    taken = _near_a_sample(known, uv, samples_uv, reach)
+    depth, _ = read(relative, uv)
+    use = (true_depth > 0) & depth.isfinite() & ~taken
+    ratio = torch.where(use, true_depth / torch.where(use, depth, torch.ones_like(depth)), torch.nan)
+    count = use.sum(-1)
+    factor = ratio.nanmedian(-1).values
+    return Scale(torch.where(count >= MIN_PIXELS, factor, torch.full_like(factor, torch.nan)), count)
+
+
+def judge(outcome: Outcome, ours: str, theirs: str) -> tuple[bool | None, str]:
+    """Whether the network has the smaller median error on the candidates ours answered, on most scenes; and why."""
+    mine, yours = outcome.scenes(ours), outcome.scenes(theirs)
+    both = {}
+    for scene in mine:
+        row = yours.get(scene, {}).get("on_ours") or {}
+        if mine[scene].get("median_rel") is not None and row.get("median_rel") is not None:
+            both[scene] = (row["median_rel"], mine[scene]["median_rel"])
+    if not both:
+        return None, "no scene on which both answered" if yours else f"{theirs} was not run: give its weights"
+    better = [scene for scene, (a, b) in both.items() if a < b]
+    a, b = (median([pair[k] for pair in both.values()]) or 0.0 for k in (0, 1))
+    why = f"{theirs} is more accurate on {len(better)} of {len(both)} scenes, median of medians {a:.2%} against {b:.2%}"
+    return 2 * len(better) > len(both), why
+
+
+def _has_weights(build: Callable[..., Network]) -> bool:
+    return getattr(build, "keywords", {}).get("weights", "none asked for") is not None
+
+
+def _given(batch: Batch, *, scale: str, seed: int) -> dict[str, Any]:
+    """What fixes the scale: the truth of the anchor, or the returns that ours sees too."""
+    known = batch.exact if scale == "oracle" else holdout.range_split(batch.anchor, batch.cutoff)
+    return {"known": known, "seed": seed}
+
+
+def _near_a_sample(frame: Frame, uv: Tensor, samples_uv: Tensor, reach: Tensor) -> Tensor:
+    """Which of the pixels (B, M) lie, in the depth map, within ``reach`` (B, 1) pixels of one that a sample reads."""
+    size = (frame.depth.shape[-2], frame.depth.shape[-1])
+    place = partial(cam.depth_pixels, frame.camera, frame.hw, frame.depth_camera, size)
+    here, there = (round_half_up(place(x)) for x in (uv, samples_uv))
+    near = [torch.cdist(a[None], b[None], p=torch.inf)[0].amin(-1) for a, b in zip(here, there, strict=True)]
+    return torch.stack(near) <= reach
+
+
+def _described(network: Any) -> dict[str, int]:
+    return memory.weights(getattr(network, "network", network))
+
+
+def _columns(answer: protocol.Answer) -> Row:
+    scale = answer.trace.get("scale")
+    return {} if scale is None else {"scale_factor": float(scale.factor[0]), "scale_pixels": float(scale.n_pixels[0])}
+
+
+def _complete(outcome: Outcome, ours: str, labels: Mapping[str, Row], device: str) -> None:
+    """Fill in what rows of the protocol do not know: labels, time for the video, numbers on what ours answered."""
+    for row in outcome.rows:
+        name, scene = row["method"], row["scene"]
+        row.update(labels[name], device=device)
+        if name != ours:
+            row.update({k: None for k in ("pnp_ok", "pnp_success", "n_inlier") if k in row})
+        mine = [r for r in outcome.rows if (r["scene"], r["method"]) == (scene, name) and r["pair"] is not None]
+        if row["pair"] is not None or not mine:
+            continue
+        row["seconds_per_video"] = sum(sum(r["ms"].values()) for r in mine) / 1e3
+        if name != ours:
+            answered = outcome.points[scene, ours, row["truth"]].keep
+            numbers = errors.measure(outcome.points[scene, name, row["truth"]][answered])
+            row["on_ours"] = {k: numbers[k] for k in ("n_kept", "coverage", "median_rel", "p90_rel", "corr")}

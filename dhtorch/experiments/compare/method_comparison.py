@@ -1,0 +1,195 @@
+"""Question: is ``map`` more accurate than ``paper``, and does it know what it does not know?
+
+Expectation (written before the run): over the scenes the median error falls to at most 0.7 of the paper's (``window``:
+0.6), no scene is more than 15 % worse at equal coverage, the area under the risk–coverage curve falls to 0.65 (0.55),
+more than a quarter of the candidates can be answered at 5 % mean risk, about 68 % of the errors lie within one stated
+sigma and 90 % within two, the recalibrated score is off by at most 0.07, and thresholds chosen on other rooms keep the
+mean error within their target.
+What would refute it: any of these numbers missed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from functools import partial
+
+from dhtorch import pytree as tree
+from dhtorch.data.pairs import around, fixed
+from dhtorch.data.scene import Given, Scene, scenes_of
+from dhtorch.experiments import compare_methods as compare
+from dhtorch.experiments import protocol
+from dhtorch.experiments.baselines import xfeat
+from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
+from dhtorch.experiments.rows import Row
+from dhtorch.metrics import bootstrap, errors
+from dhtorch.metrics.errors import Points
+
+QUESTION = "Is the method more accurate than the paper's, and does it know what it does not know?"
+EXPECTATION = (
+    "Every number of the list of bars is met; scenes are the unit, promises are kept in rooms not learnt from."
+)
+
+#: Number → (bar, whether it holds); the second of two bars is for a method of several views.
+BARS: dict[str, tuple[float, float, Callable[[float, float], bool]]] = {
+    "median_rel_ratio": (0.70, 0.60, lambda value, bar: value <= bar),
+    "worst_scene_ratio": (1.15, 1.15, lambda value, bar: value <= bar),
+    "aurc_ratio": (0.65, 0.55, lambda value, bar: value <= bar),
+    "coverage_at_5": (0.26, 0.27, lambda value, bar: value >= bar),
+    "within_sigma": (0.68, 0.68, lambda value, bar: abs(value - bar) <= 0.07),
+    "within_2sigma": (0.90, 0.90, lambda value, bar: value >= bar),
+    "ece": (0.07, 0.07, lambda value, bar: value <= bar),
+    "realised_risk_10": (0.10, 0.10, lambda value, bar: value <= bar),
+    "realised_risk_5": (0.05, 0.05, lambda value, bar: value <= bar),
+}
+
+
+def run(
+    scenes: Sequence[Given],
+    chosen: Mapping[str, Method],
+    pairs: Pairs,
+    settings: Settings,
+    *,
+    methods: Mapping[str, Method] | None = None,
+    reference: str = "paper",
+    once: Sequence[str] = ("opencv", "xfeat"),
+    seeds: int = 5,
+    stand_ins: Mapping[str, str] | None = None,
+    baseline: str = "window",
+    indoor: Sequence[str] = (),
+    moving: Sequence[str] = (),
+    progress: Progress = protocol.quiet,
+) -> Outcome:
+    """Run several methods on the same pairs, several seeds each, and compare them with the reference.
+
+    Rows are those of the first seed; scene rows of a compared method carry ``against_<reference>``: its numbers over
+    all seeds. The summary holds, for every compared method, the numbers of
+    :func:`dhtorch.experiments.compare_methods.method_ratios`. A method of several views is replaced, on scenes too
+    short for three, by its stand-in; one that has none is asked there with the views that there are.
+
+    Args:
+        scenes, chosen, pairs, settings, progress: as :func:`dhtorch.experiments.protocol.run`.
+        methods: name → method; None = ``chosen``.
+        reference: name of the method to compare with.
+        once: methods that are shown for one seed and not compared.
+        seeds: how many, from the job's own upwards.
+        stand_ins: method of several views → method of one; None = the first compared method for all.
+        baseline: the method of several views that the others of several views are held against as well.
+        indoor: rooms whose scenes make the mean ``<method>.coverage_at_5_indoor``.
+        moving: rooms in which what is near moves; their scenes, whatever their role, make ``<method>.convoy_wrong``,
+            the largest share of the candidates of one scene (all seeds) that is answered and more than 20 % off.
+
+    Raises:
+        ValueError: no reference, or nothing to compare with it; else as the main job.
+    """
+    methods = dict(methods or chosen)
+    compared = [name for name in methods if name not in (*once, reference)]
+    if reference not in methods or not compared:
+        raise ValueError(f"experiment.methods: found {', '.join(methods)}, expected {reference} and one more")
+    fallback = stand_ins or {name: compared[0] for name in compared if methods[name].views > 1}
+    variants = {
+        named(name, k): _variant(method, settings.seed + k, pairs if name in fallback else None)
+        for name, method in methods.items()
+        for k in range(1 if name in once else seeds)
+    }
+    outcome = protocol.run(scenes, Protocol(variants), pairs, settings, progress=progress)
+    rooms = {scene.name: scene.place for scene in scenes_of(scenes)}
+    apart = {scene.name for scene in scenes_of(scenes) if scene.role is not None}
+    everywhere = {name: seeds_of(outcome, name, seeds) for name in (reference, *compared)}
+    found = {name: {s: p for s, p in of.items() if s not in apart} for name, of in everywhere.items()}
+    complete = compare.completed(found, reference, fallback)
+    judged = compare.method_ratios(complete, reference=reference, rooms=rooms)
+    leave_first_seed(outcome, methods, seeds)
+    outcome.summary |= judged.summary
+    outcome.summary |= _indoor(judged, rooms, indoor)
+    for name, of in everywhere.items():
+        outcome.summary |= _convoy_wrong(name, [p for scene, p in of.items() if rooms[scene] in moving])
+    several = [name for name in compared if methods[name].views > 1]
+    for name in (n for n in several if n != baseline and baseline in compared):
+        numbers, by_scene = compare.against(complete[name], complete[baseline], baseline)
+        outcome.summary |= {f"{name}.{k}": v.entry("1") for k, v in numbers.items()}
+        for scene, row in outcome.scenes(name).items():
+            row.update(by_scene.get(scene, {}))  # none where there were too few candidates
+    _annotate(outcome.rows, judged.rows, f"against_{reference}")
+    return outcome.decide(QUESTION, EXPECTATION, *verdict(judged, compared, set(several)))
+
+
+def verdict(judged: compare.Comparison, compared: Sequence[str], several: set[str]) -> tuple[bool | None, str]:
+    """Hold the summary against the bars, and name what is missed, left out or silenced."""
+    missed, n_held = [], 0
+    for method in compared:
+        for number, (one, many, holds) in BARS.items():
+            value, bar = judged.summary.get(f"{method}.{number}", {}).get("value"), many if method in several else one
+            if value is None:
+                return None, f"{method}.{number} is not defined on these scenes"
+            n_held += holds(value, bar)
+            missed += [] if holds(value, bar) else [f"{method}.{number} {value:.3f} (bar {bar:g})"]
+    notes = [f"{m} without ratio: {', '.join(scenes)}" for m, scenes in judged.left_out.items() if scenes]
+    notes += [f"{m} % risk silences {', '.join(scenes)}" for m, scenes in judged.silent.items() if scenes]
+    return not missed, "; ".join([f"{n_held} of {n_held + len(missed)} bars met", *missed, *notes])
+
+
+def _indoor(judged: compare.Comparison, rooms: Mapping[str, str], indoor: Sequence[str]) -> Row:
+    """Coverage at 5 % risk, its mean over the scenes of some rooms."""
+    reached: dict[str, list[float]] = {}
+    for row in judged.rows:
+        if rooms[row["scene"]] in indoor and row["coverage_at_5"] is not None:
+            reached.setdefault(row["method"], []).append(row["coverage_at_5"])
+    return {
+        f"{name}.coverage_at_5_indoor": bootstrap.interval(values, statistic="mean").entry("1")
+        for name, values in reached.items()
+    }
+
+
+def _convoy_wrong(name: str, scenes: Sequence[Sequence[Points]]) -> Row:
+    """The worst of the scenes' shares of candidates that are answered and wrong, over the seeds of each."""
+    pools = [pool for pool in map(tree.collate, scenes) if pool.keep.numel()]
+    if not pools:
+        return {}
+    shares = [float((pool.keep & (pool.error > errors.WRONG)).double().mean()) for pool in pools]
+    return {f"{name}.convoy_wrong": bootstrap.single(max(shares), len(shares))}
+
+
+def _variant(method: Method, seed: int, pairs: Pairs | None) -> Variant:
+    """A method that chooses its views is offered those around the anchor; another takes the pair's own.
+
+    With ``pairs`` it is not asked on scenes of too few views.
+    """
+    if method.choose is not None:
+        return Variant(method, seed=seed, offers=around, needs=partial(_views, None, method))
+    return Variant(method, seed=seed, needs=partial(_views, pairs, method))
+
+
+def named(method: str, k: int) -> str:
+    """The variant that is a method with its seed ``k``; the first bears the method's own name."""
+    return method if k == 0 else f"{method}, seed {k}"
+
+
+def _views(pairs: Pairs | None, method: Method, scene: Scene) -> str | None:
+    """Why a method is not asked on a scene: a package, or views that there are not; None where it is."""
+    short = pairs is not None and method.views > 1 and min((j - i for i, j in fixed(pairs(scene))), default=2) < 2
+    return xfeat.lacking(method) or ("fewer than 3 views" if short else None)
+
+
+def leave_first_seed(outcome: Outcome, methods: Iterable[str], seeds: int) -> None:
+    """Take the later seeds out of the rows and the summary; their points stay."""
+    later = {named(name, k) for name in methods for k in range(1, seeds)}
+    outcome.rows = [r for r in outcome.rows if r["method"] not in later]
+    outcome.summary = {k: v for k, v in outcome.summary.items() if not any(k.startswith(f"{m}.") for m in later)}
+
+
+def seeds_of(outcome: Outcome, method: str, seeds: int, apart: Collection[str] = ()) -> dict[str, list[Points]]:
+    """Scene → candidates of every seed; scenes that stand apart stay out."""
+    scenes: dict[str, list[Points]] = {}
+    for k in range(seeds):
+        for (scene, variant, cohort), points in outcome.points.items():
+            if (variant, cohort) == (named(method, k), "full") and scene not in apart:
+                scenes.setdefault(scene, []).append(points)
+    return scenes
+
+
+def _annotate(rows: Sequence[Row], numbers: Sequence[Row], key: str) -> None:
+    """Put the comparison's numbers of a scene into its row."""
+    known = {(n["scene"], n["method"]): {k: v for k, v in n.items() if k not in ("scene", "method")} for n in numbers}
+    for row in rows:
+        if row["pair"] is None and (row["scene"], row["method"]) in known:
+            row[key] = known[row["scene"], row["method"]]

@@ -1,0 +1,276 @@
+"""One method against a reference, scene by scene: ratios over seeds, and promises kept in rooms not learnt from.
+
+A ratio asks first for the median over seeds, of either method, then divides, then takes the geometric mean over
+scenes: a scene where the error halves and one where it doubles cancel. Promises (calibrated score, sigma, thresholds)
+are learnt on the other rooms, with the seeds of a scene pooled and every scene of the same weight.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import torch
+
+from dhtorch import pytree as tree
+from dhtorch.calibration.score_calibration import fit
+from dhtorch.metrics import bootstrap, control, errors, reliability, risk
+from dhtorch.metrics.bootstrap import Interval
+from dhtorch.metrics.errors import Points
+
+#: A scene on which either method answers fewer points says nothing about their ratio.
+MIN_ANSWERS = 20
+
+#: A scene with fewer answers above a threshold (mean over seeds) says nothing about keeping its target.
+MIN_ABOVE = 100
+
+#: Targets of the plug-in control, per cent of mean error.
+TARGETS = (10, 5)
+
+#: Errors below this count as this much: a ratio of two roundings is no ratio.
+SMALLEST = 1e-6
+
+#: Scene → the candidates of every seed.
+Seeds = Mapping[str, Sequence[Points]]
+
+
+@dataclass
+class Comparison:
+    """Summary keys ``<method>.<number>``, one row per method and scene, and the scenes that need naming."""
+
+    summary: dict[str, dict[str, Any]] = field(default_factory=dict)
+    rows: list[dict[str, Any]] = field(default_factory=list)  # {method, scene, number: value}
+    left_out: dict[str, list[str]] = field(default_factory=dict)  # method → scenes without a ratio: too few answers
+    silent: dict[str, list[str]] = field(default_factory=dict)  # "<method>.<per cent>" → scenes its threshold silences
+
+
+def method_ratios(
+    methods: Mapping[str, Seeds],
+    *,
+    reference: str = "paper",
+    rooms: Mapping[str, str] | None = None,
+    fallback: Mapping[str, str] | None = None,
+    draws: int = 2000,
+    seed: int = 0,
+) -> Comparison:
+    """What every other method gains on the reference, and whether it keeps its promises.
+
+    Args:
+        methods: method → scene → candidates of every seed, with the method's own uncalibrated score and sigma. Seed k
+            of one method is paired with seed k of the reference.
+        reference: the method to compare with.
+        rooms: scene → room, for what is learnt elsewhere; a scene that is not named is a room of its own.
+        fallback: method → the method that stands in for it on scenes where it has no candidates of its own, such as
+            ``{"window": "map"}`` where a scene has too few views.
+        draws, seed: of the bootstrap over scenes.
+
+    Returns:
+        Comparison. For every other method, geometric means over scenes: ``median_rel_ratio`` (each method on its own
+        answers), ``median_rel_ratio_at_equal_coverage`` (both cut by their own score to the smaller number of answers,
+        seed by seed), ``aurc_ratio``. ``worst_scene_ratio``: the largest ratio at equal coverage. ``coverage_at_5``:
+        mean over scenes (on many it is zero, so that their median jumps). In rooms not learnt from, means over
+        scenes: ``within_sigma`` and ``within_2sigma`` after the correction of sigma; ``realised_risk_<per cent>``,
+        mean capped error at the threshold that nine in ten of the other scenes keep, where a silent scene counts 0
+        (``risk_of_speaking_<per cent>``: without those); ``coverage_within_<per cent>``, what is answered above it;
+        ``within_target_<per cent>``, share of the scenes that meet it among those with a hundred answers above the
+        threshold; ``ece_scenes``, scene by scene what :func:`dhtorch.metrics.reliability.excess_ece` says. And over
+        all answers, every scene of the same weight: ``ece`` of the table, ``ece_sigmoid`` of the simple control,
+        ``ece_raw`` of the score as it came.
+
+    Raises:
+        ValueError: no reference, or methods that differ in scenes or number of seeds.
+    """
+    complete = completed(methods, reference, fallback or {})
+    found = Comparison()
+    for method, ours in complete.items():
+        if method == reference:
+            continue
+        rows: dict[str, dict[str, Any]] = {scene: {"method": method, "scene": scene} for scene in ours}
+        numbers = _ratios(ours, complete[reference], rows, found.left_out.setdefault(method, []), draws, seed)
+        numbers |= promises(ours, rooms, rows, draws, seed)
+        for percent in TARGETS:
+            key = f"realised_risk_{percent}"
+            found.silent[f"{method}.{percent}"] = [s for s, row in rows.items() if key in row and row[key] is None]
+        for name, value in numbers.items():
+            found.summary[f"{method}.{name}"] = value.entry(errors.unit(name))
+        found.rows += rows.values()
+    return found
+
+
+def against(
+    ours: Seeds, theirs: Seeds, name: str, *, draws: int = 2000, seed: int = 0
+) -> tuple[dict[str, Interval], dict[str, dict[str, float]]]:
+    """What one method of several views gains on another, with what it leaves silent counted as well.
+
+    Args:
+        ours, theirs: the same scenes and seeds.
+        name: of the other method, for the names of the numbers.
+        draws, seed: of the bootstrap over scenes.
+
+    Returns:
+        ``error_ratio_to_<name>``, geometric mean over scenes of the ratio of median errors, both cut by their own score
+        to the smaller number of answers; ``worst_scene_ratio_to_<name>``, the largest of them;
+        ``aurc_full_ratio_to_<name>``, geometric mean of the ratio of the areas over all candidates, where silence
+        counts as an error of one. And the same scene by scene, where it is defined.
+    """
+    equal, _ = ratio_over_seeds(*equal_coverage(ours, theirs), _median_rel)
+    full, _ = ratio_over_seeds(ours, theirs, lambda p: risk.measure(p)["aurc_full"], min_answers=0)
+    numbers = {
+        f"error_ratio_to_{name}": _geometric(equal, draws, seed),
+        f"worst_scene_ratio_to_{name}": _worst(equal),
+        f"aurc_full_ratio_to_{name}": _geometric(full, draws, seed),
+    }
+    rows = {s: {f"error_ratio_to_{name}": equal[s]} if s in equal else {} for s in ours}
+    for scene, ratio in full.items():
+        rows[scene][f"aurc_full_ratio_to_{name}"] = ratio
+    return numbers, rows
+
+
+def ratio_over_seeds(
+    ours: Seeds, theirs: Seeds, measure: Callable[[Points], float | None], *, min_answers: int = MIN_ANSWERS
+) -> tuple[dict[str, float], list[str]]:
+    """Ratio of the medians over seeds of one number, scene by scene, and the scenes that have none.
+
+    Args:
+        ours, theirs: the same scenes.
+        measure: number of a scene's candidates, None where undefined.
+        min_answers: a scene where either answers fewer (median over seeds) is left out.
+    """
+    found, left_out = {}, []
+    for scene in ours:
+        kept = [statistics.median(int(p.keep.sum()) for p in side[scene]) for side in (ours, theirs)]
+        a, b = (_median_over_seeds(side[scene], measure) for side in (ours, theirs))
+        if min(kept) < min_answers or a is None or b is None:
+            left_out.append(scene)
+        else:
+            found[scene] = max(a, SMALLEST) / max(b, SMALLEST)
+    return found, left_out
+
+
+def equal_coverage(ours: Seeds, theirs: Seeds) -> tuple[dict[str, list[Points]], dict[str, list[Points]]]:
+    """Both methods, cut by their own score to the smaller number of answers, seed by seed."""
+    cut_ours: dict[str, list[Points]] = {}
+    cut_theirs: dict[str, list[Points]] = {}
+    for scene in ours:
+        pairs = list(zip(ours[scene], theirs[scene], strict=True))
+        sizes = [min(int(a.keep.sum()), int(b.keep.sum())) for a, b in pairs]
+        cut_ours[scene] = [risk.surest(a, n) for (a, _), n in zip(pairs, sizes, strict=True)]
+        cut_theirs[scene] = [risk.surest(b, n) for (_, b), n in zip(pairs, sizes, strict=True)]
+    return cut_ours, cut_theirs
+
+
+def _ratios(
+    ours: Seeds, theirs: Seeds, rows: dict[str, dict[str, Any]], left_out: list[str], draws: int, seed: int
+) -> dict[str, Interval]:
+    def geometric(ratios: Mapping[str, float], name: str) -> Interval:
+        for scene, row in rows.items():
+            row[name] = ratios.get(scene)
+        return _geometric(ratios, draws, seed)
+
+    own, unanswered = ratio_over_seeds(ours, theirs, _median_rel)
+    left_out += unanswered
+    equal, _ = ratio_over_seeds(*equal_coverage(ours, theirs), _median_rel)
+    ranked, _ = ratio_over_seeds(ours, theirs, lambda p: risk.measure(p)["aurc"])
+    for scene, row in rows.items():
+        row["coverage_at_5"] = _median_over_seeds(ours[scene], lambda p: risk.measure(p)["coverage_at_5"])
+    reached = [row["coverage_at_5"] for row in rows.values()]
+    return {
+        "median_rel_ratio": geometric(own, "median_rel_ratio"),
+        "median_rel_ratio_at_equal_coverage": geometric(equal, "median_rel_ratio_at_equal_coverage"),
+        "worst_scene_ratio": _worst(equal),
+        "aurc_ratio": geometric(ranked, "aurc_ratio"),
+        "coverage_at_5": bootstrap.interval(reached, statistic="mean", draws=draws, seed=seed),
+    }
+
+
+def promises(
+    ours: Seeds, rooms: Mapping[str, str] | None, rows: dict[str, dict[str, Any]], draws: int, seed: int
+) -> dict[str, Interval]:
+    """What was promised in every room by what the other rooms taught: the second half of :func:`method_ratios`.
+
+    Args:
+        ours: scene → candidates of every seed.
+        rooms: scene → room.
+        rows: scene → its numbers, filled.
+        draws, seed: of the bootstrap over scenes.
+    """
+    pooled = {scene: tree.collate(points) for scene, points in ours.items()}
+    table, sigmoid = {}, {}
+    for others, held in reliability.leave_one_room_out(pooled, rooms):
+        if not any(bool(s.keep.any()) for s in others.values()):
+            continue  # nothing to learn from: these scenes have no such number
+        few = MIN_ABOVE * max(map(len, ours.values()))
+        learnt = fit(list(others.values()), targets=TARGETS, choose=partial(control.most_scenes, few=few))
+        for scene, points in held.items():
+            table[scene] = learnt.apply(points)
+            sigmoid[scene] = points.replace(score=torch.where(points.keep, learnt.sigmoid(points.score), 0.0))
+            stated = errors.measure(table[scene])
+            rows[scene] |= {k: stated[k] for k in ("within_sigma", "within_2sigma")}
+            rows[scene]["ece"] = reliability.excess_ece(table[scene], seed=seed)
+            for percent, threshold in learnt.thresholds.items():
+                rows[scene][f"realised_risk_{percent}"] = risk.realised(points, threshold)
+                above = 0 if threshold is None else int((points.keep & (points.score >= threshold)).sum())
+                rows[scene][f"n_above_{percent}"] = above / len(ours[scene])
+                rows[scene][f"coverage_within_{percent}"] = above / max(points.keep.numel(), 1)
+
+    def mean(values: list[float | None]) -> Interval:
+        return bootstrap.interval(values, statistic="mean", draws=draws, seed=seed)
+
+    judged = [rows[scene] for scene in table]
+    numbers = {name: mean([row[name] for row in judged]) for name in ("within_sigma", "within_2sigma")}
+    for percent in TARGETS:
+        realised = [row[f"realised_risk_{percent}"] or 0.0 for row in judged]
+        numbers[f"realised_risk_{percent}"] = mean(realised)
+        enough = [r for r, row in zip(realised, judged, strict=True) if row[f"n_above_{percent}"] >= MIN_ABOVE]
+        spoke = [row[f"realised_risk_{percent}"] for row in judged if row[f"realised_risk_{percent}"] is not None]
+        numbers[f"risk_of_speaking_{percent}"] = mean(spoke)
+        numbers[f"coverage_within_{percent}"] = mean([row[f"coverage_within_{percent}"] for row in judged])
+        numbers[f"within_target_{percent}"] = mean([float(r <= percent / 100) for r in enough])
+    numbers["ece_scenes"] = mean([row["ece"] for row in judged])
+    for name, scenes in (("ece", table), ("ece_sigmoid", sigmoid), ("ece_raw", pooled)):
+        numbers[name] = reliability.ece_interval([scenes[s] for s in table], draws=draws, seed=seed)
+    return numbers
+
+
+def completed(
+    methods: Mapping[str, Seeds], reference: str, fallback: Mapping[str, str]
+) -> dict[str, dict[str, Sequence[Points]]]:
+    """Every method on the reference's scenes, in its order; arguments and errors as :func:`method_ratios`."""
+    if reference not in methods:
+        raise ValueError(
+            f"compare.reference: found {', '.join(methods) or 'no method'}, expected {reference} among them"
+        )
+    complete: dict[str, dict[str, Sequence[Points]]] = {}
+    for method, given in methods.items():
+        scenes = {**methods.get(fallback.get(method, method), {}), **given}
+        for scene, seeds in methods[reference].items():
+            if scene not in scenes or len(scenes[scene]) != len(seeds):
+                found = f"{len(scenes[scene])} seeds" if scene in scenes else "nothing"
+                raise ValueError(f"compare.{method}.{scene}: found {found}, expected {len(seeds)} seeds as {reference}")
+        unknown = sorted(scenes.keys() - methods[reference].keys())
+        if unknown:
+            raise ValueError(f"compare.{method}.{unknown[0]}: found a scene that {reference} does not have")
+        complete[method] = {scene: scenes[scene] for scene in methods[reference]}
+    return complete
+
+
+def _geometric(ratios: Mapping[str, float], draws: int, seed: int) -> Interval:
+    """Geometric mean over scenes."""
+    return bootstrap.interval(list(ratios.values()), statistic="geometric_mean", draws=draws, seed=seed)
+
+
+def _worst(ratios: Mapping[str, float]) -> Interval:
+    """The largest over scenes."""
+    return Interval(max(ratios.values(), default=None), None, None, len(ratios))
+
+
+def _median_over_seeds(seeds: Sequence[Points], measure: Callable[[Points], float | None]) -> float | None:
+    defined = [v for v in map(measure, seeds) if v is not None]
+    return statistics.median(defined) if defined else None
+
+
+def _median_rel(points: Points) -> float | None:
+    return errors.measure(points)["median_rel"]

@@ -1,0 +1,202 @@
+"""DDFF-12: focal stacks of twelve rooms, refocused from a light-field camera, with depth from an RGB-D sensor.
+
+The published HDF5 files (``stack_<split>``, ``disp_<split>``), or the raw light fields
+``LightField/<split>/<scene>/LF_<n>.npy`` beside ``DepthRegistered/<split>/<scene>/DEPTH_<n>.png`` (16 bits, mm), which
+are refocused here. Depth is a constant over the disparity, 0 = none. The stored type and the number of stacks of the
+HDF5 files are not documented: both are taken from the file, and numbers of which none exceeds 1.5 count as 0 to 1
+instead of 0 to 255.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dhtorch.data import convert
+from dhtorch.data.codecs.hdf5 import Hdf5Array, hdf5_arrays
+from dhtorch.data.codecs.npy import real_header
+from dhtorch.data.io import decode as files
+from dhtorch.data.io.decode import FormatError
+from dhtorch.experiments.focal.light_field import refocus
+from dhtorch.experiments.focal.stacks import FocalStack, Stacks, focus_distances
+
+_DEPTH_DISPARITY = 0.1412376  # m px: 521.4052 px focal length times 0.27088 mm between two sub-apertures
+_DISPARITIES = (0.28247513, 0.02017679)  # px, of the first slice (0.5 m) and the last (7 m)
+_SLICES = 10
+_HW = (383, 552)
+_K = (521.4052, 521.4052, 285.114, 187.825)
+_MIN_DISPARITY = 1e-4  # px; 1.4 km
+_MAX_STACKS = 1_000_000
+_MAX_APERTURES = 32  # along one side
+
+
+def recognise(root: Path) -> str | None:
+    """What makes ``root`` focal stacks of this format, in words; None if nothing does."""
+    if (root / "LightField").is_dir() and next((root / "LightField").glob("*/*/LF_*.npy"), None):
+        return "light fields LightField/<split>/<scene>/LF_<n>.npy"
+    sources = [root] if root.suffix in (".h5", ".hdf5") and root.is_file() else sorted(root.glob("*.h5"))[:1]
+    if sources and any(key.startswith(("stack_", "stacks_")) for key in hdf5_arrays(sources[0])):
+        return "HDF5 arrays stack_<split>"
+    return None
+
+
+def read(
+    root: str | Path,
+    *,
+    split: str | None = None,
+    focus_m: Sequence[float] | None = None,
+    depth_disparity: float = _DEPTH_DISPARITY,
+    depth_folder: str = "DepthRegistered",
+    per_scene: int | None = None,
+) -> Stacks:
+    """Open DDFF-12.
+
+    Args:
+        root: an HDF5 file, a folder with some, or the folder that holds ``LightField/``.
+        split: ``"train"``, ``"val"``, ``"test"``. None = all there are.
+        focus_m: distances in focus. None = equal steps of disparity from 0.5 m to 7 m, as the stacks were made; raw
+            light fields are refocused at these.
+        depth_disparity: m px, depth times disparity: focal length times distance of two neighbouring sub-apertures.
+        depth_folder: of the raw depth maps (16-bit PNG, mm).
+        per_scene: stacks of one room, where those of an HDF5 file are known to follow one another. None = not known: as
+            the file does not say which stacks share a room, all of a split count as one scene.
+
+    Returns:
+        Stacks in the order of the file, near focus first; light fields of one folder are one scene. The published HDF5
+        mixes the rooms of train and val. Depth is None where a split has no labels. The camera is the calibrated one
+        where the size is 552×383.
+
+    Raises:
+        FormatError: no stack, a stack and its labels that disagree, a damaged file, or an option that cannot be.
+    """
+    root = Path(root)
+    constant = files.to_positive(depth_disparity, root, "option depth_disparity")
+    steps = torch.linspace(*_DISPARITIES, _SLICES, dtype=torch.float64)
+    focus = (constant / steps).float() if focus_m is None else focus_distances(focus_m, root)
+    if per_scene is not None and per_scene < 1:
+        raise FormatError(root, "option per_scene", per_scene, "at least 1")
+    raw = (root / "LightField").is_dir()
+    shots, report = _light_fields(root, depth_folder) if raw else _hdf5_stacks(root, per_scene)
+    shots = [shot for shot in shots if split in (None, shot.split)]
+    if not shots:
+        raise FormatError(root, "stacks", f"none of split {split or 'any'}", "stack_<split> or LightField/<split>/")
+    load = _Load(tuple(shots), focus, constant)
+    names, scenes = (tuple(found) for found in zip(*((s.name, s.scene) for s in shots), strict=True))
+    return Stacks(root.resolve().stem, "ddff12", load, names, root=root, report=tuple(report), scenes=scenes)
+
+
+@dataclass(frozen=True, eq=False)
+class _Shot:
+    """Where one stack lies: a row of an array, or a light field."""
+
+    name: str
+    split: str
+    scene: str
+    stack: Hdf5Array | Path
+    truth: Hdf5Array | Path | None
+    row: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class _Load:
+    """Position → stack."""
+
+    shots: tuple[_Shot, ...]
+    focus: Tensor  # (S,)
+    depth_disparity: float
+
+    def __call__(self, i: int) -> FocalStack:
+        shot = self.shots[i]
+        if isinstance(shot.stack, Path):
+            images = refocus(_light_field(shot.stack), self.depth_disparity / self.focus.double())
+        else:
+            images = _as_images(shot.stack.row(shot.row), shot.stack)
+        source, hw = _file(shot.stack), (images.shape[-2], images.shape[-1])
+        if len(images) != len(self.focus):
+            raise FormatError(
+                _file(shot.stack), "slices", len(images), f"{len(self.focus)}, one for each focus distance"
+            )
+        depth = None
+        if isinstance(shot.truth, Path):
+            depth = torch.from_numpy(files.read_depth_png(shot.truth, 1000.0, hw))[None]
+        elif shot.truth is not None:
+            disparity = shot.truth.row(shot.row).astype(np.float64)
+            usable = np.isfinite(disparity) & (disparity > _MIN_DISPARITY)
+            metres = np.where(usable, self.depth_disparity / np.where(usable, disparity, 1), 0)
+            depth = torch.from_numpy(metres.astype(np.float32))[None]
+        camera = convert.to_camera(convert.matrix_of(*_K), hw, source) if hw == _HW else None
+        return FocalStack(images[None], self.focus[None], depth, camera)
+
+
+def _hdf5_stacks(root: Path, per_scene: int | None) -> tuple[list[_Shot], list[str]]:
+    sources = [root] if root.is_file() else sorted(root.glob("*.h5"))
+    shots = []
+    for file in sources:
+        arrays = hdf5_arrays(file)
+        for key, stack in arrays.items():
+            match = re.fullmatch(r"stacks?_(\w+)", key)
+            if not match:
+                continue
+            truth = arrays.get(f"disp_{match[1]}")
+            n, hw = stack.shape[0], stack.shape[2:4]
+            if len(stack.shape) != 5 or stack.shape[4] not in (1, 3) or 0 in stack.shape or n > _MAX_STACKS:
+                raise FormatError(file, key, f"shape {stack.shape}", "stacks, slices, height, width, 1 or 3 channels")
+            if truth is not None and truth.shape != (n, *hw):
+                raise FormatError(file, truth.key, f"shape {truth.shape}", f"{(n, *hw)}, as {key}")
+            prefix = f"{file.stem}/{match[1]}" if len(sources) > 1 else match[1]
+            rooms = [prefix if per_scene is None else f"{prefix}/scene_{i // per_scene:02d}" for i in range(n)]
+            shots += [_Shot(f"{prefix}/{i:04d}", match[1], rooms[i], stack, truth, i) for i in range(n)]
+    return shots, []
+
+
+def _light_fields(root: Path, depth_folder: str) -> tuple[list[_Shot], list[str]]:
+    shots, report = [], []
+    for file in sorted((root / "LightField").glob("*/*/LF_*.npy")):
+        scene = file.parent.relative_to(root / "LightField")
+        number = file.stem.removeprefix("LF_")
+        folder = root / depth_folder / scene
+        truth = folder / f"DEPTH_{number}.png"
+        if folder.is_dir() and not truth.is_file():
+            report.append(f"{scene}/{number}: no {truth.name}: left out")
+        else:
+            label = truth if folder.is_dir() else None
+            room = scene.as_posix()
+            shots.append(_Shot(f"{room}/{number}", scene.parts[0], room, file, label))
+    return shots, report
+
+
+def _light_field(file: Path) -> Tensor:
+    """(U, V, H, W, 3) uint8."""
+    raw = files.read_bytes(file)
+    header = real_header(file, "light field", raw)
+    shape = header.shape
+    usable = len(shape) == 5 and shape[4] in (1, 3) and max(shape[:2]) <= _MAX_APERTURES and min(shape) > 0
+    if header.dtype != np.uint8 or header.fortran or not usable:
+        raise FormatError(file, "light field", f"{header.dtype} of {shape}", "uint8: 9, 9, height, width, 3")
+    if len(raw) - header.start != math.prod(shape):
+        raise FormatError(file, "data", f"{len(raw) - header.start} bytes", f"{shape}")
+    return torch.from_numpy(np.frombuffer(raw, np.uint8, offset=header.start).reshape(shape).copy())
+
+
+def _as_images(stack: np.ndarray, source: Hdf5Array) -> Tensor:
+    """(S, C, H, W): whole numbers up to 255 as uint8, else float in [0, 1]."""
+    if not np.isfinite(stack).all() or stack.min() < 0 or stack.max() > 255:
+        raise FormatError(source.file, source.key, f"{stack.min():g} to {stack.max():g}", "values from 0 to 255")
+    images = torch.from_numpy(np.ascontiguousarray(stack.transpose(0, 3, 1, 2)))
+    if not images.is_floating_point():
+        return images.to(torch.uint8)
+    images = images.float()
+    if float(images.max()) <= 1.5:
+        return images.clamp(max=1)
+    return images.to(torch.uint8) if bool((images == images.round()).all()) else images / 255
+
+
+def _file(source: Hdf5Array | Path) -> Path:
+    return source if isinstance(source, Path) else source.file

@@ -1,0 +1,263 @@
+"""Question: how much depth is there in the defocus of a single picture?
+
+On scenes of exact depth the picture is taken through a thin lens focused on what stands in its middle; blur is measured
+edge by edge and turned into inverse depth with the true lens, so that nothing but the measurement and the *side* of the
+focus is open. The side comes from an oracle (``oracle_side``), or has to be produced: from the height in the picture
+(``by_height``), from the colour of the blur (``by_colour``: none without axial colour), or by always saying beyond
+(``all_beyond``). Controls: the height in the picture alone, without any blur (``height_alone``), and the same blur
+measured in the picture that no lens has blurred (``texture_alone``). ``natural`` is the picture as it came, the only
+variant on recordings without exact depth: there the blur is what it is, and only ``rho_abs`` can be asked.
+
+Expectation (written before the run): the signal is there and weak (|rho| of blur and inverse depth at most 0.5; the
+paper: 0.22); with the oracle's side r is at least 0.4 (paper: 0.66); a side that has to be produced loses more than
+half of it (paper: 0.06).
+What would refute it: |rho| above 0.5, r with the oracle's side below 0.4, or a deployable r of half the oracle's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from dhtorch.data.recording import Recording
+from dhtorch.data.scene import Given, Scene, scenes_of
+from dhtorch.experiments.focal.blur import Blur, inverse_depth, local_blur, side_by_colour, side_by_height
+from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
+from dhtorch.experiments.rows import Row, median
+from dhtorch.experiments.screening import Item, screen
+from dhtorch.geometry.thin_lens import GAUSSIAN_OF_DISC, Lens, spot_diameter
+from dhtorch.metrics import bootstrap, holdout
+from dhtorch.metrics.correlation import pearson, spearman
+from dhtorch.records import Frame
+from dhtorch.synthetic.recording import SyntheticRoom
+from dhtorch.synthetic.thin_lens import lens_of, photograph
+
+QUESTION = "How much depth is there in the defocus of a single picture?"
+EXPECTATION = (
+    "A weak signal, useful once an oracle gives the side of the focus, next to nothing when it has to be produced."
+)
+
+#: Ways to produce the side without an oracle.
+DEPLOYABLE = ("by_height", "by_colour", "all_beyond")
+VARIANTS = ("oracle_side", *DEPLOYABLE, "height_alone", "texture_alone", "natural")
+
+#: Fewest pixels on which a correlation is said.
+MIN_SITES = 50
+
+#: Inverse distance beyond which nothing is focused, 1/m.
+FARTHEST_DPT = 0.01
+
+#: What counts as weak, as a working oracle, and how much of it a deployable estimator may keep.
+WEAK, USEFUL, KEPT = 0.5, 0.4, 0.5
+
+
+def run(
+    scenes: Sequence[Given],
+    methods: Mapping[str, Method],
+    pairs: Pairs,
+    settings: Settings,
+    *,
+    focal_length_m: float = 0.035,
+    f_number: float = 0.35,
+    axial_colour_dpt: float = 0.0,
+    noise: float = 1 / 255,
+    stride_px: int = 4,
+    window_px: float = 6.0,
+    progress: Progress = quiet,
+) -> Outcome:
+    """Measure blur in every picture at valid pixels of a grid whose depth passes the truth test.
+
+    Rows, per picture and per scene: ``rho_abs``, |Spearman| of blur and inverse depth; ``corr`` and ``rank_corr`` of
+    claimed and true inverse depth; ``side_right``, share of pixels whose side is right; ``blur_corr``, Pearson of
+    measured and true blur; ``texture_corr``, Pearson of measured blur and the blur measured without a lens;
+    ``rho_perfect``, what ``rho_abs`` would be with the true blur; ``coverage``, share of the candidates with edges.
+    The two ambiguities stand apart in the summary: ``blank_wall.*`` and ``two_sides.*``, see :func:`ambiguities`.
+
+    Args:
+        scenes, settings, progress: as :func:`dhtorch.experiments.protocol.run`. One with exact depth
+            (``lidar`` is "exact") is photographed through the lens; of any other the first frame is taken as it is.
+        methods, pairs: not used.
+        focal_length_m, f_number: of the lens; its pixel pitch is such that the picture keeps its field of view. What
+            counts is the spot in pixels: in a picture of 320 columns f/0.35 gives the spots of f/1.4 at 1280 columns,
+            and f/1.8 those of a phone (5.7 mm, f/1.8) at 1920.
+        axial_colour_dpt: by how many dioptres blue is focused nearer than red; a lens of one glass has about 0.5.
+        noise: standard deviation of a pixel, added after the lens.
+        stride_px: of the grid.
+        window_px: in which blur is measured.
+
+    Source: paper, "What Does Not Work", single-frame depth from defocus.
+    """
+    optics = {"focal_length_m": focal_length_m, "f_number": f_number}
+
+    def ask(scene: Scene, item: Item) -> dict[str, Row]:
+        frame = scene.recording[item[0]].to(settings.dtype).to(settings.device)
+        uv = _grid(frame.hw, stride_px, frame.camera.f)
+        if not is_exact(scene.recording):
+            blur = local_blur(frame.image, noise=noise, window_px=window_px)
+            return {"natural": _unsigned(frame, uv, blur)}
+        lens = lens_of(float(frame.camera.f[0, 0]), **optics).to(settings.dtype)
+        return _through_lens(
+            frame, uv, lens, colour=axial_colour_dpt, noise=noise, window_px=window_px, seed=settings.seed
+        )
+
+    outcome = screen(scenes_of(scenes), lambda _r: [(0, 0)], ask, VARIANTS, truth="full", progress=progress)
+    outcome.summary |= {k: bootstrap.single(v, 1) for k, v in ambiguities(noise=noise, window_px=window_px).items()}
+    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
+
+
+def is_exact(recording: Recording) -> bool:
+    """Whether every pixel of a recording has exact depth, so that a lens can be put in front of it."""
+    return isinstance(recording, SyntheticRoom) and recording.lidar == "exact"
+
+
+def verdict(outcome: Outcome) -> tuple[bool | None, str]:
+    """Weak without a side, useful with the oracle's, and mostly lost when the side has to be produced?"""
+
+    def over_scenes(variant: str, metric: str) -> float | None:
+        return bootstrap.interval([r.get(metric) for r in outcome.scenes(variant).values()]).value
+
+    rho, oracle = over_scenes("oracle_side", "rho_abs"), over_scenes("oracle_side", "corr")
+    tried = {v: r for v in DEPLOYABLE if (r := over_scenes(v, "corr")) is not None}
+    if rho is None or oracle is None or not tried:
+        natural = over_scenes("natural", "rho_abs")
+        found = "" if natural is None else f"; |rho| of the pictures as they are {natural:.2f} (paper 0.22)"
+        return None, f"no scene with exact depth and enough edges{found}"
+    best = max(tried, key=lambda v: tried[v])
+    why = (
+        f"medians over {len(outcome.scenes('oracle_side'))} scenes: |rho| {rho:.2f} (paper 0.22), r with the oracle's"
+        f" side {oracle:.2f} (0.66), best deployable {best} {tried[best]:+.2f} (0.06);"
+        f" the height in the picture alone, without any blur, {over_scenes('height_alone', 'corr') or 0:+.2f}"
+    )
+    return rho <= WEAK and oracle >= USEFUL and tried[best] < KEPT * oracle, why
+
+
+def ambiguities(*, noise: float = 0.0, window_px: float = 6.0, seed: int = 0) -> dict[str, float | None]:
+    """The two things that one picture cannot tell apart, each alone, on a wall facing a lens.
+
+    Returns:
+        ``blank_wall.…``: a wall *in focus*: blur claimed in px of paint with sharp edges, of the same paint with soft
+        edges, and the share of a plain wall with a soft shadow on it that is measured at all. ``two_sides.…``: the same
+        sharp paint equally far (in dioptres) in front of the focus and beyond it: blur claimed, true blur, and the
+        ratio of the two claims, 1 = nothing tells them apart.
+    """
+    hw, focus = (120, 160), torch.tensor([[2.0]])
+    lens = lens_of(265.0, f_number=0.35)
+    draw = torch.Generator().manual_seed(seed)
+    blocks = torch.rand(1, 1, 8, 10, generator=draw).repeat_interleave(15, 2).repeat_interleave(16, 3)
+    shadow = torch.linspace(0.3, 0.7, hw[1]).expand(1, 1, *hw)
+
+    def claimed(paint: Tensor, z: float) -> tuple[float | None, float]:
+        seen = photograph(paint, torch.full((1, *hw), z), lens, focus)[:, 0]
+        seen = seen + noise * torch.randn(seen.shape, generator=draw)
+        blur = local_blur(seen, noise=noise, window_px=window_px)
+        return median(blur.sigma[blur.valid].tolist()), float(blur.valid.float().mean())
+
+    soft = photograph(blocks, torch.full((1, *hw), 8.0), lens, focus)[:, 0]  # paint as soft as a spot of 6 m off
+    near, far = (claimed(blocks, 1 / (0.5 + d))[0] for d in (0.25, -0.25))
+    true = GAUSSIAN_OF_DISC * abs(float(spot_diameter(lens, torch.tensor([[4.0]]), focus[:, 0])))
+    return {
+        "blank_wall.sharp_paint_px": claimed(blocks, 2.0)[0],
+        "blank_wall.soft_paint_px": claimed(soft, 2.0)[0],
+        "blank_wall.plain_share": claimed(shadow, 2.0)[1],
+        "two_sides.near_px": near,
+        "two_sides.far_px": far,
+        "two_sides.true_px": true,
+        "two_sides.ratio": near / far if near and far else None,
+    }
+
+
+def _through_lens(
+    frame: Frame, uv: Tensor, lens: Lens, *, colour: float, noise: float, window_px: float, seed: int
+) -> dict[str, Row]:
+    """Variant → numbers of one picture, focused on its middle."""
+    depth, (h, w) = frame.depth, frame.hw
+    sharp = frame.image / 255.0 if frame.image.dtype == torch.uint8 else frame.image
+    focus = depth[:, h // 2, w // 2]
+    shifts = (-colour / 2, 0.0, colour / 2) if sharp.shape[1] == 3 else (0.0,)
+    parts = [(sharp, 0.0)] if not colour else [(sharp[:, k : k + 1], shift) for k, shift in enumerate(shifts)]
+    # Red of a lens focused far may be in focus nowhere: as far as can be stands for that.
+    focused = [(x, (1 / (1 / focus + d).clamp_min(FARTHEST_DPT))[:, None]) for x, d in parts]
+    seen = torch.cat([photograph(x, depth, lens, s)[:, 0] for x, s in focused], 1)
+    grain = noise * torch.randn(seen.shape, generator=torch.Generator().manual_seed(seed)).to(seen)
+    seen = seen + grain
+    blur = local_blur(seen, noise=noise, window_px=window_px)
+    pinhole = local_blur(sharp + grain, noise=noise, window_px=window_px)
+    spot = spot_diameter(lens, depth.flatten(1), focus).view(depth.shape)
+    true_side = torch.where(spot < 0, -torch.ones_like(spot), torch.ones_like(spot))
+    row_up = torch.arange(h, 0, -1, dtype=depth.dtype)[:, None].expand(depth.shape)
+    sides = {
+        "oracle_side": true_side,
+        "by_height": side_by_height(blur),
+        "by_colour": side_by_colour(seen, window_px=window_px, noise=noise) if colour else None,
+        "all_beyond": torch.ones_like(spot),
+    }
+    sites = _Sites(frame, uv)
+    rows = {}
+    for name, side in sides.items():
+        if side is not None:
+            claim = inverse_depth(blur, side, lens, focus)
+            rows[name] = sites.numbers(blur.valid & (side != 0), claim, blur.sigma)
+            rows[name] |= {"side_right": sites.share(blur.valid & (side != 0), side == true_side)}
+            rows[name] |= {"blur_corr": sites.against(blur.valid, blur.sigma, GAUSSIAN_OF_DISC * spot.abs())}
+            rows[name] |= {"texture_corr": sites.against(blur.valid & pinhole.valid, blur.sigma, pinhole.sigma)}
+            rows[name] |= {"rho_perfect": sites.rho(blur.valid, spot.abs())}
+    rows["height_alone"] = sites.numbers(blur.valid, -row_up, row_up)
+    rows["texture_alone"] = sites.numbers(pinhole.valid, -pinhole.sigma, pinhole.sigma)
+    return rows
+
+
+class _Sites:
+    """The candidates of a picture: pixels of the grid whose depth passes the truth test."""
+
+    def __init__(self, frame: Frame, uv: Tensor) -> None:
+        truth = holdout.truth_at(frame, uv)
+        self.index = (uv[0, :, 1].long(), uv[0, :, 0].long())
+        self.candidate, self.depth = truth.ok[0], truth.depth[0].double()
+
+    def at(self, x: Tensor) -> Tensor:
+        """Values (N,) of a map (1, H, W)."""
+        return x[0][self.index]
+
+    def numbers(self, valid: Tensor, claim: Tensor, blur: Tensor) -> Row:
+        """How a claim of inverse depth (1, H, W), and the blur under it, go with the true one."""
+        use = self.candidate & self.at(valid)
+        enough = int(use.sum()) >= MIN_SITES
+        n = int(self.candidate.sum())
+        x, y = self.at(claim)[use].double(), 1 / self.depth[use]
+        return {
+            "n_candidates": n,
+            "n_kept": int(use.sum()),
+            "coverage": int(use.sum()) / n if n else None,
+            "rho_abs": self.rho(valid, blur),
+            "corr": pearson(x, y) if enough else None,
+            "rank_corr": spearman(x, y) if enough else None,
+        }
+
+    def rho(self, valid: Tensor, x: Tensor) -> float | None:
+        """|Spearman| of a map with true inverse depth."""
+        use = self.candidate & self.at(valid)
+        found = spearman(self.at(x)[use].double(), 1 / self.depth[use]) if int(use.sum()) >= MIN_SITES else None
+        return None if found is None else abs(found)
+
+    def against(self, valid: Tensor, x: Tensor, y: Tensor) -> float | None:
+        """Pearson's r of two maps."""
+        use = self.candidate & self.at(valid)
+        return pearson(self.at(x)[use].double(), self.at(y)[use].double()) if int(use.sum()) >= MIN_SITES else None
+
+    def share(self, valid: Tensor, right: Tensor) -> float | None:
+        """Share of the valid candidates where a mask holds."""
+        use = self.candidate & self.at(valid)
+        return float(self.at(right)[use].double().mean()) if bool(use.any()) else None
+
+
+def _unsigned(frame: Frame, uv: Tensor, blur: Blur) -> Row:
+    return {"rho_abs": _Sites(frame, uv).rho(blur.valid, blur.sigma)}
+
+
+def _grid(hw: tuple[int, int], stride: int, like: Tensor) -> Tensor:
+    """Whole pixels (1, N, 2) of a grid."""
+    v = torch.arange(stride // 2, hw[0], stride, dtype=like.dtype, device=like.device)
+    u = torch.arange(stride // 2, hw[1], stride, dtype=like.dtype, device=like.device)
+    return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1).reshape(1, -1, 2)

@@ -1,0 +1,121 @@
+"""FoD500 (Focus on Defocus): five rendered pictures of a table of objects, each in focus elsewhere, with depth.
+
+``<index>…All.tif`` five times and ``<index>…Dpt.exr`` (half floats, metres) for each index of six digits. What stands
+between index and suffix is not known from the authors' loaders; the names are taken in their order, near focus first.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dhtorch.data.codecs import exr
+from dhtorch.data.io import decode as files
+from dhtorch.data.io.decode import FormatError
+from dhtorch.experiments.focal.stacks import FocalStack, Stacks, focus_distances, read_pictures
+from dhtorch.runtime.console import many
+
+_FOCUS = (0.1, 0.15, 0.3, 0.7, 1.5)  # m
+_SAMPLE = re.compile(r"(\d{6}).*(All\.tif|Dpt\.exr)")
+_FIRST_VALIDATION = 400
+
+
+def recognise(root: Path) -> str | None:
+    """What makes ``root`` focal stacks of this format, in words; None if nothing does."""
+    names = {m[2] for file in root.iterdir() if (m := _SAMPLE.fullmatch(file.name))} if root.is_dir() else set()
+    return "files <index>…All.tif" if "All.tif" in names else None
+
+
+def read(
+    root: str | Path,
+    *,
+    split: str | None = None,
+    focus_m: Sequence[float] = _FOCUS,
+    focal_length_m: float = 2.9e-3,
+    f_number: float = 1.0,
+    max_depth: float | None = 3.0,
+) -> Stacks:
+    """Open FoD500.
+
+    Args:
+        root: the folder with the pictures (``fs_6``).
+        split: ``"train"`` = index below 400, ``"val"`` = the rest. None = both.
+        focus_m: distances in focus, in the order of the files.
+        focal_length_m: of the rendering lens.
+        f_number: of the rendering lens. 1.0 is what the authors train with (a default of 0.1 elsewhere in their code
+            is not used).
+        max_depth: depth is clipped here, as the authors do. None = not at all.
+
+    Returns:
+        Stacks with depth where the folder has any; a sample that lacks a picture or its depth is left out and reported.
+        The pixel pitch is not published, so there is no camera.
+
+    Raises:
+        FormatError: no whole sample, or an option that cannot be.
+    """
+    root = Path(root)
+    focus = focus_distances(focus_m, root)
+    if split not in (None, "train", "val"):
+        raise FormatError(root, "option split", split, "train or val")
+    if max_depth is not None:
+        files.to_positive(max_depth, root, "option max_depth")
+    samples = {k: v for k, v in _samples(root).items() if split in (None, _split(k))}
+    any_depth = any(depths for _, depths in samples.values())
+    whole = {k: v for k, v in samples.items() if (len(v[0]), len(v[1])) == (len(focus), int(any_depth))}
+    if not whole:
+        expected = f"{len(focus)} *All.tif and one *Dpt.exr"
+        raise FormatError(root, "samples", f"none whole among {len(samples)}", expected)
+    load = _Load(
+        pictures=tuple(tuple(pictures) for pictures, _ in whole.values()),
+        depths=tuple(depths[0] if depths else None for _, depths in whole.values()),
+        focus=focus,
+        focal_length_m=files.to_positive(focal_length_m, root, "option focal_length_m"),
+        f_number=files.to_positive(f_number, root, "option f_number"),
+        max_depth=max_depth,
+    )
+    odd = [(k, *v) for k, v in samples.items() if k not in whole]
+    report = tuple(
+        f"sample {k}: {many(len(a), 'picture')} and {many(len(b), 'depth map')}: left out" for k, a, b in odd
+    )
+    return Stacks(root.resolve().name, "fod500", load, tuple(whole), root, report)
+
+
+@dataclass(frozen=True, eq=False)
+class _Load:
+    """Position → stack."""
+
+    pictures: tuple[tuple[Path, ...], ...]
+    depths: tuple[Path | None, ...]
+    focus: Tensor  # (S,)
+    focal_length_m: float
+    f_number: float
+    max_depth: float | None
+
+    def __call__(self, i: int) -> FocalStack:
+        images, file = read_pictures(self.pictures[i]), self.depths[i]
+        depth = None
+        if file is not None:
+            metres = exr.read_exr(file, "R", (images.shape[-2], images.shape[-1]))
+            metres = np.where(np.isfinite(metres) & (metres > 0), metres, 0)
+            depth = torch.from_numpy(metres if self.max_depth is None else metres.clip(max=self.max_depth))[None]
+        lens, f_number = torch.tensor([self.focal_length_m]), torch.tensor([self.f_number])
+        return FocalStack(images[None], self.focus[None], depth, focal_length_m=lens, f_number=f_number)
+
+
+def _samples(root: Path) -> dict[str, tuple[list[Path], list[Path]]]:
+    """Index → its pictures and its depth maps, by name."""
+    samples: dict[str, tuple[list[Path], list[Path]]] = {}
+    for file in sorted(root.iterdir()) if root.is_dir() else ():
+        if match := _SAMPLE.fullmatch(file.name):
+            samples.setdefault(match[1], ([], []))[match[2] == "Dpt.exr"].append(file)
+    return samples
+
+
+def _split(index: str) -> str:
+    return "val" if int(index) >= _FIRST_VALIDATION else "train"

@@ -1,0 +1,80 @@
+"""Focal stacks of any known format: ``open_stacks(path)``. They show one view, so that no pairs are in them."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Final
+
+from dhtorch.data import scenes_root
+from dhtorch.data.io.decode import FormatError
+from dhtorch.data.io.safe_open import inside
+from dhtorch.experiments.focal import ddff12, fod500, image_folder
+from dhtorch.experiments.focal.stacks import Stacks
+
+#: Name → reader, asked in this order; the first that recognises a folder reads it.
+STACK_FORMATS: Final[dict[str, ModuleType]] = {"fod500": fod500, "ddff12": ddff12, "images": image_folder}
+
+
+def open_stacks(root: str | Path, format: str = "auto", *, follow_links: bool = False, **options: Any) -> Stacks:
+    """The focal stacks at ``root``, opened lazily: nothing is decoded before a stack is asked for.
+
+    Args:
+        root: a folder, or an HDF5 file.
+        format: ``fod500``, ``ddff12``, ``images``, or ``auto`` to recognise it by its content.
+        follow_links: whether symbolic links inside may lead out of it.
+        options: keyword options of the reader, see ``dhtorch.experiments.focal.<format>.read`` (``images``:
+            ``image_folder``).
+
+    Raises:
+        FormatError: nothing there, an unknown format, or a file that is not what its format promises.
+        ValueError: an option that the reader does not have.
+    """
+    root = Path(root)
+    if not root.exists():
+        raise FormatError(root, "path", "no such file or folder", "focal stacks")
+    if format == "auto":
+        format = recognise_stacks(root, follow_links=follow_links)[0]
+    elif format not in STACK_FORMATS:
+        raise FormatError(root, "format", format, f"auto, {', '.join(STACK_FORMATS)}")
+    read = STACK_FORMATS[format].read
+    known = list(inspect.signature(read).parameters)[1:]
+    for option in options:
+        if option not in known:
+            raise ValueError(f"stacks: format {format} has no option {option!r}, expected one of {', '.join(known)}")
+    bounds = None if follow_links else root
+    with inside(bounds):
+        return replace(read(root, **options), bounds=bounds)
+
+
+def recognise_stacks(root: str | Path, *, follow_links: bool = False) -> tuple[str, str]:
+    """(format, what makes it one, in words) of focal stacks.
+
+    Raises:
+        FormatError: no format recognises it.
+    """
+    with inside(None if follow_links else Path(root)):
+        for name, reader in STACK_FORMATS.items():
+            if evidence := reader.recognise(Path(root)):
+                return name, evidence
+    raise FormatError(root, "format", "no focal stack", f"one of {', '.join(STACK_FORMATS)}")
+
+
+def open_collections(root: str | Path | None = None, scenes: Sequence[Mapping[str, Any]] = ()) -> list[Stacks]:
+    """Focal stacks of a list of scenes below one folder.
+
+    Args:
+        root: folder that the scenes' paths start from. None = the environment variable ``DHTORCH_DATA``.
+        scenes: for each ``path``, and the arguments of :func:`open_stacks` that it needs.
+
+    Raises:
+        FormatError: as :func:`dhtorch.data.open_scenes`.
+    """
+    root = scenes_root(root)
+    for scene in scenes:
+        if "path" not in scene:
+            raise FormatError(root, "scenes", dict(scene), "an entry with a path")
+    return [open_stacks(root / str(s["path"]), **{k: v for k, v in s.items() if k != "path"}) for s in scenes]

@@ -1,0 +1,113 @@
+"""What a call costs in memory: its learned weights, and the peak of a process that does nothing else."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import gc
+import sys
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from dhtorch.data.io.decode import set_opencv_threads
+from dhtorch.pipeline.spec import networks
+from dhtorch.pytree import Record
+
+_MIB = 2**20
+
+
+def weights(*parts: Any) -> dict[str, int]:
+    """``parameters`` and ``weight_bytes`` of all networks among ``parts`` and in the options of partials."""
+    tensors = {id(p): p for network in networks(*parts) for p in network.parameters()}.values()
+    return {
+        "parameters": sum(p.numel() for p in tensors),
+        "weight_bytes": sum(p.numel() * p.element_size() for p in tensors),
+    }
+
+
+def peak_mib(call: Callable[[], Any], before: Callable[[], Any] | None = None) -> float | None:
+    """Highest resident memory (MiB) while ``call`` runs once, above what the process held before it.
+
+    Measured in a fresh process that has imported dhtorch and holds the inputs.
+
+    Args:
+        call: a picklable partial; its arguments are inputs and are copied before anything is measured.
+        before: called first, uncounted: what is loaded at first use.
+
+    Returns:
+        MiB; None where the system does not tell.
+    """
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
+        return process.submit(_peak, call, before, torch.get_num_threads()).result()
+
+
+def _peak(call: Callable[[], Any], before: Callable[[], Any] | None, threads: int) -> float | None:
+    """The child's part."""
+    torch.set_num_threads(threads)
+    set_opencv_threads(threads)
+    if before is not None:
+        before()
+    call = _own(call)
+    gc.collect()
+    _give_back()
+    _forget_peak()
+    start = _resident()
+    with torch.no_grad():
+        call()
+    highest = _highest()
+    return None if start is None or highest is None else max(highest - start, 0) / _MIB
+
+
+def _own(call: Any) -> Any:
+    """The same call on private copies: what came through shared memory would count on first touch."""
+    if isinstance(call, partial):
+        copies = [a.map(torch.clone) if isinstance(a, Record) else _own(a) for a in call.args]
+        return partial(call.func, *copies, **call.keywords)
+    return call.clone() if isinstance(call, torch.Tensor) else call
+
+
+def _resident() -> int | None:
+    """Bytes resident now."""
+    return _status("VmRSS") or _rusage()
+
+
+def _highest() -> int | None:
+    """Bytes resident at most so far. The kernel's own high-water mark of this address space comes first:
+    ``ru_maxrss`` of a new process starts at the size of the one that made it."""
+    return _status("VmHWM") or _rusage()
+
+
+def _give_back() -> None:
+    """Hand free memory back to the system, where the C library can: what is kept would be used again, uncounted."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+def _forget_peak() -> None:
+    """Set the high-water mark back to what is resident now, where the kernel allows it."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+
+
+def _status(name: str) -> int | None:
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+    except OSError:
+        return None
+    found = [int(line.split()[1]) * 1024 for line in lines if line.startswith(f"{name}:")]
+    return found[0] if found else None
+
+
+def _rusage() -> int | None:
+    try:
+        import resource  # noqa: PLC0415  (not on Windows)
+    except ImportError:
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024

@@ -1,0 +1,246 @@
+"""Question: does ICP between independently sampled sparse sets add anything to a good device pose?
+
+A chain of frames is placed by relative poses from one of three sources: ``good``, the recording's own trajectory;
+``poor``, the same turned and shifted from link to link; ``none``, the identity. Each is used as it is, and refined by
+ICP, point to point and point to plane, between sets that each frame draws for itself. A refined link counts where it is
+confident; elsewhere the source's pose is kept and the frame leaves the map. Lengths are in units of the median depth
+of the scene's first frame, so that a table and a street are judged alike.
+
+Expectation (written before the run): no; over a good pose ICP is not always confident, so it covers fewer voxels than
+the pose alone (the paper: 5417 against 6200), and where the trajectory is exact it adds drift. It earns its keep only
+without a pose: there it ends nearer to the truth than the identity does.
+What would refute it: on half of the scenes point-to-point ICP over the good pose covers as many voxels as the pose
+alone, or without a pose it fails to end nearer to the truth on half of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from dhtorch.data.recording import Recording
+from dhtorch.data.scene import Given, Scene, scenes_of
+from dhtorch.experiments.negative.registration import Registration, normals, register
+from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
+from dhtorch.experiments.rows import Row
+from dhtorch.experiments.screening import Item, paired, screen
+from dhtorch.geometry import se3, sparse_grid
+from dhtorch.metrics import bootstrap
+from dhtorch.records import Frame, Pose
+from dhtorch.runtime.console import many
+from dhtorch.synthetic.recording import SyntheticRoom
+
+QUESTION = "Does ICP between independently sampled sparse sets add anything to a good device pose?"
+EXPECTATION = "No: it covers fewer voxels than the pose alone; without a pose it ends nearer to the truth than nothing."
+
+SOURCES = ("good", "poor", "none")
+SOLVERS = ("", " + icp points", " + icp planes")
+VARIANTS = tuple(source + solver for source in SOURCES for solver in SOLVERS)
+TRUTH = "trajectory"
+
+#: A set of fewer points is no set: links that meet one are not asked.
+MIN_POINTS = 16
+
+
+def run(
+    scenes: Sequence[Given],
+    methods: Mapping[str, Method],
+    pairs: Pairs,
+    settings: Settings,
+    *,
+    n: int = 1024,
+    links: int = 10,
+    voxel: float = 0.02,
+    reach: float = 0.12,
+    least_reach: float = 0.05,
+    min_inlier_share: float = 0.6,
+    min_condition: float = 1e-3,
+    poor_deg: float = 3.0,
+    poor_shift: float = 0.03,
+    progress: Progress = quiet,
+) -> Outcome:
+    """Chain the frames of every recording with each source of poses, alone and refined.
+
+    Rows of links: error of the relative pose against the trajectory (``rotation_deg``, ``translation_m``,
+    ``translation_rel`` in median depths), ``confident`` (0 or 1), ``inlier_share``, ``rms_m``, ``condition``. Rows of
+    scenes: their medians, ``confident_share``, and of the whole chain ``n_voxels`` covered by the frames whose link is
+    confident, ``voxels_vs_pose``, their number over that of the same poses alone, ``n_voxels_all`` by all frames,
+    ``right_share`` (of the former, within one voxel of the map under the true path: a smeared map covers more),
+    ``drift_deg`` and ``drift_rel`` at its end. A built-in room knows its true path; elsewhere the good pose is the
+    reference, its drift zero by definition, and where it is loose some of ICP's drift is the reference's own.
+
+    Args:
+        scenes, settings, progress: as :func:`dhtorch.experiments.protocol.run`. Scenes without a trajectory or with
+            depth in one frame only have nothing to ask.
+        methods: name → method; of the first the seats 1 and 2 are asked, its sampler with another gaze in every frame.
+        pairs: not used: links follow the recording, evenly.
+        n: samples of a frame.
+        links: most links of a chain.
+        voxel, reach, least_reach: side of a voxel, farthest match at first and at last, in median depths.
+        min_inlier_share, min_condition: from which on a link is confident.
+        poor_deg, poor_shift: errors of a poor link, degrees and median depths, in seeded directions.
+
+    Source: paper, "What Does Not Work", point-to-point ICP over a good VIO track.
+    """
+    method = next(iter(methods.values())).replace(n=n)
+    worlds: dict[str, _Chain] = {}
+
+    def ask(scene: Scene, item: Item) -> dict[str, Row]:
+        chain = worlds.setdefault(scene.name, _Chain(scene.recording, method, settings, voxel))
+        if not all(chain.cloud(k)[0].isfinite().all(-1).sum() >= MIN_POINTS for k in item):
+            return {}
+        starts = {"good": chain.relative(item), "none": se3.identity(1, chain.cloud(item[0]).double())}
+        starts["poor"] = se3.compose(chain.error(item, poor_deg, poor_shift), starts["good"])
+        found: dict[str, Row] = {}
+        for source in SOURCES:
+            for solver in SOLVERS:
+                fit = chain.refine(item, starts[source], solver, reach, least_reach)
+                sure = fit is None or bool(
+                    fit.ok & (fit.inlier_share >= min_inlier_share) & (fit.condition >= min_condition)
+                )
+                T = starts[source] if fit is None or not sure else fit.T_1_from_0.to(torch.float64)
+                chain.keep(source + solver, item, T, sure)
+                found[source + solver] = _link(chain, item, T, fit, sure)
+        return found
+
+    def whole(scene: Scene, found: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
+        chain = worlds.pop(scene.name, None)
+        return {v: chain.summary(v) for v in VARIANTS} if chain and any(found) else {}
+
+    def items(scene: Scene) -> list[Item]:
+        return chain_of(scene.recording, links)
+
+    outcome = screen(scenes_of(scenes), items, ask, VARIANTS, truth=TRUTH, whole=whole, progress=progress)
+    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
+
+
+def verdict(outcome: Outcome) -> tuple[bool | None, str]:
+    """Fewer voxels over a good pose, and less drift than with none, each on more than half of the scenes?"""
+    covered = paired(outcome, TRUTH, "good + icp points", "good", "n_voxels")
+    lost = paired(outcome, TRUTH, "none + icp points", "none", "drift_rel")
+    if not covered or not lost:
+        return None, "no scene with a trajectory and depth in two frames"
+    fewer, nearer = (sum(a < b for a, b in both) for both in (covered, lost))
+    total = [sum(pair[k] for pair in covered) for k in (0, 1)]
+    ratio = bootstrap.interval([a / max(b, 1) for a, b in covered])
+    low, high = (ratio.value if bound is None else bound for bound in (ratio.low, ratio.high))
+    sure = [r["confident_share"] for r in outcome.scenes("good + icp points", TRUTH).values() if r["n_pairs"]]
+    why = (
+        f"over a good pose ICP covers {total[0]:.0f} voxels, the pose alone {total[1]:.0f} (paper: 5417, 6200), fewer"
+        f" on {fewer} of {len(covered)} scenes, median ratio {ratio.value:.2f} ({low:.2f} to {high:.2f}),"
+        f" {sum(sure) / len(sure):.0%} of the links confident; without a pose it ends nearer than the identity on"
+        f" {nearer} of {len(lost)}"
+    )
+    return fewer > len(covered) / 2 and nearer > len(lost) / 2, why
+
+
+def chain_of(recording: Recording, links: int) -> list[Item]:
+    """Consecutive frames, evenly spread; none without a trajectory.
+
+    Raises:
+        ValueError: fewer than two frames, or no link to make.
+    """
+    if len(recording) < 2 or links < 1:
+        found = f"{many(len(recording), 'frame')} of {recording.name} and links={links}"
+        raise ValueError(f"icp: found {found}, expected at least two frames and one link")
+    if recording.poses is None:
+        return []
+    step = math.ceil((len(recording) - 1) / links)
+    return [(i, i + step) for i in range(0, len(recording) - step, step)]
+
+
+class _Chain:
+    """The sparse sets of a recording, its trajectory, and where each variant has put the frames so far."""
+
+    def __init__(self, recording: Recording, method: Method, settings: Settings, voxel: float) -> None:
+        self.recording, self.method, self.settings = recording, method, settings
+        self.clouds: dict[int, Tensor] = {}
+        self.placed: dict[str, dict[int, tuple[Pose, bool]]] = {v: {} for v in VARIANTS}
+        depth = self.cloud(0)[0, :, 2]
+        self.scale = float(depth[depth.isfinite()].median()) if bool(depth.isfinite().any()) else 1.0  # m
+        self.voxel = voxel * self.scale
+        assert recording.poses is not None  # else it has no links
+        self.poses: Pose = recording.poses
+        self.true_poses: Pose = recording.true_poses if isinstance(recording, SyntheticRoom) else recording.poses
+
+    def cloud(self, i: int) -> Tensor:
+        """Points (1, n, 3) that frame ``i`` drew for itself."""
+        if i not in self.clouds:
+            frame: Frame = self.recording[i].to(self.settings.dtype).to(self.settings.device)
+            generator = torch.Generator().manual_seed(self.settings.seed + 1000 * (i + 1))
+            share = 0.4 + 0.2 * torch.rand(2, generator=generator)
+            gaze = (float(share[0]) * frame.hw[1], float(share[1]) * frame.hw[0])
+            seats, like = self.method.replace(sample={"gaze": gaze}), frame.camera.f
+            uv = seats.sample(frame.hw, seats.n, device=like.device, dtype=like.dtype)
+            self.clouds[i] = seats.backproject(frame, uv).xyz
+        return self.clouds[i]
+
+    def relative(self, item: Item, true: bool = False) -> Pose:
+        """Pose of the later frame from the earlier one."""
+        poses = self.true_poses if true else self.poses
+        return se3.relative(*(poses[k : k + 1].to(torch.float64) for k in item))
+
+    def error(self, item: Item, degrees: float, shift: float) -> Pose:
+        """A motion of the given size in a seeded direction."""
+        generator = torch.Generator().manual_seed(self.settings.seed + 7919 * (item[0] + 1))
+        way = torch.nn.functional.normalize(torch.randn(2, 3, generator=generator, dtype=torch.float64), dim=-1)
+        return se3.exp(torch.cat((way[0] * math.radians(degrees), way[1] * shift * self.scale))[None])
+
+    def refine(self, item: Item, start: Pose, solver: str, reach: float, least: float) -> Registration | None:
+        """ICP from a start; None where no solver is asked."""
+        if not solver:
+            return None
+        first, second = self.cloud(item[0]), self.cloud(item[1])
+        planes = normals(second) if solver.endswith("planes") else None
+        return register(
+            first, second, start, normals_1=planes, reach_m=reach * self.scale, least_reach_m=least * self.scale
+        )
+
+    def keep(self, variant: str, item: Item, T: Pose, sure: bool) -> None:
+        """Put the later frame of a link into the map of a variant."""
+        placed = self.placed[variant]
+        if item[0] not in placed:
+            placed[item[0]] = (self.true_poses[item[0] : item[0] + 1].to(torch.float64), True)
+        placed[item[1]] = (se3.compose(placed[item[0]][0], se3.invert(T)), sure)
+
+    def voxels(self, placed: Mapping[int, tuple[Pose, bool]], sure_only: bool) -> Tensor:
+        """Numbers (V,) of the cells that the points of the frames fall into."""
+        points = [se3.apply(T, self.cloud(i).double())[0] for i, (T, sure) in placed.items() if sure or not sure_only]
+        return sparse_grid.occupied(torch.cat(points), self.voxel)
+
+    def summary(self, variant: str) -> Row:
+        """What a variant's chain covers and where it ends."""
+        placed = self.placed[variant]
+        true = {i: (self.true_poses[i : i + 1].to(torch.float64), True) for i in placed}
+        covered, real = self.voxels(placed, sure_only=True), self.voxels(true, sure_only=False)
+        alone = self.voxels(self.placed[variant.split(" + ", maxsplit=1)[0]], sure_only=False)
+        last = max(placed)
+        drift = _off(placed[last][0], true[last][0])
+        links = [sure for i, (_, sure) in placed.items() if i != min(placed)]
+        return {
+            "n_voxels": len(covered),
+            "voxels_vs_pose": len(covered) / max(len(alone), 1),
+            "n_voxels_all": len(self.voxels(placed, sure_only=False)),
+            "right_share": float(sparse_grid.near(covered, real).double().mean()) if len(covered) else None,
+            "confident_share": sum(links) / len(links),
+            "drift_deg": drift[0],
+            "drift_rel": drift[1] / self.scale,
+            "median_depth_m": self.scale,
+        }
+
+
+def _link(chain: _Chain, item: Item, T: Pose, fit: Registration | None, sure: bool) -> Row:
+    angle, distance = _off(T, chain.relative(item, true=True))
+    row: Row = {"rotation_deg": angle, "translation_m": distance, "translation_rel": distance / chain.scale}
+    row |= {"confident": int(sure), "inlier_share": None, "rms_m": None, "condition": None}
+    if fit is not None:
+        row |= {k: float(v) if bool(v.isfinite()) else None for k in row if (v := getattr(fit, k, None)) is not None}
+    return row
+
+
+def _off(T: Pose, true: Pose) -> tuple[float, float]:
+    """Angle (degrees) and distance (m) between two motions."""
+    return math.degrees(float(se3.rotation_angle(T.R @ true.R.mT)[0])), float((T.t - true.t).norm())

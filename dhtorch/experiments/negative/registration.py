@@ -1,0 +1,196 @@
+"""Iterative closest point between two sparse sets, and how far its answer may be believed.
+
+Alphabet: ``x`` points of set 0 and ``Y = R x + t`` in frame 1; ``q`` the point of set 1 nearest to Y and ``m`` the
+normal there. Point to point drives Y − q to zero, point to plane only its part along m. ``xi`` is the left
+perturbation of the pose, as in :mod:`dhtorch.geometry.least_squares`.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dhtorch.geometry import se3
+from dhtorch.geometry.checks import check
+from dhtorch.geometry.least_squares import choose, gauss_newton_step
+from dhtorch.geometry.linalg import product
+from dhtorch.geometry.se3 import Pose
+from dhtorch.pytree import Record, record
+
+#: Fewest matched points that fix a rigid motion with something to spare.
+MIN_MATCHES = 6
+
+
+@record
+class Registration(Record):
+    """The motion between two sets and the evidence for it."""
+
+    T_1_from_0: Pose
+    matched: Tensor  # (B, N) bool: points of set 0 with a point of set 1 within reach, at the final pose
+    inlier_share: Tensor  # (B,) of the points of set 0 that could be matched; 0 without any
+    rms_m: Tensor  # (B,) distance of the matched points (along the normal for planes); NaN without any
+    condition: Tensor  # (B,) smallest over largest eigenvalue of the normal matrix, lengths in units of the set's size
+    ok: Tensor  # (B,) bool: there were enough matches and they fix all six degrees of freedom
+
+
+def register(
+    xyz_0: Tensor,  # (B, N, 3) m in frame 0, NaN = no point
+    xyz_1: Tensor,  # (B, M, 3) m in frame 1, NaN = no point
+    T_init: Pose,  # (B) 1 from 0
+    *,
+    normals_1: Tensor | None = None,  # (B, M, 3) unit, NaN = no plane there
+    reach_m: float = 0.25,
+    shrink: float = 0.9,
+    least_reach_m: float = 0.1,
+    keep: float = 0.8,
+    iterations: int = 30,
+) -> Registration:
+    """Register set 0 to set 1 from a start: match every point with its nearest, keep the best matches, step, repeat.
+
+    Every iteration is one Gauss–Newton step over the kept matches, which for points is the closed-form alignment up to
+    second order in the turn. The reach shrinks from step to step, so that a far start may still be pulled in and the
+    end is not pulled away by what the other view does not show.
+
+    Args:
+        xyz_0, xyz_1: the sets; their numbers of points may differ.
+        T_init: where to start: a device's pose, or the identity.
+        normals_1: gives point to plane; None = point to point.
+        reach_m: farthest match at the start.
+        shrink: factor on the reach from step to step.
+        least_reach_m: the reach never falls below; matches within it count for ``inlier_share`` and ``rms_m``.
+        keep: share of the matches kept in a step, the nearest ones (trimmed ICP).
+        iterations: steps, always all.
+
+    Returns:
+        Registration. Not ok: the pose is the start's.
+
+    Raises:
+        ValueError: wrong shapes or options, or a set with no room for a point (N = 0 or M = 0).
+
+    Gradient: none; matches are choices.
+    Cost: iterations × N × M distances.
+    Source: P. Besl, N. McKay 1992 (points); Y. Chen, G. Medioni 1991 (planes); D. Chetverikov et al. 2002 (trimming).
+    """
+    sizes = check("icp.register", xyz_0=(xyz_0, "B N 3"), xyz_1=(xyz_1, "B M 3"), R=(T_init.R, "B 3 3"))
+    check("icp.register", xyz_1=(xyz_1, "B M 3"), normals_1=(normals_1, "B M 3"))
+    if not (sizes["N"] and sizes["M"]):
+        raise ValueError(f"icp.register: sets have {sizes['N']} and {sizes['M']} points, expected at least one each")
+    if not (0 < keep <= 1 and 0 < shrink <= 1 and 0 < least_reach_m <= reach_m and iterations > 0):
+        given = f"keep={keep}, shrink={shrink}, least_reach_m={least_reach_m}, reach_m={reach_m}"
+        raise ValueError(f"icp.register: found {given}, expected shares in (0, 1], a least reach up to the reach")
+    with torch.no_grad():
+        sets = _Sets(xyz_0, xyz_1, normals_1)
+        start = Pose(T_init.R.double(), T_init.t.double())
+        finite = start.R.isfinite().all(-1).all(-1) & start.t.isfinite().all(-1)
+        T = choose(finite, start, se3.identity(len(start.t), start.t))
+        reach = reach_m
+        for _ in range(iterations):
+            H, g, _, _ = sets.linearise(T, reach, keep)
+            T, _ = gauss_newton_step(T, H, g)
+            reach = max(reach * shrink, least_reach_m)
+        H, _, matched, square = sets.linearise(T, least_reach_m, 1.0)
+    n = matched.sum(-1)
+    condition = sets.condition(T, H)
+    ok = finite & (n >= MIN_MATCHES) & (condition > 1e-9)
+    rms = torch.where(n > 0, (torch.where(matched, square, 0.0).sum(-1) / n.clamp_min(1)).sqrt(), torch.nan)
+    share = n / sets.valid_0.sum(-1).clamp_min(1)
+    pose = choose(ok, T, start).to(xyz_0.dtype)
+    share, rms, condition = (v.to(xyz_0.dtype) for v in (share, rms, condition))
+    return Registration(pose, matched, share, rms, condition, ok)
+
+
+def normals(
+    xyz: Tensor,  # (B, M, 3) m, NaN = no point
+    *,
+    neighbours: int = 8,
+    max_bend: float = 0.1,
+) -> Tensor:
+    """Unit normals (B, M, 3) of the planes through each point and its nearest neighbours, towards the camera.
+
+    Args:
+        xyz: points in a camera's frame.
+        neighbours: how many others take part.
+        max_bend: largest share of the neighbourhood's variance off the plane; where it is larger there is none (NaN).
+
+    Raises:
+        ValueError: wrong shapes, fewer points than neighbours, or fewer than three neighbours.
+
+    Gradient: none.
+    """
+    sizes = check("icp.normals", xyz=(xyz, "B M 3"))
+    if not 3 <= neighbours < sizes["M"]:
+        raise ValueError(f"icp.normals: found {sizes['M']} points, {neighbours} neighbours, expected 3 or more of more")
+    with torch.no_grad():
+        valid = xyz.isfinite().all(-1)
+        x = _away(xyz, valid, 1e6)
+        near = torch.cdist(x, x, compute_mode="donot_use_mm_for_euclid_dist").topk(neighbours + 1, -1, largest=False)
+        group = x.gather(1, near.indices.flatten(1)[..., None].expand(-1, -1, 3)).view(*near.indices.shape, 3)
+        off = (group - group.mean(-2, keepdim=True)).double()
+        spread = (off[..., :, None] * off[..., None, :]).mean(-3)
+        good = valid & (near.values[..., -1] < 1e5)
+        eye = torch.eye(3, dtype=spread.dtype, device=spread.device)
+        values, vectors = torch.linalg.eigh(torch.where(good[..., None, None], spread, eye))
+        normal = vectors[..., 0]
+        normal = torch.where(((normal * x).sum(-1) > 0)[..., None], -normal, normal).to(xyz.dtype)
+        flat = good & (values[..., 0] <= max_bend * values.sum(-1)) & (values[..., 1] > 2 * values[..., 0])
+    return torch.where(flat[..., None], normal, torch.nan)
+
+
+class _Sets:
+    """Two sets without NaN, in float64 where sums are taken."""
+
+    def __init__(self, xyz_0: Tensor, xyz_1: Tensor, normals_1: Tensor | None) -> None:
+        self.valid_0, valid_1 = xyz_0.isfinite().all(-1), xyz_1.isfinite().all(-1)
+        if normals_1 is not None:
+            valid_1 = valid_1 & normals_1.isfinite().all(-1)
+        self.x = torch.where(self.valid_0[..., None], xyz_0, 0.0).double()
+        self.q = _away(xyz_1, valid_1, 1e6)
+        self.normals = None if normals_1 is None else torch.where(valid_1[..., None], normals_1, 0.0)
+        weight = self.valid_0[..., None].double()
+        count = weight.sum(1).clamp_min(1)
+        off = (self.x - (self.x * weight).sum(1, keepdim=True) / count[:, None]) * weight
+        self.size = ((off * off).sum((1, 2)) / count[:, 0]).sqrt().clamp_min(1e-9)  # (B,) m
+        self.centre = (self.x * weight).sum(1) / count
+
+    def linearise(self, T: Pose, reach: float, keep: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """H (B, 6, 6), g (B, 6), the matches that take part (B, N) and their squared residuals (B, N)."""
+        Y = se3.apply(T, self.x)
+        distance, index = torch.cdist(Y.to(self.q.dtype), self.q, compute_mode="donot_use_mm_for_euclid_dist").min(-1)
+        taking_part = self.valid_0 & (distance < reach)
+        if keep < 1:
+            ranked = torch.where(taking_part, distance, torch.inf).sort(-1).values
+            last = (keep * taking_part.sum(-1, keepdim=True)).ceil().long().sub(1).clamp_min(0)
+            taking_part = taking_part & (distance <= ranked.gather(-1, last))
+        r = Y - _at(self.q, index).double()  # (B, N, 3)
+        J = torch.cat((-se3.hat(Y), torch.eye(3, dtype=Y.dtype, device=Y.device).expand(*Y.shape, 3)), -1)
+        if self.normals is not None:
+            m = _at(self.normals, index).double()
+            r = (m * r).sum(-1, keepdim=True)
+            J = (m[..., None] * J).sum(-2, keepdim=True)
+        w = taking_part.double()[..., None, None]
+        Jw = J * w
+        H = (Jw[..., :, None] * J[..., None, :]).sum((1, 2))
+        g = (Jw * r[..., None]).sum((1, 2))
+        return H, g, taking_part, (r * r).sum(-1)
+
+    def condition(self, T: Pose, H: Tensor) -> Tensor:
+        """Smallest over largest eigenvalue of H (B,), turns about the set's middle counted at its size; 0 if singular.
+
+        About the middle the motion of a point is ω × (Y − c) + u, so that the translation in H is u − ω × c.
+        """
+        eye = torch.eye(3, dtype=H.dtype, device=H.device).expand(len(H), 3, 3)
+        c = se3.apply(T, self.centre[:, None])[:, 0]
+        size = self.size[:, None, None]
+        A = torch.cat((torch.cat((eye / size, 0 * eye), -1), torch.cat((se3.hat(c) / size, eye), -1)), -2)
+        values = torch.linalg.eigvalsh(product(A.mT, product(H, A)))
+        return (values[:, 0].clamp_min(0) / values[:, -1].clamp_min(1e-300)).clamp(0, 1)
+
+
+def _at(values: Tensor, index: Tensor) -> Tensor:
+    """Rows (B, N, 3) of (B, M, 3)."""
+    return values.gather(1, index[..., None].expand(-1, -1, 3))
+
+
+def _away(xyz: Tensor, valid: Tensor, far: float) -> Tensor:
+    """Points with those that do not exist put where nothing is near."""
+    return torch.where(valid[..., None], xyz, far)

@@ -1,0 +1,30 @@
+"""The main job: methods on every pair of every scene, held against the returns that were kept back.
+
+It asks no question (its question, expectation and verdict are null); the experiments beside it do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+
+from dhtorch.data.scene import Given
+from dhtorch.experiments import protocol
+from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
+
+
+def run(
+    scenes: Sequence[Given],
+    methods: Mapping[str, Method],
+    pairs: Pairs,
+    settings: Settings,
+    *,
+    progress: Progress = protocol.quiet,
+) -> Outcome:
+    """Run every method on every pair of every recording, for every truth test of ``settings``.
+
+    Args and errors: as :func:`dhtorch.experiments.protocol.run`; ``methods`` is name → method.
+    """
+    variants = {name: Variant(method) for name, method in methods.items()}
+    cohorts = {test: partial(protocol.held_back, test=test) for test in settings.truth}
+    return protocol.run(scenes, Protocol(variants, cohorts), pairs, settings, progress=progress)

@@ -1,0 +1,89 @@
+"""Question: does the score order answers by risk, and is it a probability?
+
+Expectation (written before the run): it orders, not strictly (risk falls at first as the threshold rises, the trend
+is not monotone), and it is not a probability (the paper: expected calibration error 0.22 to 0.28).
+What would refute it: on the median scene the area under the risk–coverage curve is not below the mean risk of all
+answers (no order), or the expected calibration error is at most 0.1 (calibrated after all).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from dhtorch.data.scene import Given
+from dhtorch.experiments import protocol
+from dhtorch.experiments.cohorts import HeldOut, everything
+from dhtorch.experiments.outcome import join
+from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
+from dhtorch.experiments.rows import Row, summarise
+from dhtorch.metrics import bootstrap, errors, reliability, risk
+
+QUESTION = "Does the score order answers by risk, and is it a probability?"
+EXPECTATION = "It orders (AURC below the mean risk) without being calibrated (ECE above 0.1)."
+
+
+def run(
+    scenes: Sequence[Given],
+    methods: Mapping[str, Method],
+    pairs: Pairs,
+    settings: Settings,
+    *,
+    thresholds: Sequence[float] = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8),
+    progress: Progress = protocol.quiet,
+) -> Outcome:
+    """Reliability, risk–coverage and thresholds of every method, on the range split and on the hold-out.
+
+    Cohorts ``heldout`` and ``full`` (the range split, which decides). Scene rows carry ``mean_risk`` and, under
+    ``at_<threshold>``, coverage, median and p90 error of the answers whose score reaches the threshold. The summary
+    adds ``<method>.ece_pooled``: all scenes in one reliability table, each of equal weight.
+
+    Args:
+        scenes, methods, pairs, settings, progress: as :func:`dhtorch.experiments.protocol.run`.
+        thresholds: on the score.
+
+    Source: paper, "Calibration" and the figure on selective risk–coverage.
+    """
+    split = Protocol({name: Variant(m) for name, m in methods.items()})
+    parts = [protocol.run(scenes, split, pairs, settings, progress=progress)]
+    for name, method in methods.items():
+        held = HeldOut(method, settings.seed)
+        asked = Protocol({name: held.variant()}, {"heldout": held.heldout}, everything)
+        parts.append(protocol.run(scenes, asked, pairs, settings, progress=progress))
+    outcome = join(parts)
+    for row in outcome.rows:
+        key = (row["scene"], row["method"], row["truth"])
+        if row["pair"] is None and key in outcome.points:
+            row.update(_at_thresholds(outcome.points[key], thresholds))
+    outcome.summary = summarise(outcome.rows, list(methods), ["heldout", "full"])
+    for name in methods:
+        outcome.summary |= _pooled(outcome, name)
+    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, next(iter(methods))))
+
+
+def verdict(outcome: Outcome, method: str) -> tuple[bool | None, str]:
+    """Order and calibration on the range split."""
+    scenes = [r for r in outcome.scenes(method).values() if r.get("aurc") is not None]
+    if not scenes:
+        return None, "no scene with answers"
+    orders = sum(r["aurc"] < r["mean_risk"] for r in scenes)
+    found = {k: bootstrap.interval([r[k] for r in scenes]).value for k in ("aurc", "mean_risk", "ece", "monotonicity")}
+    shown = ", ".join(f"{k} {v:.3f}" for k, v in found.items() if v is not None)
+    holds = orders > len(scenes) / 2 and found["ece"] is not None and found["ece"] > 0.1
+    return holds, f"orders answers on {orders} of {len(scenes)} scenes; scene medians: {shown}"
+
+
+def _at_thresholds(points: errors.Points, thresholds: Sequence[float]) -> Row:
+    answered = points.answered()
+    row: Row = {"mean_risk": float(risk.capped(answered.error).mean()) if answered.error.numel() else None}
+    for threshold in thresholds:
+        above = points.replace(keep=points.keep & (points.score >= threshold))
+        found = errors.measure(above)
+        row[f"at_{threshold:g}"] = {k: found[k] for k in ("n_kept", "coverage", "median_rel", "p90_rel")}
+    return row
+
+
+def _pooled(outcome: Outcome, method: str) -> dict[str, Any]:
+    apart = {r["scene"] for r in outcome.rows if r.get("role")}
+    scenes = [p for (s, m, t), p in outcome.points.items() if (m, t) == (method, "full") and s not in apart]
+    return {f"{method}.ece_pooled": bootstrap.single(reliability.measure(scenes)["ece"], len(scenes))}

@@ -1,0 +1,88 @@
+"""Question: is the device's own trajectory good enough to triangulate with?
+
+Expectation (written before the run): no; as the device writes it, it is useless where its axes differ from the
+camera's, and even converted its rotation is off by more than triangulation forgives, so that depth correlates with
+truth better under the anchored pose.
+What would refute it: on the median scene the converted trajectory gives a correlation at least as high and an error at
+most as large as the anchored pose. (On data sets whose trajectory comes from a motion-capture system or from depth
+registration this may well happen: they are not a phone's.)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from functools import partial
+
+from dhtorch.data.scene import Given
+from dhtorch.experiments import protocol
+from dhtorch.experiments.cohorts import HeldOut, device_fit, everything, has_trajectory, trajectory
+from dhtorch.experiments.protocol import Answer, Method, Outcome, Pairs, Progress, Protocol, Settings
+from dhtorch.experiments.rows import Row
+from dhtorch.geometry import se3
+
+QUESTION = "Is the device's own trajectory good enough to triangulate with?"
+EXPECTATION = "No: depth correlates with truth better, and errs less, under the anchored pose."
+
+
+def run(
+    scenes: Sequence[Given],
+    methods: Mapping[str, Method],
+    pairs: Pairs,
+    settings: Settings,
+    *,
+    progress: Progress = protocol.quiet,
+) -> Outcome:
+    """Triangulate held-out samples under the device's trajectory, raw and converted, and under the anchored pose.
+
+    Variants ``device_raw``, ``device_gl_to_cv``, ``anchored``; rows carry ``rotation_deg``, ``translation_m`` and
+    ``direction_deg``, by which each variant's relative pose differs from the converted trajectory's. Cohort: set B of
+    the hold-out, the same for all three.
+
+    Args and errors: as :func:`dhtorch.experiments.protocol.run`; of ``methods`` the first is asked.
+    Source: paper, "LiDAR-anchored relative pose".
+    """
+    split = HeldOut(next(iter(methods.values())), settings.seed)
+    variants = {
+        "device_raw": split.variant(fit=partial(device_fit, raw=True), needs=has_trajectory),
+        "device_gl_to_cv": split.variant(fit=device_fit, needs=has_trajectory),
+        "anchored": split.variant(),
+    }
+    asked = Protocol(variants, {"heldout": split.heldout}, everything, disagreement)
+    outcome = protocol.run(scenes, asked, pairs, settings, progress=progress)
+    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
+
+
+def disagreement(answer: Answer) -> Row:
+    """By how much the relative pose of a pair differs from that of the device's trajectory."""
+    given, found = trajectory(answer.batch), answer.trace["fit"]
+    if given is None or not bool(found.ok[0]):
+        return {"rotation_deg": None, "translation_m": None, "direction_deg": None, "baseline_m": None}
+    given, T = given.to(found.cov.dtype), found.T_1_from_0
+    turn = se3.rotation_angle(T.R @ given.R.mT)[0]
+    size = (T.t.norm(dim=-1) * given.t.norm(dim=-1)).clamp_min(1e-12)
+    direction = ((T.t * given.t).sum(-1) / size).clamp(-1, 1).acos()[0]
+    return {
+        "rotation_deg": math.degrees(float(turn)),
+        "translation_m": float((T.t - given.t).norm(dim=-1)[0]),
+        "direction_deg": math.degrees(float(direction)),
+        "baseline_m": float(T.t.norm(dim=-1)[0]),
+    }
+
+
+def verdict(outcome: Outcome) -> tuple[bool | None, str]:
+    """Compare correlation and error over the scenes that have a trajectory."""
+    device = outcome.scenes("device_gl_to_cv", "heldout")
+    ours = outcome.scenes("anchored", "heldout")
+    both = [s for s in device if None not in (device[s].get("corr"), ours[s].get("corr"))]
+    if not both:
+        return None, "no scene on which both poses gave answers"
+    wins = [ours[s]["corr"] > device[s]["corr"] and ours[s]["median_rel"] < device[s]["median_rel"] for s in both]
+    summary = outcome.summary
+
+    def shown(variant: str) -> str:
+        corr, error = (summary[f"{variant}.{k}"]["value"] for k in ("corr", "median_rel"))
+        return "no answer" if corr is None else f"corr {corr:.2f}, error {error:.1%}"
+
+    why = "; ".join(f"{v}: {shown(v)}" for v in ("device_raw", "device_gl_to_cv", "anchored"))
+    return sum(wins) > len(both) / 2, f"anchored better in both on {sum(wins)} of {len(both)} scenes; {why}"

@@ -1,0 +1,154 @@
+"""Question: does fusing recovered points into one map widen it, and do they stitch its fragments into one?
+
+Returns beyond the scene's cutoff are hidden. What is left of the sensor, and the sensor with what was recovered, are
+each fused into a signed distance field along the recording's own poses (``device``) and along chained poses of the
+method (``anchored``). Lengths are in units of the median depth of the scene's first frame, as in ``icp``; a map covers
+the voxels that its surface passes through, and falls into islands of voxels that touch.
+
+Expectation (written before the run): wider, but not stitched, as the paper says of its maps: recovered points are
+sparse and lie where the sensor sees nothing, so that they make new islands. Without a device's trajectory frames fall
+into fragments besides.
+What would refute it: along the device's poses the fused map covers no more voxels than the sensor's on half of the
+scenes, or has fewer islands on more than half of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from torch import Tensor
+
+from dhtorch import integrate
+from dhtorch.codes import Source
+from dhtorch.data.pairs import fixed
+from dhtorch.data.recording import Recording
+from dhtorch.data.scene import Given, Scene, scenes_of
+from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
+from dhtorch.experiments.rows import Row
+from dhtorch.experiments.screening import Item, paired, screen
+from dhtorch.geometry import sparse_grid
+from dhtorch.integrate.recording import POSES, PairEstimate, Places, build, chain, coverage, place
+from dhtorch.integrate.recording import ask as ask_pairs
+from dhtorch.metrics import bootstrap
+
+QUESTION = "Does fusing recovered points widen the map, and do they stitch its fragments into one?"
+EXPECTATION = "Wider, but not stitched: the fused map covers more voxels than the sensor's and has no fewer islands."
+
+TRUTH = "whole sensor"
+VARIANTS = tuple(f"{what} {poses}" for poses in POSES for what in ("sensor", "fused"))
+
+
+def run(
+    scenes: Sequence[Given],
+    methods: Mapping[str, Method],
+    pairs: Pairs,
+    settings: Settings,
+    *,
+    n: int = 2048,
+    voxel: float = 0.02,
+    progress: Progress = quiet,
+) -> Outcome:
+    """Fuse every recording four ways: the sensor alone and with recovered points, by device and by anchored poses.
+
+    Rows of pairs: ``pnp_ok``, ``n_kept``, ``n_recovered``. Rows of scenes: ``n_voxels`` covered, ``n_islands`` and
+    ``largest_island`` (share), ``voxels_vs_sensor``, ``n_fragments`` into which the frames fall, ``placed_share`` of
+    them, ``right_share``: voxels within one step of the map of the sensor without a cutoff, along the same poses; what
+    that sensor never sees counts as wrong.
+
+    Args:
+        scenes, settings, progress: as :func:`dhtorch.experiments.protocol.run`.
+        methods: name → method; the first is asked.
+        pairs: anchors and their partners; further links for ``anchored`` come from
+            :func:`dhtorch.integrate.recording.chain`.
+        n: samples of a pair.
+        voxel: side of a voxel, in median depths.
+
+    Source: paper, "Global integration (scope note)" and the limitation "map fragmentation".
+    """
+    method = next(iter(methods.values())).replace(n=n)
+    answers: dict[str, dict[Item, PairEstimate]] = {}
+
+    def items(scene: Scene) -> list[Item]:
+        chosen = fixed(pairs(scene))
+        return [*chosen, *chain(chosen)]
+
+    def ask(scene: Scene, item: Item) -> dict[str, Row]:
+        common: dict[str, Any] = {"seed": settings.seed, "device": settings.device, "dtype": settings.dtype}
+        cutoff = settings.cutoff_of(scene)
+        (answer,) = ask_pairs(scene, method, [item], cutoff=cutoff, **common)
+        answers.setdefault(scene.name, {})[item] = answer
+        row: Row = {"pnp_ok": int(answer.fit.ok[0]), "n_kept": int(answer.estimate.keep.sum())}
+        row["n_recovered"] = int(answer.recovered.sum())
+        own = item in set(pairs(scene))  # else it only is a link between frames
+        found: dict[str, Row] = {"sensor anchored": {}, "fused anchored": row}
+        return found | ({"sensor device": {}, "fused device": row} if own and scene.recording.poses is not None else {})
+
+    def whole(scene: Scene, _found: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
+        recording, found = scene.recording, answers.pop(scene.name, {})
+        maps = _Maps(recording, [found[p] for p in fixed(pairs(scene))], settings.cutoff_of(scene), voxel)
+        rows: dict[str, Row] = {}
+        for poses in POSES:
+            if poses == "anchored" or recording.poses is not None:
+                every = list(found.values()) if poses == "anchored" else maps.answers
+                rows |= maps.rows(place(recording, every, poses=poses), poses)
+        return rows
+
+    outcome = screen(scenes_of(scenes), items, ask, VARIANTS, truth=TRUTH, whole=whole, progress=progress)
+    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
+
+
+def verdict(outcome: Outcome) -> tuple[bool | None, str]:
+    """More voxels, and no fewer islands, along the device's poses, each on more than half of the scenes?"""
+    voxels = paired(outcome, TRUTH, "fused device", "sensor device", "n_voxels")
+    islands = paired(outcome, TRUTH, "fused device", "sensor device", "n_islands")
+    if not voxels:
+        return None, "no scene with a trajectory"
+    wider, stitched = sum(a > b for a, b in voxels), sum(a < b for a, b in islands)
+    ratio = bootstrap.interval([a / max(b, 1) for a, b in voxels])
+    low, high = (ratio.value if bound is None else bound for bound in (ratio.low, ratio.high))
+    anchored = [r["n_fragments"] for r in outcome.scenes("fused anchored", TRUTH).values() if r.get("n_fragments")]
+    whole = sum(n == 1 for n in anchored)
+    why = (
+        f"the fused map covers more voxels on {wider} of {len(voxels)} scenes, {ratio.value:.2f} times as many in the"
+        f" median ({low:.2f} to {high:.2f}), and has fewer islands on {stitched}; along anchored poses the frames stay"
+        f" in one piece on {whole} of {len(anchored)}"
+    )
+    return wider > len(voxels) / 2 and stitched <= len(islands) / 2, why
+
+
+class _Maps:
+    """The maps of one recording."""
+
+    def __init__(self, recording: Recording, answers: list[PairEstimate], cutoff: float | None, voxel: float) -> None:
+        self.recording, self.answers, self.cutoff = recording, answers, cutoff
+        depth = recording[0].depth
+        there = depth[depth.isfinite() & (depth > 0)]
+        self.voxel = voxel * (float(there.median()) if len(there) else 1.0)
+
+    def rows(self, places: Places, poses: str) -> dict[str, Row]:
+        """What the sensor's map and the fused one cover."""
+        everything = self.covered(self.fused(places, [Source.SENSOR], None))
+        near = self.fused(places, [Source.SENSOR], self.cutoff)
+        both = build(self.recording, near, self.answers, places, sources=[Source.RECOVERED])
+        total = len(places.poses) + places.n_unplaced
+        common: Row = {"n_fragments": places.n_fragments, "placed_share": len(places.poses) / max(total, 1)}
+        rows = {}
+        for what, volume in (("sensor", near), ("fused", both)):
+            found = self.covered(volume)
+            row = common | coverage(integrate.points(volume).xyz, self.voxel)
+            row["right_share"] = float(sparse_grid.near(found, everything).double().mean()) if len(found) else None
+            row["voxel_m"] = self.voxel
+            rows[f"{what} {poses}"] = row
+        alone = rows[f"sensor {poses}"]["n_voxels"]
+        rows[f"fused {poses}"]["voxels_vs_sensor"] = rows[f"fused {poses}"]["n_voxels"] / alone if alone else None
+        return rows
+
+    def fused(self, places: Places, sources: Sequence[int], cutoff: float | None) -> integrate.Volume:
+        """A new map along these poses."""
+        empty = integrate.empty(self.voxel)
+        return build(self.recording, empty, self.answers, places, sources=sources, cutoff=cutoff)
+
+    def covered(self, volume: integrate.Volume) -> Tensor:
+        """Numbers of the voxels that the surface passes through."""
+        return sparse_grid.occupied(integrate.points(volume).xyz, self.voxel)

@@ -1,0 +1,111 @@
+"""Question: are most of the sensor's holes places where the picture could still be tracked?
+
+Expectation (written before the run): yes; most holes are TRACKABLE_NO_LIDAR (the paper: 90.4 % indoors, 86.1 %
+outdoors), and their trackability is of the same order as that of samples with a return.
+What would refute it: on the median scene fewer than half of the holes are of that class, or their median trackability
+is below a tenth of that of samples with a return.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+
+from dhtorch.codes import ROUTE_OF_HOLE, Hole, Route, names
+from dhtorch.data.scene import Given, Scene, scenes_of
+from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
+from dhtorch.experiments.rows import Row, mean, median
+from dhtorch.metrics import errors
+from dhtorch.records import Samples
+
+QUESTION = "Are most of the sensor's holes places where the picture could still be tracked?"
+EXPECTATION = "At least half of the holes are TRACKABLE_NO_LIDAR, of trackability like that of samples with a return."
+
+
+def run(
+    scenes: Sequence[Given],
+    methods: Mapping[str, Method],
+    pairs: Pairs,
+    settings: Settings,
+    *,
+    stride: int = 1,
+    progress: Progress = quiet,
+) -> Outcome:
+    """Classify the samples of every frame; nothing is hidden and no second view is read.
+
+    Rows: one per frame (``pair`` is [i, i]) and one per scene: ``n_samples``, ``n_holes``, ``hole_rate``,
+    ``hole_share.<class>``, ``route_share.<route>`` and the median trackability of trackable holes
+    (``trackability_hole``) and of samples with a return (``trackability_valid``).
+
+    Args:
+        scenes, settings, progress: as :func:`dhtorch.experiments.protocol.run`.
+        methods: name → method; seats 1 to 3 of the first are asked.
+        pairs: not used.
+        stride: every how many frames.
+
+    Source: paper, "Hole taxonomy".
+    """
+    name, method = next(iter(methods.items()))
+    outcome = Outcome()
+    for scene in scenes_of(scenes):
+        recording = scene.recording
+        frames = list(range(0, len(recording), stride))
+        rows = []
+        for i in progress(frames, recording.name, len(frames)):
+            rows.append({"scene": recording.name, "pair": [i, i], "method": name, "truth": None})
+            rows[-1] |= census(look(method, recording[i].to(settings.dtype).to(settings.device)))
+        outcome.rows += [*rows, _scene(rows, scene)]
+        outcome.n_pairs += len(rows)
+    whole = [r for r in outcome.rows if r["pair"] is None and r["role"] is None]
+    outcome.summary = errors.summarise([{k: v for k, v in r.items() if k not in ("pair", "role")} for r in whole])
+    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome.summary))
+
+
+def verdict(summary: Mapping[str, Any]) -> tuple[bool | None, str]:
+    """Read the answer off the scene medians."""
+    share = summary.get("hole_share.trackable_no_lidar", {}).get("value")
+    hole, valid = (summary.get(f"trackability_{k}", {}).get("value") for k in ("hole", "valid"))
+    if share is None or hole is None or valid is None:
+        return None, "no scene with both holes and returns"
+    why = f"{share:.1%} of the holes are trackable; their trackability {hole:.2g} against {valid:.2g} (scene medians)"
+    return share >= 0.5 and hole >= 0.1 * valid, why
+
+
+def look(method: Method, frame: Any) -> Samples:
+    """Seats 1 to 3 of a method: what its samples find in a frame."""
+    with torch.no_grad():
+        return method.look(frame)
+
+
+def census(samples: Samples) -> Row:
+    """Holes of one frame (B = 1): how many, of which class, and what could fill them."""
+    hole, quality = samples.hole[0], samples.trackability[0]
+    n_holes = int((hole != Hole.NONE).sum())
+    share = {k: float((hole == k).sum()) / n_holes if n_holes else None for k in names(Hole) if k != Hole.NONE}
+    route = {r: sum(v or 0.0 for k, v in share.items() if ROUTE_OF_HOLE[k] == r) for r in names(Route)}
+    open_hole, valid = quality[hole == Hole.TRACKABLE_NO_LIDAR], quality[hole == Hole.NONE]
+    return {
+        "n_samples": hole.numel(),
+        "n_holes": n_holes,
+        "hole_rate": n_holes / max(hole.numel(), 1),
+        "hole_share": {names(Hole)[k].lower(): v for k, v in share.items()},
+        "route_share": {names(Route)[r].lower(): v if n_holes else None for r, v in route.items()},
+        "trackability_hole": median(open_hole.tolist()),
+        "trackability_valid": median(valid.tolist()),
+    }
+
+
+def _scene(rows: Sequence[Row], scene: Scene) -> Row:
+    """Frames joined: counts added up, shares by mean over frames that have holes, trackability by median."""
+    row: Row = {"scene": scene.name, "pair": None, "method": rows[0]["method"], "truth": None}
+    row |= {"role": scene.role, "n_pairs": len(rows)}
+    row |= {k: sum(r[k] for r in rows) for k in ("n_samples", "n_holes")}
+    row["hole_rate"] = row["n_holes"] / max(row["n_samples"], 1)
+    for group in ("hole_share", "route_share"):
+        some = [r[group] for r in rows if r["n_holes"]]
+        row[group] = {k: mean([g[k] for g in some]) for k in rows[0][group]}
+    for key in ("trackability_hole", "trackability_valid"):
+        row[key] = median([r[key] for r in rows if r[key] is not None])
+    return row

@@ -1,0 +1,310 @@
+"""Question: what does the method cost beside the visual branch of a robot policy, and how does it grow with the image?
+
+The front end (spiral, back-projection, hole taxonomy; n = 1024) is what the paper times, at 224×224 and at 1440×1920,
+beside one forward pass of DINOv2-L at 224×224 on the same machine and threads. Beyond the paper: every stage, the
+whole pair, and the memory both need.
+
+Expectation (written before the run): a forward pass of DINOv2-L takes at least 96 times as long as the front end at
+224×224, and the front end at 1440×1920 takes at most 3.4 times as long as at 224×224, as in the paper. On few threads
+the first ratio should come out larger than the paper's: a transformer uses every core, the front end does not.
+What would refute it: a ratio below 96, or a growth above 3.4, beyond the spread from round to round. Milliseconds are
+the machine's own and decide nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from dhtorch.data.pairs import fixed
+from dhtorch.data.scene import Given, Scene, scenes_of
+from dhtorch.experiments import memory
+from dhtorch.experiments.baselines import dinov2 as visual
+from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
+from dhtorch.experiments.rows import Row
+from dhtorch.geometry import camera as cam
+from dhtorch.metrics import holdout
+from dhtorch.metrics.bootstrap import Interval
+from dhtorch.pipeline.spec import Trace
+from dhtorch.records import Estimate, Frame, Samples
+
+QUESTION = "What does the method cost beside a DINOv2-L forward pass, and how does it grow with the image?"
+EXPECTATION = (
+    "A DINOv2-L forward takes at least 96 times as long as the front end at 224x224, and the front end grows at most "
+    "3.4 times to 1440x1920."
+)
+
+#: The paper's figures (Apple M4 Pro, OpenCV on 14 threads): ms, and the two ratios that another machine can test.
+PAPER = {"front_end_ms": 1.11, "front_end_large_ms": 3.81, "dinov2_ms": 106.5, "speedup": 96.0, "growth": 3.81 / 1.11}
+
+#: Fewest repeats that can show the tail: one in 20 and one in 100.
+TAILS = {"p50_ms": (0.5, 1), "p95_ms": (0.95, 20), "p99_ms": (0.99, 100)}
+
+#: Name of the visual branch in rows and summary.
+VISUAL = "dinov2_l"
+
+
+@dataclass
+class Branch:
+    """One thing to time, and the times found: milliseconds by stage, one list per round."""
+
+    method: str
+    stage: str  # of the whole call; a call that returns a dict of milliseconds by stage adds those
+    hw: tuple[int, int]
+    call: Callable[[], Any]
+    repeats: int  # per round
+    more: Row  # parameters, weight_bytes, peak_mib
+    rounds: list[dict[str, list[float]]] = field(default_factory=list)
+
+    def times(self, stage: str) -> list[float]:
+        """All milliseconds of a stage."""
+        return [t for found in self.rounds for t in found[stage]]
+
+    def medians(self, stage: str) -> list[float]:
+        """Median of each round."""
+        return [statistics.median(found[stage]) for found in self.rounds]
+
+
+def run(
+    scenes: Sequence[Given],
+    chosen: Mapping[str, Method],
+    pairs: Pairs,
+    settings: Settings,
+    *,
+    sizes: Sequence[tuple[int, int]] = ((224, 224), (1440, 1920)),
+    n: int = 1024,
+    rounds: int = 5,
+    front_end_repeats: int = 60,
+    pair_repeats: int = 20,
+    dinov2_repeats: int = 4,
+    warm_up: int = 2,
+    peak: bool = True,
+    dinov2: Callable[..., torch.nn.Module] = visual.load,
+    progress: Progress = quiet,
+) -> Outcome:
+    """Time the method and DINOv2 in turn, on the first pair of the first scene, resampled to each size.
+
+    Everything is timed in rounds, so that a busy minute of the machine falls on all sides; batch size 1. Whatever is
+    reported as an interval is the lowest and highest median of a round.
+
+    Args:
+        scenes, chosen, pairs, settings, progress: as :func:`dhtorch.experiments.pair.run`; the method named first.
+        sizes: (height, width) of the pictures; the first is the one that ratios are taken at, the last the largest.
+        n: samples.
+        rounds: how often everything is timed anew.
+        front_end_repeats, pair_repeats, dinov2_repeats: calls per round. A 95th percentile needs 20 calls in all, a
+            99th 100, else it is null.
+        warm_up: untimed calls before each block.
+        peak: also measure peak memory, each in a process of its own.
+        dinov2: makes the network; without ``transformers`` its rows say what to install.
+
+    Returns:
+        Outcome with one row per branch, stage and size (``p50_ms``, ``p95_ms``, ``p99_ms``, ``parameters``,
+        ``weight_bytes``, ``peak_mib``, …), and in the summary the medians and ratios.
+
+    Raises:
+        ValueError: no pair, no size, or a count below 1.
+    """
+    counts = {"rounds": rounds, "front_end_repeats": front_end_repeats, "pair_repeats": pair_repeats}
+    for name, count in {**counts, "dinov2_repeats": dinov2_repeats, "n": n, "sizes": len(sizes)}.items():
+        if count < 1:
+            raise ValueError(f"experiment.{name}: found {count}, expected at least 1")
+    name, method = next(iter(chosen.items()))
+    scene = scenes_of(scenes)[0]
+    told: dict[str, Any] = {"seed": settings.seed, "hint": scene.hint}
+    views = _views(scene, pairs, settings)
+    branches: list[Branch] = []
+    for hw in sizes:
+        frame_0, frame_1 = (_resampled(view, (hw[0], hw[1])) for view in views)
+        timed: list[tuple[str, Callable[[], Any], int]] = [
+            ("front_end", partial(front_end, method, frame_0, n), front_end_repeats),
+            ("pair", partial(whole_pair, partial(method, n=n, **told), frame_0, frame_1), pair_repeats),
+        ]
+        for stage, call, repeats in timed:
+            more = memory.weights(method) | {"peak_mib": _peak_mib(call, settings, peak)}
+            branches.append(Branch(name, stage, frame_0.hw, call, repeats, more))
+    theirs, note = _visual(dinov2, views[0], settings, peak, dinov2_repeats)
+    branches += theirs
+    for _ in progress(range(rounds), f"{len(branches)} timings", rounds):
+        for branch in branches:
+            _time(branch, warm_up, settings.device)
+    rows = [_row(scene.name, b, stage, settings, n) for b in branches for stage in b.rounds[0]]
+    if note:
+        rows.append({"scene": scene.name, "pair": None, "method": VISUAL, "stage": "forward", "note": note})
+    outcome = Outcome(rows=rows, summary=summarise(branches), n_pairs=1)
+    return outcome.decide(QUESTION, EXPECTATION, *judge(name, outcome.summary, sizes, note))
+
+
+def front_end(method: Method, frame: Frame, n: int) -> Samples:
+    """Seats 1 to 3 of a method: what the paper times."""
+    return method.replace(n=n).look(frame)
+
+
+def whole_pair(method: Callable[..., Estimate], frame_0: Frame, frame_1: Frame) -> dict[str, float]:
+    """All seven seats; returns the milliseconds of each."""
+    trace: Trace = {}
+    method(frame_0, frame_1, trace=trace)
+    return dict(trace["ms"])
+
+
+def forward(make: Callable[[], torch.nn.Module], pixels: Tensor) -> None:
+    """Make the network and ask it once: what a process needs that has nothing else to do."""
+    with torch.no_grad():
+        make()(pixel_values=pixels)
+
+
+def judge(
+    method: str, summary: Mapping[str, Any], sizes: Sequence[Sequence[int]], note: str = ""
+) -> tuple[bool | None, str]:
+    """Whether both of the paper's ratios hold, None where the spread from round to round leaves it open; and why."""
+    first = "x".join(map(str, sizes[0]))
+    said = [f"{stage} {summary[f'{method}.{stage}.{first}']['value']:.3g} ms" for stage in ("front_end", "pair")]
+    said = [f"{first}: {', '.join(said)}"]
+    claims: list[bool | None] = []
+    for ratio, words in (("speedup", "DINOv2-L / front end"), ("growth", "growth of the front end")):
+        entry, paper = summary.get(f"{method}.{ratio}"), PAPER[ratio]
+        if entry is None:
+            claims.append(None)
+            said.append(f"{words} {note if ratio == 'speedup' and note else 'not measured'}")
+            continue
+        worst, best = (entry["low"], entry["high"]) if ratio == "speedup" else (-entry["high"], -entry["low"])
+        least = paper if ratio == "speedup" else -paper
+        claims.append(True if worst >= least else False if best < least else None)
+        said.append(f"{words} {entry['value']:.3g} ({entry['low']:.3g} to {entry['high']:.3g}), paper {paper:.3g}")
+    return False if False in claims else None if None in claims else True, "; ".join(said)
+
+
+def _views(scene: Scene, pairs: Pairs, settings: Settings) -> tuple[Frame, Frame]:
+    """The first pair, as a method may see it."""
+    chosen = fixed(pairs(scene))
+    if not chosen:
+        raise ValueError(f"latency: {scene.name} has no pair, expected at least one")
+    cutoff = settings.cutoff_of(scene)
+    anchor, other = (scene.recording[k].to(settings.dtype).to(settings.device) for k in chosen[0])
+    return holdout.range_split(anchor, cutoff), holdout.range_split(other, cutoff)
+
+
+def _resampled(frame: Frame, hw: tuple[int, int]) -> Frame:
+    """The frame with a picture of another size; the depth map keeps its own."""
+    image = frame.image / 255 if frame.image.dtype == torch.uint8 else frame.image
+    image = interpolate(image, hw, mode="bilinear", antialias=True, align_corners=False).clamp(0, 1)
+    if frame.image.dtype == torch.uint8:
+        image = (image * 255 + 0.5).to(torch.uint8)
+    return frame.replace(image=image, camera=cam.resize(frame.camera, frame.hw, hw))
+
+
+def _visual(
+    make: Callable[..., torch.nn.Module], frame: Frame, settings: Settings, peak: bool, repeats: int
+) -> tuple[list[Branch], str]:
+    """The forward pass of DINOv2, or no branch and why not."""
+    try:
+        visual.library()
+    except ImportError as error:
+        return [], f"not measured: {error}"
+    side = make.keywords.get("side", 224) if isinstance(make, partial) else 224
+    pixels = visual.pixel_values(frame.image, side).to(settings.dtype)
+    # Before this process holds the network, so that there is memory for both.
+    highest = _peak_mib(partial(forward, make, pixels), settings, peak, visual.library)
+    network = make().to(settings.device, settings.dtype)
+
+    def call() -> None:
+        network(pixel_values=pixels)
+
+    more = memory.weights(network) | {"peak_mib": highest}
+    return [Branch(VISUAL, "forward", (side, side), call, repeats, more)], ""
+
+
+def _peak_mib(
+    call: Callable[[], Any], settings: Settings, wanted: bool, before: Callable[[], Any] | None = None
+) -> float | None:
+    """Peak memory on the CPU, in a process of its own; None elsewhere or where it is not asked for."""
+    return memory.peak_mib(call, before) if wanted and settings.device == "cpu" else None
+
+
+def _time(branch: Branch, warm_up: int, device: str) -> None:
+    """One round of a branch."""
+    found: dict[str, list[float]] = {branch.stage: []}
+    with torch.no_grad():
+        for k in range(-warm_up, branch.repeats):
+            start = time.perf_counter()
+            stages = branch.call()
+            if device != "cpu":
+                torch.cuda.synchronize(device)
+            total = 1e3 * (time.perf_counter() - start)
+            if k < 0:
+                continue
+            found[branch.stage].append(total)
+            if device == "cpu":  # elsewhere a stage returns before it is done
+                for stage, ms in stages.items() if isinstance(stages, dict) else ():
+                    found.setdefault(stage, []).append(ms)
+    branch.rounds.append(found)
+
+
+def _row(scene: str, branch: Branch, stage: str, settings: Settings, n: int) -> Row:
+    """One branch or stage at one size."""
+    times = sorted(branch.times(stage))
+    row: Row = {"scene": scene, "pair": None, "method": branch.method, "stage": stage, "hw": list(branch.hw)}
+    row |= {"n": None if branch.method == VISUAL else n, "repeats": len(times)}
+    row |= {"threads": torch.get_num_threads(), "device": settings.device, **_machine()}
+    for name, (share, least) in TAILS.items():
+        row[name] = percentile(times, share) if len(times) >= least else None
+    row |= {"low_ms": min(branch.medians(stage)), "high_ms": max(branch.medians(stage))}
+    return row | branch.more if stage == branch.stage else row
+
+
+def summarise(branches: Sequence[Branch]) -> dict[str, Any]:
+    """Medians by ``<method>.<stage>.<height>x<width>``, memory, and the paper's two ratios, round by round."""
+    summary: dict[str, Any] = {}
+    front = [b for b in branches if b.stage == "front_end"]
+    for b in branches:
+        size = "x".join(map(str, b.hw))
+        for stage in b.rounds[0]:
+            medians = b.medians(stage)
+            middle = statistics.median(b.times(stage))
+            summary[f"{b.method}.{stage}.{size}"] = _entry(middle, medians, len(b.times(stage)), "ms")
+        if b.more["peak_mib"] is not None:
+            summary[f"{b.method}.{b.stage}.{size}.peak_mib"] = _entry(b.more["peak_mib"], [], 1, "MiB")
+    for b in (front[0], *(b for b in branches if b.method == VISUAL)):
+        for key, unit in (("parameters", "count"), ("weight_bytes", "B")):
+            summary[f"{b.method}.{key}"] = _entry(b.more[key], [], 1, unit)
+    small = front[0].medians("front_end")
+    above_it = [("growth", b.medians("front_end")) for b in front[1:][-1:]]
+    above_it += [("speedup", b.medians("forward")) for b in branches if b.method == VISUAL]
+    for name, above in above_it:
+        ratios = [a / b for a, b in zip(above, small, strict=True)]
+        summary[f"{front[0].method}.{name}"] = _entry(statistics.median(ratios), ratios, len(ratios), "1")
+    return summary
+
+
+def _entry(value: float, spread: Sequence[float], n: int, unit: str) -> dict[str, Any]:
+    low, high = (min(spread), max(spread)) if spread else (None, None)
+    return Interval(value, low, high, n).entry(unit)
+
+
+def _machine() -> Row:
+    """What milliseconds depend on: processor, cores, and how busy it is (runnable processes, last minute)."""
+    name = ""
+    with contextlib.suppress(OSError):
+        found = [x for x in Path("/proc/cpuinfo").read_text().splitlines() if x.startswith("model name")]
+        name = found[0].partition(":")[2].strip() if found else ""
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+    return {"cpu": name or platform.processor() or platform.machine(), "cores": os.cpu_count(), "load": load}
+
+
+def percentile(ordered: Sequence[float], share: float) -> float:
+    """Percentile with linear interpolation of sorted numbers."""
+    place = share * (len(ordered) - 1)
+    low = int(place)
+    return ordered[low] + (place - low) * (ordered[min(low + 1, len(ordered) - 1)] - ordered[low])

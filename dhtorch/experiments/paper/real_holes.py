@@ -1,0 +1,61 @@
+"""Question: are the sensor's real holes recovered as well as returns that were merely hidden?
+
+Expectation (written before the run): no; real drop-outs lie at edges, on dark, shiny and distant surfaces, so on the
+median scene their error is larger, and some scenes have no answer at all.
+What would refute it: on the median scene the error on real holes is not above that on hidden returns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from dhtorch.data.scene import Given
+from dhtorch.experiments import protocol
+from dhtorch.experiments.cohorts import has_truth, real_holes
+from dhtorch.experiments.paper.range_split import NO_GATES
+from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
+
+QUESTION = "Are the sensor's real holes recovered as well as returns that were merely hidden?"
+EXPECTATION = "No: on the median scene the error on real holes is larger, and some scenes have no answer."
+
+
+def run(
+    scenes: Sequence[Given],
+    methods: Mapping[str, Method],
+    pairs: Pairs,
+    settings: Settings,
+    *,
+    progress: Progress = protocol.quiet,
+) -> Outcome:
+    """Gated and ungated on the sensor's true drop-outs, beside the same method on hidden far returns.
+
+    Needs independent truth: other scenes keep a row that says so. A drop-out counts when it survives the filter of
+    :func:`dhtorch.metrics.holdout.drop_outs`; ``n_dropped`` says what did not. Cohorts: ``full`` (hidden returns) and
+    ``real_holes``; variants ``no_gates`` and ``gated``.
+
+    Args and errors: as :func:`dhtorch.experiments.protocol.run`; of ``methods`` the first is asked.
+    Source: paper, "Real holes are harder than masked ones".
+    """
+    method = next(iter(methods.values()))
+    variants = {
+        "no_gates": Variant(method.replace(triangulate=NO_GATES), needs=has_truth),
+        "gated": Variant(method, needs=has_truth),
+    }
+    cohorts = {"full": protocol.held_back, "real_holes": real_holes}
+    asked = Protocol(variants, cohorts, min_candidates=1)
+    outcome = protocol.run(scenes, asked, pairs, settings, progress=progress)
+    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
+
+
+def verdict(outcome: Outcome) -> tuple[bool | None, str]:
+    """Compare the two cohorts of the gated method, and name the scenes without an answer."""
+    holes = outcome.scenes("gated", "real_holes")
+    real, hidden = (outcome.summary.get(f"gated.{k}median_rel", {}).get("value") for k in ("", "full."))
+    measured = {s: r for s, r in holes.items() if r.get("n_candidates")}
+    silent = [s for s, r in measured.items() if not r["n_kept"]]
+    n = sum(r["n_candidates"] for r in measured.values())
+    counted = f"{n} drop-outs on {len(measured)} of {len(holes)} scenes survive the filter"
+    none = f"; no answer on {', '.join(silent)}" if silent else ""
+    if real is None or hidden is None:
+        return None, counted + none
+    return real > hidden, f"{counted}; median error {real:.1%} against {hidden:.1%} on hidden returns{none}"

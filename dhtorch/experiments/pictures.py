@@ -1,0 +1,59 @@
+"""What a pair found, as its pictures and its point cloud."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from dhtorch.codes import Source
+from dhtorch.export import write_ply
+from dhtorch.geometry.camera import unproject
+from dhtorch.metrics import errors
+from dhtorch.metrics.risk import risk_coverage
+from dhtorch.pipeline import dense
+from dhtorch.pipeline.pair import merge
+from dhtorch.viz.plots import (
+    at_cutoff,
+    draw_completed,
+    draw_depth,
+    draw_holes,
+    draw_risk_coverage,
+    draw_samples,
+)
+from dhtorch.viz.plots.colours import of_source
+
+
+def draw_example(folder: str | Path, example: Any) -> list[Path]:
+    """Figures and the point cloud of one pair; returns the files written.
+
+    Args:
+        folder: made if need be.
+        example: a :class:`dhtorch.experiments.protocol.Example`.
+    """
+    e = example.cpu()
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    place = at_cutoff(f"{e.scene} {e.pair}", e.cutoff)
+    whole, image, uv = merge(e.samples, e.estimate), e.frame.image[0], e.samples.uv[0]
+    draw_samples(folder / "samples.png", image, uv, whole.source[0], e.estimate.gate[0], title=place)
+    draw_holes(folder / "holes.png", image, uv, e.samples.hole[0], title=place)
+    written = ["samples.png", "holes.png", "points.ply"]
+    if example.asked is not None:  # where the method was asked
+        with torch.no_grad():
+            maps = dense.complete(example.frame, calibration=dense.shipped(), **example.asked).to("cpu")[0]
+        draw_completed(folder / "completed.png", image, maps.depth, maps.sigma, maps.source, title=place)
+        written.append("completed.png")
+    pooled = errors.select(e.estimate, e.truth)
+    if pooled.keep.any():
+        draw_depth(folder / "depth.png", pooled.true_depth, pooled.depth, pooled.score, title=place)
+        curves = {e.method: risk_coverage(pooled)}
+        draw_risk_coverage(folder / "risk_coverage.png", curves, oracle=risk_coverage(pooled, oracle=True), title=place)
+        written += ["depth.png", "risk_coverage.png"]
+    filled = whole.source[0] != Source.NONE
+    xyz = unproject(e.frame.camera, whole.uv, whole.depth)[0][filled]
+    columns = {name: getattr(whole, name)[0][filled] for name in ("sigma", "score")}
+    columns |= {"hole": e.samples.hole[0][filled], "source": whole.source[0][filled]}
+    write_ply(folder / "points.ply", xyz, of_source(columns["source"]), **columns)
+    return [folder / name for name in written]

@@ -1,0 +1,282 @@
+"""A linear probe: how much of a target a ridge regression reads off given features, in closed form.
+
+A ridge regression needs no more of the data than means and scatter matrices. So shards of any length pass through one
+by one (:class:`Stream`), what is kept is a square of the number of features, and every penalty and every selection of
+features is solved from the same numbers. Features are standardised by their own spread inside; a feature that does not
+vary has the weight 0.
+
+Alphabet: N samples, F features, D targets, P penalties, G groups (tasks) that a split never tears apart; ``*`` any
+leading dimensions. Penalties are per sample and in units of standardised features: the loss is the *mean* squared
+error + penalty · |w|², so that one grid serves sets of all sizes (scikit-learn's ``alpha`` is N times as large).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from random import Random
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dhtorch.geometry.checks import check
+from dhtorch.metrics import bootstrap
+from dhtorch.metrics.bootstrap import Interval
+from dhtorch.pytree import Record, record
+
+#: Smaller penalties count as this much: what keeps the equations solvable when features repeat each other.
+FLOOR = 1e-12
+
+#: A feature whose standard deviation is a smaller part of its mean does not vary: what is left is rounding.
+CONSTANT = 1e-9
+
+#: Confidence of the interval that decides on equivalence: two one-sided tests at 5 % each.
+EQUIVALENCE_LEVEL = 0.90
+
+
+@record
+class Moments(Record):
+    """All that a ridge regression needs of some samples; float64."""
+
+    n: Tensor  # (*,) samples that count
+    x: Tensor  # (*, F) mean of the features
+    y: Tensor  # (*, D) mean of the targets
+    xx: Tensor  # (*, F, F) sum of products of deviations from the mean
+    xy: Tensor  # (*, F, D)
+    yy: Tensor  # (*, D) sum of squared deviations
+
+
+@record
+class Linear(Record):
+    """One linear map for each penalty; float64."""
+
+    weight: Tensor  # (*, P, F, D), for features as they come
+    bias: Tensor  # (*, P, D)
+
+
+class Fold(NamedTuple):
+    """Which groups a probe learns from, which choose its penalty, and which it is judged on."""
+
+    train: tuple[str, ...]
+    choose: tuple[str, ...]
+    test: tuple[str, ...]
+
+
+def moments(x: Tensor, y: Tensor) -> Moments:
+    """Means and scatter of samples; one with a number that is not finite does not count.
+
+    Args:
+        x: (*, N, F) features.
+        y: (*, N, D) targets.
+
+    Raises:
+        ValueError: wrong shapes.
+
+    Gradient: to x and y.
+    """
+    dx, dy, n, x_mean, y_mean = _centred(x, y)
+    return Moments(n, x_mean, y_mean, dx.mT @ dx, dx.mT @ dy, (dy * dy).sum(-2))
+
+
+def join(a: Moments, b: Moments) -> Moments:
+    """Moments of the samples of both, as if they had been seen together.
+
+    Raises:
+        ValueError: different numbers of features or targets.
+
+    Source: T. Chan, G. Golub, R. LeVeque, "Updating formulae and a pairwise algorithm for computing sample variances",
+    1979.
+    """
+    check("probe.join", a_x=(a.x, "* F"), b_x=(b.x, "* F"), a_y=(a.y, "* D"), b_y=(b.y, "* D"))
+    n = a.n + b.n
+    share = b.n / n.clamp_min(1)
+    between = (a.n * share)[..., None]
+    dx, dy = b.x - a.x, b.y - a.y
+    return Moments(
+        n,
+        a.x + dx * share[..., None],
+        a.y + dy * share[..., None],
+        a.xx + b.xx + between[..., None] * dx[..., :, None] * dx[..., None, :],
+        a.xy + b.xy + between[..., None] * dx[..., :, None] * dy[..., None, :],
+        a.yy + b.yy + between * dy * dy,
+    )
+
+
+def columns(of: Moments, index: Tensor) -> Moments:
+    """The same samples with some features only: ``index`` (f,) int64 into the F."""
+    xx = of.xx.index_select(-1, index).index_select(-2, index)
+    return of.replace(x=of.x.index_select(-1, index), xx=xx, xy=of.xy.index_select(-2, index))
+
+
+class Stream:
+    """Moments of shards that pass by, added in place: F² numbers are kept, however many samples there were.
+
+    Equal to :func:`moments` of all shards together up to rounding. With :func:`ridge` behind it the peak is four F × F
+    matrices of float64 and a few copies of a shard: 3.3 GB measured for F = 10,000 in shards of 1,000. No gradients.
+    """
+
+    def __init__(self, features: int, targets: int, device: torch.device | str = "cpu") -> None:
+        zeros = {"dtype": torch.float64, "device": device}
+        F, D = features, targets
+        self.moments = Moments(*(torch.zeros(size, **zeros) for size in ((), (F,), (D,), (F, F), (F, D), (D,))))  # type: ignore[call-overload]
+
+    @torch.no_grad()
+    def add(self, x: Tensor, y: Tensor) -> None:
+        """Samples (N, F) and targets (N, D) of one shard.
+
+        Raises:
+            ValueError: wrong shapes.
+        """
+        m = self.moments
+        check("probe.add", x=(x, "N F"), y=(y, "N D"), features=(m.x, "F"), targets=(m.y, "D"))
+        dx, dy, n, x_mean, y_mean = _centred(x, y)
+        share = n / (m.n + n).clamp_min(1)
+        way_x, way_y, between = x_mean - m.x, y_mean - m.y, float(m.n * share)
+        m.xx.addmm_(dx.mT, dx).addr_(way_x, way_x, alpha=between)
+        m.xy.addmm_(dx.mT, dy).addr_(way_x, way_y, alpha=between)
+        m.yy.add_((dy * dy).sum(0)).add_(way_y * way_y, alpha=between)
+        m.x.add_(way_x * share)
+        m.y.add_(way_y * share)
+        m.n.add_(n)
+
+
+def ridge(of: Moments, penalty: Tensor) -> Linear:
+    """Ridge regressions with an intercept, one for each penalty.
+
+    Args:
+        of: the samples to learn from.
+        penalty: (P,), or (P, F) where blocks of features are to be held back differently. Below :data:`FLOOR` it
+            counts as that.
+
+    Returns:
+        Linear. Without samples, and for features that do not vary, the weights are 0.
+
+    Raises:
+        ValueError: wrong shapes.
+
+    Gradient: to the moments and the penalties.
+    Cost: P Cholesky factorisations of F × F.
+    Source: A. Hoerl, R. Kennard, "Ridge regression: biased estimation for nonorthogonal problems", 1970.
+    """
+    check("ridge", x=(of.x, "* F"), xx=(of.xx, "* F F"), xy=(of.xy, "* F D"), y=(of.y, "* D"))
+    F = of.x.shape[-1]
+    if penalty.dim() not in (1, 2) or penalty.shape[1:] not in ((), (F,)):
+        raise ValueError(f"ridge: penalty has shape {tuple(penalty.shape)}, expected (P,) or (P, {F})")
+    n = of.n.clamp_min(1)[..., None]
+    variance = of.xx.diagonal(dim1=-2, dim2=-1) / n
+    varies = variance > (CONSTANT * of.x).square().clamp_min(1e-300)
+    unit = torch.where(varies, torch.where(varies, variance, 1.0).rsqrt(), 0.0)
+    gram = of.xx * (unit / n)[..., :, None] * unit[..., None, :]
+    known = of.xy * (unit / n)[..., None]
+    weights = [_solve(gram, p, known) for p in penalty.to(gram).clamp_min(FLOOR).unbind(0)]
+    weight = torch.stack(weights, -3) if weights else known.new_zeros(*known.shape[:-2], 0, *known.shape[-2:])
+    weight = weight * unit[..., None, :, None]
+    bias = of.y[..., None, :] - (weight * of.x[..., None, :, None]).sum(-2)
+    return Linear(weight, bias)
+
+
+def predict(linear: Linear, x: Tensor) -> Tensor:
+    """Targets (*, P, N, D), float64, that every map of ``linear`` gives for features (*, N, F).
+
+    Raises:
+        ValueError: another number of features.
+    """
+    check("probe.predict", weight=(linear.weight, "* F D"), x=(x, "* N F"))
+    return x.double()[..., None, :, :] @ linear.weight + linear.bias[..., None, :]
+
+
+def folds(groups: Sequence[str], n: int = 5, *, seed: int = 0) -> list[Fold]:
+    """Every group is judged on once: part k tests, the next part chooses the penalty, the others teach.
+
+    Args:
+        groups: names; repeated ones count once.
+        n: parts, dealt out after a shuffle; fewer where there are fewer groups.
+        seed: of the shuffle.
+
+    Raises:
+        ValueError: fewer than three groups or parts.
+    """
+    names = sorted(set(groups))
+    n = min(n, len(names))
+    if n < 3:
+        raise ValueError(f"folds: found {n} parts of {len(names)} groups, expected at least three of each")
+    Random(f"folds {seed}").shuffle(names)
+    parts = [tuple(names[k::n]) for k in range(n)]
+    return [
+        Fold(
+            tuple(name for j in range(n) if j not in (k, (k + 1) % n) for name in parts[j]),
+            parts[(k + 1) % n],
+            parts[k],
+        )
+        for k in range(n)
+    ]
+
+
+def mean_error(squares: Tensor, counts: Tensor, *, level: float = 0.95, draws: int = 2000, seed: int = 0) -> Interval:
+    """Mean squared error over all samples, its interval by resampling groups.
+
+    Args:
+        squares, counts: (G,) sum of squared errors and number of samples of each group; groups without samples are
+            left out.
+        level, draws, seed: of the bootstrap.
+    """
+    check("mean_error", squares=(squares, "G"), counts=(counts, "G"))
+    return _quotient(squares, counts, counts > 0, level, draws, seed)
+
+
+def ratio(ours: Tensor, theirs: Tensor, *, level: float = 0.95, draws: int = 2000, seed: int = 0) -> Interval:
+    """Quotient of two errors on the same samples, its interval by resampling groups, both sides alike (paired).
+
+    Args:
+        ours, theirs: (G,) sum of squared errors of each group; groups where neither has any are left out.
+        level, draws, seed: of the bootstrap.
+    """
+    check("ratio", ours=(ours, "G"), theirs=(theirs, "G"))
+    return _quotient(ours, theirs, (ours > 0) | (theirs > 0), level, draws, seed)
+
+
+def equivalent(found: Interval, margin: float = 0.02) -> bool | None:
+    """Whether a ratio is 1 within ``margin``: True or False where its interval says so, else None.
+
+    True: the whole interval lies within. False: the whole interval lies beyond, on one side. With an interval of
+    :data:`EQUIVALENCE_LEVEL` the former is the usual pair of one-sided tests at 5 %.
+
+    Source: D. Schuirmann, "A comparison of the two one-sided tests procedure …", 1987.
+    """
+    if found.low is None or found.high is None:
+        return None
+    if 1 - margin < found.low and found.high < 1 + margin:
+        return True
+    return False if found.high < 1 - margin or found.low > 1 + margin else None
+
+
+def _centred(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Deviations, number and means of the samples that count; float64."""
+    check("moments", x=(x, "* N F"), y=(y, "* N D"))
+    if x.shape[:-1] != y.shape[:-1]:
+        raise ValueError(f"moments: x has shape {tuple(x.shape)}, y {tuple(y.shape)}, expected the same samples")
+    use = (x.isfinite().all(-1) & y.isfinite().all(-1))[..., None]
+    n = use.sum((-2, -1)).double()
+    parts = []
+    for values in (x.double(), y.double()):
+        kept = torch.where(use, values, 0.0)
+        mean = kept.sum(-2) / n.clamp_min(1)[..., None]
+        parts += [torch.where(use, kept - mean[..., None, :], 0.0), mean]
+    return parts[0], parts[2], n, parts[1], parts[3]
+
+
+def _solve(gram: Tensor, penalty: Tensor, known: Tensor) -> Tensor:
+    diagonal = gram.diagonal(dim1=-2, dim2=-1) + penalty
+    lower, _ = torch.linalg.cholesky_ex(torch.diagonal_scatter(gram, diagonal, dim1=-2, dim2=-1))
+    return torch.cholesky_solve(known, lower)
+
+
+def _quotient(above: Tensor, below: Tensor, use: Tensor, level: float, draws: int, seed: int) -> Interval:
+    above, below = above[use].double(), below[use].double()
+
+    def number(index: Tensor) -> Tensor:
+        total = below[index].sum(-1)
+        return torch.where(total > 0, above[index].sum(-1) / total, math.nan)
+
+    return bootstrap.interval_of(number, len(above), level=level, draws=draws, seed=seed)

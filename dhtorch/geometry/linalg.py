@@ -1,0 +1,87 @@
+"""2×2 and 3×3 matrices in closed form: what is written out is written out here, once.
+
+Alphabet: a 2×2 matrix is its *entries* ((a, b), (c, d)), four tensors of one shape, so that each operation is
+contiguous over points and the caller may keep them as he likes; a symmetric one is ((a, b), (b, c)). *Matrices* are
+(…, m, n), *planes* (m, n, …), components first and points last.
+
+Products are sums of products, not matrix products: their rounding does not depend on how many matrices there are
+(:mod:`dhtorch.geometry.determinism`). The order of every sum is part of the answer.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def determinant(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
+    """a d − b c. Gradient: to all."""
+    return a * d - b * c
+
+
+def adjugate(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Entries ((d, −b), (−c, a)): the inverse times the determinant. Gradient: to all."""
+    return d, -b, -c, a
+
+
+def inverse(a: Tensor, b: Tensor, c: Tensor, d: Tensor, *, least: float) -> Tensor:
+    """Entries (4, …) of the inverse; a determinant not larger than ``least`` in size, or no number, counts as that.
+
+    Gradient: to all; finite where the determinant counts as ``least``.
+    """
+    det = determinant(a, b, c, d)
+    det = torch.where(det.abs() > least, det, torch.full_like(det, least))
+    return torch.stack(adjugate(a, b, c, d)) / det
+
+
+def eigenvalues(a: Tensor, b: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
+    """The smaller and the larger eigenvalue of ((a, b), (b, c)).
+
+    Gradient: to all; where both are equal that of their mean.
+    """
+    half, middle = (a - c) / 2, (a + c) / 2
+    square = half * half + b * b
+    apart = square > 0
+    split = torch.where(apart, torch.where(apart, square, torch.ones_like(square)).sqrt(), square)
+    return middle - split, middle + split
+
+
+def quadratic(x: Tensor, y: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    """(x, y) ((a, b), (b, c)) (x, y)ᵀ. Gradient: to all."""
+    return x * x * a + 2 * x * y * b + y * y * c
+
+
+def upper(S: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Entries a, b, c of symmetric matrices (…, 2, 2), whose lower left is not read. Gradient: to ``S``."""
+    return S[..., 0, 0], S[..., 0, 1], S[..., 1, 1]
+
+
+def product(A: Tensor, B: Tensor) -> Tensor:
+    """Matrices (…, m, k) times (…, k, n). Gradient: to both."""
+    return (A[..., :, :, None] * B[..., None, :, :]).sum(-2)
+
+
+def product_of_planes(A: Tensor, B: Tensor) -> Tensor:
+    """Planes (m, k, …) times (k, n, …). Gradient: to both."""
+    return (A[:, :, None] * B[None]).sum(1)
+
+
+def turned(
+    R: Tensor,  # (B, m, 3)
+    x: Tensor,  # (B, 3, N)
+) -> Tensor:
+    """R x of vectors in planes (B, m, N); :func:`dhtorch.geometry.se3.rotate` is the same of points (B, N, 3).
+
+    Gradient: to both.
+    """
+    first, second, third = x[:, None].unbind(2)
+    R = R[..., None]
+    return R[:, :, 0] * first + R[:, :, 1] * second + R[:, :, 2] * third
+
+
+def cofactors(A: Tensor) -> Tensor:
+    """Cofactor matrices of planes (3, 3, …): row i is the cross product of the two rows that follow it in the circle.
+
+    Gradient: to ``A``.
+    """
+    return torch.linalg.cross(A.roll(-1, 0), A.roll(-2, 0), dim=1)

@@ -1,0 +1,87 @@
+"""In which other way a pose may have been meant: other axes, the inverse, another unit.
+
+Alphabet: ``M`` takes our camera axes (x right, y down, z forward) to somebody's, so that a relative motion ``T``
+written in theirs is Mᵀ T M in ours. Whoever only reads two such motions cannot tell them apart; near returns can.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import torch
+from torch import Tensor
+
+from dhtorch.geometry import se3
+from dhtorch.geometry.checks import check
+from dhtorch.geometry.se3 import Pose
+
+#: Camera axes in which poses are written, as rows of M.
+AXES: dict[str, tuple[tuple[int, int, int], ...]] = {
+    "": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    "OpenGL axes (x right, y up, z backward)": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
+    "left-handed axes (x right, y up, z forward)": ((1, 0, 0), (0, -1, 0), (0, 0, 1)),
+    "robot axes (x forward, y left, z up)": ((0, 0, 1), (-1, 0, 0), (0, -1, 0)),
+    "axes of a picture turned by a quarter": ((0, 1, 0), (-1, 0, 0), (0, 0, 1)),
+    "axes of a picture turned by half": ((-1, 0, 0), (0, -1, 0), (0, 0, 1)),
+    "axes of a picture turned by three quarters": ((0, -1, 0), (1, 0, 0), (0, 0, 1)),
+}
+
+#: Ways round, and metres per unit.
+WAYS = ("", "the inverse")
+UNITS = {"": 1.0, "millimetres": 1e-3, "centimetres": 1e-2}
+
+_ALL = sorted(itertools.product(AXES, WAYS, UNITS), key=lambda parts: sum(bool(part) for part in parts))
+
+#: What a reading is called, the simplest first; the first is the pose as it was stated.
+CONVENTIONS = tuple(", ".join(part for part in parts if part) for parts in _ALL)
+
+#: Names of the camera axes that can be stated, and their M.
+STATED = {"cv": AXES[""], "gl": AXES["OpenGL axes (x right, y up, z backward)"]}
+
+
+def readings(
+    T: Pose,  # (B,), as it was stated
+    other_way: Pose,  # (B,), with every pose it comes from taken for its inverse
+) -> Pose:
+    """The motions (B, K) that the numbers mean in each of the K :data:`CONVENTIONS`.
+
+    Raises:
+        ValueError: wrong shapes.
+
+    Gradient: to both.
+    """
+    check("readings", R=(T.R, "B 3 3"), t=(T.t, "B 3"), R_back=(other_way.R, "B 3 3"), t_back=(other_way.t, "B 3"))
+    found = []
+    for axes, way, unit in _ALL:
+        motion = in_axes(other_way if way else T, AXES[axes])
+        found.append(Pose(motion.R, motion.t * UNITS[unit]))
+    return Pose(torch.stack([m.R for m in found], 1), torch.stack([m.t for m in found], 1))
+
+
+def in_axes(T: Pose, axes: tuple[tuple[int, int, int], ...]) -> Pose:
+    """A motion (B,) between cameras with these axes as one between cameras with ours. Gradient: to the motion."""
+    M = _matrix(axes, T.R)
+    return Pose(M.T @ T.R @ M, (M.T @ T.t[..., None])[..., 0])
+
+
+def camera_axes(T_world_from_cam: Pose, axes: tuple[tuple[int, int, int], ...]) -> Pose:
+    """The pose (B,) of a camera with these axes as that of one with ours. Gradient: to the pose."""
+    return T_world_from_cam.replace(R=T_world_from_cam.R @ _matrix(axes, T_world_from_cam.R))
+
+
+def relative_covariance(
+    T_world_from_1: Pose,  # (B,)
+    cov_0: Tensor,  # (B, 6, 6) of the left perturbation of T_world_from_0
+    cov_1: Tensor,  # (B, 6, 6) of the left perturbation of T_world_from_1
+) -> Tensor:
+    """Covariance (B, 6, 6) of T_1_from_0 of two poses in one world whose errors are independent.
+
+    Gradient: to all. Raises ValueError for wrong shapes.
+    """
+    check("relative_covariance", R=(T_world_from_1.R, "B 3 3"), cov_0=(cov_0, "B 6 6"), cov_1=(cov_1, "B 6 6"))
+    A = se3.adjoint(se3.invert(T_world_from_1))
+    return A @ (cov_0 + cov_1) @ A.mT
+
+
+def _matrix(axes: tuple[tuple[int, int, int], ...], like: Tensor) -> Tensor:
+    return torch.tensor(axes, dtype=like.dtype, device=like.device)

@@ -1,0 +1,289 @@
+"""Where to cut the score so that the error stays below a target: three controls, two kinds of promise.
+
+*Plug-in* looks at the error among the answers, on the scenes it is given, and leaves room for one standard error. It
+promises nothing about another scene. *Most scenes* asks the same of nine scenes in ten, one by one, instead of their
+mean. *Conformal* promises: if the scenes, the next one included, could have come in
+any order (are exchangeable), the loss of the next scene meets the target. The loss there is per candidate, capped
+error × answered / candidates, because it must not rise when less is answered; and a promise takes scenes: with fewer
+than it needs it says how many.
+
+Both need only scores, answers and truth, so any depth source will do; ``errors.points`` joins three arrays to a scene.
+The unit is the scene: points of one scene share its truth and its poses and are no independent witnesses. Pieces of
+one room are no exchangeable scenes either: join them to one first (``dhtorch.pytree.collate``).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from statistics import NormalDist
+
+import torch
+from torch import Tensor
+
+from dhtorch.metrics.errors import Points
+from dhtorch.metrics.risk import capped
+
+#: Scenes of which the spread of their risks is taken to be known.
+FEW_SCENES = 5
+
+#: Thresholds tried at most; where there are more distinct scores, evenly spaced ones among them.
+MOST_THRESHOLDS = 4096
+
+
+@dataclass(frozen=True)
+class Control:
+    """A threshold and what it did on the scenes it was chosen on."""
+
+    threshold: float | None  # answer where score ≥ threshold; None = answer nothing
+    target: float
+    bound: float | None  # what was held against the target, at the threshold
+    risk: float  # mean over the scenes, at the threshold: of what the control calls risk
+    coverage: float  # mean over the scenes of answered / candidates, at the threshold
+    n: int  # scenes it was chosen on
+    needed: int | None = None  # scenes below which no threshold can meet the target; None = no such number
+    confidence: float | None = None
+
+    @property
+    def why(self) -> str:
+        """In words."""
+        if self.needed is not None and self.n < self.needed:
+            return f"{self.n} scenes are too few: a target of {self.target:g} takes at least {self.needed}"
+        if self.threshold is None:
+            return f"no threshold meets {self.target:g} on these {self.n} scenes"
+        return f"score ≥ {self.threshold:.4g} answers {self.coverage:.1%} of the candidates"
+
+
+def plug_in(scenes: Sequence[Points], target: float) -> Control:
+    """The largest coverage whose scene-mean risk plus one standard error over scenes meets the target.
+
+    The risk of a scene is the mean capped error of its answers, 0 where it is silent. No guarantee is claimed.
+
+    Args:
+        scenes: candidates with scores, one entry a scene; scenes without candidates are passed over.
+        target: mean capped error allowed, in (0, 1).
+
+    Returns:
+        Control; with fewer than two scenes there is no standard error and no threshold.
+
+    Raises:
+        ValueError: a target outside (0, 1).
+    """
+    scenes = _checked(scenes, target)
+    answers = [_ordered(scene) for scene in scenes]
+    thresholds = _thresholds(answers)
+    loss, answered = _accepted(answers, thresholds)
+    risk = loss / answered.clamp_min(1)
+    coverage = answered / _sizes(scenes)
+    n = len(scenes)
+    mean = risk.sum(0) / max(n, 1)
+    variance = (risk - mean).square().sum(0) / (n - 1) if n > 1 else torch.full_like(thresholds, torch.inf)
+    bound = mean + (variance / max(n, 1)).sqrt()
+    return _lowest(thresholds, bound <= target, bound, risk, coverage, target=target)
+
+
+def most_scenes(scenes: Sequence[Points], target: float, *, share: float = 0.9, few: int = 0) -> Control:
+    """The largest coverage at which so many scenes meet the target, each by itself, that the next one likely does.
+
+    A mean over scenes may be met although half of them are above it; this asks how many are not: of n scenes
+    share · (n + 1), rounded up, so that of n + 1 exchangeable ones that share would. Where that is more than all, all
+    are asked; of so few the worst to come is read from their spread as well: mean + t · s · √(1 + 1/n), which the risk
+    of one more scene exceeds with probability 1 − share were the risks normal, meets the target too. Of fewer than
+    :data:`FEW_SCENES` no spread is known, and no more is claimed than that all meet it.
+
+    Args:
+        scenes: candidates with scores, one entry a scene; scenes without candidates are passed over.
+        target: mean capped error allowed of the answers of one scene, in (0, 1).
+        share: of the scenes that are to meet it, in (0, 1].
+        few: a scene with fewer answers above a threshold says nothing against it.
+
+    Returns:
+        Control; its ``bound`` is the share of the scenes that meet the target.
+
+    Raises:
+        ValueError: a target outside (0, 1), or a share outside (0, 1].
+    """
+    if not 0 < share <= 1:
+        raise ValueError(f"control.share: found {share}, expected a number above 0, at most 1")
+    scenes = _checked(scenes, target)
+    answers = [_ordered(scene) for scene in scenes]
+    thresholds = _thresholds(answers)
+    loss, answered = _accepted(answers, thresholds)
+    risk = loss / answered.clamp_min(1)
+    kept = ((risk <= target) | (answered < few)).to(risk.dtype).mean(0)
+    needed = math.ceil(share * (len(scenes) + 1) - 1e-9)
+    fits = kept * len(scenes) >= min(needed, len(scenes)) - 1e-6
+    if needed > len(scenes) >= FEW_SCENES and share < 1:
+        fits = fits & (_one_more(risk, answered >= max(few, 1), share) <= target)
+    return _lowest(thresholds, fits, kept, risk, answered / _sizes(scenes), target=target)
+
+
+def conformal(scenes: Sequence[Points], target: float, *, confidence: float | None = None) -> Control:
+    """A threshold under which the loss of the next scene meets the target, if scenes are exchangeable.
+
+    The loss of a scene is the sum of the capped errors of its answers over the number of its candidates: between 0
+    and 1, and never larger at a higher threshold. In expectation: n / (n + 1) · (mean loss) + 1 / (n + 1) ≤ target.
+    With a confidence: the Hoeffding–Bentkus p-value of "the expected loss exceeds the target" is at most
+    1 − confidence, here and at every higher threshold.
+
+    Args:
+        scenes: candidates with scores, one entry a scene; scenes without candidates are passed over.
+        target: loss allowed, in (0, 1).
+        confidence: None promises E(loss of the next scene) ≤ target, over the scenes here and the next one; a
+            probability in (0, 1) promises that, with it, the scenes here give a threshold whose expected loss is at
+            most the target.
+
+    Returns:
+        Control with ``needed`` = 1 / target − 1, or ln(1 − confidence) / ln(1 − target), rounded up; no threshold with
+        fewer scenes. Its ``bound`` is the left side of the inequality, or the limit of the p-value.
+
+    Raises:
+        ValueError: a target or confidence outside (0, 1).
+
+    Source: A. Angelopoulos et al., "Conformal risk control", 2024; S. Bates et al., "Distribution-free,
+    risk-controlling prediction sets", 2021 (with confidence).
+    """
+    scenes = _checked(scenes, target)
+    answers = [_ordered(scene) for scene in scenes]
+    thresholds = _thresholds(answers)
+    loss, answered = _accepted(answers, thresholds)
+    sizes, n = _sizes(scenes), len(scenes)
+    risk = loss / sizes
+    needed = scenes_needed(target, confidence=confidence)
+    # The loss does not rise with the threshold, so neither do its bounds: whatever lies above one that fits, fits.
+    if confidence is None:
+        bound = (risk.sum(0) + 1) / (n + 1)
+        fits = bound <= target
+    else:
+        bound = torch.full_like(thresholds, 1 - confidence)
+        fits = risk.sum(0) / max(n, 1) <= _largest_mean(n, target, 1 - confidence)
+    fits = fits & (n >= needed)
+    return _lowest(thresholds, fits, bound, risk, answered / sizes, target=target, needed=needed, confidence=confidence)
+
+
+def _one_more(risk: Tensor, speaks: Tensor, share: float) -> Tensor:
+    """Risk (thresholds,) that one more scene stays below with that probability, by those (scenes, thresholds) that
+    speak, were they normal; infinite where fewer than two do."""
+    n = speaks.sum(0)
+    mean = torch.where(speaks, risk, 0.0).sum(0) / n.clamp_min(1)
+    variance = torch.where(speaks, (risk - mean).square(), 0.0).sum(0) / (n - 1).clamp_min(1)
+    z = NormalDist().inv_cdf(share)
+    freedom = (n - 1).clamp_min(1)
+    # Student's t by its expansion around the normal quantile (Abramowitz and Stegun 1964, 26.7.5)
+    t = z + (z**3 + z) / (4 * freedom) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * freedom.square())
+    return torch.where(n > 1, mean + t * (variance * (1 + 1 / n.clamp_min(1))).sqrt(), torch.inf)
+
+
+def scenes_needed(target: float, *, confidence: float | None = None) -> int:
+    """Fewest scenes on which :func:`conformal` can meet a target, were they all without any error.
+
+    Raises:
+        ValueError: a target or confidence outside (0, 1).
+    """
+    _probability("target", target)
+    if confidence is None:
+        return math.ceil(1 / target - 1 - 1e-9)
+    _probability("confidence", confidence)
+    return math.ceil(math.log(1 - confidence) / math.log(1 - target) - 1e-9)
+
+
+def p_value(mean: float, n: int, target: float) -> float:
+    """Hoeffding–Bentkus: how probable a mean loss as small as ``mean`` over n scenes is where ``target`` is exceeded.
+
+    Losses lie in [0, 1] and are independent.
+    """
+    if n == 0 or mean >= target:
+        return 1.0
+    divergence = (1 - mean) * math.log((1 - mean) / (1 - target))
+    divergence += mean * math.log(mean / target) if mean > 0 else 0.0
+    bentkus = math.e * _binomial_cdf(math.ceil(n * mean - 1e-9), n, target)
+    return min(1.0, math.exp(-n * divergence), bentkus)
+
+
+def _ordered(scene: Points) -> tuple[Tensor, Tensor]:
+    """Scores of a scene's answers, rising, and the sum of the capped errors of the first 0, 1, … of them."""
+    score, order = scene.score[scene.keep].sort()
+    loss = capped(scene.error[scene.keep])[order]
+    return score, torch.cat((loss.new_zeros(1), loss.cumsum(0)))
+
+
+def _accepted(answers: Sequence[tuple[Tensor, Tensor]], thresholds: Tensor) -> tuple[Tensor, Tensor]:
+    """Sum of the capped errors of what is accepted, and its number: (scenes, thresholds) each."""
+    none = torch.zeros(0, thresholds.numel(), dtype=torch.float64)
+    loss, count = [none], [none]
+    for score, total in answers:
+        below = torch.searchsorted(score, thresholds)
+        loss.append((total[-1] - total[below])[None])
+        count.append((score.numel() - below)[None])
+    return torch.cat(loss).clamp_min(0), torch.cat(count)
+
+
+def _thresholds(answers: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
+    """Scores of answers, rising: every threshold that makes a difference, or evenly spaced ones among them."""
+    scores = torch.cat([torch.zeros(0, dtype=torch.float64), *(score for score, _ in answers)]).unique()
+    if scores.numel() > MOST_THRESHOLDS:
+        scores = scores[torch.linspace(0, scores.numel() - 1, MOST_THRESHOLDS, dtype=torch.float64).round().long()]
+    return scores
+
+
+def _sizes(scenes: Sequence[Points]) -> Tensor:
+    return torch.tensor([s.keep.numel() for s in scenes], dtype=torch.float64)[:, None]
+
+
+def _lowest(
+    thresholds: Tensor,
+    fits: Tensor,
+    bound: Tensor,
+    risk: Tensor,
+    coverage: Tensor,
+    *,
+    target: float,
+    needed: int | None = None,
+    confidence: float | None = None,
+) -> Control:
+    """The lowest threshold that fits, which answers most; None of none."""
+    n = risk.shape[0]
+    none = Control(None, target, None, risk=0.0, coverage=0.0, n=n, needed=needed, confidence=confidence)
+    if not bool(fits.any()):
+        return none
+    k = int(fits.long().argmax())
+    return replace(
+        none,
+        threshold=float(thresholds[k]),
+        bound=float(bound[k]),
+        risk=float(risk[:, k].mean()),
+        coverage=float(coverage[:, k].mean()),
+    )
+
+
+def _checked(scenes: Sequence[Points], target: float) -> list[Points]:
+    _probability("target", target)
+    return [s for s in scenes if s.keep.numel()]
+
+
+def _probability(name: str, value: float) -> None:
+    if not 0 < value < 1:
+        raise ValueError(f"control.{name}: found {value}, expected a number between 0 and 1")
+
+
+def _largest_mean(n: int, target: float, level: float) -> float:
+    """Largest mean loss whose p-value is at most ``level``, to rounding and never above it; −1 where none is."""
+    if p_value(0.0, n, target) > level:
+        return -1.0
+    low, high = 0.0, target
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (middle, high) if p_value(middle, n, target) <= level else (low, middle)
+    return low
+
+
+def _binomial_cdf(k: int, n: int, p: float) -> float:
+    """P(X ≤ k) of a binomial, summed from logarithms."""
+    if k >= n:
+        return 1.0
+    terms = (
+        math.lgamma(n + 1) - math.lgamma(i + 1) - math.lgamma(n - i + 1) + i * math.log(p) + (n - i) * math.log1p(-p)
+        for i in range(k + 1)
+    )
+    return min(1.0, math.fsum(math.exp(t) for t in terms))

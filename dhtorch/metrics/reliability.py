@@ -1,0 +1,159 @@
+"""Whether a score means what it says: claimed against realised probability of a good answer.
+
+An answer is *good* where its relative error is below 10 %. Every scene weighs the same, however many answers it has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from dhtorch.geometry.checks import check
+from dhtorch.metrics import bootstrap
+from dhtorch.metrics.errors import Numbers, Points
+from dhtorch.pytree import Record, record
+
+#: Relative error below which an answer is good.
+GOOD = 0.1
+
+
+@record
+class Reliability(Record):
+    """A reliability diagram, bin by bin; an empty bin has weight 0 and NaN for the rest."""
+
+    claimed: Tensor  # (bins,) mean claimed probability
+    realised: Tensor  # (bins,) share that turned out good
+    weight: Tensor  # (bins,) share of the total weight
+
+    @property
+    def ece(self) -> float | None:
+        """Expected calibration error: mean gap between claimed and realised, by weight; None without answers."""
+        if not bool((self.weight > 0).any()):
+            return None
+        return float((self.weight * (self.claimed - self.realised).abs()).nansum())
+
+
+def diagram(
+    claimed: Tensor,  # (n,) in [0, 1]
+    good: Tensor,  # (n,) bool
+    weight: Tensor | None = None,  # (n,) ≥ 0
+    *,
+    bins: int = 10,
+    equal_mass: bool = False,
+) -> Reliability:
+    """Claimed probabilities against what happened, in bins.
+
+    Args:
+        claimed: probability of a good answer; values outside [0, 1] are clipped.
+        good: whether it was.
+        weight: of each answer; None = equal.
+        bins: how many.
+        equal_mass: bins of equal weight instead of equal width; equal claims always share a bin.
+
+    Raises:
+        ValueError: unequal lengths, or fewer than one bin.
+
+    Source: C. Guo et al., "On calibration of modern neural networks", 2017.
+    """
+    check("reliability", claimed=(claimed, "n"), good=(good, "n"), weight=(weight, "n"))
+    if bins < 1:
+        raise ValueError(f"reliability: found bins={bins}, expected at least 1")
+    claimed = claimed.double().clamp(0, 1)
+    weight = torch.ones_like(claimed) if weight is None else weight.double()
+    place = _mass_below(claimed, weight) if equal_mass else claimed
+    index = (place * bins).long().clamp(max=bins - 1)
+
+    def total(x: Tensor) -> Tensor:
+        return torch.zeros(bins, dtype=torch.float64, device=claimed.device).index_add(0, index, x)
+
+    mass = total(weight)
+    return Reliability(
+        claimed=total(weight * claimed) / mass,
+        realised=total(weight * good.double()) / mass,
+        weight=mass / mass.sum().clamp_min(torch.finfo(torch.float64).tiny),
+    )
+
+
+def excess_ece(scene: Points, *, bins: int = 10, draws: int = 200, seed: int = 0) -> float | None:
+    """How much further off the claims of one scene are than chance alone would have them; None without answers.
+
+    The calibration error over ``bins`` of equal mass less what it would be on average if every answer were good with
+    exactly the probability that it claims (``draws`` draws), and never below 0: few answers scatter.
+
+    Args:
+        scene: candidates whose score is a probability of a good answer.
+    """
+    said = scene.answered()
+    if not len(said.score):
+        return None
+    claimed = said.score.double().clamp(0, 1)
+    found = diagram(claimed, said.error < GOOD, bins=bins, equal_mass=True).ece
+    g = torch.Generator().manual_seed(seed)
+    expected = 0.0
+    for _ in range(draws):
+        good = torch.rand(len(claimed), generator=g, dtype=torch.float64) < claimed
+        expected += (diagram(claimed, good, bins=bins, equal_mass=True).ece or 0.0) / draws
+    return max(0.0, (found or 0.0) - expected)
+
+
+def pool(scenes: Sequence[Points]) -> tuple[Tensor, Tensor, Tensor]:
+    """Claimed probability, goodness and weight (n,) of the answers of several scenes, each scene of total weight 1."""
+    answers = [scene.answered() for scene in scenes]
+    if not answers:
+        none = torch.zeros(0, dtype=torch.float64)
+        return none, none.bool(), none
+    return (
+        torch.cat([a.score for a in answers]),
+        torch.cat([a.error < GOOD for a in answers]),
+        torch.cat([torch.full_like(a.score, 1 / max(a.score.numel(), 1)) for a in answers]),
+    )
+
+
+def measure(scenes: Sequence[Points], *, bins: int = 10) -> Numbers:
+    """``ece`` (bins of equal width) and ``ece_equal_mass`` of one or several scenes; None without answers."""
+    pooled = pool(scenes)
+    return {
+        "ece": diagram(*pooled, bins=bins).ece,
+        "ece_equal_mass": diagram(*pooled, bins=bins, equal_mass=True).ece,
+    }
+
+
+def ece_interval(scenes: Sequence[Points], *, bins: int = 10, draws: int = 2000, seed: int = 0) -> bootstrap.Interval:
+    """``ece`` (bins of equal width) with its interval over scenes; scenes without answers are passed over."""
+    tables = [diagram(*pool([s]), bins=bins) for s in scenes if bool(s.keep.any())]
+    if not tables:
+        return bootstrap.Interval(None, None, None, 0)
+    gaps = torch.stack([(t.weight * (t.claimed - t.realised)).nan_to_num() for t in tables])
+
+    def ece(index: Tensor) -> Tensor:
+        return gaps[index].mean(1).abs().sum(-1)
+
+    return bootstrap.interval_of(ece, len(tables), draws=draws, seed=seed)
+
+
+def leave_one_room_out(
+    scenes: Mapping[str, Points], rooms: Mapping[str, str] | None = None
+) -> Iterator[tuple[dict[str, Points], dict[str, Points]]]:
+    """Folds (scenes of the other rooms, scenes of this room), each by name: learn on the first, judge the second.
+
+    Pieces of one room share walls, light and camera, so one of them must not teach the judgement of another.
+
+    Args:
+        scenes: by name.
+        rooms: scene → room; a scene that is not named is a room of its own.
+    """
+    room = {name: (rooms or {}).get(name, name) for name in scenes}
+    for held in dict.fromkeys(room.values()):
+        others = {name: s for name, s in scenes.items() if room[name] != held}
+        yield others, {name: s for name, s in scenes.items() if room[name] == held}
+
+
+def _mass_below(x: Tensor, weight: Tensor) -> Tensor:
+    """Share of the weight below each value, half of its own (and its equals') included: its place on [0, 1]."""
+    order = x.argsort(stable=True)
+    _, group, size = x[order].unique_consecutive(return_inverse=True, return_counts=True)
+    mass = torch.zeros(size.numel(), dtype=x.dtype, device=x.device).index_add(0, group, weight[order])
+    middle = (mass.cumsum(0) - mass / 2) / mass.sum().clamp_min(torch.finfo(x.dtype).tiny)
+    return torch.zeros_like(x).index_copy(0, order, middle[group])

@@ -1,0 +1,177 @@
+"""What a score is worth: error among the surest answers, as more and more of them are accepted.
+
+Answers are taken in the order of falling score; the *risk* at k is the mean loss of the first k, where the loss is the
+relative error, at most 1. Answers of equal score cannot be told apart, so each counts as the mean of its group: the
+curve is then the expectation over all orders of the tied ones and does not depend on how they happen to be listed.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dhtorch.geometry.checks import check
+from dhtorch.metrics.errors import Numbers, Points
+
+#: Fewest answers that a coverage at some risk may rest on.
+MIN_POINTS = 10
+
+#: Coverages, as tenths of the answers, between which the curve is asked whether it rises.
+STEPS = 10
+
+
+def curve(
+    loss: Tensor,  # (n,)
+    score: Tensor,  # (n,)
+) -> Tensor:
+    """Risk (n,) of the surest 1, 2, … n answers: running mean of the loss by falling score, ties by their mean.
+
+    Any numbers that order the answers will do as a score; infinities are allowed. Works in float64.
+
+    Raises:
+        ValueError: unequal lengths.
+    """
+    return _running_sum(loss, score) / _count(loss)
+
+
+def risk_coverage(pooled: Points, *, oracle: bool = False) -> tuple[Tensor, Tensor]:
+    """Coverage (share of the candidates) and risk (n,) as the answers are accepted by falling score.
+
+    Args:
+        pooled: candidates of a pair or scene.
+        oracle: by rising error instead, the best possible order.
+    """
+    answered = pooled.answered()
+    loss = capped(answered.error)
+    return _count(loss) / max(pooled.keep.numel(), 1), curve(loss, -loss if oracle else answered.score)
+
+
+def measure(pooled: Points, *, min_points: int = MIN_POINTS) -> Numbers:
+    """How well the score of a pair or scene orders its answers by error.
+
+    Returns:
+        ``aurc``: mean of the risk over the answered candidates. ``aurc_excess``: what remains after subtracting the
+        best possible order's. ``aurc_full``: over all candidates, silent ones last with loss 1. ``augrc``: mean over
+        the answered candidates of their running *sum* of loss over their number (an early error is not counted over
+        and over). ``coverage_at_5``, ``_10``, ``_20``: largest share of the candidates, at least ``min_points``, that a
+        threshold on the score can accept at a risk of at most 5, 10, 20 %; 0 where none can. ``monotonicity``: share
+        of the nine steps between the tenths of the answers over which the risk does not fall. ``largest_fall``: the
+        most that the risk falls from one of these tenths to a later one, 0 for a curve that never does. None where
+        undefined (no candidate; for all but ``aurc_full`` and the coverages also no answer; for the last two fewer
+        than ten).
+
+    Source: J. Traub et al., "Overcoming common flaws in the evaluation of selective classification systems", 2024
+    (AUGRC); Y. Geifman, G. Uziel, R. El-Yaniv, "Bias-reduced uncertainty estimation", 2019 (excess AURC); A. Shah et
+    al., "Selective regression under fairness criteria", 2022 (a risk that should fall whenever less is answered; the
+    two numbers for how nearly it does are ours).
+    """
+    n = pooled.keep.numel()
+    answered = pooled.answered()
+    loss, score = capped(answered.error), answered.score
+    risk = curve(loss, score)
+    some = bool(risk.numel())
+    last = torch.where(pooled.keep, pooled.score, -torch.inf)
+    full = curve(torch.where(pooled.keep, capped(pooled.error), 1.0), last)
+    numbers: Numbers = {
+        "aurc": _mean(risk),
+        "aurc_excess": _mean(risk - curve(loss, -loss)),
+        "aurc_full": _mean(full),
+        "augrc": _mean(_running_sum(loss, score) / max(loss.numel(), 1)),
+    }
+    cuts = _ends_of_ties(score)
+    for percent in (5, 10, 20):
+        fits = cuts & (risk <= percent / 100) & (_count(loss) >= min_points)
+        most = int(torch.where(fits, _count(loss), 0).max()) if some else 0
+        numbers[f"coverage_at_{percent}"] = most / n if n else None
+    numbers["monotonicity"], numbers["largest_fall"] = _monotonicity(risk)
+    return numbers
+
+
+def ause(pooled: Points) -> float | None:
+    """Area between the sparsification curve of the score and that of the errors themselves, over random's.
+
+    The curve is the mean capped error of what is left when the worst-scored 0, 1, … 95 % of the answers are removed;
+    a random order leaves the mean. 0 is a perfect order, 1 no better than chance; None where undefined.
+
+    Source: E. Ilg et al., "Uncertainty estimates and multi-hypotheses networks for optical flow", 2018.
+    """
+    answered = pooled.answered()
+    loss = capped(answered.error)
+    n = answered.keep.numel()
+    if not n:
+        return None
+    left = torch.tensor([max(round(n * (100 - k) / 100), 1) - 1 for k in range(96)], device=loss.device)
+    best = curve(loss, -loss)[left].mean()
+    chance = loss.mean() - best
+    return float((curve(loss, answered.score)[left].mean() - best) / chance) if float(chance) > 0 else None
+
+
+def realised(pooled: Points, threshold: float | None) -> float | None:
+    """Mean capped error of the answers that score at least ``threshold`` (None answers nothing); None where silent."""
+    accepted = pooled.keep & (pooled.score >= (torch.inf if threshold is None else threshold))
+    return _mean(capped(pooled.error[accepted]))
+
+
+def surest(pooled: Points, n: int) -> Points:
+    """The same candidates with only the ``n`` surest answers kept: two methods cut so answer equally much.
+
+    Where the cut falls among answers of equal score, which cannot be told apart, those that stay are spread evenly
+    over the group's errors: their median and mean are the group's, whatever the order of the list.
+    """
+    answered = pooled.keep.nonzero()[:, 0]
+    if n >= answered.numel():
+        return pooled
+    keep = torch.zeros_like(pooled.keep)
+    if n > 0:
+        score = pooled.score[answered]
+        limit = score.sort(descending=True).values[n - 1]
+        keep[answered[score > limit]] = True
+        tied = answered[score == limit]
+        tied = tied[pooled.error[tied].argsort(stable=True)]
+        few = n - int(keep.sum())
+        keep[tied[(torch.arange(few, device=tied.device) * 2 + 1) * tied.numel() // (2 * few)]] = True
+    return pooled.replace(
+        keep=keep,
+        depth=torch.where(keep, pooled.depth, torch.nan),
+        sigma=torch.where(keep, pooled.sigma, torch.nan),
+        residual_px=torch.where(keep, pooled.residual_px, torch.nan),
+        score=torch.where(keep, pooled.score, 0.0),
+    )
+
+
+def capped(error: Tensor) -> Tensor:
+    """Loss of a relative error: the error itself, at most 1; 1 where it is not a number."""
+    return error.nan_to_num(nan=1.0).clamp(max=1.0)
+
+
+def _running_sum(loss: Tensor, score: Tensor) -> Tensor:
+    check("curve", loss=(loss, "n"), score=(score, "n"))
+    order = score.argsort(descending=True, stable=True)
+    _, group, size = score[order].unique_consecutive(return_inverse=True, return_counts=True)
+    total = torch.zeros(size.numel(), dtype=torch.float64, device=loss.device)
+    total = total.index_add(0, group, loss[order].double())
+    return (total / size)[group].cumsum(0)
+
+
+def _count(loss: Tensor) -> Tensor:
+    return torch.arange(1, loss.numel() + 1, dtype=torch.float64, device=loss.device)
+
+
+def _ends_of_ties(score: Tensor) -> Tensor:
+    """(n,) bool, by falling score: a threshold can cut here, because the next answer has a smaller score."""
+    ordered = score.sort(descending=True).values
+    return torch.cat((ordered[1:] < ordered[:-1], ordered.new_ones(min(1, ordered.numel()), dtype=torch.bool)))
+
+
+def _monotonicity(risk: Tensor) -> tuple[float | None, float | None]:
+    n = risk.numel()
+    if n < STEPS:
+        return None, None
+    at = torch.tensor([n * k // STEPS - 1 for k in range(1, STEPS + 1)], device=risk.device)
+    tenths = risk[at]
+    fall = (tenths.cummax(0).values - tenths).max()
+    return float((tenths.diff() >= -1e-12).double().mean()), float(fall)
+
+
+def _mean(x: Tensor) -> float | None:
+    return float(x.mean()) if x.numel() else None

@@ -1,0 +1,375 @@
+// The steps of dhtorch/geometry/affine_alignment.py on one level as an operator on torch's stable ABI, point after point: the same
+// pictures, steps and rule to stop. Sums over a window are taken in another order than torch's, so that places agree to
+// rounding and not bit for bit; what a point is told depends on no other. One thread, no gradient. Callers check shapes,
+// types and that everything is contiguous; see dhtorch/ops/loader.py.
+
+#include "vectors.h"
+
+#include <torch/csrc/stable/library.h>
+
+#include <algorithm>
+#include <cmath>
+#include <vector>
+
+namespace {
+
+// What affine.py, least_squares.py and pyramid.py hold under the same names.
+constexpr int64_t REACH = 8, MARGIN = 4;
+constexpr float AHEAD = 0.5f, LEAST_GAIN = 0.2f, MOST_GAIN = 5.0f;
+constexpr double NOISE = 2.0 / 255 / 2, DAMPING = NOISE * NOISE, MIN_PIVOT = 1e-6;
+
+// A warp's W_0, W_1 and W_2, or a change of it: each (x, y).
+struct Warp {
+  float of[3][2];
+};
+
+// The pixels around which a picture is read, whatever a place may be.
+inline int64_t pixel(float place, int64_t least, int64_t most) {
+  return place > static_cast<float>(least) ? static_cast<int64_t>(std::min(place, static_cast<float>(most))) : least;
+}
+
+struct Level {
+  const float* pixels;
+  int64_t planes, rows, width, pad;
+
+  Level(const Tensor& x, int64_t pad)
+      : pixels(data<float>(x)), planes(x.size(1)), rows(x.size(2)), width(x.size(3)), pad(pad) {}
+
+  const float* at(int64_t batch, int64_t plane, int64_t column, int64_t row) const {
+    return pixels + ((batch * planes + plane) * rows + row + pad) * width + column + pad;
+  }
+};
+
+// A square of pixels of image 1.
+struct Patch {
+  const float* pixels;
+  int64_t stride;
+  float corner[2];  // its first pixel
+  float last;       // a place at its far border, in its own pixels
+
+  Patch(const Level& level, int64_t batch, const float* x, int64_t reach) : stride(level.width) {
+    const int64_t column = pixel(std::floor(x[0] + 0.5f), 0, level.width - 2 * level.pad - 1),
+                  row = pixel(std::floor(x[1] + 0.5f), 0, level.rows - 2 * level.pad - 1);
+    pixels = level.at(batch, 0, column - reach, row - reach);
+    corner[0] = static_cast<float>(column - reach);
+    corner[1] = static_cast<float>(row - reach);
+    last = static_cast<float>(2 * reach);
+  }
+};
+
+inline Vector within(Vector x, float most) {  // what is no number becomes 0
+  x = x > 0.0f ? x : Vector{};
+  return x < most ? x : Vector{} + most;
+}
+
+// The window of image 0 as six pictures, T without its mean, and J, each a row filled up to whole vectors by zeros.
+struct Window {
+  int64_t size, count, wide;
+  std::vector<float> u, v, inside, pictures, J;  // inside: 1, and 0 in what is filled up
+
+  explicit Window(int64_t size)
+      : size(size), count(size * size), wide((count + LANES - 1) / LANES * LANES), u(wide), v(wide), inside(wide),
+        pictures(7 * wide), J(wide) {
+    const float step = 2.0f / static_cast<float>(size - 1);
+    std::vector<float> place(size);  // as torch.linspace
+    for (int64_t i = 0; i < size; ++i) {
+      place[i] = i < size / 2 ? -1.0f + step * static_cast<float>(i) : 1.0f - step * static_cast<float>(size - 1 - i);
+    }
+    for (int64_t i = 0; i < count; ++i) {
+      u[i] = place[i % size];
+      v[i] = place[i / size];
+      inside[i] = 1.0f;
+    }
+  }
+
+  float* picture(int64_t k) { return pictures.data() + k * wide; }
+
+  float sum(const float* a) const {
+    Vector sums = {};
+    for (int64_t i = 0; i < wide; i += LANES) sums += load(a + i);
+    return total(sums);
+  }
+
+  float sum(const float* a, const float* b) const {
+    Vector sums = {};
+    for (int64_t i = 0; i < wide; i += LANES) sums += load(a + i) * load(b + i);
+    return total(sums);
+  }
+
+  void read(const Level& level, const float* q, int64_t batch) {
+    const int64_t column = pixel(q[0], -MARGIN, level.width - 2 * level.pad - 1 + MARGIN),
+                  row = pixel(q[1], -MARGIN, level.rows - 2 * level.pad - 1 + MARGIN);
+    for (int64_t k = 0; k < 3; ++k) {
+      const float* from = level.at(batch, (k + 1) % 3, column - size / 2, row - size / 2);
+      float* to = picture(k < 2 ? k : 6);
+      for (int64_t i = 0; i < size; ++i) std::copy_n(from + i * level.width, size, to + i * size);
+    }
+    float* T = picture(6);
+    const float mean = sum(T) / static_cast<float>(count);
+    for (int64_t i = 0; i < count; ++i) T[i] -= mean;
+    for (int64_t i = 0; i < wide; i += LANES) {
+      const Vector along = load(&u[i]), across = load(&v[i]);
+      for (int64_t k = 0; k < 2; ++k) {
+        const Vector g = load(picture(k) + i);
+        store(g * along, picture(2 + k) + i);
+        store(g * across, picture(4 + k) + i);
+      }
+    }
+  }
+
+  // Normal equations of the six pictures, T and 1, their lower half.
+  void normal(double (*H)[8]) {
+    for (int64_t a = 0; a < 7; ++a) {
+      for (int64_t b = 0; b <= a; ++b) H[a][b] = sum(picture(a), picture(b));
+      H[7][a] = sum(picture(a));
+    }
+    H[7][7] = static_cast<double>(count);
+    for (int64_t a = 2; a < 6; ++a) H[a][a] = static_cast<float>(H[a][a]) + static_cast<float>(DAMPING);
+  }
+
+  // J at a warp of the patch's pixels; beyond its border the border's value.
+  void look(const Patch& patch, const Warp& warp) {
+    const auto& W = warp.of;
+    const int32_t stride = static_cast<int32_t>(patch.stride), most = static_cast<int32_t>(patch.last) - 1;
+    for (int64_t i = 0; i < wide; i += LANES) {
+      const Vector along = load(&u[i]), across = load(&v[i]);
+      const Vector x = within(W[0][0] + W[2][0] * across + W[1][0] * along, patch.last),
+                   y = within(W[0][1] + W[2][1] * across + W[1][1] * along, patch.last);
+      Bits column = __builtin_convertvector(x, Bits), row = __builtin_convertvector(y, Bits);
+      column = column < most ? column : Bits{} + most;
+      row = row < most ? row : Bits{} + most;
+      const Vector right = x - __builtin_convertvector(column, Vector), down = y - __builtin_convertvector(row, Vector);
+      const Bits first = row * stride + column;
+      Vector corners[4];
+      for (int64_t k = 0; k < LANES; ++k) {
+        const float* from = patch.pixels + first[k];
+        corners[0][k] = from[0];
+        corners[1][k] = from[1];
+        corners[2][k] = from[stride];
+        corners[3][k] = from[stride + 1];
+      }
+      const Vector above = corners[0] + right * (corners[1] - corners[0]),
+                   below = corners[2] + right * (corners[3] - corners[2]);
+      store((above + down * (below - above)) * load(&inside[i]), &J[i]);
+    }
+  }
+
+  void project(float* sums) {  // the eight pictures on J
+    Vector parts[8] = {};
+    for (int64_t i = 0; i < wide; i += LANES) {
+      const Vector there = load(&J[i]);
+      for (int64_t k = 0; k < 7; ++k) parts[k] += load(picture(k) + i) * there;
+      parts[7] += there;
+    }
+    for (int64_t k = 0; k < 8; ++k) sums[k] = total(parts[k]);
+  }
+
+  // Gain of J over T, and the mean square of what gain and bias leave.
+  void quality(float* fit) {
+    float* T = picture(6);
+    const float energy = sum(T, T), gain = sum(T, J.data()) / (energy > 0.0f ? energy : 1.0f);
+    const float mean = (sum(J.data()) - gain * sum(T)) / static_cast<float>(count);
+    Vector squares = {};
+    for (int64_t i = 0; i < wide; i += LANES) {
+      const Vector rest = (load(&J[i]) - gain * load(T + i) - mean) * load(&inside[i]);
+      squares += rest * rest;
+    }
+    fit[0] = gain;
+    fit[1] = total(squares) / static_cast<float>(count);
+  }
+
+  // Which share of the variance of white noise is left by reading at a warp.
+  float share(const Warp& warp) const {
+    const auto& W = warp.of;
+    Vector sums = {};
+    for (int64_t i = 0; i < wide; i += LANES) {
+      Vector left = load(&inside[i]);
+      for (int64_t axis = 0; axis < 2; ++axis) {
+        left *= kept(W[0][axis] + W[2][axis] * load(&v[i]) + W[1][axis] * load(&u[i]));
+      }
+      sums += left;
+    }
+    return total(sums) / static_cast<float>(count);
+  }
+
+  static Vector kept(Vector x) {
+    x = x < 1e6f && x > -1e6f ? x : Vector{};  // no such place is believed
+    const Vector whole = __builtin_convertvector(__builtin_convertvector(x, Bits), Vector), fraction = x - whole;
+    const Vector off = (fraction < 0.0f ? -fraction : fraction) - 0.5f;
+    return off * off * 2.0f + 0.5f;
+  }
+};
+
+// Inverse of normal equations whose lower half is given, and whether there is one.
+bool invert(const double (*H)[8], float (*inverse)[8]) {
+  double scale[8], L[8][8], R[8][8] = {};  // R = 1 / L
+  bool textured = true;
+  for (int i = 0; i < 8; ++i) scale[i] = H[i][i] > 0 ? 1 / std::sqrt(H[i][i]) : 1.0;
+  for (int j = 0; j < 8; ++j) {
+    for (int i = j; i < 8; ++i) {
+      double rest = H[i][j] * (scale[i] * scale[j]);
+      for (int k = 0; k < j; ++k) rest -= L[i][k] * L[j][k];
+      if (i == j) {
+        textured = textured && rest > MIN_PIVOT * MIN_PIVOT;
+        L[j][j] = std::sqrt(rest);
+        R[j][j] = 1 / L[j][j];
+      } else {
+        L[i][j] = rest * R[j][j];
+      }
+    }
+  }
+  if (!textured) {  // as if L were a multiple of the identity
+    for (int i = 0; i < 8; ++i) {
+      std::fill_n(inverse[i], 8, 0.0f);
+      inverse[i][i] = static_cast<float>(scale[i] * scale[i] / DAMPING);
+    }
+    return false;
+  }
+  for (int j = 0; j < 8; ++j) {
+    for (int i = j + 1; i < 8; ++i) {
+      double sum = 0;
+      for (int k = j; k < i; ++k) sum += L[i][k] * R[k][j];
+      R[i][j] = -sum * R[i][i];
+    }
+  }
+  for (int i = 0; i < 8; ++i) {
+    for (int j = 0; j <= i; ++j) {
+      double sum = 0;
+      for (int k = i; k < 8; ++k) sum += R[k][i] * R[k][j];
+      inverse[i][j] = inverse[j][i] = static_cast<float>(sum * (scale[i] * scale[j]));
+    }
+  }
+  return true;
+}
+
+// The change that regression on the eight pictures says.
+Warp change(const float (*inverse)[8], const float* sums) {
+  float solution[7];
+  for (int i = 0; i < 7; ++i) {
+    solution[i] = 0.0f;
+    for (int k = 0; k < 8; ++k) solution[i] += inverse[i][k] * sums[k];
+  }
+  const float gain = std::clamp(solution[6], LEAST_GAIN, MOST_GAIN);
+  Warp found;
+  for (int i = 0; i < 6; ++i) found.of[i / 2][i % 2] = solution[i] / gain;
+  return found;
+}
+
+// The step to take where regression says `now`, having said `before` when `taken` was taken.
+Warp further(const Warp& now, const Warp& taken, const Warp& before) {
+  float along = 0.0f, square = 0.0f;
+  for (int i = 0; i < 6; ++i) {
+    const float bend = now.of[i / 2][i % 2] - before.of[i / 2][i % 2];
+    along += now.of[i / 2][i % 2] * bend;
+    square += bend * bend;
+  }
+  const float share = std::clamp(along / std::max(square, 1e-20f), -AHEAD, AHEAD / (1.0f + AHEAD));
+  Warp found;
+  for (int i = 0; i < 6; ++i) {
+    const float bend = now.of[i / 2][i % 2] - before.of[i / 2][i % 2];
+    found.of[i / 2][i % 2] = now.of[i / 2][i % 2] - share * (taken.of[i / 2][i % 2] + bend);
+  }
+  return found;
+}
+
+Warp compose(const Warp& warp, const Warp& change, float half) {
+  const float(*D)[2] = change.of + 1;
+  const float a = 1.0f + D[0][0] / half, b = D[0][1] / half, c = D[1][0] / half, d = 1.0f + D[1][1] / half;
+  float det = a * d - b * c;
+  if (!(std::abs(det) > 1e-30f)) det = 1e-30f;
+  const float inverse[2][2] = {{d / det, -b / det}, {-c / det, a / det}};
+  Warp found;
+  for (int axis = 0; axis < 2; ++axis) {
+    for (int k = 0; k < 2; ++k) {
+      found.of[1 + k][axis] = inverse[k][0] * warp.of[1][axis] + inverse[k][1] * warp.of[2][axis];
+    }
+    const float back = found.of[1][axis] * change.of[0][0] + found.of[2][axis] * change.of[0][1];
+    found.of[0][axis] = warp.of[0][axis] - back / half;
+  }
+  return found;
+}
+
+float furthest(const Warp& change) {  // of the window's corners, along an axis
+  float most[2];
+  for (int axis = 0; axis < 2; ++axis) {
+    most[axis] = std::abs(change.of[0][axis]) + std::abs(change.of[1][axis]) + std::abs(change.of[2][axis]);
+  }
+  return std::max(most[0], most[1]);
+}
+
+// Gauss-Newton steps of one point from a warp in pixels of the patch; J is read where they end.
+Warp descend(Window& window, const Patch& patch, const float (*inverse)[8], Warp warp, int64_t steps, float epsilon) {
+  const float half = static_cast<float>(window.size / 2);
+  Warp taken, before;
+  for (int64_t k = 0; k < steps; ++k) {
+    float sums[8];
+    window.project(sums);
+    const Warp now = change(inverse, sums);
+    taken = k ? further(now, taken, before) : now;
+    before = now;
+    warp = compose(warp, taken, half);
+    window.look(patch, warp);
+    if (!(furthest(now) > epsilon)) break;
+  }
+  return warp;
+}
+
+// source (B, 3, ., .), target (B, 1 or 3, ., .), q (2, M) whole pixels, place (3, M) and begin (3, 2, M), px of the
+// target, float32; batch (M) int64. warp (3, 2, M), fit and first (3, M), inverse (2, 8, M) and textured (M) bool: the
+// fields of affine.py's _State.
+void align(Tensor source, Tensor target, Tensor q, Tensor place, Tensor begin, Tensor batch, Tensor warp, Tensor textured,
+           Tensor fit, Tensor first, Tensor inverse, int64_t window, int64_t steps, int64_t source_pad,
+           int64_t target_pad, double epsilon) {
+  const Level here(source, source_pad), there(target, target_pad);
+  const int64_t M = q.size(1);
+  Window own(window);
+  for (int64_t m = 0; m < M; ++m) {
+    const int64_t b = data<int64_t>(batch)[m];
+    const float at[2] = {data<float>(q)[m], data<float>(q)[M + m]};
+    own.read(here, at, b);
+    double H[8][8];
+    own.normal(H);
+    float R[8][8];
+    const bool fine = invert(H, R);
+    Warp now;
+    for (int k = 0; k < 6; ++k) now.of[k / 2][k % 2] = data<float>(begin)[k * M + m];
+    const Patch patch(there, b, now.of[0], window / 2 + REACH);
+    for (int axis = 0; axis < 2; ++axis) now.of[0][axis] -= patch.corner[axis];
+    own.look(patch, now);
+    float quality[3], kept[LANES];
+    own.quality(quality);
+    quality[2] = 1.0f;
+    for (int axis = 0; axis < 2; ++axis) {
+      store(Window::kept(Vector{} + now.of[0][axis]), kept);
+      quality[2] *= kept[0];
+    }
+    for (int k = 0; k < 3; ++k) data<float>(first)[k * M + m] = quality[k];
+    if (fine) now = descend(own, patch, R, now, steps, static_cast<float>(epsilon));
+    if (steps) {
+      own.quality(quality);
+      quality[2] = own.share(now);
+    }
+    for (int k = 0; k < 3; ++k) data<float>(fit)[k * M + m] = quality[k];
+    for (int axis = 0; axis < 2; ++axis) {
+      now.of[0][axis] += patch.corner[axis];
+      for (int k = 0; k < 8; ++k) {
+        float row = 0.0f;
+        for (int i = 0; i < 3; ++i) row += R[2 * i + axis][k] * data<float>(place)[i * M + m];
+        data<float>(inverse)[(axis * 8 + k) * M + m] = row;
+      }
+    }
+    for (int k = 0; k < 6; ++k) data<float>(warp)[k * M + m] = now.of[k / 2][k % 2];
+    data<bool>(textured)[m] = fine;
+  }
+}
+
+}  // namespace
+
+STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
+  m.def(
+      "align(Tensor source, Tensor target, Tensor q, Tensor place, Tensor begin, Tensor batch, Tensor(a!) warp, "
+      "Tensor(b!) textured, Tensor(c!) fit, Tensor(d!) first, Tensor(e!) inverse, int window, int steps, "
+      "int source_pad, int target_pad, float epsilon) -> ()");
+}
+
+STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) { m.impl("align", TORCH_BOX(&align)); }

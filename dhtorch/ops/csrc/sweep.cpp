@@ -1,0 +1,376 @@
+// What dhtorch/geometry/plane_sweep.py does in torch as operators on torch's stable ABI, bit for bit the same: whole numbers,
+// and sums of products in torch's order (-ffp-contract=off: none is fused). One thread, no gradient. Callers check shapes,
+// types and that everything is contiguous; see dhtorch/ops/loader.py.
+
+#include "vectors.h"
+
+#include <torch/csrc/stable/library.h>
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <memory>
+#include <vector>
+
+#ifdef __linux__
+#include <sys/mman.h>
+#endif
+
+namespace {
+
+// Ask for large pages where memory is about to be filled for the first time: small ones come one by one.
+inline void large_pages(void* from, size_t bytes) {
+#if defined(__linux__) && defined(MADV_HUGEPAGE)
+  constexpr uintptr_t PAGE = uintptr_t{1} << 21;
+  const uintptr_t at = reinterpret_cast<uintptr_t>(from), first = (at + PAGE - 1) & ~(PAGE - 1), end = (at + bytes) & ~(PAGE - 1);
+  if (first < end) madvise(reinterpret_cast<void*>(first), end - first, MADV_HUGEPAGE);
+#endif
+}
+
+inline int32_t bits(int32_t code) {  // of the lower 31, as count_bits: vectors have no such instruction everywhere
+#ifdef __AVX512VPOPCNTDQ__
+  return __builtin_popcount(code);
+#else
+  uint32_t x = static_cast<uint32_t>(code);
+  x = x - ((x >> 1) & 0x55555555u);
+  x = (x & 0x33333333u) + ((x >> 2) & 0x33333333u);
+  x = (x + (x >> 4)) & 0x0F0F0F0Fu;
+  return static_cast<int32_t>((x * 0x01010101u) >> 24);
+#endif
+}
+
+// Add to C (B, h, w, D) uint8, or write into it where it is `fresh`, how badly each pixel fits at every plane. code_0 (B, N) and code_1 (B, rows * columns)
+// int32; a (B, 2, N), b (B, 2), c (B) and q (B, D) float32: pixels are seen at (a + q b) / (1 + q c), margin further in.
+void add_costs(Tensor C, Tensor code_0, Tensor code_1, Tensor a, Tensor b, Tensor c, Tensor q, int64_t rows,
+               int64_t columns, int64_t margin, int64_t unseen, bool fresh) {
+  const int64_t B = q.size(0), D = q.size(1), N = code_0.size(1), M = code_1.size(1);
+  const float inside = static_cast<float>(margin + 0.5), right = static_cast<float>(columns - 1),
+              down = static_cast<float>(rows - 1);
+  const int32_t width = static_cast<int32_t>(columns), none = static_cast<int32_t>(unseen);
+  std::vector<float> scale(D), along(D), across(D);
+  std::vector<int32_t> cell(D);
+  if (fresh) large_pages(data<uint8_t>(C), B * N * D);
+  for (int64_t k = 0; k < B; ++k) {
+    const float *bk = data<float>(b) + 2 * k, *qk = data<float>(q) + D * k, *ak = data<float>(a) + 2 * N * k;
+    for (int64_t d = 0; d < D; ++d) {
+      const float z = 1.0f + qk[d] * data<float>(c)[k];
+      scale[d] = z > 1e-3f ? 1.0f / z : 1e9f;
+      along[d] = qk[d] * bk[0];
+      across[d] = qk[d] * bk[1];
+    }
+    const int32_t *here = data<int32_t>(code_0) + N * k, *there = data<int32_t>(code_1) + M * k;
+    uint8_t* cost = data<uint8_t>(C) + N * D * k;
+    const float *s = scale.data(), *u_step = along.data(), *v_step = across.data();
+    int32_t* at = cell.data();
+    for (int64_t n = 0; n < N; ++n, cost += D) {
+      const float u0 = ak[n], v0 = ak[N + n];
+      const int32_t own = here[n];
+#pragma GCC ivdep
+      for (int64_t d = 0; d < D; ++d) {
+        float u = (u0 + u_step[d]) * s[d] + inside, v = (v0 + v_step[d]) * s[d] + inside;
+        u = u > 0.0f ? u : 0.0f;
+        v = v > 0.0f ? v : 0.0f;
+        u = u < right ? u : right;
+        v = v < down ? v : down;
+        at[d] = static_cast<int32_t>(v) * width + static_cast<int32_t>(u);
+      }
+#pragma GCC ivdep
+      for (int64_t d = 0; d < D; ++d) {
+        const int32_t code = there[at[d]];
+        at[d] = code < 0 ? none : bits(code ^ own);
+      }
+#pragma GCC ivdep
+      for (int64_t d = 0; d < D; ++d) cost[d] = static_cast<uint8_t>((fresh ? 0 : cost[d]) + at[d]);
+    }
+  }
+}
+
+// The best surface through costs C (h, w, D) uint8, by paths from four sides, and its best planes. Path, Two and Four are
+// the numbers that hold the cost of one path, of two and of all. Twice through the picture: from its first pixel on with
+// the paths from the left and from above, and back, where all four are known.
+template <typename Path, typename Two, typename Four>
+struct Surface {
+  const int64_t h, w, D, wide;  // paths have a place before and one behind their D planes
+  const Path step, jump;
+  std::vector<Path> above, under, left, right, low;  // of the row and pixel before, and of this one
+  std::unique_ptr<Two[]> half;
+  std::vector<Four> all;
+
+  Surface(int64_t h, int64_t w, int64_t D, int64_t step, int64_t jump)
+      : h(h), w(w), D(D), wide(D + 2), step(static_cast<Path>(step)), jump(static_cast<Path>(jump)), above(w * wide),
+        under(w * wide), left(wide), right(wide), low(w), half(new Two[h * w * D]), all(D) {
+    large_pages(half.get(), h * w * D * sizeof(Two));
+  }
+
+  // A path that begins has cost nothing; a step from beyond the ends costs more than any other.
+  void begin(std::vector<Path>& paths) const {
+    std::fill(paths.begin(), paths.end(), static_cast<Path>(0));
+    for (size_t i = 0; i < paths.size(); i += wide) {
+      paths[i] = paths[i + wide - 1] = static_cast<Path>(std::numeric_limits<Path>::max() - step);
+    }
+  }
+  void begin() {
+    for (auto* paths : {&above, &under, &left, &right}) begin(*paths);
+    std::fill(low.begin(), low.end(), static_cast<Path>(0));
+  }
+
+  // The cost of the best path to this pixel at a plane, of those to the pixel before: there, one before and one behind.
+  Path go(const Path* from, Path least, Path far, uint8_t cost) const {
+    Path best = std::min(from[0], from[2]);
+    best = static_cast<Path>(best + step);
+    best = std::min(best, from[1]);
+    best = std::min(best, far);
+    return static_cast<Path>(static_cast<Path>(best - least) + cost);
+  }
+
+  // Both paths to pixel x, which become those to the pixel before; their sums, with those from the other sides if there
+  // are some, and the least of those.
+  template <typename Sum>
+  Sum pass(int64_t x, const uint8_t* __restrict cost, Path& least, const Two* __restrict others, Sum* __restrict sum) {
+    const Path *__restrict p = left.data(), *__restrict r = above.data() + x * wide;
+    Path *__restrict p_to = right.data() + 1, *__restrict r_to = under.data() + x * wide + 1;
+    const Path p_least = least, r_least = low[x];
+    const Path p_far = static_cast<Path>(p_least + jump), r_far = static_cast<Path>(r_least + jump);
+    Path p_found = std::numeric_limits<Path>::max(), r_found = p_found;
+    Sum found = std::numeric_limits<Sum>::max();
+#pragma GCC ivdep
+    for (int64_t d = 0; d < D; ++d) {
+      const Path here = go(p + d, p_least, p_far, cost[d]), there = go(r + d, r_least, r_far, cost[d]);
+      p_to[d] = here;
+      r_to[d] = there;
+      p_found = std::min(p_found, here);
+      r_found = std::min(r_found, there);
+      Sum both = static_cast<Sum>(static_cast<Sum>(here) + static_cast<Sum>(there));
+      if (others) both = static_cast<Sum>(both + static_cast<Sum>(others[d]));
+      sum[d] = both;
+      found = std::min(found, both);
+    }
+    std::swap(left, right);
+    least = p_found;
+    low[x] = r_found;
+    return found;
+  }
+
+  // The first plane of the least of all, and between its neighbours where a parabola is least.
+  void choose(Four least, int64_t* plane, float* shift, int16_t* cost) const {
+    const Four* s = all.data();
+    int64_t d = 0;
+    if constexpr (sizeof(Four) == 1) {
+      d = static_cast<const Four*>(std::memchr(s, least, D)) - s;
+    } else {
+      while (s[d] != least) ++d;
+    }
+    float between = 0.0f;
+    if (d > 0 && d < D - 1) {
+      const float before = s[d - 1], here = s[d], after = s[d + 1], bend = before + after - 2.0f * here;
+      if (bend > 0.0f) between = std::clamp(0.5f * (before - after) / std::max(bend, 1e-6f), -0.5f, 0.5f);
+    }
+    *plane = d;
+    *shift = between;
+    *cost = static_cast<int16_t>(least);
+  }
+
+  void find(const uint8_t* C, int64_t* plane, float* shift, int16_t* cost, int16_t* some) {
+    begin();
+    for (int64_t y = 0, n = 0; y < h; ++y) {
+      begin(left);
+      Path least = 0;
+      for (int64_t x = 0; x < w; ++x, ++n) pass<Two>(x, C + n * D, least, nullptr, half.get() + n * D);
+      std::swap(above, under);
+    }
+    begin();
+    for (int64_t y = h - 1, n = h * w - 1; y >= 0; --y) {
+      begin(left);
+      Path least = 0;
+      for (int64_t x = w - 1; x >= 0; --x, --n) {
+        const Four found = pass<Four>(x, C + n * D, least, half.get() + n * D, all.data());
+        choose(found, plane + n, shift + n, cost + n);
+        if (x % 2 == 0 && y % 2 == 0) {
+          int16_t* __restrict kept = some + (y / 2 * ((w + 1) / 2) + x / 2) * D;
+          for (int64_t d = 0; d < D; ++d) kept[d] = all[d];
+        }
+      }
+      std::swap(above, under);
+    }
+  }
+};
+
+// Of C (B, h, w, D) uint8, step and jump (B) int16: the best planes of the best surface, plane (B, h, w) int64, between
+// planes by shift float32, its cost there int16; and the cost of all planes at every other pixel both ways, `some`
+// (B, (h + 1) / 2, (w + 1) / 2, D) int16. In bytes wherever no sum is larger.
+void surface(Tensor C, Tensor step, Tensor jump, Tensor plane, Tensor shift, Tensor cost, Tensor some) {
+  const int64_t B = C.size(0), h = C.size(1), w = C.size(2), D = C.size(3), N = h * w, quarter = some.size(1) * some.size(2);
+  for (int64_t k = 0; k < B; ++k) {
+    const uint8_t* costs = data<uint8_t>(C) + k * N * D;
+    const int64_t one = data<int16_t>(step)[k], more = data<int16_t>(jump)[k];
+    uint8_t worst = 0;
+    for (int64_t i = 0; i < N * D; ++i) worst = std::max(worst, costs[i]);
+    const int64_t most = worst + more;  // of a path: beyond its least it is kept within a jump
+    const auto found = [&]<typename Path, typename Two, typename Four>() {
+      Surface<Path, Two, Four>(h, w, D, one, more)
+          .find(costs, data<int64_t>(plane) + k * N, data<float>(shift) + k * N, data<int16_t>(cost) + k * N,
+                data<int16_t>(some) + k * quarter * D);
+    };
+    if (most + std::max(one, more) > 255) {
+      found.template operator()<int16_t, int16_t, int16_t>();
+    } else if (2 * most > 255) {
+      found.template operator()<uint8_t, int16_t, int16_t>();
+    } else if (4 * most > 255) {
+      found.template operator()<uint8_t, uint8_t, int16_t>();
+    } else {
+      found.template operator()<uint8_t, uint8_t, uint8_t>();
+    }
+  }
+}
+
+// Of S (N, D) int16: the least cost (N) further than `reach` planes from `plane` (N) int64; the type's most where there is
+// none.
+void elsewhere(Tensor S, Tensor plane, Tensor cost, int64_t reach) {
+  const int64_t N = S.size(0), D = S.size(1);
+  const int16_t* s = data<int16_t>(S);
+  for (int64_t n = 0; n < N; ++n, s += D) {
+    const int64_t at = data<int64_t>(plane)[n];
+    const int64_t before = std::max<int64_t>(at - reach, 0), after = std::min<int64_t>(at + reach + 1, D);
+    int16_t low = std::numeric_limits<int16_t>::max();
+    for (int64_t d = 0; d < before; ++d) low = std::min(low, s[d]);
+    for (int64_t d = after; d < D; ++d) low = std::min(low, s[d]);
+    data<int16_t>(cost)[n] = low;
+  }
+}
+
+// Codes (B, h, w) int32 of grey (B, h, w) float32: of each of n neighbours, offsets (n, 2) int64 down and right,
+// whether it is darker than the middle. Beyond the border is the border.
+void census(Tensor grey, Tensor offsets, Tensor code) {
+  const int64_t B = grey.size(0), h = grey.size(1), w = grey.size(2), n = offsets.size(0), margin = 8;
+  const int64_t* step = data<int64_t>(offsets);
+  const int64_t wide = w + 2 * margin;
+  std::vector<float> padded((h + 2 * margin) * wide);
+  for (int64_t k = 0; k < B; ++k) {
+    const float* image = data<float>(grey) + k * h * w;
+    for (int64_t y = 0; y < h + 2 * margin; ++y) {
+      const float* row = image + std::clamp<int64_t>(y - margin, 0, h - 1) * w;
+      float* to = padded.data() + y * wide;
+      std::fill(to, to + margin, row[0]);
+      std::copy(row, row + w, to + margin);
+      std::fill(to + margin + w, to + wide, row[w - 1]);
+    }
+    for (int64_t y = 0; y < h; ++y) {
+      int32_t* __restrict found = data<int32_t>(code) + (k * h + y) * w;
+      std::fill(found, found + w, 0);
+      const float* __restrict middle = padded.data() + (y + margin) * wide + margin;
+      for (int64_t i = 0; i < n; ++i) {
+        const float* __restrict beside = middle + step[2 * i] * wide + step[2 * i + 1];
+        const int32_t bit = static_cast<int32_t>(1u << i);
+        for (int64_t x = 0; x < w; ++x) found[x] |= beside[x] < middle[x] ? bit : 0;
+      }
+    }
+  }
+}
+
+// Where a view without a lens sees points on rays (B, 3, N) at q (B, N): uv (B, 2, N) and whether before it (B, N) bool.
+// R (B, 9), t, turn (B, 3), f, c (B, 2).
+void seen_at(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor turn, Tensor f, Tensor c, Tensor uv, Tensor front) {
+  const int64_t B = q.size(0), N = q.size(1);
+  for (int64_t k = 0; k < B; ++k) {
+    const float *m = data<float>(R) + 9 * k, *tk = data<float>(t) + 3 * k, *w = data<float>(turn) + 3 * k;
+    const float *fk = data<float>(f) + 2 * k, *ck = data<float>(c) + 2 * k, *__restrict qk = data<float>(q) + N * k;
+    const float *__restrict ax = data<float>(ray) + 3 * N * k, *__restrict ay = ax + N, *__restrict az = ay + N;
+    float *__restrict u = data<float>(uv) + 2 * N * k, *__restrict v = u + N;
+    bool* __restrict before = data<bool>(front) + N * k;
+#pragma GCC ivdep
+    for (int64_t n = 0; n < N; ++n) {
+      const float a = ax[n], b = ay[n], d = az[n];
+      float x = (a * m[0] + b * m[1] + d * m[2]) + qk[n] * tk[0];
+      float y = (a * m[3] + b * m[4] + d * m[5]) + qk[n] * tk[1];
+      float z = (a * m[6] + b * m[7] + d * m[8]) + qk[n] * tk[2];
+      const float p = w[0] * b, o = w[1] * b, s = w[2] * b;
+      const float dx = o * z - s * y, dy = s * x - p * z, dz = p * y - o * x;
+      x = x + dx;
+      y = y + dy;
+      z = z + dz;
+      const bool ahead = z > 1e-3f;
+      before[n] = ahead;
+      x = ahead ? x : 1.0f;
+      y = ahead ? y : 1.0f;
+      z = ahead ? z : 1.0f;
+      u[n] = x / z * fk[0] + ck[0];
+      v[n] = y / z * fk[1] + ck[1];
+    }
+  }
+}
+
+void smooth_rows(const float* q, float* out, int64_t h, int64_t w, float near, int64_t radius) {  // along h
+  std::vector<float> total(w), count(w);
+  for (int64_t y = 0; y < h; ++y) {
+    const float* __restrict middle = q + y * w;
+    float *__restrict sum = total.data(), *__restrict n = count.data();
+    std::copy(middle, middle + w, sum);
+    std::fill(n, n + w, 1.0f);
+    for (int64_t k = 1; k <= radius; ++k) {
+      if (y < k || y + k >= h) continue;
+      const float *__restrict before = middle - k * w, *__restrict after = middle + k * w;
+      for (int64_t x = 0; x < w; ++x) {
+        const bool fine = (std::abs(before[x] - middle[x]) <= near) & (std::abs(after[x] - middle[x]) <= near);
+        sum[x] += fine ? before[x] + after[x] : 0.0f;
+        n[x] += fine ? 2.0f : 0.0f;
+      }
+    }
+    for (int64_t x = 0; x < w; ++x) out[y * w + x] = sum[x] / n[x];
+  }
+}
+
+void smooth_columns(const float* q, float* out, int64_t h, int64_t w, float near, int64_t radius) {  // along w
+  std::vector<float> total(w), count(w);
+  for (int64_t y = 0; y < h; ++y) {
+    const float* __restrict middle = q + y * w;
+    float *__restrict sum = total.data(), *__restrict n = count.data();
+    std::copy(middle, middle + w, sum);
+    std::fill(n, n + w, 1.0f);
+    for (int64_t k = 1; k <= radius; ++k) {
+      for (int64_t x = k; x < w - k; ++x) {
+        const float before = middle[x - k], after = middle[x + k];
+        const bool fine = (std::abs(before - middle[x]) <= near) & (std::abs(after - middle[x]) <= near);
+        sum[x] += fine ? before + after : 0.0f;
+        n[x] += fine ? 2.0f : 0.0f;
+      }
+    }
+    for (int64_t x = 0; x < w; ++x) out[y * w + x] = sum[x] / n[x];
+  }
+}
+
+// out (B, h, w) float32: q, each the mean of those near it along its column, then along its row; tolerance (B).
+void smooth(Tensor q, Tensor tolerance, Tensor out, int64_t radius) {
+  const int64_t B = q.size(0), h = q.size(1), w = q.size(2);
+  std::vector<float> between(h * w);
+  for (int64_t k = 0; k < B; ++k) {
+    const float near = data<float>(tolerance)[k];
+    smooth_rows(data<float>(q) + k * h * w, between.data(), h, w, near, radius);
+    smooth_columns(between.data(), data<float>(out) + k * h * w, h, w, near, radius);
+  }
+}
+
+}  // namespace
+
+STABLE_TORCH_LIBRARY(dhtorch, m) {
+  m.def(
+      "add_costs(Tensor(a!) C, Tensor code_0, Tensor code_1, Tensor a, Tensor b, Tensor c, Tensor q, int rows, "
+      "int columns, int margin, int unseen, bool fresh) -> ()");
+  m.def(
+      "surface(Tensor C, Tensor step, Tensor jump, Tensor(a!) plane, Tensor(b!) shift, Tensor(c!) cost, "
+      "Tensor(d!) some) -> ()");
+  m.def("census(Tensor grey, Tensor offsets, Tensor(a!) code) -> ()");
+  m.def(
+      "seen_at(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor turn, Tensor f, Tensor c, Tensor(a!) uv, "
+      "Tensor(b!) front) -> ()");
+  m.def("smooth(Tensor q, Tensor tolerance, Tensor(a!) out, int radius) -> ()");
+  m.def("elsewhere(Tensor S, Tensor plane, Tensor(a!) cost, int reach) -> ()");
+}
+
+STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) {
+  m.impl("add_costs", TORCH_BOX(&add_costs));
+  m.impl("surface", TORCH_BOX(&surface));
+  m.impl("census", TORCH_BOX(&census));
+  m.impl("seen_at", TORCH_BOX(&seen_at));
+  m.impl("smooth", TORCH_BOX(&smooth));
+  m.impl("elsewhere", TORCH_BOX(&elsewhere));
+}

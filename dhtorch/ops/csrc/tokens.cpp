@@ -1,0 +1,101 @@
+// What a loader's transform does beside the stages: depth maps in metres, depth tokens of samples. Twin of
+// dhtorch/transforms/sample_spec.py and tokens.py, which are the reference: bit for bit, sums in double precision in the same order. One
+// thread, no gradient. Callers check shapes, types and strides.
+
+#include <torch/csrc/stable/library.h>
+
+#include <algorithm>
+#include <cmath>
+#include <vector>
+
+#include "vectors.h"
+
+namespace {
+
+// What is known of a patch: how many samples there are, how many with a depth, their inverse depths and those' variance.
+struct Patch {
+  double count = 0, answered = 0, inverse = 0, variance = 0;
+};
+
+inline double per(double count) { return 1.0 / (count < 1.0 ? 1.0 : count); }
+
+// uv (B, N, 2), depth, sigma (B, N) float32, source, hole (B, N) int32; tokens (B, P, 3 + classes) float32 and known (B, P)
+// bool, filled. A sample at uv lies at (uv + ½) · scale + margin in the network's picture, whose patches count `rows` and
+// `columns`.
+void patch_tokens(Tensor uv, Tensor depth, Tensor sigma, Tensor source, Tensor hole, Tensor tokens, Tensor known, int64_t patch,
+                  int64_t rows, int64_t columns, double scale_x, double scale_y, double margin_x, double margin_y) {
+  const int64_t B = depth.size(0), N = depth.size(1), P = rows * columns, channels = tokens.size(2), classes = channels - 3;
+  const double side = static_cast<double>(patch);
+  std::vector<Patch> patches(P);
+  std::vector<double> holes(P * classes), inverse(N);
+  std::vector<int64_t> cell(N);
+  for (int64_t b = 0; b < B; ++b) {
+    const float *place = data<float>(uv) + 2 * b * N, *z = data<float>(depth) + b * N, *noise = data<float>(sigma) + b * N;
+    const int32_t *from = data<int32_t>(source) + b * N, *kind = data<int32_t>(hole) + b * N;
+    const auto answered = [&](int64_t i) { return from[i] != 0 && z[i] > 0.0f; };
+    patches.assign(P, Patch());
+    holes.assign(P * classes, 0.0);
+    for (int64_t i = 0; i < N; ++i) {
+      const double column = std::floor(((place[2 * i] + 0.5) * scale_x + margin_x) / side);
+      const double row = std::floor(((place[2 * i + 1] + 0.5) * scale_y + margin_y) / side);
+      const bool inside = column >= 0 && column < columns && row >= 0 && row < rows;
+      cell[i] = inside ? static_cast<int64_t>(row) * columns + static_cast<int64_t>(column) : -1;
+      inverse[i] = answered(i) ? 1.0 / static_cast<double>(z[i]) : 0.0;
+      if (!inside) continue;
+      Patch& own = patches[cell[i]];
+      own.count += 1.0;
+      own.answered += answered(i);
+      own.inverse += inverse[i];
+      if (kind[i] >= 0 && kind[i] < classes) holes[cell[i] * classes + kind[i]] += 1.0;
+    }
+    for (int64_t i = 0; i < N; ++i) {
+      if (cell[i] < 0 || !answered(i)) continue;
+      Patch& own = patches[cell[i]];
+      const double spread = inverse[i] - own.inverse * per(own.answered), own_noise = noise[i] * inverse[i] * inverse[i];
+      own.variance += own_noise * own_noise + spread * spread;
+    }
+    for (int64_t p = 0; p < P; ++p) {
+      const Patch& own = patches[p];
+      const double share = per(own.count), variance = own.variance * per(own.answered);
+      float* to = data<float>(tokens) + (b * P + p) * channels;
+      to[0] = static_cast<float>(own.inverse * per(own.answered));
+      to[1] = variance > 0 ? static_cast<float>(std::sqrt(variance)) : 0.0f;
+      to[2] = static_cast<float>(own.answered * share);
+      for (int64_t k = 0; k < classes; ++k) to[3 + k] = static_cast<float>(holes[p * classes + k] * share);
+      data<bool>(known)[b * P + p] = own.answered > 0;
+    }
+  }
+}
+
+template <typename Word>
+void over_unit(const Word* raw, float* __restrict z, int64_t n, float unit) {
+  if (unit == 1000.0f) {
+    for (int64_t k = 0; k < n; ++k) z[k] = over<1000>(std::max(static_cast<float>(raw[k]), 0.0f));
+  } else {
+    for (int64_t k = 0; k < n; ++k) z[k] = std::max(static_cast<float>(raw[k]), 0.0f) / unit;
+  }
+}
+
+// raw: numbers of two bytes, int16 or (without a sign) uint16; z: as many float32, filled: what is positive over `unit`, else 0.
+void metres(Tensor raw, Tensor z, double unit, bool sign) {
+  const float per_metre = unit;
+  if (sign) {
+    over_unit(data<int16_t>(raw), data<float>(z), z.numel(), per_metre);
+  } else {
+    over_unit(data<uint16_t>(raw), data<float>(z), z.numel(), per_metre);
+  }
+}
+
+}  // namespace
+
+STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
+  m.def("metres(Tensor raw, Tensor(a!) z, float unit, bool sign) -> ()");
+  m.def(
+      "patch_tokens(Tensor uv, Tensor depth, Tensor sigma, Tensor source, Tensor hole, Tensor(a!) tokens, Tensor(b!) known, int "
+      "patch, int rows, int columns, float scale_x, float scale_y, float margin_x, float margin_y) -> ()");
+}
+
+STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) {
+  m.impl("metres", TORCH_BOX(&metres));
+  m.impl("patch_tokens", TORCH_BOX(&patch_tokens));
+}

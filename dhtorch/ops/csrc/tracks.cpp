@@ -1,0 +1,207 @@
+// Cost and normal equations of dhtorch/geometry/reprojection_problem.py, and the squared residuals of its tracks, as operators on
+// torch's stable ABI: the same formulas, sixteen or eight tracks at once. Sums over tracks are taken in another order than
+// torch's. One thread, no gradient. Callers check shapes, types and that everything is contiguous; see dhtorch/ops/loader.py.
+
+#include "vectors.h"
+
+#include <torch/csrc/stable/library.h>
+
+#include <cmath>
+
+namespace {
+
+// What near_far.py and least_squares.py hold under the same names.
+constexpr float MAX_NEARER = 2.0f, BEHIND = 1e4f, MIN_DEPTH = 1e-6f;
+
+inline Vector root(Vector x) {
+  float part[LANES];
+  store(x, part);
+  for (int64_t i = 0; i < LANES; ++i) part[i] = std::sqrt(part[i]);
+  return load(part);
+}
+
+// The tracks of one pair, N a multiple of LANES, and the unknowns.
+struct Tracks {
+  int64_t N;
+  const float *ray, *seen, *height, *shape, *inverse, *variance, *a, *b, *d;
+  const bool* near;
+  float nearest, R[3][3], t[3], turn[3];
+  bool turns;
+};
+
+// LANES tracks from `n` on, linearised and whitened.
+struct Whitened {
+  Bits front;
+  Vector height, square, r[2];  // residuals along the two axes
+  Vector x, y, k, m0[2], m1[2];
+
+  Whitened(const Tracks& of, int64_t n) {
+    const int64_t N = of.N;
+    const Vector none = Vector{}, one = none + 1.0f;
+    const Vector X = load(of.ray + n), Y = load(of.ray + N + n), Z = load(of.ray + 2 * N + n);
+    Vector p[3], u = load(of.seen + n), v = load(of.seen + N + n);
+    for (int i = 0; i < 3; ++i) p[i] = of.R[i][0] * X + of.R[i][1] * Y + of.R[i][2] * Z;
+    height = load(of.height + n);
+    if (of.turns) {
+      const float *by = of.turn;
+      const Vector ahead = one - height * (by[0] * v - by[1] * u);
+      const Vector z = (ahead < 0.1f) & (ahead > -0.1f) ? none + 0.1f : ahead;
+      const Vector across = u - height * (by[1] - by[2] * v), along = v - height * (by[2] * u - by[0]);
+      u = across / z;
+      v = along / z;
+    }
+    Bits near;
+    for (int64_t i = 0; i < LANES; ++i) near[i] = of.near[n + i] ? -1 : 0;
+    const Vector xx = load(of.shape + n), xy = load(of.shape + N + n), yy = load(of.shape + 2 * N + n);
+    // The most probable inverse depth of a track without one.
+    const float *t = of.t;
+    const Vector l0 = t[1] * p[2] - t[2] * p[1], l1 = t[2] * p[0] - t[0] * p[2], l2 = t[0] * p[1] - t[1] * p[0];
+    const Vector n0 = xx * l0 + xy * l1, n1 = xy * l0 + yy * l1, size = l0 * n0 + l1 * n1;
+    const Vector lift = (l0 * u + l1 * v + l2) / (size < 1e-30f ? none + 1e-30f : size);
+    const Vector u1 = u - lift * n0, v1 = v - lift * n1;
+    const Vector d0 = t[0] - t[2] * u1, d1 = t[1] - t[2] * v1, long_ = d0 * d0 + d1 * d1;
+    const Vector free = -((p[0] - p[2] * u1) * d0 + (p[1] - p[2] * v1) * d1) / (long_ < 1e-24f ? none + 1e-24f : long_);
+    const Vector q = near ? load(of.inverse + n) : (free < 0.0f ? none : free);
+    const Bits open = ~near & ~(free < 0.0f);  // nothing is known of q
+    const Vector variance = near ? load(of.variance + n) : none;
+
+    const Vector depth = p[2] + q * t[2];
+    front = (depth > MIN_DEPTH) & (near | (q < MAX_NEARER * of.nearest));
+    const Vector w = 1.0f / (front ? depth : one);
+    x = (p[0] + q * t[0]) * w;
+    y = (p[1] + q * t[1]) * w;
+    k = q * w;
+    const Vector s0 = (t[0] - x * t[2]) * w, s1 = (t[1] - y * t[2]) * w;
+    const Vector a = load(of.a + n), b = load(of.b + n), d = load(of.d + n), bd = b * d;
+    Vector e0 = a * s0, e1 = d * (s1 - b * s0);
+    const Vector slope = e0 * e0 + e1 * e1;
+    const Bits flat = slope < 1e-12f;
+    const Vector unit = 1.0f / root(flat ? one : slope);
+    e0 = flat ? one : e0 * unit;
+    e1 = flat ? none : e1 * unit;
+    const Vector left = open & ~flat ? none : 1.0f / root(1.0f + slope * variance);
+    m0[0] = left * (e0 * a - e1 * bd);
+    m0[1] = -e1 * a - e0 * bd;
+    m1[0] = left * e1 * d;
+    m1[1] = e0 * d;
+    for (int i = 0; i < 2; ++i) r[i] = m0[i] * (x - u) + m1[i] * (y - v);
+    square = front ? r[0] * r[0] + r[1] * r[1] : none + BEHIND;
+  }
+};
+
+// Sums of the robust cost, and of J'WJ (upper half) and J'Wr row by row, n = 6 or, with a turn, 9.
+template <int n, bool columns>
+float sums(const Tracks& of, const float* share, float bend, float* found) {
+  constexpr int COUNT = n * (n + 3) / 2;
+  Vector all = Vector{}, part[COUNT] = {};
+  const Vector none = Vector{};
+  for (int64_t m = 0; m < of.N; m += LANES) {
+    const Whitened at(of, m);
+    const Vector weight = load(share + m), bent = 1.0f + at.square / (bend * bend);
+    all += weight * (at.square / bent);
+    if (!columns) continue;
+    const Vector W = at.front ? weight / (bent * bent) : none;
+    const Vector x = at.x, y = at.y, k = at.k;
+    const Vector u[6] = {-x * y, 1.0f + x * x, -y, k, none, -x * k}, v[6] = {-1.0f - y * y, x * y, x, none, k, -y * k};
+    Vector J[2][n];
+    for (int i = 0; i < 2; ++i) {
+      for (int j = 0; j < 6; ++j) J[i][j] = at.m0[i] * u[j] + at.m1[i] * v[j];
+      for (int j = 6; j < n; ++j) J[i][j] = J[i][j - 6] * at.height;
+    }
+    Vector* to = part;
+    for (int i = 0; i < n; ++i) {
+      const Vector first = W * J[0][i], second = W * J[1][i];
+      for (int j = i; j < n; ++j) *to++ += first * J[0][j] + second * J[1][j];
+      *to++ += first * at.r[0] + second * at.r[1];
+    }
+  }
+  if (columns) {
+    for (int i = 0; i < COUNT; ++i) found[i] = total(part[i]);
+  }
+  return total(all);
+}
+
+template <int n>
+float equations(const Tracks& of, const float* share, float bend, float* H, float* g) {
+  if (!H) return sums<n, false>(of, share, bend, nullptr);
+  float found[n * (n + 3) / 2], *from = found;
+  const float cost = sums<n, true>(of, share, bend, found);
+  for (int i = 0; i < n; ++i) {
+    for (int j = i; j < n; ++j) H[i * n + j] = H[j * n + i] = *from++;
+    g[i] = *from++;
+  }
+  return cost;
+}
+
+Tracks pair(int64_t k, const Tensor& ray, const Tensor& seen, const Tensor& height, const Tensor& shape, const Tensor& inverse,
+            const Tensor& variance, const Tensor& near, const Tensor& nearest, const Tensor& a, const Tensor& b, const Tensor& d,
+            const Tensor& R, const Tensor& t, const Tensor& turn) {
+  const int64_t N = ray.size(2);
+  Tracks of;
+  of.N = N;
+  of.ray = data<float>(ray) + 3 * N * k;
+  of.seen = data<float>(seen) + 2 * N * k;
+  of.height = data<float>(height) + N * k;
+  of.shape = data<float>(shape) + 3 * N * k;
+  of.inverse = data<float>(inverse) + N * k;
+  of.variance = data<float>(variance) + N * k;
+  of.near = data<bool>(near) + N * k;
+  of.nearest = data<float>(nearest)[k];
+  of.a = data<float>(a) + N * k;
+  of.b = data<float>(b) + N * k;
+  of.d = data<float>(d) + N * k;
+  of.turns = turn.size(0) > 0;
+  for (int i = 0; i < 3; ++i) {
+    for (int j = 0; j < 3; ++j) of.R[i][j] = data<float>(R)[9 * k + 3 * i + j];
+    of.t[i] = data<float>(t)[3 * k + i];
+    of.turn[i] = of.turns ? data<float>(turn)[3 * k + i] : 0.0f;
+  }
+  return of;
+}
+
+// ray (B, 3, N), seen (B, 2, N), height (B, N), shape (B, 3, N), inverse, variance and near (B, N), nearest (B, 1), a, b and d
+// (B, N): near_far.py's Problem, Fixed and _sphere; share (B, N) of a track's cost; R (B, 3, 3), t (B, 3), turn (B, 3) or (0, 3)
+// where there is none. cost (B), H (B, n, n) and g (B, n), or B = 0 where they are not asked for. All float32, near bool.
+void track_equations(Tensor ray, Tensor seen, Tensor height, Tensor shape, Tensor inverse, Tensor variance, Tensor near,
+                     Tensor nearest, Tensor a, Tensor b, Tensor d, Tensor R, Tensor t, Tensor turn, Tensor share, Tensor cost,
+                     Tensor H, Tensor g, double bend) {
+  const int64_t B = ray.size(0), N = ray.size(2), n = turn.size(0) > 0 ? 9 : 6;
+  for (int64_t k = 0; k < B; ++k) {
+    const Tracks of = pair(k, ray, seen, height, shape, inverse, variance, near, nearest, a, b, d, R, t, turn);
+    float *to = H.size(0) ? data<float>(H) + n * n * k : nullptr, *right = to ? data<float>(g) + n * k : nullptr;
+    const float *weight = data<float>(share) + N * k, by = static_cast<float>(bend);
+    data<float>(cost)[k] = of.turns ? equations<9>(of, weight, by, to, right) : equations<6>(of, weight, by, to, right);
+  }
+}
+
+// As above; squared whitened residuals (B, N), and which tracks are in front (B, N) bool.
+void track_squares(Tensor ray, Tensor seen, Tensor height, Tensor shape, Tensor inverse, Tensor variance, Tensor near,
+                   Tensor nearest, Tensor a, Tensor b, Tensor d, Tensor R, Tensor t, Tensor turn, Tensor square, Tensor front) {
+  const int64_t B = ray.size(0), N = ray.size(2);
+  for (int64_t k = 0; k < B; ++k) {
+    const Tracks of = pair(k, ray, seen, height, shape, inverse, variance, near, nearest, a, b, d, R, t, turn);
+    for (int64_t m = 0; m < N; m += LANES) {
+      const Whitened at(of, m);
+      store(at.square, data<float>(square) + N * k + m);
+      for (int64_t i = 0; i < LANES; ++i) data<bool>(front)[N * k + m + i] = at.front[i] != 0;
+    }
+  }
+}
+
+}  // namespace
+
+STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
+  m.def(
+      "track_equations(Tensor ray, Tensor seen, Tensor height, Tensor shape, Tensor inverse, Tensor variance, Tensor near, "
+      "Tensor nearest, Tensor a, Tensor b, Tensor d, Tensor R, Tensor t, Tensor turn, Tensor share, Tensor(a!) cost, "
+      "Tensor(b!) H, Tensor(c!) g, float bend) -> ()");
+  m.def(
+      "track_squares(Tensor ray, Tensor seen, Tensor height, Tensor shape, Tensor inverse, Tensor variance, Tensor near, "
+      "Tensor nearest, Tensor a, Tensor b, Tensor d, Tensor R, Tensor t, Tensor turn, Tensor(a!) square, Tensor(b!) front) "
+      "-> ()");
+}
+
+STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) {
+  m.impl("track_equations", TORCH_BOX(&track_equations));
+  m.impl("track_squares", TORCH_BOX(&track_squares));
+}

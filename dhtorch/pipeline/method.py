@@ -1,0 +1,77 @@
+"""A method that can be called: the record of stages and options, joined by the pair or the multi-view pipeline."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from dhtorch.pipeline.inputs import agreed
+from dhtorch.pipeline.multiview import ask_window
+from dhtorch.pipeline.pair import ask_pair
+from dhtorch.pipeline.spec import MethodSpec, Trace
+from dhtorch.records import NO_HINT, Estimate, Frame, GivenPose, PoseFit, TrackHint
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Method(MethodSpec):
+    """A :class:`~dhtorch.pipeline.spec.MethodSpec` that extends the depth sensor of a reference view when called.
+
+    Near returns fix the metric relative pose of two views; every tracked sample, those without a return above all, is
+    triangulated under that pose; gates leave a hole with a reason where the geometry is weak. Several other views are
+    solved as pairs, and ``fuse`` combines their estimates.
+
+    The defaults are the paper's (:data:`dhtorch.pipeline.presets.PAPER`).
+    """
+
+    def __call__(
+        self,
+        anchor: Frame,
+        others: Frame | Sequence[Frame],
+        *,
+        seed: int | Tensor = 0,
+        fit: PoseFit | GivenPose | None = None,
+        hint: TrackHint = NO_HINT,
+        trace: Trace | None = None,
+        **changes: Any,
+    ) -> Estimate:
+        """Depth along the samples of ``anchor``, by the parallax to one other view or several.
+
+        Args:
+            anchor: B views.
+            others: B other views; or several of each anchor, V × B in one record or a sequence of V, in the order in
+                which the camera took them. Their depth is not read. Cameras may differ.
+            seed: an int gives every pair the same draws; a (B,) int64 tensor gives each pair its own. All views of an
+                anchor have the same.
+            fit: a pose that is believed, (B,) or (V, B): seat 5 is then skipped; or a :class:`GivenPose` from
+                elsewhere, which near returns may refute (:func:`dhtorch.stages.pose_prior.hold`). None = as ``given``
+                says.
+            hint: what is known of the motion, for the tracker.
+            trace: a dict that receives ``samples``, ``tracks`` (as tracked), ``tracks_ideal`` (undistorted), ``fit``,
+                ``estimate`` and ``ms`` (milliseconds by stage). Of several views those of the last, with ``ms`` summed
+                and ``views``, the traces of all.
+            **changes: seats and options for this call alone, as :meth:`replace` takes them.
+
+        Returns:
+            Estimate for the B × n samples, silent ones with their reason; in the dtype of the intrinsics, float32
+            where these are half precision. Images and depth may be of any floating dtype, each frame's
+            of its own (:func:`dhtorch.pipeline.inputs.agreed`).
+
+        Raises:
+            ValueError: wrong shapes, different batch sizes or devices, nothing to see, no other view.
+            TypeError: no such seat or option, or no frame.
+
+        Memory: grows with the answers; pyramids are held of eight pairs at most, unless a graph keeps them.
+        Gradient: recovered depth to all images, to the near depth and to intrinsics; choices (flags, inliers, gates)
+        carry none.
+        Cost: linear in views; the anchor's pyramid is built once.
+        Source: paper, section "Method".
+        """
+        method = self.replace(**changes) if changes else self
+        anchor, others = agreed(anchor, others)
+        if fit is None and method.given is not None:
+            fit = method.given(anchor, others)
+        ask = ask_pair if others.image.dim() == 4 else ask_window
+        return ask(method, anchor, others, seed=seed, fit=fit, hint=hint, trace=trace)

@@ -1,0 +1,144 @@
+"""Many views of one anchor: each answers as a pair, and the answers that agree are joined.
+
+    anchor view ─ samples ─┬─ view 1 ─ track, pose, triangulate ─┐
+                           ├─ view 2 ─ track, pose, triangulate ─┼─ fuse ─ score
+                           └─ view … ─ track, pose, triangulate ─┘
+
+Views in between are easier to track into than the widest one, and a track that slid along its epipolar line, which no
+pair can see, contradicts them.
+"""
+
+from __future__ import annotations
+
+import time
+
+import torch
+from torch import Tensor
+
+from dhtorch import pytree as tree
+from dhtorch.geometry.checks import check
+from dhtorch.geometry.pyramid import Pyramids
+from dhtorch.pipeline.pair import Clock, lifted, tracked, under_pose
+from dhtorch.pipeline.spec import MethodSpec, Trace
+from dhtorch.pipeline.view_selection import weighed
+from dhtorch.pytree import R, stack
+from dhtorch.records import NO_HINT, Choice, Estimate, Frame, GivenPose, PoseFit, Samples, TrackHint, Tracks
+
+#: Samples, about, by which key views are chosen.
+PROBES = 256
+
+
+def ask_window(
+    method: MethodSpec,
+    anchor: Frame,
+    others: Frame,
+    *,
+    seed: int | Tensor = 0,
+    fit: PoseFit | GivenPose | None = None,
+    hint: TrackHint = NO_HINT,
+    trace: Trace | None = None,
+) -> Estimate:
+    """The method's answer for B anchors with V × B other views; what ``method(anchor, others)`` calls.
+
+    Every view is a pair with the anchor: tracked from it, with a pose and a depth of its own. The depths are fused.
+    Views are tracked into one after the other, then all poses are solved together.
+    The first three seats see the anchor once; ``score`` sees the fused estimate, with tracks and pose of the last
+    view. Of more than ``method.views`` the best are chosen, by ``method.choose`` or by a few of the samples
+    (:func:`dhtorch.pipeline.view_selection.weighed`); ``trace`` then has the :class:`dhtorch.records.Choice`.
+    ``method.chain`` only gives a start: what is searched for is always the anchor's window.
+
+    Raises:
+        ValueError: wrong shapes, different batch sizes, no other view.
+    """
+    check("extend", image_0=(anchor.image, "B C H W"), images=(others.image, "V B c h w"))
+    check("extend", f_0=(anchor.camera.f, "B 2"), f=(others.camera.f, "V B 2"))
+    if not others.image.shape[0]:
+        raise ValueError("extend: found no other view, expected at least one")
+    began, ms = time.perf_counter(), {}
+    anchor, others = lifted(anchor), lifted(others)
+    samples = method.look(anchor)
+    ms["samples"] = 1e3 * (time.perf_counter() - began)
+    hint = hint if hint.pyramid is not None else hint.replace(pyramid=Pyramids(anchor.image))
+    every = torch.arange(len(others.image), device=samples.uv.device)[:, None].expand(-1, len(samples.uv))
+    choice = Choice(every)
+    if len(others.image) > method.views:
+        began = time.perf_counter()
+        choice = _chosen(method, anchor, others, samples, seed=seed, fit=fit, hint=hint)
+        ms["choose"] = 1e3 * (time.perf_counter() - began)
+        pick = choice.index, torch.arange(len(samples.uv), device=choice.index.device)
+        others, fit = others[pick], None if fit is None else fit[pick]
+    traces = _ask_views(method, anchor, others, samples, seed=seed, fit=fit, hint=hint, ms=ms)
+    last, began = traces[-1], time.perf_counter()
+    estimate = method.fuse(stack([t["estimate"] for t in traces]))
+    estimate = method.score(estimate, samples, last["tracks_ideal"], last["fit"])
+    ms["fuse"] = 1e3 * (time.perf_counter() - began)
+    if trace is not None:
+        trace.update({**last, "estimate": estimate, "ms": ms, "views": traces, "choice": choice})
+    return estimate
+
+
+def _chosen(
+    method: MethodSpec,
+    anchor: Frame,
+    others: Frame,
+    samples: Samples,
+    *,
+    seed: int | Tensor,
+    fit: PoseFit | GivenPose | None,
+    hint: TrackHint,
+) -> Choice:
+    """Which of the views are asked, as the method chooses them or by a few of the samples."""
+    if method.choose is not None:
+        found = method.choose(anchor, others, method.views, fit=fit)
+        return found if isinstance(found, Choice) else Choice(found)
+    thin = samples[:, :: max(1, method.n // PROBES)]
+    probes = _ask_views(method, anchor, others, thin, seed=seed, fit=fit, hint=hint, ms={})
+    return weighed(stack([t["estimate"] for t in probes]), method.views)
+
+
+def _ask_views(
+    method: MethodSpec,
+    anchor: Frame,
+    others: Frame,
+    samples: Samples,
+    *,
+    seed: int | Tensor,
+    fit: PoseFit | GivenPose | None,
+    hint: TrackHint,
+    ms: dict[str, float],
+) -> list[Trace]:
+    """The anchor's samples in each of the views, as a pair."""
+    clock = Clock({"ms": ms})
+    seen: list[Tracks] = []
+    for k, image in enumerate(others.image):
+        if method.chain and seen:
+            hint = hint.replace(start=_further(seen[-1], (k + 1) / k))
+        seen.append(clock("track", tracked(method, anchor.image, image, samples.uv, hint)))
+    V, B = others.image.shape[:2]
+    answers = under_pose(
+        method,
+        _repeated(samples, V),
+        tree.collate(seen),
+        _repeated(anchor.camera, V),
+        others.camera.map(lambda x: x.flatten(0, 1)),
+        seed=seed if isinstance(seed, int) else seed.repeat(V),
+        fit=None if fit is None else fit.map(lambda x: x.flatten(0, 1)),
+        clock=clock,
+    )
+    names = "estimate", "tracks_ideal", "fit"
+    by_view = dict(zip(names, (x.map(lambda y: y.unflatten(0, (V, B))) for x in answers), strict=True))
+    return [
+        {"ms": ms, "samples": samples, "tracks": seen[k], **{name: x[k] for name, x in by_view.items()}}
+        for k in range(V)
+    ]
+
+
+def _repeated(record: R, V: int) -> R:
+    """The anchor's (B, …), once for every view: (V B, …)."""
+    return record.map(lambda x: x.expand(V, *x.shape).flatten(0, 1))
+
+
+def _further(tracks: Tracks, pace: float) -> Tensor:
+    """Where a search may start that has come ``pace`` times as far as the last one."""
+    uv_0, uv_1 = tracks.uv_0.detach(), tracks.uv_1.detach()
+    return torch.where(tracks.valid[..., None], uv_0 + (uv_1 - uv_0) * pace, uv_0)

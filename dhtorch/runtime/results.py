@@ -1,0 +1,416 @@
+"""Result files: one strict JSON per job, written whole or not at all, and recognised when it need not be redone.
+
+A result answers three questions: what was asked (``experiment``, ``config``, ``data``), what came out (``summary``,
+``rows``, ``verdict``) and whether the same question would give the same answer today (``key``).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import math
+import os
+import platform
+import subprocess
+from collections.abc import Iterable, Iterator, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from dhtorch.runtime import code_dependencies as closure
+from dhtorch.runtime.storage import dumps, loads, replace_file, strict
+
+SCHEMA = 1
+
+VERDICTS = ("supported", "refuted", "undecided")
+
+#: Jobs that ask no question: the main job, and the map of a recording.
+UNASKED = ("pair", "integrate")
+
+#: Options that do not change what is computed: where files lie, what else is written, on which machine part it runs.
+UNKEYED = frozenset(
+    {"root", "folder", "cache", "output", "figures", "device", "resume", "traceback", "workers", "hydra"}
+)
+
+#: Bytes of a data file's head and tail that enter a digest: enough to tell recordings apart, cheap for large ones.
+EDGE_BYTES = 64 * 1024
+
+#: Options that say nothing about a result to its reader.
+_PLACES = ("hydra", "output")
+
+#: Flags of x86 processors, widest vectors first, and what they are called.
+_VECTORS = {"amx_tile": "AVX-512 and AMX", "avx512f": "AVX-512", "avx2": "AVX2"}
+
+_PACKAGES = ("dhtorch", "torch", "kornia", "numpy", "opencv-python-headless", "hydra-core")
+
+#: Field → type, for the result and for its parts.
+_TEXT = (str, None)
+_NUMBER = (float, None)
+_TOP: dict[str, Any] = {
+    **{"schema": int, "experiment": str, "question": _TEXT, "expectation": _TEXT, "verdict": _TEXT, "why": _TEXT},
+    **{"key": str, "meta": dict, "config": dict, "data": dict, "summary": dict, "rows": list},
+}
+_META: dict[str, Any] = {"utc": str, "git": _TEXT, "versions": dict}
+_META |= {"device": str, "dtype": str, "threads": int, "seed": int}
+#: What results did not hold from the start.
+_TOP_LATER: dict[str, Any] = {"seal": str}
+_META_LATER: dict[str, Any] = {"processor": str}
+_DATA: dict[str, Any] = {"name": str, "scenes": list, "n_pairs": int, "digest": str}
+_SUMMARY: dict[str, Any] = {"value": _NUMBER, "low": _NUMBER, "high": _NUMBER, "n": int, "unit": str}
+_ROW: dict[str, Any] = {"scene": str, "pair": (list, None), "method": str}
+
+
+def build(
+    *,
+    experiment: str,
+    key: str,
+    meta: Mapping[str, Any],
+    config: Mapping[str, Any],
+    data: Mapping[str, Any],
+    summary: Mapping[str, Any],
+    rows: list[Any],
+    question: str | None = None,
+    expectation: str | None = None,
+    verdict: str | None = None,
+    why: str | None = None,
+) -> dict[str, Any]:
+    """A valid result, made strict: what is not finite becomes null, tuples and tensors become lists.
+
+    Args:
+        experiment: its name; ``pair`` for the main job, which asks no question.
+        key: from :func:`result_key`.
+        meta: from :func:`meta`.
+        config: resolved settings; file names are shortened as by :func:`portable`.
+        data: ``{name, scenes, n_pairs, digest}``.
+        summary: metric → ``{value, low, high, n, unit}``.
+        rows: one per pair and, with pair null, one per scene.
+        question, expectation, verdict, why: of an experiment that asks something.
+
+    Raises:
+        ValueError: a field is missing, unknown or of the wrong kind; the message names it.
+    """
+    fields = {"question": question, "expectation": expectation, "verdict": verdict, "why": why, "key": key}
+    parts = {"meta": meta, "config": portable(config), "data": data, "summary": summary, "rows": rows}
+    result = strict({"schema": SCHEMA, "experiment": experiment, **fields, **parts})
+    validate(result)
+    return dict(result)
+
+
+def seal(result: Mapping[str, Any]) -> str:
+    """SHA-256 over all of a result but itself, so that a change by hand shows."""
+    content = {name: value for name, value in result.items() if name != "seal"}
+    return hashlib.sha256(dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def validate(result: Any, where: str = "result") -> None:
+    """Check a result against schema 1.
+
+    Raises:
+        ValueError: names the first field that is missing, unknown, of the wrong kind or out of range.
+    """
+    _fields(result, _TOP | {k: v for k, v in _TOP_LATER.items() if isinstance(result, dict) and k in result}, where)
+    _expect(result["schema"] == SCHEMA, f"{where}.schema", result["schema"], str(SCHEMA))
+    _verdict(result, where)
+    key = result["key"]
+    _expect(len(key) == 64 and set(key) <= set("0123456789abcdef"), f"{where}.key", key, "64 hexadecimal digits")
+    later = {k: v for k, v in _META_LATER.items() if isinstance(result["meta"], dict) and k in result["meta"]}
+    _fields(result["meta"], _META | later, f"{where}.meta")
+    _fields(result["data"], _DATA, f"{where}.data")
+    for name, entry in result["summary"].items():
+        _fields(entry, _SUMMARY, f"{where}.summary.{name}")
+    for k, row in enumerate(result["rows"]):
+        _fields(row, _ROW, f"{where}.rows.{k}", more=True)
+        pair = row["pair"]
+        pairs = pair is None or (len(pair) == 2 and all(_is(v, int) for v in pair))
+        _expect(pairs, f"{where}.rows.{k}.pair", pair, "[i, j] or null")
+    _finite(result, where)
+
+
+def write(path: str | Path, result: Mapping[str, Any]) -> Path:
+    """Write a result so that, whatever happens, ``path`` holds either the old file or the whole new one.
+
+    Raises:
+        ValueError: the result is not valid; nothing is written.
+    """
+    result = {**result, "seal": seal(result)}
+    validate(result, str(path))
+    return replace_file(path, _text(result).encode("utf-8"))
+
+
+def _text(result: Mapping[str, Any]) -> str:
+    """JSON in which every summary entry and every row is a line: small, and two versions can be compared."""
+
+    lines = []
+    for name, value in result.items():
+        if name == "rows":
+            body = "[\n" + ",\n".join(f"  {dumps(row)}" for row in value) + "\n ]" if value else "[]"
+        elif isinstance(value, Mapping) and name != "config":
+            body = "{\n" + ",\n".join(f"  {dumps(k)}: {dumps(v)}" for k, v in value.items()) + "\n }" if value else "{}"
+        else:
+            body = dumps(value)
+        lines.append(f" {dumps(name)}: {body}")
+    return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+def read(path: str | Path) -> dict[str, Any]:
+    """Read and check a result; a folder stands for the ``result.json`` in it.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: not JSON, not strict JSON, or not a valid result; the message names file and field.
+    """
+    path = Path(path)
+    path = path / "result.json" if path.is_dir() else path
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: found no file, expected a result.json or a folder with one")
+    try:
+        result = loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path}: found no strict JSON ({error}), expected a result") from error
+    validate(result, str(path))
+    return result
+
+
+def finished(path: str | Path, key: str) -> bool:
+    """Whether ``path`` holds a valid result of this key as it was written, so that the job need not run again."""
+    try:
+        result = read(path)
+        return bool(result["key"] == key and result.get("seal") == seal(result))
+    except (OSError, ValueError):
+        return False
+
+
+def result_key(
+    config: Mapping[str, Any], digest: str, *, roots: Iterable[str] = (), code_dir: str | Path | None = None
+) -> str:
+    """SHA-256 over everything that decides a result: the settings, the code that they reach, and the data.
+
+    Args:
+        config: resolved settings; the options in ``UNKEYED`` are left out at every depth, and of an absolute file
+            name only what :func:`portable` keeps counts.
+        digest: of the data, from :func:`data_digest`.
+        roots: modules that take part beside those that the settings name.
+        code_dir: the folder of this package; None = where this file lies.
+    """
+    settings = json.dumps(_keyed(portable(config)), sort_keys=True, default=str)
+    total = hashlib.sha256()
+    for text in (settings, digest):
+        _add(total, text.encode())
+    for name, file in closure.reached([*closure.targets(config), *roots], code_dir).items():
+        _add(total, name.encode())
+        _add(total, file.read_bytes())
+    return total.hexdigest()
+
+
+def files_below(roots: Iterable[Path | None]) -> dict[str, Path]:
+    """Name → file of everything below some folders (or files); a folder's own name and place do not count."""
+    files: dict[str, Path] = {}
+    for k, root in enumerate(dict.fromkeys(root for root in roots if root is not None)):
+        below = [p for p in root.rglob("*") if p.is_file()] if root.is_dir() else [root]
+        files |= {f"{k}/{p.relative_to(root).as_posix() if p != root else p.name}": p for p in below}
+    return files
+
+
+def files_named(settings: Mapping[str, Any]) -> dict[str, Path]:
+    """Option → file that it names, as weights are: the place leaves the key of a result, the content enters it."""
+    return {f"settings/{name}": path for name, path in _paths("", settings) if path.is_file()}
+
+
+def data_digest(files: Mapping[str, str | Path]) -> str:
+    """SHA-256 over data files: their relative names, sizes, first and last 64 KiB. No file: data made by the code.
+
+    Args:
+        files: relative name → where the file lies now; the place itself does not count.
+    """
+    total = hashlib.sha256()
+    for name in sorted(files):
+        path = Path(files[name])
+        size = path.stat().st_size
+        _add(total, f"{name} {size}".encode())
+        with path.open("rb") as file:
+            _add(total, file.read(EDGE_BYTES))
+            file.seek(max(0, size - EDGE_BYTES))
+            _add(total, file.read(EDGE_BYTES))
+    return total.hexdigest()
+
+
+def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
+    """The first thing that differs between what two runs note of themselves (``config``, ``data``, ``git`` and
+    ``version``), in words."""
+    ours, theirs = _flat("", here["config"]), _flat("", there["config"])
+    for name in sorted(ours.keys() | theirs.keys()):
+        if ours.get(name) != theirs.get(name):
+            return f"{name} {theirs.get(name)} there, {ours.get(name)} here"
+    if there["data"]["digest"] != here["data"]["digest"]:
+        return "other data"
+    versions = [meta["git"] or meta["version"] for meta in (there, here)]
+    return "other code" + (f": {versions[0]} there, {versions[1]} here" if versions[0] != versions[1] else "")
+
+
+def meta(*, device: str, dtype: str, threads: int, seed: int) -> dict[str, Any]:
+    """When, with which code and on what a job runs."""
+    versions = {"python": platform.python_version(), **{name: _version(name) for name in _PACKAGES}}
+    return {
+        "utc": datetime.now(UTC).isoformat(timespec="seconds"),
+        "git": revision(Path(__file__).parents[1]),
+        "versions": versions,
+        "processor": processor(),
+        "device": str(device),
+        "dtype": str(dtype).removeprefix("torch."),
+        "threads": threads,
+        "seed": seed,
+    }
+
+
+def processor(info: str | Path = "/proc/cpuinfo") -> str:
+    """The processor by its maker's name, family and model, and the widest vectors it has: speeds depend on them.
+
+    Where ATEN_CPU_CAPABILITY holds torch to narrower ones, that is said as well.
+
+    Args:
+        info: where Linux describes it; elsewhere only what Python knows is said.
+    """
+    held = os.environ.get("ATEN_CPU_CAPABILITY", "").upper()
+    try:
+        lines = Path(info).read_text(encoding="utf-8", errors="replace").split("\n\n")[0].splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    known = {k.strip(): v.strip() for k, _, v in (line.partition(":") for line in lines)}
+    flags = known.get("flags", "").split()
+    vectors = next((word for flag, word in _VECTORS.items() if flag in flags), platform.machine())
+    model = f"family {known['cpu family']} model {known['model']}" if {"cpu family", "model"} <= set(known) else ""
+    vectors = f"{vectors} held to {held}" if held and vectors != held else vectors
+    return ", ".join(word for word in (known.get("model name", ""), model, vectors) if word)
+
+
+def portable(config: Mapping[str, Any], base: str | Path | None = None) -> dict[str, Any]:
+    """Settings without what belongs to one machine.
+
+    An absolute file name, and any ``root``, is written relative to ``base`` (None: the environment variable
+    DHTORCH_DATA) where it lies below it, else as its last component; ``hydra`` and ``output`` are left out.
+    """
+    base = os.environ.get("DHTORCH_DATA") if base is None else base
+
+    def shorten(name: str, value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {str(k): shorten(str(k), v) for k, v in value.items() if k not in _PLACES}
+        if isinstance(value, list | tuple):
+            return [shorten(name, v) for v in value]
+        is_place = isinstance(value, str | Path) and str(value) and (name == "root" or Path(value).is_absolute())
+        return _shorter(Path(value), base) if is_place else value
+
+    return {str(k): shorten(str(k), v) for k, v in config.items() if k not in _PLACES}
+
+
+def _fields(value: Any, kinds: Mapping[str, Any], where: str, more: bool = False) -> None:
+    _expect(isinstance(value, dict), where, value, "an object")
+    for name, kind in kinds.items():
+        if name not in value:
+            raise ValueError(f"{where}.{name}: found nothing, expected {_say(kind)}")
+        allowed = kind if isinstance(kind, tuple) else (kind,)
+        _expect(any(_is(value[name], k) for k in allowed), f"{where}.{name}", value[name], _say(kind))
+    unknown = sorted(set(value) - set(kinds))
+    if unknown and not more:
+        raise ValueError(f"{where}.{unknown[0]}: found an unknown field, expected {', '.join(kinds)}")
+
+
+def _verdict(result: Mapping[str, Any], where: str) -> None:
+    for name in ("question", "expectation", "verdict", "why"):
+        if result["experiment"] in UNASKED:
+            _expect(result[name] is None, f"{where}.{name}", result[name], "null, this job asks no question")
+        else:
+            _expect(bool(result[name]), f"{where}.{name}", result[name], "a text")
+    if result["experiment"] not in UNASKED:
+        _expect(result["verdict"] in VERDICTS, f"{where}.verdict", result["verdict"], ", ".join(VERDICTS))
+
+
+def _is(value: Any, kind: Any) -> bool:
+    if kind is None:
+        return value is None
+    if isinstance(value, bool):
+        return False
+    return isinstance(value, int | float) if kind is float else isinstance(value, kind)
+
+
+def _say(kind: Any) -> str:
+    words = {int: "a whole number", float: "a number", str: "a text", dict: "an object", list: "a list", None: "null"}
+    return " or ".join(words[k] for k in (kind if isinstance(kind, tuple) else (kind,)))
+
+
+def _expect(condition: bool, where: str, found: Any, expected: str) -> None:
+    if not condition:
+        shown = repr(found)
+        raise ValueError(f"{where}: found {shown if len(shown) <= 60 else shown[:57] + '...'}, expected {expected}")
+
+
+def _finite(value: Any, where: str) -> None:
+    if isinstance(value, dict):
+        for k, v in value.items():
+            _finite(v, f"{where}.{k}")
+    elif isinstance(value, list):
+        for k, v in enumerate(value):
+            _finite(v, f"{where}.{k}")
+    elif isinstance(value, float):
+        _expect(math.isfinite(value), where, value, "a finite number or null")
+
+
+def _add(total: Any, part: bytes) -> None:
+    """Length first, so that no two sequences of parts make the same stream."""
+    total.update(len(part).to_bytes(8, "big"))
+    total.update(part)
+
+
+def _keyed(config: Any) -> Any:
+    if isinstance(config, Mapping):
+        return {str(k): _keyed(v) for k, v in config.items() if str(k) not in UNKEYED}
+    return [_keyed(v) for v in config] if isinstance(config, list | tuple) else config
+
+
+def _flat(name: str, value: Any) -> dict[str, Any]:
+    if not isinstance(value, Mapping):
+        return {name: value}
+    return {k: v for key, inner in value.items() for k, v in _flat(f"{name}.{key}".lstrip("."), inner).items()}
+
+
+def _paths(name: str, value: Any) -> Iterator[tuple[str, Path]]:
+    if isinstance(value, Mapping):
+        for key, inner in value.items():
+            yield from _paths(f"{name}.{key}", inner)
+    elif isinstance(value, list | tuple):
+        for k, inner in enumerate(value):
+            yield from _paths(f"{name}.{k}", inner)
+    elif isinstance(value, str) and os.sep in value:
+        yield name, Path(value).expanduser()
+
+
+def _shorter(path: Path, base: str | Path | None) -> str:
+    place = path.expanduser().resolve()
+    if base is not None:
+        home = Path(base).expanduser().resolve()
+        if place != home and place.is_relative_to(home):
+            return place.relative_to(home).as_posix()
+    return place.name
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def revision(folder: Path) -> str | None:
+    """What ``git describe`` calls the code in ``folder``, None where it is not under version control."""
+
+    def ask(*words: str) -> str | None:
+        try:
+            command = ["git", "-C", str(folder), *words]
+            done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=10)
+        except (OSError, subprocess.SubprocessError):
+            return None
+        return done.stdout.strip() if done.returncode == 0 else None
+
+    if ask("ls-files", "--error-unmatch", "__init__.py") is None:
+        return None
+    return ask("describe", "--always", "--dirty", "--tags") or None

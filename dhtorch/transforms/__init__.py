@@ -1,0 +1,42 @@
+"""dhtorch inside a data loader: :class:`ExtendDepth` takes a sample dict and returns it with what the depth tells.
+
+transform = ExtendDepth(image="observation.images.wrist", depth="observation.depth.wrist", depth_unit="mm")
+dataset = ExtendedDataset(dataset, transform)
+loader = DataLoader(dataset, collate_fn=dataset.collate, num_workers=2, worker_init_fn=one_thread)
+"""
+
+from dhtorch.transforms.adapters import (
+    AddedCollate,
+    ExtendedDataset,
+    ExtendedStream,
+    NumpyTransform,
+    RldsBatchTransform,
+    collate_kept,
+    one_thread,
+)
+from dhtorch.transforms.extend_depth import ExtendDepth
+from dhtorch.transforms.maps import Maps
+from dhtorch.transforms.sample_access import SampleError
+from dhtorch.transforms.sample_spec import Views
+from dhtorch.transforms.status import SampleProblem
+from dhtorch.transforms.tokens import CHANNELS, grid, patch_tokens
+from dhtorch.transforms.validate_depth import JudgeDepth
+
+__all__ = [
+    "CHANNELS",
+    "AddedCollate",
+    "ExtendDepth",
+    "ExtendedDataset",
+    "ExtendedStream",
+    "JudgeDepth",
+    "Maps",
+    "NumpyTransform",
+    "RldsBatchTransform",
+    "SampleError",
+    "SampleProblem",
+    "Views",
+    "collate_kept",
+    "grid",
+    "one_thread",
+    "patch_tokens",
+]

@@ -1,0 +1,250 @@
+"""The tensors behind the keys of a sample, all with the same number of dimensions whatever their layout was.
+
+Alphabet: B samples, T frames of a sample along time, C × H × W image, h × w depth map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dhtorch.geometry.checks import is_transformed
+from dhtorch.geometry.least_squares import has_graph
+from dhtorch.records import Camera
+
+#: Where the numbers are: a key of the sample, or the numbers themselves, the same for every sample.
+Numbers = str | Sequence[float]
+
+
+#: torch knows little of unsigned words.
+_SIGNED = {torch.uint16: torch.int32, torch.uint32: torch.int64}
+
+
+class SampleError(ValueError):
+    """A sample cannot be read as stated; the message names the key, what was found and what was expected."""
+
+
+def find(sample: Mapping[str, Any], key: str) -> Any:
+    """The value under a key, or piece by piece in nested dicts.
+
+    Raises:
+        SampleError: there is none.
+    """
+    value = _found(sample, key)
+    if value is _MISSING:
+        raise SampleError(f"{key}: found no such key, expected one of {', '.join(_keys(sample))}")
+    return value
+
+
+def has(sample: Mapping[str, Any], key: str) -> bool:
+    """Whether there is a value under a key, as :func:`find` looks for it."""
+    return _found(sample, key) is not _MISSING
+
+
+def without(sample: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
+    """A copy of a sample without what :func:`find` finds under some keys; nested dicts that lose it are copied."""
+    out = dict(sample)
+    for key in keys:
+        head, _, rest = key.replace("/", ".").partition(".")
+        if key in out:
+            del out[key]
+        elif rest and isinstance(out.get(head), Mapping):
+            out[head] = without(out[head], [rest])
+    return out
+
+
+#: What is found under a key that is not there.
+_MISSING = object()
+
+
+def _found(sample: Mapping[str, Any], key: str) -> Any:
+    if key in sample:
+        return sample[key]
+    value: Any = sample
+    for piece in key.replace("/", ".").split("."):
+        if not (isinstance(value, Mapping) and piece in value):
+            return _MISSING
+        value = value[piece]
+    return value
+
+
+def to_tensor(value: Any, key: str, *, signed: bool = True) -> Tensor:
+    """A plain tensor of an array, a picture, numbers or a tensor of any class; unsigned words made ``signed``.
+
+    Raises:
+        SampleError: it holds no numbers.
+    """
+    if isinstance(value, Tensor):
+        x = value.as_subclass(Tensor)
+        return x.to(_SIGNED[x.dtype]) if signed and x.dtype in _SIGNED else x
+    array = np.asarray(value)
+    if array.dtype.kind not in "buif":
+        raise SampleError(f"{key}: found {type(value).__name__} of {array.dtype}, expected an array of numbers")
+    if signed and array.dtype.kind == "u" and array.dtype.itemsize in (2, 4):
+        array = array.astype(np.int32 if array.dtype.itemsize == 2 else np.int64)
+    array = array.astype(array.dtype.newbyteorder("="), copy=not array.flags.writeable)
+    return torch.from_numpy(np.ascontiguousarray(array))
+
+
+def plainly(value: Any) -> Hashable | None:
+    """What tells numbers from others; None of what numpy does not know, or a graph or another device has."""
+    if isinstance(value, Tensor) and value.dtype in (torch.float32, torch.float64) and not is_transformed():
+        value = value.numpy() if value.is_cpu and not has_graph(value) else value
+    if not isinstance(value, np.ndarray) or value.dtype.kind not in "buif":
+        return None
+    return value.tobytes(), value.dtype.str, value.shape
+
+
+#: Keys of numbers that samples have one of, and collated batches one for each sample.
+_COUNTED = ("episode_index", "index", "frame_index")
+
+
+def check_sample(sample: Any, image: str, intrinsics: Numbers, batched: bool | None) -> None:
+    """Refuse what is no sample; where ``batched`` is None also a batch, whose samples would be read as frames in time.
+
+    Raises:
+        SampleError: it is no dict, or a field shows several samples; the message says what to do instead.
+    """
+    if not isinstance(sample, Mapping):
+        size = f" of shape {tuple(sample.shape)}" if hasattr(sample, "shape") else ""
+        raise SampleError(
+            f"sample: found {type(sample).__name__}{size}, expected a dict with pictures and depth; image_transforms "
+            "hands over single pictures: wrap the data set instead, ExtendedDataset(dataset, transform)"
+        )
+    if batched is not None:
+        return
+    try:
+        images = find(sample, image)
+    except SampleError:
+        return  # said where it is read
+    n = len(images) if getattr(images, "ndim", 0) == 4 else 1
+    flag = f"{image}_is_pad"
+    if has(sample, flag) and tuple(getattr(find(sample, flag), "shape", ())) == (n,):
+        return  # LeRobot's delta_timestamps: time
+    keys: tuple[Any, ...] = () if n < 2 else (intrinsics, *_COUNTED, *sample)
+    for key in keys:
+        value = sample.get(key) if isinstance(key, str) else None
+        shape = tuple(getattr(value, "shape", ()))
+        texts = isinstance(value, list | tuple) and len(value) == n and all(isinstance(text, str) for text in value)
+        several = shape == (n,) and key in _COUNTED
+        if texts or several or (key == intrinsics and shape == (n, 3, 3)):
+            found = f"{n} texts" if texts else f"shape {shape}"
+            raise SampleError(
+                f"{key}: found {found} beside {n} pictures, expected one sample; batched=True reads {n} samples, "
+                f"batched=False one sample of {n} frames"
+            )
+
+
+class Leaves:
+    """The tensors of a sample, all with B in front."""
+
+    def __init__(self, sample: Mapping[str, Any], batched: bool, dtype: torch.dtype) -> None:
+        self.sample, self.batched, self.dtype = sample, batched, dtype
+        self.like: Tensor | None = None  # the anchor's images: everything follows their device and number
+
+    def get(self, key: str, *, signed: bool = True) -> Tensor:
+        """(B, …) on the device of the first one asked for."""
+        x = to_tensor(find(self.sample, key), key, signed=signed)
+        x = x if self.batched else x[None]
+        if self.like is None:
+            self.like = x
+        if x.ndim == 0 or x.shape[0] != self.like.shape[0]:
+            raise SampleError(f"{key}: found shape {tuple(x.shape)}, expected {self.like.shape[0]} samples in front")
+        return x.to(self.like.device)
+
+    def images(self, key: str, layout: str | None) -> Tensor:
+        """(B, T, C, H, W), uint8 or floating."""
+        x = self.get(key)
+        if x.ndim not in (4, 5):
+            shape = tuple(x.shape[1:])
+            raise SampleError(f"{key}: found shape {shape}, expected (C, H, W) or (H, W, C), or with T in front")
+        if x.dtype != torch.uint8 and not x.is_floating_point():
+            raise SampleError(f"{key}: found {x.dtype}, expected uint8, or float in [0, 1]")
+        x = x if x.ndim == 5 else x[:, None]
+        first, last = x.shape[2] in (1, 3), x.shape[4] in (1, 3)
+        if layout is None and first == last:
+            shape = tuple(x.shape[2:])
+            raise SampleError(f"{key}: found shape {shape}, expected one axis of 1 or 3 channels; or state layout")
+        hwc = last if layout is None else layout == "hwc"
+        if not (last if hwc else first):
+            raise SampleError(f"{key}: found shape {tuple(x.shape[2:])}, expected layout {layout} with 1 or 3 channels")
+        x = x.permute(0, 1, 4, 2, 3) if hwc else x
+        return x if x.dtype == torch.uint8 else x.to(self.dtype)
+
+    def planes(self, key: str, T: int, *, signed: bool = True) -> Tensor:
+        """(B, T or 1, h, w), floating if it was, else whole."""
+        x = self.get(key, signed=signed)
+        shape = tuple(x.shape[1:])
+        if x.ndim == 3:
+            x = x[:, None]
+        elif x.ndim == 4 and x.shape[1] not in (1, T) and x.shape[3] == 1:
+            x = x[:, None, ..., 0]
+        elif x.ndim == 5:
+            x = x[:, :, 0] if x.shape[2] == 1 else x[..., 0] if x.shape[4] == 1 else x
+        if x.ndim != 4 or x.shape[1] not in (1, T) or 0 in x.shape:
+            expected = f"(h, w), (1, h, w) or (h, w, 1), with or without {T} in front"
+            raise SampleError(f"{key}: found shape {shape}, expected {expected}")
+        return x.to(self.dtype) if x.is_floating_point() else x
+
+    def numbers(self, numbers: Numbers | None, T: int, at: int) -> Tensor | None:
+        """(B, k) of numbers given once, per sample, or per sample and frame."""
+        if numbers is None or self.like is None:
+            return None
+        name = numbers if isinstance(numbers, str) else "numbers"
+        if isinstance(numbers, str):
+            x = self.get(numbers)
+        else:
+            x = torch.as_tensor(numbers, device=self.like.device)[None].expand(self.like.shape[0], *np.shape(numbers))
+        if x.ndim >= 3 and x.shape[-1] == x.shape[-2] == 3:
+            x = x.flatten(-2)
+        if x.ndim == 3 and x.shape[1] in (1, T):
+            x = x[:, at if x.shape[1] > 1 else 0]
+        if x.ndim != 2:
+            raise SampleError(
+                f"{name}: found shape {tuple(x.shape[1:])}, expected one row of numbers, or one per frame"
+            )
+        return x.to(self.dtype)
+
+    def stated(self, numbers: Numbers) -> Hashable | None:
+        """What tells numbers from others, so that the same ones need not be read again; None where a graph, a device or
+        a type that numpy does not know has them, and in inference mode, whose tensors are of no use outside it."""
+        if torch.is_inference_mode_enabled():
+            return None
+        own = plainly(find(self.sample, numbers) if isinstance(numbers, str) else np.asarray(numbers))
+        if own is None or self.like is None:
+            return None
+        return own, self.dtype, self.like.device, self.batched, len(self.like)
+
+    def camera(self, numbers: Numbers, T: int, at: int, distortion: Tensor | None) -> Camera:
+        """Camera of the frame at a place along time."""
+        x = self.numbers(numbers, T, at)
+        assert x is not None
+        if x.shape[1] == 4:
+            return Camera(x[:, :2], x[:, 2:], distortion)
+        if x.shape[1] != 9:
+            name = numbers if isinstance(numbers, str) else "intrinsics"
+            raise SampleError(f"{name}: found {x.shape[1]} numbers, expected 3x3, or fx fy cx cy")
+        return Camera(x[:, 0:5:4].contiguous(), x[:, 2:6:3].contiguous(), distortion)
+
+    def pad(self, key: str, T: int) -> Tensor:
+        """(B, T) whether a frame only pads the start or end of an episode: LeRobot's ``<key>_is_pad``."""
+        assert self.like is not None
+        name = f"{key}_is_pad"
+        if not has(self.sample, name):
+            return torch.zeros(self.like.shape[0], T, dtype=torch.bool, device=self.like.device)
+        x = self.get(name).bool().flatten(1)
+        if x.shape[1] != T:
+            raise SampleError(f"{name}: found {x.shape[1]} values, expected {T}")
+        return x
+
+
+def _keys(sample: Mapping[str, Any], prefix: str = "") -> list[str]:
+    found: list[str] = []
+    for key, value in sample.items():
+        nested = isinstance(value, Mapping)
+        found += _keys(value, f"{prefix}{key}.") if nested else [f"{prefix}{key}"]
+    return sorted(found)

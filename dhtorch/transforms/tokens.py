@@ -1,0 +1,124 @@
+"""Sparse depth pooled to the patch grid of a vision transformer: one depth token beside each of its patch tokens.
+
+Alphabet: B pictures, N samples, P = rows × columns of patches, row by row, as ViT and DINOv2 order theirs.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dhtorch.codes import Hole, Source, names
+from dhtorch.geometry.checks import check
+from dhtorch.ops import loader as native
+from dhtorch.records import Map
+
+#: What the numbers of a token are: 1/m, 1/m, then shares of the patch's samples in [0, 1].
+CHANNELS = ("inverse_depth", "sigma", "answered", *(f"hole_{name.lower()}" for name in names(Hole).values()))
+
+#: How many classes of holes there are; their codes count from 0.
+_CLASSES = len(names(Hole))
+
+#: Types of uv, depth, sigma, source and hole that compiled code takes.
+_COMPILED = (*[torch.float32] * 3, *[torch.int32] * 2)
+
+#: How a picture is brought to the network's size: stretched, shrunk whole with bars, or cut to fill.
+FITS = ("stretch", "pad", "crop")
+
+
+def grid(hw: tuple[int, int], *, patch: int = 14, tokens_hw: tuple[int, int] | None = None) -> tuple[int, int]:
+    """Rows and columns of the patches of a picture of size ``hw``, seen by the network at ``tokens_hw``.
+
+    Raises:
+        ValueError: the picture is smaller than a patch.
+    """
+    height, width = hw if tokens_hw is None else tokens_hw
+    if patch < 1 or min(height, width) < patch:
+        raise ValueError(f"tokens: found a picture of {height}x{width}, expected at least one patch of {patch} px")
+    return height // patch, width // patch
+
+
+def patch_tokens(
+    found: Map,
+    hole: Tensor,  # (B, N) codes.Hole
+    hw: tuple[int, int],
+    *,
+    patch: int = 14,
+    tokens_hw: tuple[int, int] | None = None,
+    fit: str = "stretch",
+) -> tuple[Tensor, Tensor]:
+    """What is known of the depth inside each patch: tokens (B, P, 10) and whether any sample there has one (B, P).
+
+    Inverse depth, because it is bounded and errors of triangulation are even in it. ``inverse_depth`` and ``sigma``
+    are the mean and standard deviation of the inverse depth of a point of the patch drawn at random: the noise of the
+    samples and their spread. ``answered`` is the share of samples with a depth; a share for each class of hole says why
+    the others have none, ``hole_none`` being the share with a usable return. They sum to 1, or to 0 where the patch
+    has no sample.
+
+    Args:
+        found: sensor and recovered depths, from :func:`dhtorch.pipeline.pair.merge`.
+        hole: class of each sample.
+        hw: size of the picture that ``found.uv`` are pixels of.
+        patch: side of a patch, px of the network's picture.
+        tokens_hw: size of the network's picture; None = ``hw``. What is left of a size that is no multiple of the
+            patch, on the right and below, is dropped, as the network's convolution drops it.
+        fit: how the picture is brought to that size, one of :data:`FITS`.
+
+    Raises:
+        ValueError: wrong shapes, an unknown fit, or no patch.
+
+    Gradient: to depth and sigma; where a sample lies and whether it has an answer carry none.
+    """
+    check("patch_tokens", uv=(found.uv, "B N 2"), depth=(found.depth, "B N"), hole=(hole, "B N"))
+    check("patch_tokens", depth=(found.depth, "B N"), sigma=(found.sigma, "B N"), source=(found.source, "B N"))
+    rows, columns = grid(hw, patch=patch, tokens_hw=tokens_hw)
+    scale, margin = _placement(hw, tokens_hw or hw, fit)
+    given = found.uv.contiguous(), found.depth, found.sigma, found.source, hole
+    if native.serves(*given) and tuple(x.dtype for x in given) == _COMPILED:
+        tokens = hole.new_empty(*hole.shape[:1], rows * columns, len(CHANNELS), dtype=torch.float32)
+        known = torch.empty_like(tokens[..., 0], dtype=torch.bool)
+        torch.ops.dhtorch.patch_tokens(*given, tokens, known, patch, rows, columns, *scale, *margin)
+        return tokens, known
+    cell = _cells(found.uv, scale, margin, patch=patch, rows=rows, columns=columns)
+
+    def total(x: Tensor) -> Tensor:  # (B, N, k) → (B, P + 1, k), the last of what lies in no patch
+        zero = torch.zeros(x.shape[0], rows * columns + 1, x.shape[2], dtype=torch.float64, device=x.device)
+        return zero.scatter_add(1, cell[..., None].expand_as(x), x)
+
+    answered = (found.source != Source.NONE) & (found.depth > 0)
+    inverse = torch.where(answered, found.depth, torch.inf).double().reciprocal()
+    noise = torch.where(answered, found.sigma, 0.0).double() * inverse * inverse
+    is_class = hole[..., None] == torch.arange(_CLASSES, dtype=hole.dtype, device=hole.device)
+    sums = total(
+        torch.cat((torch.ones_like(inverse)[..., None], inverse[..., None], answered[..., None], is_class), -1)
+    )
+    per, per_answered = sums[..., ::2][..., :2].clamp_min(1).reciprocal().split(1, -1)
+    mean = sums[..., 1:2] * per_answered
+    off = torch.where(answered, inverse - mean[..., 0].gather(1, cell), 0.0)
+    variance = total((noise * noise + off * off)[..., None]) * per_answered
+    positive = variance > 0
+    sigma = torch.where(positive, torch.where(positive, variance, 1.0).sqrt(), 0.0)
+    tokens = torch.cat((mean, sigma, sums[..., 2:] * per), -1)[:, :-1]
+    return tokens.to(found.depth.dtype), sums[:, :-1, 2] > 0
+
+
+def _placement(hw: tuple[int, int], tokens_hw: tuple[int, int], fit: str) -> tuple[list[float], list[float]]:
+    """Scale and margin along x and y by which (uv + ½) lies in the network's picture."""
+    if fit not in FITS:
+        raise ValueError(f"tokens: fit is {fit!r}, expected one of {', '.join(FITS)}")
+    scale = [tokens_hw[1] / hw[1], tokens_hw[0] / hw[0]]
+    if fit != "stretch":
+        scale = [min(scale) if fit == "pad" else max(scale)] * 2
+    margin = [(tokens_hw[k] - hw[k] * s) / 2 for k, s in zip((1, 0), scale, strict=True)]
+    return scale, margin
+
+
+def _cells(uv: Tensor, scale: list[float], margin: list[float], *, patch: int, rows: int, columns: int) -> Tensor:
+    """(B, N) index of the patch each sample lies in; rows · columns where it lies in none."""
+    place = uv.detach().double() + 0.5
+    place = place * (scale[0] if scale[0] == scale[1] else place.new_tensor(scale))
+    if any(margin):
+        place = place + place.new_tensor(margin)
+    column, row = (place / patch).floor().unbind(-1)
+    inside = (column.clamp(0, columns - 1) == column) & (row.clamp(0, rows - 1) == row)
+    return torch.where(inside, torch.add(column, row, alpha=columns), rows * columns).long()

@@ -1,0 +1,224 @@
+"""A bare matplotlib figure to draw on in points (1/72 inch), left to right and upwards; and its legend.
+
+matplotlib is imported when something is drawn, and only through its figure objects, so that no global state, window or
+font setting is touched.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+from dhtorch.viz.plots.colours import GREY, INK, SOFT, THEIRS, Stroke
+
+#: Height of letters, points; their width by which words are cut, as a share of it.
+SMALL, TITLE, LETTER = 10.0, 11.0, 0.59
+#: Of a title: least height of its letters, points, and their width, as they are bold.
+LEAST, BOLD = 8.0, 0.66
+
+Place = tuple[float, float]
+
+
+class Key(NamedTuple):
+    """An entry of a legend."""
+
+    text: str
+    colour: str
+    shape: str = "line"  # line | dot | box | cross | diamond
+    stroke: Stroke | None = None  # of a line
+
+
+class Mark(NamedTuple):
+    """Something drawn: its kind, its corners (places in the panel), how, and what it says when pointed at."""
+
+    kind: str  # line | dot | diamond | bar
+    places: tuple[Place, ...]
+    stroke: Stroke
+    said: str = ""
+    edge: str | None = None  # colour of the edge of a bar
+
+
+class Canvas:
+    """A bare matplotlib figure, drawn on in points."""
+
+    def __init__(self, width: float, height: float, dpi: float) -> None:
+        from matplotlib.figure import Figure  # noqa: PLC0415
+        from matplotlib.transforms import Affine2D  # noqa: PLC0415
+
+        self.figure = Figure((width / 72, height / 72), dpi=dpi)
+        self.points = Affine2D().scale(1 / width, 1 / height) + self.figure.transFigure
+        self.said: list[str] = []  # what the artists named said-0, said-1, … say
+
+    def text(self, text: str, u: float, v: float, *, size: float = SMALL, said: str = "", **options: Any) -> None:
+        """Words at a place; ``said`` where they had to be cut."""
+        from matplotlib.text import Text  # noqa: PLC0415
+
+        text = plain(text)
+        if not text:
+            return
+        weight = "bold" if options.pop("bold", False) else "normal"
+        made = Text(u, v, text, color=INK if weight == "bold" else SOFT, fontsize=size, fontweight=weight, **options)
+        made.set(parse_math=False, rotation_mode="anchor", transform=self.points)
+        self._add(made, said if plain(said) != text else "")
+
+    def title(self, text: str, width: float, height: float, left: float = 0.0) -> None:
+        """Words along the upper edge: long ones are set smaller, then cut in their middle."""
+        text = plain(text)
+        size = min(TITLE, max(LEAST, width / (BOLD * max(len(text), 1))))
+        shown = cut(text, width * LETTER / BOLD, size, end=len(text) // 3)
+        self.text(shown, left + 2, height - 14, size=size, bold=True, said=text)
+
+    def lines(self, segments: Iterable[Sequence[Place]], stroke: Stroke, said: str = "") -> None:
+        """Lines through places, all in one path."""
+        from matplotlib.path import Path  # noqa: PLC0415
+
+        places: list[Place] = []
+        codes: list[Any] = []
+        for segment in segments:
+            places += segment
+            codes += [Path.MOVETO, *[Path.LINETO] * (len(segment) - 1)]
+        options = {"linewidth": stroke.width, "alpha": None if stroke.opacity == 1 else stroke.opacity}
+        dashes = (0, stroke.dashes) if stroke.dashes else "solid"
+        self._path(places, codes, said, fill=False, edgecolor=stroke.colour, linestyle=dashes, **options)
+
+    def dots(self, places: Iterable[Place], stroke: Stroke, said: str = "") -> None:
+        """Dots as wide as the stroke: lines without length and with round ends, the shortest that SVG knows."""
+        from matplotlib.path import Path  # noqa: PLC0415
+
+        ends = [end for u, v in places for end in ((u, v), (u + 1e-4, v))]
+        codes = [Path.MOVETO, Path.LINETO] * (len(ends) // 2)
+        options = {"linewidth": stroke.width, "capstyle": "round", "snap": False}
+        self._path(ends, codes, said, fill=False, edgecolor=stroke.colour, **options)
+
+    def mark(self, mark: Mark) -> None:
+        """One mark of a panel."""
+        if mark.kind == "line":
+            self.lines([mark.places], mark.stroke, mark.said)
+        elif mark.kind == "dot":
+            self.dots(mark.places, mark.stroke, mark.said)
+        else:
+            self.area(mark.places, mark.stroke.colour, mark.said, mark.edge, 1.8 if mark.kind == "diamond" else 0.5)
+
+    def area(
+        self,
+        corners: Sequence[Place],
+        colour: str,
+        said: str = "",
+        edge: str | None = None,
+        width: float = 0.5,  # of the edge
+    ) -> None:
+        """A filled polygon."""
+        from matplotlib.path import Path  # noqa: PLC0415
+
+        codes = [Path.MOVETO, *[Path.LINETO] * (len(corners) - 1), Path.CLOSEPOLY]
+        options = {"facecolor": colour, "edgecolor": edge or "none", "linewidth": width if edge else 0}
+        self._path([*corners, corners[0]], codes, said, **options)
+
+    def axes(self) -> Any:
+        """matplotlib's axes over the whole canvas, whose data are places: for what has a colour map."""
+        axes = self.figure.add_axes((0, 0, 1, 1), zorder=1e6)
+        width, height = 72 * self.figure.get_size_inches()
+        axes.set(xlim=(0, width), ylim=(0, height))
+        axes.set_axis_off()
+        return axes
+
+    def picture(self, pixels: Any, box: tuple[float, float, float, float]) -> None:
+        """A picture, (H, W) grey or (H, W, 3) in [0, 1], under all else; its box: left, bottom, width, height."""
+        (left, bottom, width, height), limits = box, 72 * self.figure.get_size_inches()
+        axes = self.axes()
+        axes.set_zorder(-1)
+        axes.imshow(
+            pixels,
+            cmap=GREY,
+            vmin=0,
+            vmax=1,
+            extent=(left, left + width, bottom, bottom + height),
+            aspect="auto",
+            interpolation="antialiased",
+        )
+        axes.set(xlim=(0, limits[0]), ylim=(0, limits[1]))
+
+    def finished(self, keys: Sequence[Key]) -> Any:
+        """The figure with a legend beside it, where it covers nothing."""
+        if keys:
+            options = {"bbox_to_anchor": (1.0, 1.0), "frameon": False, "fontsize": 9, "labelcolor": INK}
+            self.figure.legend(handles=list(map(_handle, keys)), loc="upper left", **options)
+        return self.figure
+
+    def _path(self, places: Sequence[Any], codes: Sequence[Any], said: str, **options: Any) -> None:
+        from matplotlib.patches import PathPatch  # noqa: PLC0415
+        from matplotlib.path import Path  # noqa: PLC0415
+
+        if places:
+            path = Path(places, codes)
+            path.should_simplify = False
+            joined = {"joinstyle": "round"} | options
+            self._add(PathPatch(path, transform=self.points, **joined), said)
+
+    def _add(self, artist: Any, said: str) -> None:
+        if said:
+            artist.set_gid(f"said-{len(self.said)}")
+            self.said.append(plain(said))
+        artist.set_figure(self.figure)
+        artist.set_zorder(len(self.figure.artists))  # in the order in which they come
+        self.figure.artists.append(artist)
+
+
+def plain(text: str) -> str:
+    """Words as a figure can hold them: on one line, without control characters and halves of surrogate pairs."""
+    text = str(text).encode("utf-8", "replace").decode()
+    return " ".join("".join(c if c.isprintable() or c.isspace() else "\ufffd" for c in text).split())
+
+
+def cut(text: str, width: float, size: float, end: int = 0) -> str:
+    """As much of a text as a width has room for, points; with up to ``end`` letters of its end, a third of all."""
+    most = int(width / (LETTER * size) + 1e-6)
+    if len(text) <= most:
+        return text
+    last = min(end, most // 3)
+    return f"{text[: most - 1 - last]}…{text[len(text) - last :]}"
+
+
+def frame_of(scene: str, frame: object, views: Sequence[object] = ()) -> str:
+    """A frame of a scene, and those that were asked beside it, by their names."""
+    beside = f", with {_frames(views)}" if views else ""
+    return f"{scene}, frame {frame}{beside}"
+
+
+def _frames(views: Sequence[object]) -> str:
+    return f"frame{'s' * (len(views) > 1)} {', '.join(map(str, views))}"
+
+
+def at_cutoff(place: str, cutoff: float | None) -> str:
+    """What is shown, and how much of the sensor's depth was kept, m."""
+    return place if cutoff is None else f"{place}, cutoff {cutoff:g} m"
+
+
+def headed(words: str, title: str) -> str:
+    """What a figure shows, behind the scene that it shows."""
+    return f"{title}: {words[0].lower()}{words[1:]}" if title else words
+
+
+def save(figure: Any, path: Any) -> None:
+    """Write a figure with what lies around its axes."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph")  # a name in letters that the font lacks
+        figure.savefig(path, bbox_inches="tight", pad_inches=0.1)
+
+
+def _handle(key: Key) -> Any:
+    """What stands for an entry in matplotlib's legend."""
+    from matplotlib.lines import Line2D  # noqa: PLC0415
+
+    made: dict[str, Any] = {"label": key.text, "linestyle": "none", "markersize": 6, "markerfacecolor": key.colour}
+    if key.shape == "line":
+        stroke = key.stroke or Stroke(key.colour)
+        dashes: Any = (0, stroke.dashes) if stroke.dashes else "solid"
+        return Line2D([], [], color=key.colour, linewidth=stroke.width, linestyle=dashes, label=key.text)
+    marker, edge = _MARKERS[key.shape]
+    return Line2D([], [], marker=marker, markeredgecolor=edge or key.colour, **made)
+
+
+#: Shape of an entry → matplotlib's marker and the colour of its edge, None = its own.
+_MARKERS = {"dot": ("o", "none"), "box": ("s", "none"), "cross": ("x", None), "diamond": ("D", THEIRS)}

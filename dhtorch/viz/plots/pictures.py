@@ -1,0 +1,222 @@
+"""Pictures of what a pair found: arrays → PNG.
+
+Arrays may be torch tensors or numpy arrays, on any device, of one pair (no batch dimension).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dhtorch.codes import ROUTE_OF_HOLE, Gate, Hole, Route, Source, names, words
+from dhtorch.runtime.console import many
+from dhtorch.viz.plots import colours
+from dhtorch.viz.plots.axis import Axis, spanning
+from dhtorch.viz.plots.canvas import Canvas, Key, headed, save
+from dhtorch.viz.plots.colours import FAINT, GATES, HOLES, INK, RECOVERED, SENSOR, Stroke, series
+from dhtorch.viz.plots.panel import Panel
+
+#: Fewest answers whose mean error is drawn.
+FEWEST = 10
+#: How the points of a layer are drawn: shape, points across, and the width of a white edge.
+MARKS = {"sensor": ("dot", 2.8, 0.0), "silent": ("cross", 2.8, 0.0), "answer": ("dot", 3.8, 0.6)}
+
+
+class Layer(NamedTuple):
+    """Points of one kind in a picture."""
+
+    label: str
+    uv: np.ndarray  # (P, 2) px
+    colour: str
+    mark: str  # one of MARKS
+
+
+class Picture:
+    """Layers of points over a picture; where there is none, over an empty ground."""
+
+    def __init__(self, title: str, hw: Sequence[float], layers: Sequence[Layer], image: Any = None, *, width: float):
+        self.title = self.words = title
+        self.hw, self.layers, self.image = (float(hw[0]), float(hw[1])), list(layers), image
+        self.width, self.inner = width, width * self.hw[0] / self.hw[1]
+        self.height = self.inner + 20  # the title stands above
+
+    def figure(self, *, dpi: float = 160) -> Any:
+        """The picture as a matplotlib ``Figure`` with its title and a legend that counts the points."""
+        canvas = Canvas(self.width, self.height, dpi)
+        self.draw(canvas)
+        shapes = {layer.label: MARKS[layer.mark][0] for layer in self.layers}
+        keys = [Key(f"{x.label}  {len(x.uv)}", x.colour, shapes[x.label]) for x in reversed(self.layers)]
+        return canvas.finished(keys)
+
+    def draw(self, canvas: Canvas) -> None:
+        """Draw title, picture and points."""
+        canvas.title(self.title, self.width, self.height)
+        w, h = self.width, self.inner
+        if self.image is None:
+            canvas.area(((0, 0), (w, 0), (w, h), (0, h)), colours.PICTURE)
+        else:
+            canvas.picture(_grey(self.image), (0, 0, w, h))
+        for layer in self.layers:
+            shape, size, edge = MARKS[layer.mark]
+            places = [self._at(u, v) for u, v in layer.uv.tolist()]
+            if shape == "cross":
+                r = 0.5 * size
+                ways = [((u - r, v - r), (u + r, v + r)) for u, v in places]
+                ways += [((u - r, v + r), (u + r, v - r)) for u, v in places]
+                canvas.lines(ways, Stroke(layer.colour, 0.8))
+                continue
+            if edge and self.image is not None:
+                canvas.dots(places, Stroke(colours.WHITE, size + edge))
+            canvas.dots(places, Stroke(layer.colour, size))
+
+    def _at(self, u: float, v: float) -> tuple[float, float]:
+        scale = self.width / self.hw[1]
+        return (u + 0.5) * scale, self.inner - (v + 0.5) * scale
+
+
+def draw_samples(
+    path: str | Path,
+    image: Any,  # (C, H, W) float in [0, 1] or uint8
+    uv: Any,  # (N, 2) px
+    source: Any,  # (N,) codes.Source of the merged map
+    gate: Any,  # (N,) codes.Gate
+    *,
+    title: str = "",
+) -> None:
+    """Draw what became of every sample: a sensor return, a recovered depth, or the reason for silence."""
+    source, gate = _array(source), _array(gate)
+    layers = [
+        (words(name), (source == Source.NONE) & (gate == code), GATES[code], "silent")
+        for code, name in names(Gate).items()
+        if code != Gate.ANSWER
+    ]
+    layers += [
+        ("sensor", source == Source.SENSOR, SENSOR, "sensor"),
+        ("recovered", source == Source.RECOVERED, RECOVERED, "answer"),
+    ]
+    _overlay(path, image, uv, layers, headed("What became of the samples", title))
+
+
+def draw_holes(
+    path: str | Path,
+    image: Any,  # (C, H, W) float in [0, 1] or uint8
+    uv: Any,  # (N, 2) px
+    hole: Any,  # (N,) codes.Hole
+    *,
+    title: str = "",
+) -> None:
+    """Draw where the sensor is silent and why, with what could be done about it."""
+    hole = _array(hole)
+    routes = names(Route)
+    layers = [("sensor", hole == Hole.NONE, SENSOR, "sensor")]
+    for code, name in reversed(names(Hole).items()):
+        if code != Hole.NONE:
+            label = f"{words(name)} → {words(routes[ROUTE_OF_HOLE[code]])}"
+            layers.append((label, hole == code, HOLES[code], "answer"))
+    _overlay(path, image, uv, layers, headed("Why there is no return", title))
+
+
+def draw_depth(
+    path: str | Path,
+    true_depth: Any,  # (P,) m
+    depth: Any,  # (P,) m
+    score: Any = None,  # (P,) in [0, 1]
+    *,
+    title: str = "",
+) -> None:
+    """Draw recovered against true depth on logarithmic axes, with the ±10 % band.
+
+    NaN is silence and left out; answers beyond the axes are drawn on their edge and counted.
+    """
+    true, found = _array(true_depth).ravel(), _array(depth).ravel()
+    good = np.isfinite(true) & np.isfinite(found) & (true > 0) & (found > 0)
+    shade = None if score is None else _array(score).ravel()[good]
+    true, found = true[good], found[good]
+    low, high = (true.min() / 1.5, true.max() * 1.5) if len(true) else (1.0, 10.0)
+    x, y = (Axis(float(low), float(high), f"{kind} depth, m", log=True) for kind in ("true", "recovered"))
+    panel = Panel(headed("Recovered against true", title), x, y, size=(380, 386))
+    corners = ((low, low / 0.9, high, high, high / 1.1, low), (low, low, 0.9 * high, high, high, 1.1 * low))
+    panel.fill(*corners, FAINT)
+    panel.line([low, high], [low, high], Stroke(INK, 1))
+    keys = [Key("± 10 %", FAINT, "box"), Key("no error", INK, stroke=Stroke(INK, 1))]
+    canvas = panel.canvas()
+    _scatter(canvas, panel, true, found, shade)
+    for k, line in enumerate(_said(true, found, low, high) if len(true) else ()):
+        canvas.text(line, panel.left + 10, panel.height - panel.top - 18 - 14 * k)
+    save(canvas.finished(keys), path)
+
+
+def _scatter(canvas: Canvas, panel: Panel, true: np.ndarray, found: np.ndarray, shade: np.ndarray | None) -> None:
+    """Answers as dots, the surest on top, with a scale of the scores beside the panel."""
+    order = np.arange(len(true)) if shade is None else np.argsort(shade, kind="stable")
+    places = np.array([panel.at(x, y) for x, y in zip(true[order].tolist(), found[order].tolist(), strict=True)])
+    axes = canvas.axes()
+    options = {"color": SENSOR} if shade is None else {"c": shade[order], "cmap": colours.SCORE, "vmin": 0, "vmax": 1}
+    dots = axes.scatter(*places.reshape(-1, 2).T, s=9, alpha=0.75, linewidth=0, clip_on=False, **options)
+    if shade is not None and len(true):
+        inside = canvas.figure.add_axes((1.04, 0.12, 0.025, 0.5))
+        canvas.figure.colorbar(dots, cax=inside, label="score").outline.set_visible(False)
+
+
+def _said(true: np.ndarray, found: np.ndarray, low: float, high: float) -> list[str]:
+    """The answers in numbers."""
+    error = np.abs(found / true - 1)
+    said = [many(len(true), "answer"), f"median error {100 * np.median(error):.1f} %"]
+    said.append(f"within 10 %: {100 * (error < 0.1).mean():.0f} %")
+    outside = int(((found < low) | (found > high)).sum())
+    return [*said, *([f"{outside} beyond the axes"] if outside else [])]
+
+
+def draw_risk_coverage(
+    path: str | Path,
+    curves: Mapping[str, tuple[Any, Any]],  # name → coverage (n,), risk (n,)
+    *,
+    oracle: tuple[Any, Any] | None = None,
+    title: str = "",
+) -> None:
+    """Draw risk against coverage, as from :func:`dhtorch.metrics.risk.risk_coverage`; the best order is dashed.
+
+    A mean over fewer than ten answers is not drawn.
+    """
+    strokes = series(curves)
+    drawn = {name: [_array(v)[FEWEST - 1 :].tolist() for v in curve] for name, curve in curves.items()}
+    drawn = {name: curve for name, curve in drawn.items() if curve[0]}
+    right = spanning([0.1, *(x for c, _ in drawn.values() for x in c)], "", low=0.0).high
+    top = spanning([0.12, *(y for _, r in drawn.values() for y in r)], "", low=0.0).high
+    x = Axis(0.0, min(1.0, right), "answered share of the candidates, %", percent=True)
+    y = Axis(0.0, min(1.0, top), "mean relative error (at most 1), %", percent=True)
+    panel = Panel(headed("Error of the surest", title), x, y, size=(400, 290))
+    for level in (0.05, 0.1):
+        panel.line([x.low, x.high], [level, level], Stroke(colours.SILENT, 0.8))
+    keys = [Key(name, strokes[name].colour, stroke=strokes[name]) for name in drawn]
+    if oracle is not None:
+        best = Stroke(INK, 1, (4, 3))
+        panel.line(_array(oracle[0]).tolist(), _array(oracle[1]).tolist(), best)
+        keys.append(Key("best order", INK, stroke=best))
+    for name, (coverage, risk) in drawn.items():
+        panel.line(coverage, risk, strokes[name])
+        panel.dot(coverage[-1], risk[-1], strokes[name], width=5)
+    save(panel.figure(keys=keys), path)
+
+
+def _overlay(
+    path: str | Path, image: Any, uv: Any, layers: Sequence[tuple[str, np.ndarray, str, str]], title: str
+) -> None:
+    """Draw groups of pixels (label, mask, colour, mark) over a picture, with their counts in a legend beside it."""
+    uv, hw = _array(uv), tuple(image.shape[-2:])
+    shown = [Layer(label, uv[mask], colour, mark) for label, mask, colour, mark in layers if mask.any()]
+    save(Picture(title, hw, shown, image, width=520).figure(), path)
+
+
+def _array(x: Any) -> np.ndarray:
+    return x.detach().cpu().numpy() if hasattr(x, "detach") else np.asarray(x)
+
+
+def _grey(image: Any) -> np.ndarray:
+    """Picture (H, W) in [0, 1] to draw on: colourless and of little contrast, so that what is drawn stands out."""
+    pixels = _array(image)
+    pixels = pixels / 255.0 if pixels.dtype == np.uint8 else pixels
+    return 0.45 + 0.5 * np.clip(pixels.mean(0), 0, 1)

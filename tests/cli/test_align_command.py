@@ -1,0 +1,107 @@
+"""``dhtorch anchor``: maps in other units written in metres, frames that are whole stay, limits decide the exit code."""
+
+import json
+
+import numpy as np
+import pytest
+
+from dhtorch import data
+from dhtorch.cli import run
+from dhtorch.data.depth_maps import open_maps
+from dhtorch.synthetic import SyntheticRoom
+
+ROOM = ["data=synthetic", "data.hw=[96,128]", "data.depth_hw=[96,128]", "data.supersample=1", "data.n_frames=6"]
+LITTLE = ["method.n=256", "cutoff=2.0", "most=2", "every=3", "steps=[1,2]"]
+
+
+@pytest.fixture(scope="module")
+def room():
+    return SyntheticRoom(n_frames=6, hw=(96, 128), depth_hw=(96, 128), supersample=1)
+
+
+@pytest.fixture(scope="module")
+def maps(tmp_path_factory, room):
+    folder = tmp_path_factory.mktemp("maps")
+    for k in range(len(room)):
+        truth = room.truth(k)["depth"][0].numpy()
+        np.savez(folder / f"net_{k:04d}.npz", disparity=np.where(truth > 0, 30 / np.maximum(truth, 0.1) + 2, 0))
+    return folder
+
+
+def test_maps_are_written_in_metres_and_stay(tmp_path, maps, room, capsys):
+    out = tmp_path / "out"
+    asked = ["anchor", *ROOM, *LITTLE, f"depth={maps}", f"out={out}", "kind=inverse", 'fail_on="silent>0.9"']
+    assert run.main(asked) == run.DONE
+    assert "2 maps" in capsys.readouterr().out
+    found = json.loads((out / "anchor.json").read_text())
+    assert [row["frame"] for row in found["frames"]] == [0, 3]
+    assert found["whole"]["held"]["unanchored"] == 0
+    for row in (frame["anchored"] for frame in found["frames"]):
+        assert 0 <= row["probability"] <= row["likeliest_probability"] <= 1
+        assert (row["probability"] == row["likeliest_probability"]) == (row["model"] == row["likeliest"])
+    again = data.open(out)
+    truth = room.truth(3)["depth"]
+    depth = again[1].depth
+    known = (truth > 0) & (depth > 0)
+    assert known.double().mean() > 0.9
+    assert ((depth - truth).abs() / truth)[known].median() < 0.02
+    assert (out / "anchor.html").read_text().count("data:image/png;base64,") == 2
+    before = {p: p.stat().st_mtime_ns for p in (out / "depth").iterdir()}
+    (out / "meta" / "000003.json").unlink()
+    assert run.main(asked) == run.DONE
+    assert "1 left untouched" in capsys.readouterr().out
+    after = {p: p.stat().st_mtime_ns for p in (out / "depth").iterdir()}
+    assert before.keys() == after.keys()
+    assert sum(before[p] != after[p] for p in before) == 1
+    assert run.main([*asked, "kind=affine"]) == run.FAILED, "other maps in the same folder"
+
+
+def test_a_limit_decides_the_exit_code(tmp_path, room, capsys):
+    for k in range(len(room)):
+        np.save(tmp_path / f"{k:04d}.npy", 1.5 * room.truth(k)["depth"][0].numpy())
+    words = [f"depth={tmp_path}", f"out={tmp_path / 'out'}", "most=1", 'fail_on="scale>0.2,silent>0.99"']
+    assert run.main(["anchor", *ROOM, *LITTLE, *words]) == run.SOME_FAILED
+    assert "exceeded: scale is 0.33" in capsys.readouterr().out
+    assert "Exceeded" in (tmp_path / "out" / "anchor.html").read_text()
+
+
+def test_a_hole_in_a_file_is_no_value_of_any_kind_and_a_sensor_beside_itself_is_told(tmp_path, room, capsys):
+    for k in range(2):
+        depth = room[k].depth[0].numpy()
+        np.save(tmp_path / f"{k:04d}.npy", np.where(np.arange(128) < 20, 0, depth))
+    words = [f"depth={tmp_path}", "most=1", "kind=affine"]
+    assert run.main(["anchor", *ROOM, *LITTLE[:1], *words, f"out={tmp_path / 'out'}"]) == run.DONE
+    assert "of one sensor" in capsys.readouterr().out
+    depth = data.open(tmp_path / "out")[0].depth
+    assert (depth[..., :20] == 0).all()
+    assert (depth[..., 20:] > 0).double().mean() > 0.5
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("kind=wrong", "kind"),
+        ("fail_on='colour>1'", "fail_on"),
+        ("depth=/nowhere", "no folder"),
+        ("every=0", "every"),
+        ("pictures=-1", "pictures"),
+    ],
+)
+def test_what_cannot_be_is_said_in_one_line(word, said, tmp_path, maps, capsys):
+    words = [f"depth={maps}", f"out={tmp_path / 'out'}", word]
+    assert run.main(["anchor", *ROOM, *LITTLE, *words]) == run.FAILED
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert said in lines[0]
+
+
+def test_limits_of_a_metre_need_a_metre(tmp_path, maps, capsys):
+    words = [f"depth={maps}", f"out={tmp_path / 'out'}", "kind=inverse", "fail_on='scale>0.1'"]
+    assert run.main(["anchor", *ROOM, *LITTLE, *words]) == run.FAILED
+    assert "expected kind=metric" in capsys.readouterr().err
+
+
+def test_an_archive_of_several_arrays_says_which_is_depth(tmp_path, room):
+    truth = room.truth(0)["depth"][0].numpy()
+    np.savez(tmp_path / "0.npz", depth=truth, normal=np.zeros((3, *truth.shape)))
+    assert np.allclose(open_maps(tmp_path, room)[0][0], truth)

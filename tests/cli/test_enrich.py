@@ -1,0 +1,286 @@
+"""dhtorch enrich: what the source had is there value for value, depth stands beside it, whatever interrupts it."""
+
+import io
+import itertools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("pyarrow")
+pytest.importorskip("av")
+
+from PIL import Image
+from pyarrow import parquet
+
+from dhtorch import data
+from dhtorch import testing as writers
+from dhtorch.cli.run import main
+from dhtorch.export.lerobot import Moments
+from dhtorch.extract import shards
+from dhtorch.extract.robot_target import RobotTarget
+from dhtorch.runtime import storage
+from dhtorch.synthetic.recording import SyntheticRoom
+
+HW, LENGTHS, NEAR = (48, 64), (4, 3), 2.5
+CAMERA = "observation.images.front"
+DEPTH = f"{CAMERA}_depth_enriched"  # the source has a depth of its own
+STEP = 2.0**-10
+ASKED = ["method=paper", "method.n=64", "method.hypotheses=10", "gap=2", "dense={size: 64, planes: 8}", "shard_rows=2"]
+
+
+@pytest.fixture(scope="module")
+def shots():
+    """Frames of the synthetic room, whose sensor sees no farther than NEAR."""
+    room = SyntheticRoom(hw=HW, n_frames=sum(LENGTHS), lidar="exact", supersample=1)
+    frames = [room[i] for i in range(len(room))]
+    return [frame.replace(depth=torch.where(frame.depth <= NEAR, frame.depth, 0.0)) for frame in frames]
+
+
+def robot_set(root, shots, version):
+    root.mkdir(parents=True)
+    starts = np.cumsum((0, *LENGTHS))
+    episodes = [shots[a:b] for a, b in itertools.pairwise(starts)]
+    writers.write_lerobot(root, episodes, version=version, depth="tiff")
+    return root
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory, shots):
+    return robot_set(tmp_path_factory.mktemp("robot") / "set", shots, 3)
+
+
+@pytest.fixture(scope="module")
+def enriched(tmp_path_factory, robot):
+    """The robot's set, enriched."""
+    out = tmp_path_factory.mktemp("enriched") / "set"
+    assert main(["enrich", str(robot), str(out), *ASKED]) == 0
+    return out
+
+
+def tree(root):
+    return {str(p.relative_to(root)): p.read_bytes() for p in sorted(Path(root).rglob("*")) if p.is_file()}
+
+
+def rows(root):
+    tables = sorted((Path(root) / "data").rglob("*.parquet"))
+    return [row for table in tables for row in parquet.read_table(table).to_pylist()]
+
+
+def map_of(row, key):
+    return np.array(Image.open(io.BytesIO(row[key]["bytes"])))
+
+
+def test_statistics_of_large_numbers_keep_their_spread():
+    """A time stamp of today squared has no digits left for how far apart two frames are."""
+    x = 1.7e9 + np.arange(600).reshape(-1, 1) / 30
+    total = Moments.of(x[:7]) + Moments.of(x[7:7]) + Moments.parse(Moments.of(x[7:]).pack())
+    entry = total.stats(len(x), (1,))
+    assert np.allclose([entry["mean"][0] - 1.7e9, entry["std"][0]], [x.mean() - 1.7e9, (x - 1.7e9).std()], rtol=1e-5)
+
+
+def test_what_the_source_had_is_there_value_for_value(robot, enriched):
+    for before, after in zip(rows(robot), rows(enriched), strict=True):
+        assert {k: after[k] for k in before} == before
+    videos = {k: v for k, v in tree(robot).items() if k.startswith("videos/")}
+    assert videos and videos.items() <= tree(enriched).items()
+    before, after = (json.loads((r / "meta" / "info.json").read_text())["features"] for r in (robot, enriched))
+    assert {k: after[k] for k in before} == before
+
+
+def test_an_episode_begins_and_ends_in_its_video_where_it_did(robot, enriched):
+    before, after = (parquet.read_table(next((r / "meta" / "episodes").rglob("*.parquet"))) for r in (robot, enriched))
+    for end in ("from_timestamp", "to_timestamp"):
+        name = f"videos/{CAMERA}/{end}"
+        assert after[name].to_pylist() == pytest.approx(before[name].to_pylist()), end
+
+
+def test_depth_is_in_steps_and_the_sensor_is_within_half_of_one(enriched, shots):
+    for row, frame in zip(rows(enriched), shots, strict=True):
+        depth, sigma, source = (map_of(row, k) for k in (DEPTH, f"{DEPTH}_sigma", f"{CAMERA}_dhtorch_source"))
+        assert depth.dtype == np.float32 and np.array_equal(np.round(depth / STEP) * STEP, depth)
+        assert np.array_equal(np.round(sigma / (STEP / 8)) * (STEP / 8), sigma) and (sigma % STEP).any()
+        assert np.array_equal(depth > 0, source > 0) and np.array_equal(sigma > 0, source > 0)
+        sensor = source == 1
+        assert sensor.any()
+        assert np.abs(depth - frame.depth[0].numpy())[sensor].max() <= STEP / 2 + 1e-6
+
+
+def test_what_is_known_to_less_than_half_a_step_is_known_to_one(robot, tmp_path):
+    """Depth in whole metres: nothing that has a depth is said to have none, or to be known exactly."""
+    assert main(["enrich", str(robot), str(tmp_path / "set"), *ASKED, "step=1"]) == 0
+    for row in rows(tmp_path / "set"):
+        depth, sigma, source = (map_of(row, k) for k in (DEPTH, f"{DEPTH}_sigma", f"{CAMERA}_dhtorch_source"))
+        assert set(np.unique(depth)) <= set(range(8)) and np.array_equal(depth > 0, source > 0)
+        assert sigma[depth > 0].min() == 1 / 8
+
+
+def test_statistics_are_of_what_is_known(enriched):
+    stats = json.loads((enriched / "meta" / "stats.json").read_text())
+    known = np.concatenate([m[m > 0] for m in (map_of(row, DEPTH) for row in rows(enriched))]).astype(np.float64)
+    found = stats[DEPTH]
+    want = {"min": known.min(), "max": known.max(), "mean": known.mean(), "std": known.std()}
+    assert {k: np.shape(found[k]) for k in want} == dict.fromkeys(want, (1, 1, 1))
+    for name, value in want.items():
+        assert np.ravel(found[name])[0] == pytest.approx(value, rel=1e-6)
+    assert np.shape(stats[CAMERA]["mean"]) == (3, 1, 1) and found["count"] == [sum(LENGTHS)]
+    features = json.loads((enriched / "meta" / "info.json").read_text())["features"]
+    stated = [features[f"{DEPTH}{end}"]["info"]["quantiser_step_m"] for end in ("", "_sigma")]
+    assert stated == [STEP, STEP / 8], "metres"
+
+
+def test_it_reads_back_as_a_recording(enriched, shots):
+    again = data.open_all(enriched, depth=DEPTH)
+    assert [len(each) for each in again] == list(LENGTHS)
+    frame = again[0][0]
+    assert torch.allclose(frame.camera.f, shots[0].camera.f)
+    near = shots[0].depth > 0
+    assert (frame.depth - shots[0].depth)[near].abs().median() <= STEP
+
+
+@pytest.mark.parametrize("place", ["shard", "table", "meta"])
+def test_interrupted_anywhere_the_same_command_gives_the_same_bytes(
+    place, robot, enriched, tmp_path, monkeypatch, capsys
+):
+    calls = itertools.count()
+
+    def stops(function, after):
+        def called(*args, **options):
+            if next(calls) == after:
+                raise KeyboardInterrupt
+            return function(*args, **options)
+
+        return called
+
+    target, name, after = {
+        "shard": (shards, "write", 2),
+        "table": (RobotTarget, "_copy_videos", 1),
+        "meta": (storage, "write_json", 2),
+    }[place]
+    out = tmp_path / "set"
+    with monkeypatch.context() as patch:
+        patch.setattr(target, name, stops(getattr(target, name), after))
+        assert main(["enrich", str(robot), str(out), *ASKED]) == 130
+    assert not (out / "meta" / "info.json").exists()
+    assert "the same command does the rest" in capsys.readouterr().err
+    assert main(["enrich", str(robot), str(out), *ASKED]) == 0
+    assert tree(out) == tree(enriched)
+
+
+def test_other_options_and_other_folders_are_refused(robot, enriched, tmp_path, capsys):
+    assert main(["enrich", str(robot), str(enriched), *ASKED, "step=0"]) == 2
+    assert "step 0.0009765625 there, 0 here" in capsys.readouterr().err
+    assert main(["enrich", str(robot), str(robot / "new"), *ASKED]) == 2
+    assert "only read" in capsys.readouterr().err and not (robot / "new").exists()
+    (tmp_path / "note.txt").write_text("mine")
+    assert main(["enrich", str(robot), str(tmp_path), *ASKED]) == 2
+    assert "something else" in capsys.readouterr().err and [p.name for p in tmp_path.iterdir()] == ["note.txt"]
+
+
+def test_an_older_set_becomes_one_of_today_and_its_numbers_stay_beside(shots, tmp_path):
+    source = robot_set(tmp_path / "old", shots, 2)
+    out = tmp_path / "new"
+    assert main(["enrich", str(source), str(out), *ASKED, "data=lerobot", "data.episode=1"]) == 0
+    found = rows(out)
+    assert [row["episode_index"] for row in found] == [0] * LENGTHS[1]
+    assert [row["index"] for row in found] == list(range(LENGTHS[1]))
+    assert [row["source.episode_index"] for row in found] == [1] * LENGTHS[1]
+    assert json.loads((out / "meta" / "info.json").read_text())["codebase_version"] == "v3.0"
+    copied = out / "videos" / CAMERA / "chunk-000" / "file-000.mp4"
+    assert copied.read_bytes() == (source / "videos" / "chunk-000" / CAMERA / "episode_000001.mp4").read_bytes()
+
+
+def test_one_episode_of_an_older_set_is_counted_from_0_in_its_own_version(shots, tmp_path):
+    source = robot_set(tmp_path / "old", shots, 2)
+    out = tmp_path / "new"
+    assert main(["enrich", str(source), str(out), *ASKED, "data=lerobot", "data.episode=1", "format=same"]) == 0
+    table = parquet.read_table(out / "data" / "chunk-000" / "episode_000000.parquet")
+    assert table.column("episode_index").to_pylist() == [0] * LENGTHS[1]
+    assert table.column("index").to_pylist() == list(range(LENGTHS[1]))
+    assert table.column("source.episode_index").to_pylist() == [1] * LENGTHS[1]
+    info = json.loads((out / "meta" / "info.json").read_text())
+    assert info["codebase_version"] == "v2.1" and info["total_chunks"] == 1 and "source.index" in info["features"]
+    (said,) = map(json.loads, (out / "meta" / "episodes.jsonl").read_text().splitlines())
+    assert said["episode_index"] == 0
+    film = Path("videos") / "chunk-000" / CAMERA
+    copied, origin = out / film / "episode_000000.mp4", source / film / "episode_000001.mp4"
+    assert copied.read_bytes() == origin.read_bytes()
+
+
+def test_a_recording_becomes_a_set_and_a_nerfstudio_folder(tmp_path, capsys):
+    folder = tmp_path / "room"
+    assert main(["enrich", "out=" + str(folder), "data=synthetic", "data.hw=[48,64]", "data.n_frames=3", *ASKED]) == 0
+    found = rows(folder)
+    assert [row["frame_index"] for row in found] == [0, 1, 2]
+    assert np.array(Image.open(io.BytesIO(found[0]["observation.images.camera"]["bytes"]))).shape == (*HW, 3)
+    nerf = tmp_path / "nerf"
+    more = ["data=synthetic", "data.hw=[48,64]", "data.n_frames=3", "format=nerfstudio"]
+    assert main(["enrich", "out=" + str(nerf), *more, *ASKED]) == 0
+    about = json.loads((nerf / "transforms.json").read_text())
+    assert [frame["file_path"] for frame in about["frames"]] == [f"images/frame_{i:06d}.png" for i in range(3)]
+    depth = np.array(Image.open(nerf / about["frames"][1]["depth_file_path"])) * about["depth_unit_scale_factor"]
+    column = map_of(found[1], "observation.images.camera_depth")
+    assert np.abs(depth - column).max() <= 1e-3
+    pose = np.array(found[1]["observation.camera.T_world_from_cam"]).reshape(4, 4)
+    assert np.allclose(np.array(about["frames"][1]["transform_matrix"]) @ np.diag([1, -1, -1, 1]), pose)
+    assert main(["enrich", "out=" + str(tmp_path / "x"), "data=synthetic", "format=same", *ASKED]) == 2
+    assert "no writer" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["stray", "record3d", "frames_dir", "rlds"])
+def test_a_format_that_nothing_writes_is_refused_in_a_line(kind, shots, tmp_path, capsys):
+    source = {"record3d": tmp_path / "room.r3d", "rlds": tmp_path / "1.0.0"}.get(kind, tmp_path / "room")
+    {
+        "stray": lambda: writers.write_stray(source, shots[:2]),
+        "record3d": lambda: writers.write_r3d(source, shots[:2]),
+        "frames_dir": lambda: writers.write_counted_frames(source, shots[:2]),
+        "rlds": lambda: writers.write_rlds(source, [shots[:2]]),
+    }[kind]()
+    out = tmp_path / "out"
+    assert main(["enrich", str(source), str(out), *ASKED, "format=same"]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and not out.exists()
+    assert said.startswith(f"dhtorch: format=same: found {kind}, which has no writer here; expected lerobot, ")
+
+
+def test_every_format_that_is_read_was_written_in_every_format_or_refused():
+    """``same`` among them: docs/enrich.md says so of its table."""
+    file = Path(__file__).parents[2] / "benchmarks" / "results" / "enrich.json"
+    found = json.loads(file.read_text())
+    targets = {row["target"] for row in found}
+    assert len(targets) == 4 and {row["source"] for row in found} == set(data.FORMATS)
+    assert {(row["source"], row["target"]) for row in found} == set(itertools.product(data.FORMATS, targets))
+    for row in (row for row in found if row["target"] == "the source's own"):
+        assert ("refused" in row) == (row["source"] != "lerobot"), row["data"]
+        assert "no writer here; expected lerobot" in row["refused"] if "refused" in row else row["compared"] > 0
+
+
+def test_a_table_without_frame_index_counts_its_rows(shots, tmp_path):
+    """As GR00T's sets: the first row bears a time that the video does not know."""
+    source = robot_set(tmp_path / "set", shots, 2)
+    for table in (source / "data").rglob("*.parquet"):
+        read = parquet.read_table(table).drop_columns(["frame_index"])
+        stamps = np.asarray(read.column("timestamp")) + np.float32(0.05)
+        place = read.column_names.index("timestamp")
+        parquet.write_table(read.set_column(place, "timestamp", [stamps]), table, row_group_size=3)
+    recording = data.open_all(source)[0]
+    assert recording.number.tolist() == list(range(LENGTHS[0])) and float(recording.times[0]) == 0
+    assert recording[2].hw == HW  # its video frame is found
+    assert any("by the order of rows" in line for line in recording.report)
+    out = tmp_path / "new"
+    assert main(["enrich", str(source), str(out), *ASKED]) == 0
+    found = rows(out)
+    assert found[0]["timestamp"] == 0 and found[0]["source.timestamp"] == pytest.approx(0.05)
+    assert [row["frame_index"] for row in found] == [*range(LENGTHS[0]), *range(LENGTHS[1])]
+    assert all((map_of(row, DEPTH) > 0).any() for row in found)
+
+
+def test_a_write_that_failed_at_the_first_file_is_no_other_set(robot, enriched, tmp_path):
+    """As a full disk or a kill leaves the folder: no file, or half of the first."""
+    out = tmp_path / "set"
+    (out / "meta").mkdir(parents=True)
+    (out / "meta" / ".dhtorch.json.x1.tmp").write_text("{")
+    assert main(["enrich", str(robot), str(out), *ASKED]) == 0
+    assert tree(out) == tree(enriched)

@@ -1,0 +1,202 @@
+"""What is typed is looked over before any work: words, names, values; and a sweep ends with one table."""
+
+import csv
+import importlib
+import re
+from types import SimpleNamespace
+
+import pytest
+from test_output import ROOM, command  # noqa: F401  (a fixture)
+
+from dhtorch import testing as writers
+from dhtorch.cli import job, run, view
+from dhtorch.cli import option_checks as words
+from dhtorch.cli import sweep_state as together
+from dhtorch.experiments.report import advice, jobs
+from dhtorch.runtime import results as archive
+from dhtorch.synthetic.recording import SyntheticRoom
+
+TINY = [*ROOM, "method.n=256", "figures=false"]
+
+
+@pytest.mark.parametrize(
+    ("typed", "begins", "near"),
+    [
+        (["inspct", "x"], "inspct", "inspect"),
+        (["help"], "help", "--help"),
+        (["version"], "version", "--version"),
+        (["nonsense"], "nonsense", "complete"),
+        (["seed=x"], "seed", "whole number"),
+        (["seed=1.5"], "seed", "whole number"),
+        (["method.n=0"], "method.n", "at least 1"),
+        (["method.n=nan"], "method.n", "whole number"),
+        (["pairs.gap=abc"], "pairs.gap", "whole number"),
+        (["pair.gap=3"], "pair.gap", "pairs.gap"),
+        (["+pair.gap=3"], "pair.gap", "pairs.gap"),
+        (["++sede=3"], "sede", "seed"),
+        (["method=mop"], "method", "map"),
+        (["method.track.windw=3"], "method.track.windw", "method.track.window"),
+        (["method.pose.far_weight=a"], "method.pose.far_weight", "number"),
+        (["data.hw=60"], "data.hw", "list"),
+        (["holdout.cutoff=far"], "holdout.cutoff", "positive"),
+        (["figures=maybe"], "figures", "true"),
+        (["threads=0"], "threads", "at least 1"),
+        (["data=auto"], "data.root", "data.root=VALUE"),
+        (["data=auto", "data.root=x", "data.camra=front"], "data.camra", "data.camera"),
+        (["data=tum", "data.root=x", "data.registr=false"], "data.registr", "such option"),
+        (["data.camera=front"], "data.camera", "such option"),
+        (["recover", "nowhere", "data.format=tum"], "data.format", "format"),
+        (["--multrun"], "--multrun", "--multirun"),
+        (["integrate", "voxel=abc"], "voxel", "positive"),
+        (["integrate", "vxel=1"], "vxel", "voxel"),
+        (["complete", "nowhere"], "out", "out=VALUE"),
+        (["-m", "seed=0,1", "pairs.gp=3"], "pairs.gp", "pairs.gap"),
+    ],
+)
+def test_a_slip_is_said_in_one_line_before_any_work(command, monkeypatch, typed, begins, near):  # noqa: F811
+    monkeypatch.setattr(job, "run", lambda *_, **__: pytest.fail("work was begun"))
+    code, out, err = command(*typed)
+    assert code == 2 and out == ""
+    (line,) = err.strip().splitlines()
+    assert line.startswith(f"dhtorch: {begins}: ") and near in line, line
+
+
+def test_an_option_of_a_function_may_be_added_and_no_other(command):  # noqa: F811
+    assert command(*TINY, "+data.name=kitchen", "output=o")[0] == 0
+    assert command(*TINY, "+method.nothing=1")[0] == 2
+
+
+def test_the_folder_of_what_is_made_is_out_or_output_to_every_command(command, tmp_path):  # noqa: F811
+    assert command(*TINY, "out=a=b")[0] == 0 and (tmp_path / "a=b/result.json").is_file()
+    (line,) = command("complete", "nowhere", "output=o")[2].splitlines()
+    assert "nowhere" in line and "out" not in line
+    assert "nowhere" in command("judge", "nowhere", "out=o")[2]
+
+
+def test_the_first_word_of_view_may_be_a_capture(command, tmp_path, monkeypatch):  # noqa: F811
+    asked = []
+    monkeypatch.setattr(view, "run", lambda settings, *_, **__: asked.append(settings))
+    monkeypatch.setattr(run, "_parts", lambda *_: {})
+    for name in ("capture", "view", "job", "sweep/1"):
+        (tmp_path / name).mkdir(parents=True)
+    for name in ("job", "sweep/1"):
+        (tmp_path / name / "result.json").write_text("{}")
+    for words_ in (["capture"], ["view"], ["view", "data=tum"], ["job"], ["sweep"], ["nowhere"]):
+        assert command("view", *words_)[0] == 0
+    assert [s["result"] for s in asked] == [None, None, None, "job", "sweep", "nowhere"]
+    assert [s["choices"]["data"] for s in asked] == ["auto", "auto", "tum", *["synthetic"] * 3]
+    assert [s["data"]["root"] for s in asked[:3]] == ["capture", "view", "view"]
+
+
+@pytest.mark.parametrize(
+    ("first", "module"),
+    [
+        (["enrich", "{}", "out=o"], "dhtorch.cli.enrich"),
+        (["judge", "{}", "depth=d"], "dhtorch.cli.validate"),
+        (["anchor", "{}", "depth=d", "out=o"], "dhtorch.cli.align"),
+        (["complete", "{}", "out=o"], "dhtorch.cli.complete"),
+        (["extract", "data=auto", "data.root={}", "out=o"], "dhtorch.extract"),
+        (["{}"], "dhtorch.cli.process_capture"),
+        (["run", "data=auto", "data.root={}"], "dhtorch.cli.job"),
+    ],
+)
+def test_options_of_the_reader_that_is_recognised_are_options(command, monkeypatch, tmp_path, first, module):  # noqa: F811
+    """``data=auto`` lists none of them: those of the capture's own format are taken, of another refused."""
+    room = SyntheticRoom(hw=(24, 32), n_frames=2, lidar="exact", supersample=1)
+    writers.write_counted_frames(tmp_path / "one", [room[i] for i in range(2)])
+    typed = [word.format(tmp_path / "one") for word in first]
+    asked = []
+
+    def run(settings, parts, *_, **__):
+        opened = parts.get("data")
+        asked.append((settings["data"]["register"], opened is None or len(opened) == 1))
+        raise ValueError("seen")
+
+    monkeypatch.setattr(importlib.import_module(module), "run", run)
+    code, _, err = command(*typed, "data.register=false")
+    assert code != 0 and "seen" in err and asked == [(False, True)]
+    if module.endswith("recover"):  # opens the capture itself
+        monkeypatch.undo()
+        monkeypatch.chdir(tmp_path)
+    code, _, err = command(*typed, "data.camera=front")
+    assert code != 0 and "format frames_dir has no option 'camera', expected one of intrinsics" in err
+
+
+def test_inspect_takes_the_options_of_the_reader_too(command, tmp_path):  # noqa: F811
+    room = SyntheticRoom(hw=(24, 32), n_frames=2, lidar="exact", supersample=1)
+    writers.write_counted_frames(tmp_path / "one", [room[i] for i in range(2)])
+    assert command("inspect", str(tmp_path / "one"), "data.register=false", "--out", str(tmp_path / "sheet"))[0] == 0
+    code, _, err = command("inspect", str(tmp_path / "one"), "data.registr=false")
+    assert code == 2 and "did you mean register?" in err
+
+
+def test_names_of_places_are_one_text():
+    assert words.quoted(["output=a=b,c=1/x"]) == ["output='a=b,c=1/x'"]
+    assert words.quoted(["out=/tmp/a=b (1)/c"]) == ["out='/tmp/a=b (1)/c'"]
+    assert words.quoted(["seed=0,1", "extract.columns=[a,b]"], True) == ["seed=0,1", "extract.columns=[a,b]"]
+
+
+def test_a_sweep_ends_with_one_table_and_its_file(command, tmp_path):  # noqa: F811
+    data = ["data.hw=[60,80]", "data.n_frames=3", "data.supersample=1", "data.lidar=exact", "figures=false"]
+    code, out, _ = command("-m", *data, "pairs.gap=1,2", "method.n=256", "output=a=b")
+    assert code == 0
+    with (tmp_path / "a=b/sweep.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [r["pairs.gap"] for r in rows] == ["1", "2"]
+    assert list(rows[0]) == ["pairs.gap", *jobs.METRICS]
+    (at,) = [k for k, line in enumerate(out.splitlines()) if re.match(r"\s*pairs.gap\s+coverage\s+median\s+p90", line)]
+    assert len(out.splitlines()) - at < 12
+    assert not (tmp_path / "a=b" / together.NOTES).exists()
+    code, out, _ = command("report", "a=b")
+    assert code == 0 and "pairs.gap" in out and "truth dropped" not in out
+    assert command("report", "a=b", "--html", "p.html")[0] == 0 and "2 jobs" in (tmp_path / "p.html").read_text()
+    results = [archive.read(p) for p in sorted(tmp_path.rglob("result.json"))]
+    for k, (coverage, error) in enumerate(((0.5, 0.1), (0.4, 0.05))):
+        results[k]["summary"] |= {"coverage": {"value": coverage}, "median_rel": {"value": error}}
+    assert {(0, 1), (1, 2)} <= jobs.table(results).best
+
+
+def test_a_job_says_little_and_all_of_it_when_asked(command):  # noqa: F811
+    code, out, _ = command(*TINY)
+    assert code == 0 and len(out.splitlines()) <= 15 and "what became of samples" not in out
+    assert len(command("-v", *TINY)[1].splitlines()) > len(out.splitlines())
+
+
+def test_jobs_note_how_far_they_are(tmp_path):
+    (tmp_path / together.NOTES).mkdir()
+    wrap = together.noting(tmp_path, "one", 2)
+    assert list(wrap(range(4), "first", 4)) == [0, 1, 2, 3]
+    assert together.read(tmp_path / together.NOTES) == (0.5, 0, ["first"])
+    together.finished(tmp_path, "one")
+    assert together.read(tmp_path / together.NOTES)[:2] == (1.0, 1)
+    assert list(together.noting(tmp_path / "unwatched", "one", 1)([7], "x", 1)) == [7]
+
+
+@pytest.mark.parametrize(("gate", "word"), [("no_track", "smaller pairs.gap"), ("no_baseline", "larger pairs.gap")])
+def test_silence_comes_with_advice(gate, word):
+    row = {"scene": "s", "pair": None, "method": "m", "gate_share": {"answer": 0.0, gate: 0.9, "residual": 0.1}}
+    assert word in advice({"rows": [row]})[0]
+    assert advice({"rows": [{**row, "gate_share": {"answer": 0.3, gate: 0.7}}]}) == []
+
+
+def test_one_bar_covers_all_jobs_and_scenes_of_every_process(command, tmp_path, monkeypatch):  # noqa: F811
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    seen, asked = [], []
+
+    def draw(notes, n_jobs, stop):
+        asked.append(n_jobs)
+        while not stop.wait(0.02):
+            seen.append(together.read(notes))
+        seen.append(together.read(notes))
+
+    monkeypatch.setattr(together, "_draw", draw)
+    monkeypatch.setattr(together, "sys", SimpleNamespace(stderr=SimpleNamespace(isatty=lambda: True)))
+    rooms = ["data=synthetic_seeds", "data.seed=[0,1]", "data.hw=[60,80]", "data.n_frames=3"]
+    options = ["method.n=256", "pairs.gap=1,2", "figures=false", "launch=joblib", "hydra.launcher.n_jobs=2"]
+    code, _, err = command("-m", *rooms, *options, "output=sweep")
+    assert code == 0, err
+    assert asked == [2], "jobs, which the bar is over"
+    done = [share for share, _, _ in seen]
+    assert done == sorted(done) and seen[-1] == (2.0, 2, []), "the notes of two workers are one growing sum"
+    assert any(0 < share < 2 for share in done), "it moves while they run"
+    assert not (tmp_path / "sweep" / together.NOTES).exists()

@@ -1,0 +1,128 @@
+"""``dhtorch PATH``: a capture of one's own, or one sentence that says why nothing comes of it."""
+
+import base64
+import json
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from dhtorch import testing as writers
+from dhtorch.cli.process_capture import coarse_to_fine
+from dhtorch.cli.run import main
+from dhtorch.metrics.holdout import range_split
+from dhtorch.synthetic.recording import SyntheticRoom
+
+SMALL = ["method=map", "method.n=256", "planes=32", "steps=[1]", "mesh=false", "threads=1"]
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    """Three views of the room, a sensor that ends at two metres."""
+    whole = SyntheticRoom(hw=(120, 160), n_frames=22, lidar="exact", supersample=1, image_noise=0.0)
+    path = tmp_path_factory.mktemp("captures") / "kitchen"
+    writers.write_counted_frames(path, [range_split(whole[k], 2.0) for k in (0, 7, 14)])
+    return path
+
+
+@pytest.fixture(scope="module")
+def made(capture, tmp_path_factory):
+    """What the command makes of it."""
+    out = tmp_path_factory.mktemp("out") / "room"
+    assert main([str(capture), f"out={out}", *SMALL]) == 0
+    return out
+
+
+def test_one_word_makes_maps_a_map_a_page_and_a_picture(made):
+    assert {"depth", "sigma", "source", "meta", "overview.png", "map.ply", "map.glb", "view.html"} <= {
+        p.name for p in made.iterdir()
+    }
+    rows = [json.loads(p.read_text()) for p in (made / "meta").iterdir()]
+    assert len(rows) == 3 and all(row["pixels"]["swept"] > 1000 for row in rows)
+    assert b"comment up " in (made / "map.ply").read_bytes()[:2000]
+    width, height = Image.open(made / "overview.png").size
+    assert width > 600 and height > 400
+
+
+def test_the_page_begins_with_the_numbers_and_the_picture(made):
+    page = (made / "view.html").read_text(encoding="utf-8")
+    rows = [json.loads(p.read_text()) for p in (made / "meta").iterdir()]
+    pixels = sum(row["pixels"]["swept"] for row in rows) / len(rows)
+    opening = page[page.index('<section id="opening"') : page.index("<main>")]
+    assert f"<dd>{pixels:,.0f}</dd>" in opening and "Median stated error" in opening
+    assert base64.b64encode((made / "overview.png").read_bytes()).decode() in opening
+    assert "Recovered " in opening and "Silent, most often: " in opening and "no_track" not in opening
+    assert "kitchen, frame" in opening and ", with frame" in opening, "whose picture, and of which views"
+
+
+def test_it_says_what_it_is_what_was_recovered_and_what_to_do_next(capture, made, capsys):
+    before = {p: p.stat().st_mtime_ns for p in (made / "meta").iterdir()}
+    assert main(["recover", str(capture), f"out={made}", *SMALL]) == 0
+    what, found, then, wrote = capsys.readouterr().out.strip().splitlines()
+    assert what.startswith("kitchen: a frames_dir capture, 3 frames of 160x120; the sensor answers")
+    assert found.startswith("Recovered ") and " pixels a frame that the sensor lacks, from " in found
+    assert then.startswith("Next: ") and str(made) in wrote
+    assert {p: p.stat().st_mtime_ns for p in (made / "meta").iterdir()} == before, "whole frames stay"
+
+
+def test_the_beginning_is_made_where_time_is_short_and_said_again_it_goes_on(capture, tmp_path, capsys):
+    words = [str(capture), f"out={tmp_path / 'x'}", *SMALL]
+    assert main([*words, "minutes=1e-6"]) == 0
+    assert "does more of the 2 frames left" in capsys.readouterr().out
+    assert [p.stem for p in (tmp_path / "x/meta").iterdir()] == ["000001"], "the middle comes first"
+    assert main([*words, "minutes=1e-6"]) == 0
+    assert main([*words, "minutes=null"]) == 0
+    assert len(list((tmp_path / "x/meta").iterdir())) == 3
+
+
+def test_a_frame_that_cannot_be_read_is_left_out_and_named(capture, tmp_path, capsys):
+    broken = tmp_path / "broken"
+    shutil.copytree(capture, broken)
+    picture = broken / "images/00001.png"
+    picture.write_bytes(picture.read_bytes()[:100])
+    assert main([str(broken), f"out={tmp_path / 'out'}", *SMALL, "steps=[1,2]"]) == 0
+    said = capsys.readouterr().out
+    assert "1 frame of broken could not be read" in said and picture.name in said
+    assert len(list((tmp_path / "out/meta").iterdir())) == 2
+
+
+def refusal(words, capsys):
+    assert main([str(w) for w in words]) == 2
+    said = capsys.readouterr()
+    assert not said.out and said.err.startswith("dhtorch: ") and said.err.count("\n") == 1
+    return said.err
+
+
+def test_one_capture_that_cannot_be_opened_does_not_stop_the_others(capture, tmp_path, capsys):
+    room = SyntheticRoom(hw=(48, 64), n_frames=3)
+    writers.write_stray(tmp_path / "both" / "alone", list(room), video=False)
+    shutil.copytree(capture, tmp_path / "both" / "kitchen")
+    assert main([str(tmp_path / "both"), f"out={tmp_path / 'out'}", "minutes=0.01", *SMALL]) == 0
+    said = capsys.readouterr().out
+    assert "kitchen" in said and "alone: depth only" in said and (tmp_path / "out/overview.png").is_file()
+
+
+def test_what_cannot_work_is_one_sentence(capture, tmp_path, capsys):
+    single = tmp_path / "single"
+    single.mkdir()
+    Image.fromarray(np.zeros((20, 30, 3), np.uint8)).save(single / "a.png")
+    assert "1 picture without depth" in refusal([single], capsys)
+    Image.fromarray(np.full((20, 30), 900, np.uint16)).save(single / "b.png")
+    assert "one frame" in refusal([single], capsys)
+    (tmp_path / "empty").mkdir()
+    assert "found an empty folder" in refusal([tmp_path / "empty"], capsys)
+    assert "lies in the capture" in refusal([capture, f"out={capture}/out"], capsys)
+    assert refusal([capture, "minutes=-1"], capsys).startswith("dhtorch: minutes: found -1, expected")
+    alone = tmp_path / "alone"
+    room = SyntheticRoom(hw=(48, 64), n_frames=3)
+    writers.write_stray(alone, list(room), video=False)
+    assert "depth only" in refusal([alone], capsys)
+
+
+@pytest.mark.parametrize("n", [1, 2, 7, 40])
+def test_coarse_to_fine_takes_every_frame_once_and_begins_evenly(n):
+    order = coarse_to_fine(n)
+    assert sorted(order) == list(range(n)) and order[0] == n // 2
+    if n == 40:
+        assert max(np.diff(sorted({-1, 40, *order[:7]}))) <= 6

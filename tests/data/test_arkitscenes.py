@@ -1,0 +1,522 @@
+"""ARKitScenes: captures written in its layout, at its clocks, with the traps its users met."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import pickle
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+from support.box_scene import CAMERA, HW, check_same, disagreement, off_wall, render, world_points
+
+from dhtorch import data
+from dhtorch import testing as writers
+from dhtorch.cli.run import config_dir
+from dhtorch.data import FormatError, clocks, convert
+from dhtorch.data.readers import arkitscenes, ca1m
+from dhtorch.experiments.protocol import PairData
+from dhtorch.geometry import camera as cameras
+from dhtorch.geometry import se3
+from dhtorch.metrics import holdout
+from dhtorch.records import Camera, Frame, Pose
+from dhtorch.testing import parts
+
+VGA_HW = (96, 128)
+VGA = Camera(torch.tensor([[124.0, 115.5]]), torch.tensor([[68.25, 43.25]]))  # not quite the small camera, scaled
+UPRIGHT = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)  # looks along y, the sky (z) on top
+
+
+def path(time: float) -> Pose:
+    """Constant velocity and turn rate, so that interpolation has an exact answer."""
+    s = time - 100
+    turn = se3.exp(torch.tensor([[0.5 * s, -0.9 * s, 0.4 * s, 0, 0, 0]], dtype=torch.float64))
+    t = torch.tensor([[0.2 + 0.6 * s, -0.3 + 0.2 * s, 0.1 - 0.5 * s]], dtype=torch.float64)
+    return Pose(turn.R @ UPRIGHT, t)
+
+
+def shots(times: object, camera: Camera = CAMERA, hw: tuple[int, int] = HW, turns: int = 0) -> list[Frame]:
+    """What the stored pictures show; ``turns`` quarter turns clockwise would make them upright."""
+    frames = []
+    for time in np.round(np.asarray(times, dtype=float), 6):
+        c2w = convert.turn_pose(se3.to_matrix(path(float(time))).numpy(), -turns)
+        frame = render(camera, se3.from_matrix(torch.from_numpy(c2w)), hw, float(time))
+        frames.append(frame.replace(conf=frame.image[:, 1] // 86))  # 0, 1 and 2, in patches
+    return frames
+
+
+def capture(root: Path, n: int = 4, **more: list[Frame]) -> list[Frame]:
+    """The plain case: small pictures with depth, confidence and poses at the same instants."""
+    frames = shots(100 + np.arange(n) / 60)
+    assets = {"lowres_wide": frames, "lowres_depth": frames, **more}
+    writers.write_arkitscenes(root, assets, trajectory=frames)
+    return frames
+
+
+def stored(root: Path, **options: object) -> data.Recording:
+    return data.open(root, "arkitscenes", upright=False, **options)
+
+
+def drop(root: Path, asset: str, time: str) -> None:
+    (found,) = (root / asset).glob(f"*_{time}.*")
+    found.unlink()
+
+
+# ------------------------------------------------------------------------------------------------ written, then read
+
+
+def test_gives_back_the_scene(tmp_path: Path) -> None:
+    frames = capture(tmp_path / "47333462")
+    assert data.recognise(tmp_path / "47333462")[0] == "arkitscenes"
+    recording = data.open(tmp_path / "47333462")
+    assert recording.name == "47333462" and recording.report == () and recording.number.tolist() == [0, 1, 2, 3]
+    assert recording.rate_hz == pytest.approx(60, rel=0.03)
+    assert recording.times.tolist() == [100.0, 100.017, 100.033, 100.05]  # the names carry milliseconds
+    check_same(recording, frames, 1 / 1000)
+    for i, want in enumerate(frames):
+        assert recording[i].depth_camera is None and torch.equal(recording[i].conf, want.conf)
+    assert not hasattr(recording, "truth")
+
+
+def test_world_to_camera_read_as_its_inverse_would_show(tmp_path: Path) -> None:
+    capture(tmp_path / "1", n=8)
+    recording = data.open(tmp_path / "1")
+    wrong = se3.invert(recording.poses)
+    assert disagreement(recording[0], recording[7])[0] < 0.01
+    a, b = (recording[i].replace(T_world_from_cam=wrong[i : i + 1]) for i in (0, 7))
+    assert disagreement(a, b)[0] > 0.03
+
+
+def test_larger_pictures_find_depth_and_pose_at_other_clocks(tmp_path: Path) -> None:
+    root = tmp_path / "1"
+    vga = shots(100.004 + np.arange(6) / 30, VGA, VGA_HW)
+    small = shots(100 + np.arange(14) / 60)
+    sparse = shots([100.0, 100.1, 100.2])
+    writers.write_arkitscenes(root, {"vga_wide": vga, "lowres_depth": small}, trajectory=sparse)
+    recording = stored(root)
+    assert len(recording) == 6 and recording.report == ()
+    for i, want in enumerate(vga):
+        frame = recording[i]
+        stamp = float(frame.time)
+        near = min(small, key=lambda f: abs(float(f.time) - stamp))
+        torch.testing.assert_close(frame.depth, near.depth, atol=6e-4, rtol=0)
+        assert torch.equal(frame.image, want.image) and torch.equal(frame.camera.f, VGA.f)
+        assert torch.equal(frame.depth_camera.c, CAMERA.c)
+        true = path(stamp)  # linear in position, at constant speed in rotation: exact
+        torch.testing.assert_close(frame.T_world_from_cam.t, true.t, atol=1e-9, rtol=0)
+        torch.testing.assert_close(frame.T_world_from_cam.R, true.R, atol=1e-9, rtol=0)
+    own = stored(root, interpolate=False)  # 4 ms from the poses at 100.0, 100.1 and, a little more, 100.2
+    assert own.number.tolist() == [0, 3] and own.report == ("4 images without a pose: left out",)
+    with pytest.raises(FormatError, match=r"frames of vga_wide: found 6 images without depth: left out"):
+        stored(root, max_difference=0.002)
+
+
+def test_color_is_another_name_of_wide_and_intrinsics_may_be_borrowed(tmp_path: Path) -> None:
+    wide = shots(100 + np.arange(3) / 10, cameras.resize(VGA, VGA_HW, (192, 256)), (192, 256))
+    small = shots(100 + np.arange(3) / 10)
+    for name in ("wide", "color"):
+        root = tmp_path / name
+        writers.write_arkitscenes(root, {name: wide, "lowres_depth": small}, trajectory=small)
+        assert torch.equal(stored(root)[1].camera.f, wide[0].camera.f)
+        for file in (root / f"{name}_intrinsics").iterdir():
+            file.unlink()
+        borrowed = stored(root)
+        assert borrowed.report == ("no wide_intrinsics: lowres_wide_intrinsics, scaled",)
+        want = cameras.resize(CAMERA, HW, (192, 256))
+        torch.testing.assert_close(borrowed[1].camera.c, want.c)
+        for file in (root / "lowres_wide_intrinsics").iterdir():
+            file.unlink()
+        with pytest.raises(FormatError, match="wide_intrinsics: found none, nor any to scale"):
+            stored(root)
+
+
+def test_the_largest_is_chosen_by_name(tmp_path: Path) -> None:
+    vga = shots(100 + np.arange(4) / 60, VGA, VGA_HW)
+    capture(tmp_path / "1", vga_wide=vga)
+    assert stored(tmp_path / "1")[0].hw == HW
+    assert stored(tmp_path / "1", image="vga_wide")[0].hw == VGA_HW
+    with pytest.raises(FormatError, match=r"wide: found none, expected <video id>_<seconds>.png"):
+        stored(tmp_path / "1", image="wide")
+    with pytest.raises(FormatError, match="option image: found ultrawide, expected one of lowres_wide, vga_wide, wide"):
+        stored(tmp_path / "1", image="ultrawide")
+
+
+def test_downloads_complete_each_other(tmp_path: Path) -> None:
+    frames = shots(100 + np.arange(3) / 10)
+    wide = shots(100 + np.arange(3) / 10, VGA, VGA_HW)
+    raw, up = (tmp_path / subset / "Training" / "42" for subset in ("raw", "upsampling"))
+    writers.write_arkitscenes(up, {"wide": wide, "lowres_depth": frames, "highres_depth": wide})
+    assert stored(up).poses is None
+    writers.write_arkitscenes(raw, {"lowres_wide": frames}, trajectory=frames)
+    recording = stored(up, image="wide")
+    torch.testing.assert_close(recording.poses.t, torch.cat([f.T_world_from_cam.t for f in frames]))
+    assert hasattr(stored(raw, image="lowres_wide"), "truth")
+    elsewhere = tmp_path / "42"  # not where the download puts it: nothing beside it is read
+    up.rename(elsewhere)
+    assert stored(elsewhere).poses is None
+
+
+def test_3dod_keeps_its_frames_one_folder_down(tmp_path: Path) -> None:
+    root = tmp_path / "3dod" / "Validation" / "42445173"
+    frames = shots(100 + np.arange(3) / 10)
+    inner = root / "42445173_frames"
+    writers.write_arkitscenes(inner, {"lowres_wide": frames, "lowres_depth": frames}, trajectory=frames)
+    (root / "42445173_3dod_annotation.json").write_text("{}")
+    for place in (root, inner):
+        recording = data.open(place, upright=False)
+        assert recording.name == "42445173" and recording.format == "arkitscenes" and len(recording) == 3
+
+
+# ------------------------------------------------------------------------------------------------------ poses and time
+
+
+def test_no_pose_is_ever_taken_over(tmp_path: Path) -> None:
+    root = tmp_path / "1"
+    frames = shots(100 + np.arange(12) / 60)
+    writers.write_arkitscenes(root, {"lowres_wide": frames, "lowres_depth": frames}, trajectory=frames)
+    rows = (root / "lowres_wide.traj").read_text().splitlines()
+    (root / "lowres_wide.traj").write_text("\n".join(row for i, row in enumerate(rows) if i not in (3, 4, 5)))
+    own = stored(root, interpolate=False)
+    assert own.number.tolist() == [0, 1, 2, 6, 7, 8, 9, 10, 11]
+    assert own.report == ("3 images without a pose: left out",)
+    check_same(own, [f for i, f in enumerate(frames) if i not in (3, 4, 5)], 1 / 1000)
+    narrow = stored(root, max_pose_gap=0.05)  # the hole is 67 ms wide
+    assert narrow.number.tolist() == own.number.tolist()
+    bridged = stored(root)
+    assert len(bridged) == 12
+    true = path(float(bridged.times[4]))
+    torch.testing.assert_close(bridged.poses.t[4:5], true.t, atol=1e-9, rtol=0)
+
+
+def test_names_a_millisecond_apart_are_one_instant(tmp_path: Path) -> None:
+    """Names are cut to milliseconds, each by itself, and the trajectory has six decimals."""
+    root = tmp_path / "1"
+    frames = capture(root)
+    times = np.array([float(f.time) for f in frames])
+    writers.write_arkitscenes(root, {}, trajectory=shots(times + 0.0001))
+    rows = np.loadtxt(root / "lowres_wide.traj")
+    assert (rows[:, 0] * 1000 % 1).max() > 0.4  # the stamps are no whole milliseconds
+    recording = stored(root)
+    for got, want in zip(recording, shots(times + 0.0001), strict=True):  # its own pose, not one in between
+        torch.testing.assert_close(got.T_world_from_cam.t, want.T_world_from_cam.t, atol=1e-7, rtol=0)
+    first, second, *_ = sorted((root / "lowres_wide_intrinsics").iterdir())
+    first.rename(first.with_name(first.name.replace("100.000", "100.001")))
+    second.rename(second.with_name(second.name.replace("100.017", "100.019")))
+    recording = stored(root)
+    assert recording.number.tolist() == [0, 2, 3] and recording.report == ("1 image without intrinsics: left out",)
+
+
+def test_first_and_last_images_need_a_pose_too(tmp_path: Path) -> None:
+    root = tmp_path / "1"
+    frames = shots(100 + np.arange(6) / 60)
+    writers.write_arkitscenes(root, {"lowres_wide": frames, "lowres_depth": frames}, trajectory=frames[2:4])
+    assert stored(root).number.tolist() == [2, 3]
+    writers.write_arkitscenes(root, {}, trajectory=shots([100 + 2 / 60 - 0.004]))  # one pose, 4 ms off
+    recording = stored(root)
+    assert recording.number.tolist() == [2] and recording.rate_hz is None
+    torch.testing.assert_close(recording.poses.t, path(100 + 2 / 60 - 0.004).t, atol=1e-5, rtol=0)
+    writers.write_arkitscenes(root, {}, trajectory=shots([100.06]))
+    with pytest.raises(FormatError, match="6 images without a pose: left out, expected images with depth"):
+        stored(root)
+
+
+def test_captures_without_trajectory_keep_their_frames(tmp_path: Path) -> None:
+    root = tmp_path / "1"
+    capture(root)
+    (root / "lowres_wide.traj").unlink()
+    recording = data.open(root)
+    assert len(recording) == 4 and recording.poses is None and recording[0].T_world_from_cam is None
+    assert recording.report == ("no lowres_wide.traj: frames have no pose, and stay as stored",)
+    assert data.open(root, poses=False).report == ()
+
+
+def test_names_are_sorted_as_numbers(tmp_path: Path) -> None:
+    root = tmp_path / "1"
+    frames = shots([99.95, 99.9833, 100.0, 100.0167])
+    writers.write_arkitscenes(root, {"lowres_wide": frames, "lowres_depth": frames}, trajectory=frames[::-1])
+    recording = stored(root)
+    assert recording.times.tolist() == [99.95, 99.983, 100.0, 100.017]
+    check_same(recording, frames, 1 / 1000)
+
+
+def test_a_frame_missing_in_the_middle_is_skipped_and_reported(tmp_path: Path) -> None:
+    root = tmp_path / "1"
+    frames = capture(root, n=8)
+    drop(root, "lowres_depth", "100.017")  # the depth before and after is 16 ms away: not its depth
+    drop(root, "confidence", "100.050")
+    drop(root, "lowres_wide_intrinsics", "100.083")
+    drop(root, "lowres_wide", "100.100")
+    recording = stored(root)
+    assert recording.number.tolist() == [0, 2, 4, 6]  # of seven images
+    assert recording.report == (
+        "1 image without depth: left out",
+        "1 image without confidence: left out",
+        "1 image without intrinsics: left out",
+    )
+    check_same(recording, [frames[i] for i in (0, 2, 4, 7)], 1 / 1000)
+
+
+def test_confidence_is_that_of_the_depth_map(tmp_path: Path) -> None:
+    root = tmp_path / "1"
+    image = shots([100.0], VGA, VGA_HW)
+    depths = shots([99.991, 100.007])
+    writers.write_arkitscenes(root, {"vga_wide": image, "lowres_depth": depths}, trajectory=image)
+    assert torch.equal(stored(root)[0].conf, depths[1].conf)
+    drop(root, "confidence", "100.007")  # the other one is near the image too, but belongs to another depth map
+    with pytest.raises(FormatError, match="1 image without confidence: left out"):
+        stored(root)
+
+
+def test_no_confidence_at_all(tmp_path: Path) -> None:
+    root = tmp_path / "1"
+    capture(root)
+    for file in (root / "confidence").iterdir():
+        file.unlink()
+    recording = stored(root)
+    assert recording[0].conf is None and recording.report == ("no confidence: every return counts alike",)
+
+
+def test_nearest_against_brute_force() -> None:
+    rng = np.random.default_rng(0)
+    for m in (1, 2, 30):
+        times, others = rng.uniform(0, 1, 50), np.sort(rng.uniform(0, 1, m))
+        gap = np.abs(times[:, None] - others)
+        want = np.where(gap.min(1) <= 0.03, gap.argmin(1), -1)
+        assert np.array_equal(clocks.nearest(times, others, 0.03), want)
+
+
+def test_rotation_vectors_and_the_way_between_rotations() -> None:
+    rng = np.random.default_rng(1)
+    for angle in (0.0, 1e-12, 1e-3, 1.0, math.pi - 1e-9, math.pi):
+        axis = rng.normal(size=3)
+        vector = axis / np.linalg.norm(axis) * angle
+        R = convert.to_c2w(convert.to_quaternions(vector[None]), np.zeros((1, 3)), Path("x"))[0, :3, :3]
+        np.testing.assert_allclose(R, cv2.Rodrigues(vector)[0], atol=1e-12)
+        a = convert.to_quaternions(rng.normal(size=(1, 3)))
+        b = convert.to_quaternions(rng.normal(size=(1, 3)))
+        for sign in (1, -1):
+            q = convert.slerp(a, sign * b, np.array([0.3]))
+            assert np.linalg.norm(q) == pytest.approx(1, abs=1e-12)
+            part, whole = (2 * math.acos(min(abs(float((a * x).sum())), 1)) for x in (q, b))
+            assert part == pytest.approx(0.3 * whole, abs=1e-7)
+        np.testing.assert_allclose(convert.slerp(a, a, np.array([0.7])), a, atol=1e-15)
+
+
+# -------------------------------------------------------------------------------------------------------- orientation
+
+
+@pytest.mark.parametrize("turns", [0, 1, 2, 3])
+def test_pictures_are_turned_upright_by_the_poses(tmp_path: Path, turns: int) -> None:
+    root = tmp_path / "1"
+    frames = shots(100 + np.arange(3) / 60, turns=turns)
+    laser = shots(100 + np.arange(3) / 60, VGA, VGA_HW, turns=turns)
+    writers.write_arkitscenes(
+        root, {"lowres_wide": frames, "lowres_depth": frames, "highres_depth": laser}, trajectory=frames
+    )
+    (tmp_path / "metadata.csv").write_text("video_id,visit_id,fold,sky_direction\n1,1,Training,Up\n")  # a lie
+    recording = data.open(root)
+    (h, w), (f, c) = HW, (CAMERA.f[0], CAMERA.c[0])
+    f_want, c_want = {  # the rules for integer pixel centres, written out
+        0: ([f[0], f[1]], [c[0], c[1]]),
+        1: ([f[1], f[0]], [h - 1 - c[1], c[0]]),
+        2: ([f[0], f[1]], [w - 1 - c[0], h - 1 - c[1]]),
+        3: ([f[1], f[0]], [c[1], w - 1 - c[0]]),
+    }[turns]
+    for i, frame in enumerate(recording):
+        size = HW if turns % 2 == 0 else HW[::-1]
+        assert frame.hw == size and frame.depth.shape[1:] == size and frame.conf.shape[1:] == size
+        assert torch.equal(frame.conf, frame.image[:, 1] // 86) and frame.conf.unique().numel() > 1
+        assert frame.camera.f[0].tolist() == [float(x) for x in f_want]
+        assert frame.camera.c[0].tolist() == [float(x) for x in c_want]
+        assert float(frame.T_world_from_cam.R[0, 2, 1]) < -0.9  # down in the picture is down in the world
+        assert torch.linalg.det(frame.T_world_from_cam.R).item() == pytest.approx(1)
+        assert float(off_wall(world_points(frame)).max()) < 2e-3
+        lit = render(frame.camera, path(float(frames[i].time)), size)  # what an upright camera there sees
+        assert float((lit.image.int() - frame.image.int()).abs().double().mean()) < 0.5
+        truth = recording.truth(i)["depth"]
+        assert truth.shape[1:] == size
+        assert float(((truth - lit.depth).abs() / lit.depth)[truth > 0].median()) < 0.01
+    assert disagreement(recording[0], recording[2])[0] < 0.01
+    assert stored(root)[0].hw == HW
+
+
+def test_looking_straight_down_names_no_side(tmp_path: Path) -> None:
+    root = tmp_path / "1"
+    down = torch.tensor([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]], dtype=torch.float64)[None]
+    frame = render(CAMERA, Pose(down, torch.zeros(1, 3, dtype=torch.float64)), HW, 100.0)
+    writers.write_arkitscenes(root, {"lowres_wide": [frame], "lowres_depth": [frame]}, trajectory=[frame])
+    recording = data.open(root)
+    assert recording[0].hw == HW
+    assert "the camera looks straight up or down: pictures stay as stored" in recording.report
+
+
+def test_turning_a_lens_keeps_every_ray() -> None:
+    lens = Camera(CAMERA.f.double(), CAMERA.c.double(), torch.tensor([[0.1, -0.05, 0.01, -0.02, 0.03]]).double())
+    xyz = torch.tensor([[[0.3, -0.2, 1.5], [-0.4, 0.1, 1.2], [0.0, 0.5, 2.0]]]).double()
+    uv = cameras.project(lens, xyz)[0]
+    for turns, turned in ((1, (HW[0] - 1 - uv[:, 1], uv[:, 0])), (2, (HW[1] - 1 - uv[:, 0], HW[0] - 1 - uv[:, 1]))):
+        pose = torch.from_numpy(convert.turn_pose(np.eye(4)[None], turns))
+        seen = se3.apply(se3.invert(se3.from_matrix(pose)), xyz)
+        got = cameras.project(convert.turn_camera(lens, HW, turns), seen)[0]
+        torch.testing.assert_close(got, torch.stack(turned, -1), atol=1e-9, rtol=0)
+        picture = torch.arange(HW[0] * HW[1]).view(HW)
+        assert convert.turn_picture(picture, turns)[5, 7] == (
+            picture[HW[0] - 1 - 7, 5] if turns == 1 else picture[HW[0] - 1 - 5, HW[1] - 1 - 7]
+        )
+
+
+# -------------------------------------------------------------------------------------------------------- laser truth
+
+
+def test_laser_depth_is_taken_to_the_images_pixels(tmp_path: Path) -> None:
+    root = tmp_path / "1"
+    laser_camera = cameras.resize(VGA, VGA_HW, (192, 256))
+    laser = shots(100 + np.arange(3) / 10, laser_camera, (192, 256))
+    frames = shots(100 + np.arange(13) / 60)
+    writers.write_arkitscenes(
+        root, {"lowres_wide": frames, "lowres_depth": frames, "highres_depth": laser}, trajectory=frames
+    )
+    recording = stored(root)
+    assert len(recording) == 13
+    exact = recording.truth(6)  # same instant, another camera: half a laser pixel on a slanted wall
+    want = frames[6].depth
+    assert exact["depth"].shape == want.shape and exact["depth"].dtype == torch.float32
+    known = exact["depth"] > 0
+    assert float(known.double().mean()) > 0.9
+    assert float(((exact["depth"] - want).abs() / want)[known].max()) < 0.02
+    assert float(exact["disagreement"]) < 0.01 and exact["surface"].shape == want.shape
+    late = recording.truth(3)  # the nearest laser map is 50 ms away: accepted, and measurably off
+    assert float(exact["disagreement"]) < float(late["disagreement"]) < 0.05
+    assert recording.surfaces == {0: "ordinary"} and recording.odd_surfaces == ()
+
+
+def test_laser_depth_far_in_time_or_in_disagreement_is_no_truth(tmp_path: Path) -> None:
+    root = tmp_path / "1"
+    frames = shots(100 + np.arange(13) / 60)
+    wrong = frames[0].replace(depth=frames[0].depth * 1.1)  # registration failed
+    writers.write_arkitscenes(
+        root, {"lowres_wide": frames, "lowres_depth": frames, "highres_depth": [wrong]}, trajectory=frames
+    )
+    recording = stored(root)
+    assert recording.report == ("8 frames without laser depth within 0.08 s: no truth",)
+    rejected = recording.truth(0)
+    assert not rejected["depth"].any() and float(rejected["disagreement"]) == pytest.approx(0.091, abs=0.002)
+    assert stored(root, max_disagreement=0.2).truth(0)["depth"].all()
+    far = recording.truth(-1)
+    assert not far["depth"].any() and math.isnan(float(far["disagreement"]))
+    assert len(stored(root, max_truth_gap=1.0).report) == 0
+    blind = frames[0].replace(depth=torch.zeros_like(frames[0].depth))
+    writers.write_arkitscenes(root, {"highres_depth": frames[:1], "lowres_depth": [blind]})
+    unchecked = stored(root).truth(0)  # right, but nothing says so
+    assert not unchecked["depth"].any() and math.isnan(float(unchecked["disagreement"]))
+    assert not hasattr(stored(root, truth=False), "truth")
+
+
+def test_laser_truth_enters_the_main_job(tmp_path: Path) -> None:
+    root = tmp_path / "1"
+    frames = shots(100 + np.arange(4) / 60)
+    laser = shots(100 + np.arange(4) / 60, VGA, VGA_HW)
+    for frame in frames:
+        frame.depth[..., 32:] = 0  # what the LiDAR does not see
+    writers.write_arkitscenes(
+        root, {"lowres_wide": frames, "lowres_depth": frames, "highres_depth": laser}, trajectory=frames
+    )
+    anchor, _, exact, surface, *_ = PairData(stored(root), [(0, 3)], torch.float32)[0]
+    assert exact.depth_camera is None and surface.shape == exact.depth.shape
+    uv = torch.tensor([[[20.0, 20.0], [40.0, 30.0], [50.0, 10.0]]])
+    assert (holdout.truth_at(anchor, uv, truth="raw").depth > 0).tolist() == [[True, False, False]]
+    found = holdout.truth_at(exact, uv, truth="full")
+    assert found.ok.all() and float((found.depth - 1.8).abs().max()) < 0.1
+
+
+# --------------------------------------------------------------------------------------------------- lazy, and damaged
+
+
+def test_opening_decodes_nothing_and_recordings_travel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    capture(tmp_path / "1", highres_depth=shots([100.0], VGA, VGA_HW))
+    decoded = []
+    decode = cv2.imdecode
+    monkeypatch.setattr(cv2, "imdecode", lambda *args: decoded.append(1) or decode(*args))
+    recording = data.open(tmp_path / "1")
+    assert decoded == []
+    twin = pickle.loads(pickle.dumps(recording))
+    assert torch.equal(twin[2].depth, recording[2].depth) and len(decoded) == 6
+    assert torch.equal(twin.truth(0)["depth"], recording.truth(0)["depth"])
+
+
+def fails(message: str, root: Path, **options: object) -> None:
+    with pytest.raises(FormatError, match=message) as caught:
+        list(data.open(root, "arkitscenes", **options))
+    assert "\n" not in str(caught.value)
+
+
+def test_bad_files(tmp_path: Path) -> None:
+    root = tmp_path / "1"
+    capture(root)
+    pincam = next(iter(sorted((root / "lowres_wide_intrinsics").iterdir())))
+    good = pincam.read_text()
+    for text, message in (
+        ("64 48 61 58 33", r"pincam: line 1: found 5 columns, expected 6 numbers"),
+        ("64 48 nan 58 33 21", r"pincam: intrinsics: found .*nan.*, expected 6 finite numbers"),
+        ("64.5 48 61 58 33 21", r"pincam: width and height: found 64.5 48, expected the size of a picture"),
+        ("0 48 61 58 33 21", r"pincam: width and height: found 0 48"),
+        ("1e5 1e5 61 58 33 21", r"pincam: width and height: found 100000 100000"),
+        ("640 480 61 58 33 21", r"lowres_wide.*png: size: found 64x48, expected 640x480"),
+        (good + good, r"pincam: intrinsics: found nothing"),
+        ("64 48 -61 58 33 21", r"pincam: intrinsics focal length"),
+    ):
+        pincam.write_text(text)
+        fails(message, root)
+    pincam.write_text(good)
+    conf = next(iter(sorted((root / "confidence").iterdir())))
+    image = next(iter(sorted((root / "lowres_wide").iterdir())))
+    good_conf = conf.read_bytes()
+    conf.write_bytes(parts.png(np.full(HW, 3, np.uint8)[..., None]))
+    fails(r"confidence: found 1 channels up to 3, expected 1 channel of 0, 1 or 2", root)
+    conf.write_bytes(image.read_bytes())
+    fails(r"confidence: found 3 channels", root)
+    conf.write_bytes(good_conf)
+    traj = root / "lowres_wide.traj"
+    rows = traj.read_text().splitlines()
+    traj.write_text("\n".join(["100.0 nan 0 0 0 0 0", *rows[1:], "100.2 inf 0 0 0 0 0"]))
+    assert stored(root).number.tolist() == [1, 2, 3]
+    for text, message in (
+        ("100.0 nan 0 0 0 0 0", r"lowres_wide.traj: poses: found no usable row"),
+        ("100.0 0 0 0 0 0", r"lowres_wide.traj: line 1: found 6 columns, expected 7 numbers"),
+        ("\n".join(rows).replace("100", "one", 1), r"lowres_wide.traj: line 1: found one"),
+        ("# nothing", r"lowres_wide.traj: poses: found no usable row"),
+    ):
+        traj.write_text(text)
+        fails(message, root)
+    fails("option max_pose_gap: found 0.0", root, max_pose_gap=0)
+    for file in (root / "lowres_depth").iterdir():
+        file.unlink()
+    fails(r"lowres_depth: found none, expected <video id>_<seconds>.png", root)
+
+
+def test_other_folders_are_not_taken_for_captures(tmp_path: Path) -> None:
+    for names in (("rgb", "depth"), ("wide",), ("wide", "color"), ("lowres_wide",)):
+        root = tmp_path / "-".join(names)
+        for name in names:
+            (root / name).mkdir(parents=True)
+        assert arkitscenes.recognise(root) is None
+    assert arkitscenes.recognise(tmp_path / "gone") is None
+
+
+@pytest.mark.parametrize("reader", [arkitscenes, ca1m])
+def test_settings_hold_the_defaults(reader: object) -> None:
+    settings = OmegaConf.load(config_dir() / "data" / f"{reader.__name__.split('.')[-1]}.yaml")
+    options = {k: p.default for k, p in inspect.signature(reader.read).parameters.items() if k != "root"}
+    assert {k: settings[k] for k in options} == options
+
+
+def hostile_sample(root: Path) -> Path:
+    root = root / "raw" / "Training" / "41048190"
+    frames = shots(100 + np.arange(3) / 60)
+    assets = {"lowres_wide": frames, "lowres_depth": frames, "highres_depth": shots([100.0], VGA, VGA_HW)}
+    writers.write_arkitscenes(root, assets, trajectory=frames)
+    return root

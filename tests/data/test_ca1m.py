@@ -1,0 +1,374 @@
+"""CA-1M archives, and the tar and TIFF decoding below them."""
+
+from __future__ import annotations
+
+import io
+import math
+import pickle
+import tarfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+import torch
+from support.box_scene import CAMERA, HW, check_same, disagreement, off_wall, render, world_points
+from test_arkitscenes import VGA, VGA_HW, shots
+
+from dhtorch import data
+from dhtorch import testing as writers
+from dhtorch.data import FormatError
+from dhtorch.data.codecs import tarballs, tiff
+from dhtorch.data.readers import ca1m
+from dhtorch.export.tiff import float_tiff
+from dhtorch.geometry import se3
+from dhtorch.records import Camera, Frame
+
+LASER_HW = (72, 96)
+LASER = Camera(torch.tensor([[92.0, 86.0]]), torch.tensor([[50.5, 31.0]]))
+PORTRAIT = Camera(torch.tensor([[58.25, 61.5]]), torch.tensor([[21.75, 30.5]]))
+
+
+def scene(n: int = 4) -> tuple[list[Frame], list[Frame]]:
+    """Frames with a depth camera of their own, and the laser's."""
+    times = 100 + np.arange(n) / 10
+    frames = []
+    for image, depth in zip(shots(times, VGA, VGA_HW), shots(times), strict=True):
+        frames.append(image.replace(depth=depth.depth, conf=depth.conf, depth_camera=CAMERA))
+    return frames, shots(times, LASER, LASER_HW)
+
+
+def archive(folder: Path, n: int = 4, **options: object) -> tuple[Path, list[Frame], list[Frame]]:
+    frames, lasers = scene(n)
+    file = folder / "ca1m-val-42898570.tar"
+    writers.write_ca1m(file, frames, lasers, **options)
+    return file, frames, lasers
+
+
+def rewrite(file: Path, change: Callable[[str, bytes], tuple[str, bytes] | None]) -> None:
+    """The archive with its members changed, renamed or (None) left out."""
+    out = io.BytesIO()
+    with tarfile.open(file) as old, tarfile.open(fileobj=out, mode="w") as new:
+        for info in old.getmembers():
+            kept = change(info.name, old.extractfile(info).read())
+            if kept is not None:
+                info.name, info.size = kept[0], len(kept[1])
+                new.addfile(info, io.BytesIO(kept[1]))
+    file.write_bytes(out.getvalue())
+
+
+# ------------------------------------------------------------------------------------------------ written, then read
+
+
+def test_gives_back_the_scene(tmp_path: Path) -> None:
+    file, frames, _ = archive(tmp_path)
+    assert data.recognise(file)[0] == "ca1m" and data.recognise(tmp_path)[0] == "ca1m"
+    recording = data.open(file)
+    assert recording.name == "ca1m-val-42898570" and recording.report == () and len(recording) == 4
+    assert recording.rate_hz == pytest.approx(10) and recording.number.tolist() == [0, 1, 2, 3]
+    torch.testing.assert_close(recording.times, torch.cat([f.time for f in frames]), atol=1e-9, rtol=0)
+    check_same(recording, frames, 1 / 1000)
+    for i, want in enumerate(frames):
+        assert torch.equal(recording[i].depth_camera.f, CAMERA.f) and torch.equal(recording[i].conf, want.conf)
+    assert len(data.open_all(tmp_path)) == 1
+
+
+def test_portrait_pictures_keep_their_orientation(tmp_path: Path) -> None:
+    T = shots([100.0])[0].T_world_from_cam
+    size = (64, 48)
+    frame, laser = (render(PORTRAIT, T, size, 100.0) for _ in range(2))
+    writers.write_ca1m(tmp_path / "ca1m-train-1.tar", [frame], [laser])
+    recording = data.open(tmp_path)
+    assert recording[0].hw == size and recording.report == ("no confidence: every return counts alike",)
+    check_same(recording, [frame], 1 / 1000)
+    assert recording.truth(0)["depth"].shape == (1, *size)
+
+
+def test_laser_depth_is_the_truth_at_the_images_pixels(tmp_path: Path) -> None:
+    file, frames, _ = archive(tmp_path, n=2)
+    recording = data.open(file)
+    for i, frame in enumerate(frames):
+        exact = recording.truth(i)
+        want = render(VGA, frame.T_world_from_cam, VGA_HW).depth
+        known = exact["depth"] > 0
+        assert exact["depth"].shape == (1, *VGA_HW) and float(known.double().mean()) > 0.7
+        assert float(((exact["depth"] - want).abs() / want)[known].max()) < 0.01
+        assert float(exact["disagreement"]) < 0.01 and not exact["surface"].any()
+    assert not hasattr(data.open(file, truth=False), "truth")
+
+
+def test_failed_registration_is_rejected(tmp_path: Path) -> None:
+    frames, lasers = scene(2)
+    lasers[1] = lasers[1].replace(depth=lasers[1].depth * 0.9)
+    writers.write_ca1m(tmp_path / "ca1m-val-1.tar", frames, lasers, without=[(0, "gt/depth.png")])
+    recording = data.open(tmp_path)
+    assert recording.report == ("1 frame without gt/depth: no truth",)
+    none, bad = recording.truth(0), recording.truth(1)
+    assert none["depth"].shape == (1, *VGA_HW) and not none["depth"].any() and math.isnan(none["disagreement"])
+    assert not bad["depth"].any() and float(bad["disagreement"]) == pytest.approx(0.111, abs=0.005)
+    assert data.open(tmp_path, max_disagreement=0.2).truth(1)["depth"].any()
+
+
+def test_a_member_missing_in_the_middle_is_skipped_and_reported(tmp_path: Path) -> None:
+    missing = [(1, "gt/RT.json"), (3, "wide/depth/confidence.tiff"), (4, "wide/image.png"), (5, "gt/depth/K.json")]
+    file, frames, _ = archive(tmp_path, n=6, without=missing)
+    recording = data.open(file)
+    assert recording.number.tolist() == [0, 2, 5]
+    assert set(recording.report) == {
+        "1 frame without gt/rt: left out",
+        "1 frame without wide/depth/confidence: left out",
+        "1 frame without wide/image: left out",
+    }
+    check_same(recording, [frames[i] for i in (0, 2, 5)], 1 / 1000)
+    assert recording.truth(2)["depth"].any()  # the laser's camera taken for that of the image, scaled
+    assert data.open(file, confidence=None).number.tolist() == [0, 2, 3, 5]
+
+
+def test_without_any_confidence_or_depth_intrinsics(tmp_path: Path) -> None:
+    file, _, _ = archive(tmp_path)
+    rewrite(file, lambda name, body: None if "confidence" in name or "wide/depth/K" in name else (name, body))
+    recording = data.open(file)
+    assert recording.report == ("no confidence: every return counts alike",) and len(recording) == 4
+    assert recording[0].conf is None and recording[0].depth_camera is None
+
+
+def test_confidence_is_a_share_or_a_level(tmp_path: Path) -> None:
+    file, frames, _ = archive(tmp_path, n=1)
+    steps = torch.linspace(0, 1, HW[0] * HW[1]).view(HW)
+
+    def stored(picture: np.ndarray) -> None:
+        rewrite(file, lambda name, body: (name, float_tiff(picture) if "confidence" in name else body))
+
+    stored(steps.numpy())
+    conf = data.open(file)[0].conf[0]
+    assert conf[steps < 0.25].max() == 0 and conf[steps >= 0.75].min() == 2
+    assert set(conf[(steps >= 0.25) & (steps < 0.75)].tolist()) == {1}
+    levels = frames[0].conf[0].numpy()
+    stored(levels)
+    assert torch.equal(data.open(file, confidence="level")[0].conf, frames[0].conf)
+    with pytest.raises(FormatError, match=r"confidence: found 0 to 2, expected 0 to 1 \(option confidence"):
+        data.open(file)[0]
+    stored(np.where(levels > 1, np.nan, 0.0))
+    with pytest.raises(FormatError, match="confidence: found 0 to 0, expected 0 to 1"):
+        data.open(file)[0]
+    with pytest.raises(FormatError, match="option confidence: found percent, expected unit, level or None"):
+        data.open(file, confidence="percent")
+
+
+def test_flat_matrices_other_extensions_and_strange_members(tmp_path: Path) -> None:
+    file, frames, _ = archive(tmp_path)
+
+    def change(name: str, body: bytes) -> tuple[str, bytes]:
+        if "RT" in name or "K.json" in name:
+            body = body.replace(b"[", b"").replace(b"]", b"")
+            return f"./{name}", b"[" + body + b"]"
+        return (name.replace(".png", ".tiff").replace("wide/depth.", "WIDE/Depth."), body)
+
+    rewrite(file, change)
+    with tarfile.open(file, "a") as more:
+        for name in ("../../outside.wide/image.png", "/1/2.wide/image.png", "readme.txt", "42898570/x.wide/image.png"):
+            info = tarfile.TarInfo(name)
+            more.addfile(info)
+    check_same(data.open(file), frames, 1 / 1000)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [file.name]
+
+
+def test_frames_are_sorted_as_numbers(tmp_path: Path) -> None:
+    times = [99.9, 100.0, 100.1]
+    frames = shots(times)
+    writers.write_ca1m(tmp_path / "ca1m-val-1.tar", frames[::-1], frames[::-1])
+    recording = data.open(tmp_path)
+    assert recording.times.tolist() == times
+    check_same(recording, frames, 1 / 1000)
+
+
+def test_poses_are_camera_to_world(tmp_path: Path) -> None:
+    file, _, _ = archive(tmp_path)
+    recording = data.open(file)
+    wrong = se3.invert(recording.poses)
+    assert disagreement(recording[0], recording[3])[0] < 0.01
+    a, b = (recording[i].replace(T_world_from_cam=wrong[i : i + 1]) for i in (0, 3))
+    assert disagreement(a, b)[0] > 0.03
+    assert float(off_wall(world_points(recording[0])).max()) < 2e-3
+
+
+def test_opening_reads_only_poses_and_recordings_travel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file, _, _ = archive(tmp_path)
+    read: list[int] = []
+    member = tarballs.read_member
+    monkeypatch.setattr(tarballs, "read_member", lambda *args: read.append(args[2]) or member(*args))
+    recording = data.open(file)
+    assert len(read) == 4 and max(read) < 400
+    twin = pickle.loads(pickle.dumps(recording))
+    assert torch.equal(twin[2].depth, recording[2].depth)
+    assert torch.equal(twin.truth(2)["depth"], recording.truth(2)["depth"])
+
+
+def test_what_is_no_archive_of_ours(tmp_path: Path) -> None:
+    with tarfile.open(tmp_path / "other.tar", "w") as other:
+        other.addfile(tarfile.TarInfo("a/b.png"))
+    (tmp_path / "noise.tar").write_bytes(bytes(range(256)) * 8)
+    (tmp_path / "empty.tar").write_bytes(b"")
+    for name, message in (
+        ("other.tar", r"other.tar: frames: found none, expected members wide/image"),
+        ("noise.tar", r"noise.tar: header at byte 0: found a wrong check sum"),
+        ("empty.tar", r"empty.tar: content: found 0 bytes, expected a tar archive"),
+        ("gone.tar", r"gone.tar: path: found no such file"),
+        ("", r"archives: found none, expected ca1m-<split>-<video id>.tar"),
+    ):
+        assert ca1m.recognise(tmp_path / name) is None
+        with pytest.raises(FormatError, match=message):
+            data.open(tmp_path / name, "ca1m")
+    with pytest.raises(FormatError, match="file: found no such file"):
+        list(tarballs.members(tmp_path / "gone.tar"))
+
+
+def test_a_folder_of_archives_is_listed_and_none_is_opened(tmp_path: Path) -> None:
+    """A hundred gigabytes are a hundred archives; one that is damaged leaves the others alone."""
+    file, frames = archive(tmp_path, n=2)[:2]
+    (tmp_path / "ca1m-val-99.tar").write_bytes(b"no archive")
+    recordings = data.open_all(tmp_path)
+    assert list(recordings.names) == [file.stem, "ca1m-val-99"]
+    assert recordings[0].name == file.stem and len(recordings[0]) == len(frames)
+    with pytest.raises(FormatError, match=r"ca1m-val-99.tar: "):
+        recordings[1]
+    scenes = data.open_capture(tmp_path, gap=1)
+    assert len(scenes) == 2 and (scenes[0].name, scenes[0].gap) == (file.stem, 1)
+
+
+# -------------------------------------------------------------------------------------------------------------- tar
+
+
+@pytest.mark.parametrize("format", [tarfile.USTAR_FORMAT, tarfile.GNU_FORMAT, tarfile.PAX_FORMAT])
+def test_members_against_the_standard_library(tmp_path: Path, format: int) -> None:
+    file = tmp_path / "a.tar"
+    rng = np.random.default_rng(0)
+    long = "folder/" * 20 + "name.png"
+    with tarfile.open(file, "w", format=format) as archive:
+        for name in ("a.txt", "b/c.txt", long, "é.txt", "d.txt"):
+            info = tarfile.TarInfo(name)
+            body = rng.bytes(int(rng.integers(0, 2000)))
+            info.size = len(body)
+            archive.addfile(info, io.BytesIO(body))
+        for kind in (tarfile.SYMTYPE, tarfile.DIRTYPE, tarfile.FIFOTYPE, tarfile.LNKTYPE):
+            info = tarfile.TarInfo("odd" if kind != tarfile.DIRTYPE else "odd/")
+            info.type, info.linkname = kind, "a.txt"
+            archive.addfile(info)
+        info = tarfile.TarInfo("last.txt")
+        info.size = 3
+        archive.addfile(info, io.BytesIO(b"end"))
+    with tarfile.open(file) as archive:
+        want = [(m.name, m.offset_data, m.size) for m in archive.getmembers() if m.isreg()]
+        got = list(tarballs.members(file))
+        assert [tuple(m) for m in got] == want and len(got) == 6
+        for m in got:
+            assert tarballs.read_member(file, m.offset, m.size) == archive.extractfile(m.name).read()
+
+
+def test_damaged_archives_end_the_walk(tmp_path: Path) -> None:
+    file, _, _ = archive(tmp_path, n=1)
+    good = file.read_bytes()
+    offset = next(iter(tarballs.members(file))).offset
+
+    def header(at: int, field: bytes) -> bytes:
+        block = bytearray(good[:512])
+        block[at : at + len(field)] = field
+        block[148:156] = b" " * 8
+        block[148:156] = b"%06o\0 " % sum(block)
+        return bytes(block) + good[512:]
+
+    for content, message in (
+        (good[: offset + 10], r"wide/image.png: found 10 of \d+ bytes, expected a whole archive"),
+        (b"x" + good[1:], r"header at byte 0: found a wrong check sum, expected a tar header, not compressed"),
+        (header(124, b"77777777777\0"), r"wide/image.png: found \d+ of 8589934591 bytes, expected a whole archive"),
+        (header(124, b"\x80" + b"\xff" * 11), r"wide/image.png: found \d+ of \d{20,} bytes"),
+        (header(124, b"\xff" * 12), r"header at byte 0: found size .*, expected a number of bytes"),
+        (header(124, b"eleven     \0"), r"header at byte 0: found size b'eleven"),
+        (header(156, b"S"), r"wide/image.png: found a sparse member, expected plain files"),
+        (header(156, b"x"), None),  # a picture where a pax header is announced: ignored
+    ):
+        file.write_bytes(content)
+        if message is None:
+            assert len(list(tarballs.members(file))) == 10
+        else:
+            with pytest.raises(FormatError, match=message):
+                list(tarballs.members(file))
+    file.write_bytes(good)
+    with pytest.raises(FormatError, match="found 9 bytes, expected at most 8 bytes"):
+        tarballs.read_member(file, 512, 9, limit=8)
+    with pytest.raises(FormatError, match="found 0 bytes, expected 9 bytes"):
+        tarballs.read_member(file, len(good), 9)
+
+
+def test_pax_sizes_and_long_names_are_bounded(tmp_path: Path) -> None:
+    file = tmp_path / "a.tar"
+    for key, value, message in (
+        ("size", "99999999999999", "found .* of 99999999999999 bytes, expected a whole archive"),
+        ("path", "x" * 1_100_000, "expected at most 1000000 bytes"),
+    ):
+        with tarfile.open(file, "w", format=tarfile.PAX_FORMAT) as archive:
+            info = tarfile.TarInfo("a.txt")
+            info.pax_headers = {key: value}
+            archive.addfile(info)
+        with pytest.raises(FormatError, match=message):
+            list(tarballs.members(file))
+
+
+# -------------------------------------------------------------------------------------------------------------- TIFF
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("kind", ["u1", "u2", "i2", "f2", "f4", "f8"])
+@pytest.mark.parametrize("compression", [None, "zlib", "lzw"])
+def test_tiff_against_tifffile(tmp_path: Path, order: str, kind: str, compression: str | None) -> None:
+    picture = (np.random.default_rng(0).random((20, 30)) * 100).astype(kind)
+    file = tmp_path / "a.tiff"
+    tifffile.imwrite(file, picture, byteorder=order, compression=compression)
+    got = tiff.read_tiff(file, (20, 30))
+    assert got.dtype == picture.dtype and np.array_equal(got, picture)
+    with pytest.raises(FormatError, match=r"a.tiff: size: found 30x20, expected 20x30"):
+        tiff.read_tiff(file, (30, 20))
+
+
+def test_our_tiff_is_one() -> None:
+    picture = np.random.default_rng(0).random((5, 7), dtype=np.float32)
+    assert np.array_equal(tifffile.imread(io.BytesIO(float_tiff(picture))), picture)
+
+
+def test_bad_tiff(tmp_path: Path) -> None:
+    good = float_tiff(np.ones((5, 7)))
+    directory = 8 + 5 * 7 * 4
+
+    def tag(number: int, value: int) -> bytes:
+        """The file with one tag changed."""
+        at = good.index(np.array([number, 4], "<u2").tobytes(), directory)
+        return good[: at + 8] + int(value).to_bytes(4, "little") + good[at + 12 :]
+
+    for content, message in (
+        (b"II+\0" + good[4:], "content: found b'II"),
+        (good[:100], "directory: found one beyond the 100 bytes"),
+        (tag(256, 2**31), "size: found 2147483648x5, expected 1 to"),
+        (tag(256, 0), "size: found 0x5"),
+        (tag(257, 6), "strips: found 140 bytes, expected 168 bytes"),
+        (tag(258, 12), "samples: found 12 bits of kind f"),
+        (tag(259, 7), "layout: found 1 samples a pixel, compression 7"),
+        (tag(259, 8), "data: found "),  # deflated, it says
+        (tag(273, 300), "strips: found 1 places, 1 sizes, expected all inside the file"),
+        (tag(277, 3), "layout: found 3 samples a pixel"),
+    ):
+        with pytest.raises(FormatError, match=message) as caught:
+            tiff.decode_tiff(content, Path("a.tiff"))
+        assert "\n" not in str(caught.value)
+
+
+# ----------------------------------------------------------------------------------------------------------- hostile
+
+
+def hostile_sample(root: Path) -> Path:
+    return archive(root, n=2)[0]
+
+
+def hostile_tiff(root: Path) -> Path:
+    tifffile.imwrite(root / "a.tiff", np.ones((40, 50), np.float32), compression="zlib", predictor=True)
+    return root / "a.tiff"

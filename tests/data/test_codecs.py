@@ -1,0 +1,268 @@
+"""Decoders of LZFSE, OpenEXR and video: what they give back, and that damage never reaches further than an error."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import random
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dhtorch.data.codecs import exr as codec_exr
+from dhtorch.data.codecs import lzfse as codec_lzfse
+from dhtorch.data.codecs import video as codec_video
+from dhtorch.data.io import decode as files
+from dhtorch.data.io.decode import FormatError
+from dhtorch.testing.mp4 import write_video
+
+lzfse = pytest.importorskip("lzfse")
+OpenEXR = pytest.importorskip("OpenEXR")
+av = pytest.importorskip("av")
+
+HERE = Path("here")
+
+
+def test_a_missing_decoder_names_its_extra() -> None:
+    with pytest.raises(ImportError, match=r"needs no_such_a or no_such_b, .* pip install 'dhtorch\[data\]'"):
+        files.need("no_such_a", "no_such_b")
+    assert files.need("no_such_a", "json").__name__ == "json"
+
+
+# -------------------------------------------------------------------------------------------------------------- lzfse
+
+
+def texts() -> list[bytes]:
+    """One for each kind of block: compressed, LZVN, stored, empty, many blocks."""
+    draw = np.random.default_rng(0)
+    noise = draw.normal(2, 0.1, (256, 192)).astype("<f4").tobytes()
+    return [noise, b"abcabcabcd" * 300, b"short", b"", bytes(1_000_000), draw.bytes(100_000), noise * 4]
+
+
+@pytest.mark.parametrize("text", texts(), ids=lambda text: f"{len(text)}")
+def test_lzfse_gives_back_the_bytes(text: bytes) -> None:
+    packed = lzfse.compress(text)
+    assert codec_lzfse.unpacked_size(packed, HERE, "depth") == len(text)
+    assert codec_lzfse.unpack(packed, len(text), HERE, "depth") == text
+    for other in (len(text) + 4, max(len(text) - 4, 0)):
+        if other != len(text):
+            with pytest.raises(FormatError, match=rf"depth: found {len(text)} bytes when unpacked, expected {other}"):
+                codec_lzfse.unpack(packed, other, HERE, "depth")
+    if len(packed) > 100:  # each place where a block may end, and a good many others
+        for cut in {*range(1, 40), len(packed) // 2, len(packed) - 4, len(packed) - 20}:
+            with pytest.raises(FormatError, match=r"here: depth: found b'.*' at byte \d+ of \d+"):
+                codec_lzfse.unpack(packed[:-cut], len(text), HERE, "depth")
+
+
+def test_a_member_that_is_not_compressed_is_taken_as_it_is() -> None:
+    raw = np.arange(12, dtype="<f4").tobytes()
+    assert codec_lzfse.unpack(raw, 48, HERE, "depth") == raw
+    with pytest.raises(FormatError, match="whole LZFSE block"):
+        codec_lzfse.unpack(raw, 44, HERE, "depth")
+
+
+def test_a_stream_that_lies_about_its_size_never_gets_room() -> None:
+    """A block that claims few bytes and holds a million: the decoder is given the room that was claimed."""
+    packed = bytearray(lzfse.compress(bytes(1_000_000)))
+    packed[4:8] = struct.pack("<I", 1000)
+    claimed = codec_lzfse.unpacked_size(bytes(packed), HERE, "depth")
+    assert claimed < 1_000_000
+    try:
+        assert len(codec_lzfse.unpack(bytes(packed), claimed, HERE, "depth")) == claimed
+    except FormatError as error:
+        assert "here: depth" in str(error)
+
+
+# ------------------------------------------------------------------------------------------------------------ OpenEXR
+
+
+def exr(file: Path, channels: dict[str, np.ndarray], compression: object = OpenEXR.ZIP_COMPRESSION) -> Path:
+    OpenEXR.File({"compression": compression, "type": OpenEXR.scanlineimage}, channels).write(str(file))
+    return file
+
+
+@pytest.mark.parametrize("name", ["NO", "RLE", "ZIPS", "ZIP", "PIZ"])
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.uint32])
+def test_exr_gives_back_the_channel(tmp_path: Path, name: str, dtype: type) -> None:
+    depth = (np.random.default_rng(0).random((77, 51)) * 5).astype(dtype)
+    file = exr(tmp_path / "d.exr", {"R": depth}, getattr(OpenEXR, f"{name}_COMPRESSION"))
+    got = codec_exr.read_exr(file, hw=(77, 51))
+    assert got.dtype == np.float32
+    np.testing.assert_array_equal(got, depth.astype(np.float32))
+    whole = file.read_bytes()
+    for cut in (1, 10, len(whole) // 3, len(whole) - 20, len(whole) - 4):
+        file.write_bytes(whole[:-cut])
+        with pytest.raises(FormatError, match=r"d\.exr: \w+"):
+            codec_exr.read_exr(file)
+
+
+def test_exr_chunks_lie_inside_the_file(tmp_path: Path) -> None:
+    file = exr(tmp_path / "d.exr", {"R": np.ones((40, 6), np.float32)})
+    whole = bytearray(file.read_bytes())
+    header = codec_exr.exr_header(file)
+    assert header.chunks == 3
+    for offset in (len(whole), 2**63, 8):
+        whole[header.start + 8 : header.start + 16] = struct.pack("<Q", offset)
+        file.write_bytes(bytes(whole))
+        with pytest.raises(FormatError, match=r"d.exr: chunk 1: found bytes beyond the \d+ of the file"):
+            codec_exr.read_exr(file)
+
+
+def test_exr_chooses_its_channel(tmp_path: Path) -> None:
+    a, b = np.full((4, 6), 1, np.float32), np.full((4, 6), 2, np.float32)
+    assert codec_exr.read_exr(exr(tmp_path / "1.exr", {"odd": a}))[0, 0] == 1
+    two = exr(tmp_path / "2.exr", {"R": b, "odd": a})
+    assert codec_exr.exr_header(two).channels == ("R", "odd")
+    assert codec_exr.read_exr(two)[0, 0] == 2 and codec_exr.read_exr(two, "odd")[0, 0] == 1
+    with pytest.raises(FormatError, match="channels: found R, odd, expected far"):
+        codec_exr.read_exr(two, "far")
+    with pytest.raises(FormatError, match="channels: found odd1, odd2, expected one of R"):
+        codec_exr.read_exr(exr(tmp_path / "3.exr", {"odd1": a, "odd2": b}))
+    with pytest.raises(FormatError, match="size: found 6x4, expected 4x6"):
+        codec_exr.read_exr(two, hw=(6, 4))
+
+
+def test_exr_header_decides_before_the_decoder(tmp_path: Path) -> None:
+    file = exr(tmp_path / "d.exr", {"R": np.zeros((4, 6), np.float32)})
+    whole = file.read_bytes()
+    at = whole.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4
+    file.write_bytes(whole[:at] + struct.pack("<4i", 0, 0, 2**30, 2**30) + whole[at + 16 :])
+    with pytest.raises(FormatError, match=r"dataWindow: found 1073741825x1073741825 with 1 channels"):
+        codec_exr.read_exr(file)
+    file.write_bytes(whole[:4] + struct.pack("<I", 2 | 0x1000) + whole[8:])
+    with pytest.raises(FormatError, match="version: found 0x1002"):
+        codec_exr.read_exr(file)
+    file.write_bytes(b"\x89PNG" + whole)
+    with pytest.raises(FormatError, match="expected an OpenEXR picture"):
+        codec_exr.exr_header(file)
+
+
+# -------------------------------------------------------------------------------------------------------------- video
+
+N = 40
+
+
+def grey(i: int) -> np.ndarray:
+    return np.full((48, 64, 3), 40 + 5 * i, np.uint8)
+
+
+def number(picture: np.ndarray) -> int:
+    """Which of the grey pictures this is."""
+    return round((float(picture.mean()) - 40) / 5)
+
+
+def film(file: Path, codec: str = "libx264", **options: object) -> Path:
+    write_video(file, [grey(i) for i in range(N)], [i / 60 for i in range(N)], codec=codec, **options)
+    return file
+
+
+@pytest.mark.parametrize("codec", ["libx264", "libx265"])
+@pytest.mark.parametrize("b_frames", [0, 3])
+def test_frames_by_number_in_any_order(tmp_path: Path, codec: str, b_frames: int) -> None:
+    file = film(tmp_path / "a.mp4", codec, b_frames=b_frames)
+    header = codec_video.video_header(file)
+    assert (header.n, header.hw, header.rate_hz) == (N, (48, 64), 60)
+    assert header.codec == {"libx264": "h264", "libx265": "hevc"}[codec]
+    np.testing.assert_allclose(codec_video.video_times(file), np.arange(N) / 60, atol=1e-6)
+    order = [*range(N), *random.Random(0).choices(range(N), k=40), *reversed(range(N))]
+    assert [number(codec_video.read_video_frame(file, i)) for i in order] == order
+
+
+@pytest.mark.parametrize("codec", ["libx264", "libx265"])
+@pytest.mark.parametrize("b_frames", [0, 2])
+def test_a_frame_hidden_by_an_edit_list_is_there_for_who_asks(tmp_path: Path, codec: str, b_frames: int) -> None:
+    file = film(tmp_path / "a.mp4", codec, b_frames=b_frames, hide_first=True)
+    shown = len(codec_video.video_times(file))
+    assert shown == N - 1 and number(codec_video.read_video_frame(file, 0)) == 1
+    assert codec_video.video_header(file, all_frames=True).n == N
+    assert codec_video.video_times(file, all_frames=True)[0] == pytest.approx(-1 / 60, abs=1e-4)
+    got = [number(codec_video.read_video_frame(file, i, all_frames=True)) for i in range(N)]
+    assert got == list(range(N))
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_a_decoder_that_shows_no_index_counts_the_same(tmp_path: Path, hidden: bool, monkeypatch) -> None:
+    """PyAV before 17."""
+    file = film(tmp_path / "a.mp4", hide_first=hidden)
+    said = [codec_video.video_header(file, all_frames=every) for every in (False, True)]
+    codec_video.close_videos()
+    monkeypatch.setattr(codec_video, "_index", lambda stream: ())
+    assert [codec_video.video_header(file, all_frames=every) for every in (False, True)] == said
+    assert [header.n for header in said] == [N - hidden, N]
+    codec_video.close_videos()
+
+
+def test_a_damaged_frame_never_shifts_the_others(tmp_path: Path) -> None:
+    file = film(tmp_path / "a.mp4", key_every=10, b_frames=0)
+    with av.open(str(file)) as container:
+        places = [(packet.pos, packet.size) for packet in container.demux(video=0) if packet.size]
+    whole = bytearray(file.read_bytes())
+    for at, size in places[10:13]:  # the second key frame and what follows
+        whole[at + 4 : at + size] = bytes(size - 4)
+    file.write_bytes(bytes(whole))
+    assert codec_video.video_header(file).n == N
+    with pytest.raises(FormatError, match=r"a.mp4: frame 10: found"):
+        codec_video.read_video_frame(file, 10)
+    for i in (*range(10), *range(20, N)):
+        assert number(codec_video.read_video_frame(file, i)) == i
+
+
+def test_unsound_videos(tmp_path: Path) -> None:
+    file = film(tmp_path / "a.mp4")
+    with pytest.raises(FormatError, match=r"frame 40: found 40 frames, expected 40 frames"):
+        codec_video.read_video_frame(file, N)
+    with pytest.raises(FormatError, match=r"frame 0 size: found 64x48, expected 48x64"):
+        codec_video.read_video_frame(file, 0, (64, 48))
+    with pytest.raises(FormatError, match=r"no.mp4: file: found no such file, expected a readable file"):
+        codec_video.video_header(tmp_path / "no.mp4")
+    whole = file.read_bytes()
+    file.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(FormatError, match=r"a.mp4: content"):
+        codec_video.video_header(file)
+    (tmp_path / "b.mp4").write_text("no video at all")
+    with pytest.raises(FormatError, match=r"b.mp4: content"):
+        codec_video.video_header(tmp_path / "b.mp4")
+
+
+def _in_child(file: Path, wanted: list[int], say: Callable[[list[int]], None]) -> None:
+    say([number(codec_video.read_video_frame(file, i)) for i in wanted])
+
+
+def test_a_forked_worker_opens_its_own(tmp_path: Path) -> None:
+    """Parent and children read on in turn: with a shared file position they would get one another's bytes."""
+    noise = np.random.default_rng(0).integers(-30, 30, (N, 96, 128, 3))
+    pictures = [np.full((96, 128, 3), 40 + 5 * i) + noise[i] for i in range(N)]
+    file = tmp_path / "a.mp4"
+    noisy = [np.clip(x, 0, 255).astype(np.uint8) for x in pictures]
+    write_video(file, noisy, [i / 60 for i in range(N)], crf=0)
+    assert file.stat().st_size > 400_000  # many times what a decoder reads ahead
+    assert number(codec_video.read_video_frame(file, 3)) == 3
+    fork = multiprocessing.get_context("fork")
+    answers = fork.SimpleQueue()
+    wanted = list(range(4, N - 4))
+    children = [fork.Process(target=_in_child, args=(file, wanted, answers.put)) for _ in range(2)]
+    for child in children:
+        child.start()
+    assert [number(codec_video.read_video_frame(file, i)) for i in wanted] == wanted
+    for child in children:
+        child.join(30)
+        assert child.exitcode == 0
+    assert [answers.get() for _ in children] == [wanted] * 2
+
+
+def test_a_few_decoders_stay_open(tmp_path: Path) -> None:
+    many = [film(tmp_path / f"{i}.mp4", b_frames=0) for i in range(11)]
+
+    def held() -> int:
+        return sum(os.path.realpath(each).startswith(str(tmp_path)) for each in Path("/proc/self/fd").iterdir())
+
+    codec_video.close_videos()
+    for i in range(3):
+        for file in many:
+            assert number(codec_video.read_video_frame(file, i)) == i
+    assert held() == 8
+    codec_video.close_videos()
+    assert held() == 0

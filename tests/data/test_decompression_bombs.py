@@ -1,0 +1,254 @@
+"""Files of a few kilobytes that ask for gigabytes or minutes, and files that are none: refused before either is spent."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import pickle
+import socket
+import struct
+import tarfile
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from support import damage_harness as hostile
+from support.box_scene import walk
+
+from dhtorch import data
+from dhtorch import testing as writers
+from dhtorch.data.codecs import hdf5, npy, parquet, pickles, tarballs, tiff, video
+from dhtorch.data.io import decode as files
+from dhtorch.data.io.decode import FormatError
+from dhtorch.data.members import zip_members
+from dhtorch.testing.mp4 import write_video
+
+pyarrow = pytest.importorskip("pyarrow")
+tifffile = pytest.importorskip("tifffile")
+h5py = pytest.importorskip("h5py")
+from pyarrow import parquet as arrow_parquet  # noqa: E402
+
+FRUGAL = 256 << 20  # bytes above the level before the call
+
+
+def dictionary(file: Path) -> Callable[[Path], Any]:
+    column = pyarrow.DictionaryArray.from_arrays(np.zeros(20_000, np.int32), [bytes(1 << 20)])
+    arrow_parquet.write_table(pyarrow.table({"x": column}), file, compression="zstd", store_schema=False)
+    return lambda path: parquet.read_columns(path, ["x"])
+
+
+def zeros(file: Path) -> Callable[[Path], Any]:
+    column = pyarrow.DictionaryArray.from_arrays(np.zeros(40_000_000, np.int32), [0.5])
+    arrow_parquet.write_table(pyarrow.table({"x": column}), file, compression="zstd", store_schema=False)
+    return lambda path: parquet.read_columns(path, ["x"])
+
+
+def objects(file: Path) -> Callable[[Path], Any]:
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("metadata", "[" + "{}," * 4_000_000 + "{}]")
+    return lambda path: files.decode_json(zip_members(path)["metadata"].read(), path)
+
+
+def long_directory(file: Path) -> Callable[[Path], Any]:
+    """Nine gigabytes of nothing, all of it directory."""
+    size = 9_000_000_000
+    long = struct.pack("<4sQHHIIQQQQ", b"PK\6\6", 44, 45, 45, 0, 0, 1, 1, size, 0)
+    place = struct.pack("<4sIQI", b"PK\6\7", 0, size, 1)
+    with file.open("wb") as stream:
+        stream.seek(size)
+        stream.write(long + place + struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, 0xFFFF, 0xFFFF, 2**32 - 1, 2**32 - 1, 0))
+    return zip_members
+
+
+def many_entries(file: Path) -> Callable[[Path], Any]:
+    entry = struct.pack("<4s6H3I5H2I", b"PK\1\2", 20, 20, 0, 0, 0, 33, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0) + b"a"
+    body = entry * 400_000
+    file.write_bytes(body + struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, 0xFFFF, 0xFFFF, len(body), 0, 0))
+    return zip_members
+
+
+def small_numbers(file: Path) -> Callable[[Path], Any]:
+    np.savez_compressed(file, data=np.zeros(100_000_000, np.uint8))
+    return lambda path: npy.read_npz(path, "data")
+
+
+def large_tile(file: Path) -> Callable[[Path], Any]:
+    tifffile.imwrite(
+        file, np.zeros((24, 32), np.uint8), tile=(20_000, 20_000), compression="zlib", compressionargs={"level": 1}
+    )
+    return tiff.read_tiff
+
+
+def many_samples(file: Path) -> Callable[[Path], Any]:
+    write_video(file, [np.zeros((32, 32, 3), np.uint8)] * 3, [0.0, 0.1, 0.2])
+    raw = bytearray(file.read_bytes())
+    at = raw.index(b"stsz")
+    raw[at + 8 : at + 16] = struct.pack(">II", 10, 50_000_000)
+    file.write_bytes(raw)
+    return video.video_header
+
+
+def empty_sets(file: Path) -> Callable[[Path], Any]:
+    head = io.BytesIO()
+    np.lib.format.write_array_header_1_0(head, {"descr": "|O", "fortran_order": False, "shape": ()})  # type: ignore[arg-type]
+    file.write_bytes(head.getvalue() + b"\x80\x04](" + b"\x8f" * 3_000_000 + b"e.")
+    return pickles.read_npy
+
+
+def stacks(file: Path) -> Callable[[Path], Any]:
+    with h5py.File(file, "w") as group:
+        group.create_dataset("stack_train", (999_999, 10, 8, 8, 3), "u1", chunks=(1, 10, 8, 8, 3))
+    return hdf5.hdf5_arrays
+
+
+def scans(file: Path) -> Callable[[Path], Any]:
+    picture = cv2.imencode(".jpg", np.zeros((4000, 4000), np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+    at = picture.rindex(b"\xff\xda")
+    file.write_bytes(picture[:at] + picture[at:-2] * 900 + b"\xff\xd9")
+    return files.read_image
+
+
+def words(file: Path) -> Callable[[Path], Any]:
+    file.write_bytes(b"1 " * 25_000_000)
+    return files.read_rows
+
+
+def lines(file: Path) -> Callable[[Path], Any]:
+    file.write_bytes(b"ab\x0b" * 10_000_000)
+    return files.read_rows
+
+
+def wide_text(file: Path) -> Callable[[Path], Any]:
+    file.write_bytes("\N{GRINNING FACE}".encode() + b"a" * 60_000_000)
+    return files.read_text
+
+
+BOMBS: dict[str, Callable[[Path], Callable[[Path], Any]]] = {
+    "a dictionary.parquet": dictionary,
+    "runs.parquet": zeros,
+    "objects.r3d": objects,
+    "long directory.r3d": long_directory,
+    "entries.r3d": many_entries,
+    "small numbers.npz": small_numbers,
+    "tile.tif": large_tile,
+    "samples.mp4": many_samples,
+    "sets.npy": empty_sets,
+    "stacks.h5": stacks,
+    "scans.jpg": scans,
+    "words.txt": words,
+    "lines.txt": lines,
+    "wide.txt": wide_text,
+}
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_little_that_would_become_much_is_refused(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a child of its own, so that time and memory are those of this file."""
+    monkeypatch.setattr(hostile, "BYTES", FRUGAL)
+    (tmp_path / "capture").mkdir()
+    file = tmp_path / "capture" / name
+    outcome = hostile.run(BOMBS[name](file), file, tmp_path)
+    assert outcome.kind == "FormatError", outcome
+    assert name in outcome.detail
+
+
+def test_what_is_no_regular_file_is_never_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pipe would wait for ever, a device may never end; a link to one is one."""
+    monkeypatch.setattr(hostile, "PATIENCE", 10.0)
+    monkeypatch.chdir(tmp_path)
+    root = tmp_path / "capture"
+    root.mkdir()
+    pipe, device, plug = root / "pipe", root / "device", root / "plug"
+    os.mkfifo(pipe)
+    device.symlink_to("/dev/zero")
+    with socket.socket(socket.AF_UNIX) as end:
+        end.bind("capture/plug")
+        readers = {
+            "bytes": files.read_bytes,
+            "table": parquet.parquet_header,
+            "arrays": hdf5.hdf5_arrays,
+            "archive": lambda path: list(tarballs.members(path)),
+            "members": zip_members,
+            "video": video.video_header,
+        }
+        for what, read in readers.items():
+            for file, word in ((pipe, "a pipe"), (device, "a device"), (plug, "a socket")):
+                outcome = hostile.run(read, file, tmp_path)
+                assert outcome.kind == "FormatError" and f"found {word}, expected a regular file" in outcome.detail, (
+                    what
+                )
+
+
+def test_a_size_of_thousands_of_digits_is_a_damaged_header(tmp_path: Path) -> None:
+    file = tmp_path / "x.tar"
+    with tarfile.open(file, "w", format=tarfile.PAX_FORMAT) as archive:
+        info = tarfile.TarInfo("a")
+        info.pax_headers = {"size": "9" * 5000}
+        archive.addfile(info)
+    with pytest.raises(FormatError, match=r"x.tar: header at byte \d+: found size 9+…, expected a number of bytes"):
+        list(tarballs.members(file))
+
+
+def test_a_list_of_other_files_is_no_video(tmp_path: Path) -> None:
+    write_video(tmp_path / "other.mp4", [np.zeros((32, 32, 3), np.uint8)] * 3, [0.0, 0.1, 0.2])
+    file = tmp_path / "x.mp4"
+    file.write_text("ffconcat version 1.0\nfile other.mp4\n")
+    with pytest.raises(FormatError, match=r"x.mp4: content: found b'ffconcat.*expected a video file"):
+        video.video_header(file)
+
+
+def test_honest_files_stay_within_the_law(tmp_path: Path) -> None:
+    """What is large because it holds much is still read: long texts, many scans of a small picture, plain arrays."""
+    (tmp_path / "x.txt").write_text("1.0 2.0 3.0 4.0\n" * 100_000)
+    assert files.read_table(tmp_path / "x.txt").shape == (100_000, 4)
+    (tmp_path / "x.json").write_text(json.dumps({"poses": [[0.25] * 7] * 100_000}))
+    assert len(files.read_json(tmp_path / "x.json")["poses"]) == 100_000
+    cv2.imwrite(str(tmp_path / "x.jpg"), np.zeros((480, 640, 3), np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])
+    assert files.read_image(tmp_path / "x.jpg").shape == (3, 480, 640)
+    cv2.imwrite(str(tmp_path / "x.png"), np.zeros((4000, 6000), np.uint8))
+    assert files.read_image(tmp_path / "x.png").shape == (1, 4000, 6000)
+    np.savez_compressed(tmp_path / "x.npz", data=np.zeros((2000, 3000), np.uint8))
+    assert npy.read_npz(tmp_path / "x.npz", "data").dtype == np.float32
+    dump = {k: [{"stamp": k, "tcp": np.zeros(7), "ft": np.zeros(6)}] for k in range(20_000)}
+    np.save(tmp_path / "x.npy", dump, allow_pickle=True)  # type: ignore[arg-type]
+    assert len(pickles.read_npy(tmp_path / "x.npy")) == 20_000
+    texts = pyarrow.table({"x": ["pick up the cube"] * 300_000})
+    arrow_parquet.write_table(texts, tmp_path / "x.parquet")
+    assert parquet.read_columns(tmp_path / "x.parquet", ["x"])["x"][-1] == "pick up the cube"
+
+
+def test_links_that_leave_a_capture_are_refused_unless_asked_for(tmp_path: Path) -> None:
+    """Also those that are met when a frame is read, and in another process."""
+    outside, root = tmp_path / "outside", tmp_path / "capture"
+    for folder in (outside, root):
+        writers.write_tum(folder, walk(3, hw=(24, 32)))
+    secret = tmp_path / "secret"
+    secret.write_text("root:x:0:0\n")
+    (root / "rgb.txt").unlink()
+    (root / "rgb.txt").symlink_to(secret)
+    with pytest.raises(FormatError, match=r"rgb.txt: link: found one that leads out .*follow_links=true") as caught:
+        data.open_all(root, "tum")
+    assert "root:x" not in str(caught.value)
+    (root / "rgb.txt").unlink()
+    (root / "rgb.txt").symlink_to("../outside/rgb.txt")
+    with pytest.raises(FormatError, match="link"):
+        data.open(root, "tum")
+    assert len(data.open(root, "tum", follow_links=True)) > 0
+    (root / "rgb.txt").unlink()
+    (root / "real.txt").write_text((outside / "rgb.txt").read_text())
+    (root / "rgb.txt").symlink_to("real.txt")
+    inner = data.open(root)
+    picture = next((root / "rgb").iterdir())
+    picture.unlink()
+    picture.symlink_to(outside / "rgb" / picture.name)
+    with pytest.raises(FormatError, match="link"):
+        [pickle.loads(pickle.dumps(inner))[i] for i in range(len(inner))]
+    assert all(frame.image.numel() for frame in data.open(root, follow_links=True))
+    entry = tmp_path / "entry"
+    entry.symlink_to(outside)
+    assert data.open(entry)[0].image.numel(), "the capture itself may lie behind a link"

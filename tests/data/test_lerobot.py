@@ -1,0 +1,456 @@
+"""LeRobot data sets, v3 and v2.1: written with known geometry, read back, and damaged."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import shutil
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from support.box_scene import CAMERA, HW, off_wall, pose, render, world_points
+
+pytest.importorskip("av")
+pytest.importorskip("pyarrow")
+
+import pyarrow
+from pyarrow import parquet
+
+from dhtorch import data
+from dhtorch.cli import run
+from dhtorch.data.codecs import parquet as codec_parquet
+from dhtorch.data.codecs.video import close_videos
+from dhtorch.data.io.decode import FormatError
+from dhtorch.data.readers import lerobot_depth, lerobot_rows
+from dhtorch.data.readers.lerobot_meta import Feature
+from dhtorch.records import Camera, Frame
+from dhtorch.testing.lerobot import quantise, write_lerobot
+from dhtorch.testing.lossless import write_lossless
+
+KEY = "observation.images.front"
+STEP = {"video": 3e-3, "tiff": 1e-6, "png": 1e-3, "array": 1e-3}  # m, up to 5 m (codes: 2.8 mm there)
+
+
+@pytest.fixture(autouse=True)
+def _clean() -> Iterator[None]:
+    yield
+    close_videos()
+
+
+def episodes() -> list[list[Frame]]:
+    """Two episodes of unequal length, so that nothing falls on the same place in both."""
+    return [
+        [render(CAMERA, pose(i), HW, i / 30) for i in range(2)],
+        [render(CAMERA, pose(5 + i), HW, i / 30) for i in range(4)],
+    ]
+
+
+def same_scene(recording: data.Recording, frames: list[Frame], step: float) -> None:
+    assert len(recording) == len(frames) and recording.report == ()
+    for frame, want in zip(recording, frames, strict=True):
+        assert torch.equal(frame.image, want.image)
+        torch.testing.assert_close(frame.depth, want.depth, atol=step / 2 + 1e-6, rtol=0)
+        assert torch.equal(frame.camera.f, want.camera.f) and torch.equal(frame.camera.c, want.camera.c)
+        torch.testing.assert_close(frame.T_world_from_cam.R, want.T_world_from_cam.R, atol=1e-12, rtol=0)
+        torch.testing.assert_close(frame.T_world_from_cam.t, want.T_world_from_cam.t, atol=1e-12, rtol=0)
+        torch.testing.assert_close(frame.time, want.time, atol=1e-9, rtol=0)
+        assert float(off_wall(world_points(frame)).max()) < 2 * step
+
+
+# ------------------------------------------------------------------------------------------------ written, then read
+
+
+@pytest.mark.parametrize("version", [3, 2])
+@pytest.mark.parametrize(
+    ("image", "depth", "intrinsics"),
+    [("video", "video", "feature"), ("image", "tiff", "side-car"), ("video", "png", "feature"), ("image", "array", "feature")],
+)  # fmt: skip
+def test_gives_back_the_scene(tmp_path: Path, version: int, image: str, depth: str, intrinsics: str) -> None:
+    shots = episodes()
+    write_lerobot(tmp_path, shots, version=version, image=image, depth=depth, intrinsics=intrinsics)
+    assert data.recognise(tmp_path)[0] == "lerobot"
+    recordings = data.open_all(tmp_path)
+    assert [r.name for r in recordings] == [f"{tmp_path.name}/episode_{i:06d}/front" for i in range(2)]
+    for recording, frames in zip(recordings, shots, strict=True):
+        same_scene(recording, frames, STEP[depth])
+        assert recording.rate_hz == 30 and len(pickle.dumps(recording)) < 20_000
+    backwards = [recordings[1][i].image for i in (3, 0, 2)]
+    assert all(torch.equal(got, shots[1][i].image) for got, i in zip(backwards, (3, 0, 2), strict=True))
+
+
+def test_one_episode_and_its_camera_by_name(tmp_path: Path) -> None:
+    write_lerobot(tmp_path, episodes())
+    same_scene(data.open(tmp_path, episode=1, camera=KEY), episodes()[1], STEP["video"])
+    assert [r.name[-12:] for r in data.open_all(tmp_path, episode=[1, 0])] == ["000001/front", "000000/front"]
+    with pytest.raises(FormatError, match=r"meta: episodes: found 0 of those asked for, expected \[7\]"):
+        data.open(tmp_path, episode=7)
+    with pytest.raises(
+        FormatError, match=r"info.json: cameras: found wrist, expected some of observation.images.front"
+    ):
+        data.open(tmp_path, camera="wrist")
+
+
+@pytest.mark.parametrize("version", [3, 2])
+def test_thousands_of_episodes_are_listed_and_none_is_opened(
+    tmp_path: Path, version: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Twenty thousand, by copies of the metadata: opening reads no table, and the last one is the right one."""
+    write_lerobot(tmp_path, episodes(), version=version)
+    n, meta = 20_000, tmp_path / "meta"
+    if version == 2:
+        (meta / "episodes.jsonl").write_text("\n".join(json.dumps({"episode_index": i, "length": 4}) for i in range(n)))
+        for kind in ("data", "videos"):
+            for file in list((tmp_path / kind).rglob("episode_000001.*")):
+                other = Path(str(file).replace("chunk-000", "chunk-019").replace("000001", f"{n - 1:06d}"))
+                other.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy(file, other)
+        rewrite(next((tmp_path / "data/chunk-019").iterdir()), partial(with_column, "episode_index", n - 1))
+    else:
+        listed = meta / "episodes/chunk-000/file-000.parquet"
+        parquet.write_table(many(parquet.read_table(listed), n), listed)
+        rewrite(tmp_path / "data/chunk-000/file-000.parquet", lambda t: with_column("episode_index", n - 1, t.slice(2)))
+    opened: list[Path] = []
+    read = lerobot_rows.read_columns
+    monkeypatch.setattr(lerobot_rows, "read_columns", lambda f, *a, **k: opened.append(f) or read(f, *a, **k))
+    recordings = data.open_all(tmp_path)
+    assert opened == []
+    assert len(recordings) == n and recordings.names[7].endswith("/episode_000007/front")
+    same_scene(recordings[-1], episodes()[1], STEP["video"])
+    assert data.open_capture(tmp_path, gap=3)[-1].gap == 3 and 1 <= len(opened) <= 4
+    assert recordings[n - 1].name == recordings.names[-1]
+    assert pickle.loads(pickle.dumps(recordings)).names == recordings.names
+    assert [r.name for r in recordings[n - 1 :]] == recordings.names[n - 1 :]
+    with pytest.raises(IndexError):
+        recordings[n]
+    with pytest.raises(FormatError, match=r"20000 recordings: .*episode_000000/front, .*…, expected one"):
+        data.open(tmp_path)
+
+
+def many(table: pyarrow.Table, n: int) -> pyarrow.Table:
+    """The first row n − 1 times, then the second, numbered."""
+    rows = table.take([0] * (n - 1) + [1])
+    return rows.set_column(rows.schema.get_field_index("episode_index"), "episode_index", pyarrow.array(range(n)))
+
+
+def with_column(name: str, value: int, table: pyarrow.Table) -> pyarrow.Table:
+    """The table with one value in every row of a column."""
+    return table.set_column(table.schema.get_field_index(name), name, pyarrow.array([value] * len(table)))
+
+
+@pytest.mark.parametrize("depth_pixels", ["gray12le", "yuv420p12le"])
+def test_depth_codes_survive_both_pixel_formats(tmp_path: Path, depth_pixels: str) -> None:
+    """A conversion of yuv420p12le to grey would stretch its range: codes are read as they stand."""
+    write_lerobot(tmp_path, episodes(), depth_pixels=depth_pixels)
+    same_scene(data.open(tmp_path, episode=0), episodes()[0], STEP["video"])
+
+
+def test_lost_zeros_are_no_returns(tmp_path: Path) -> None:
+    frame = episodes()[0][0]
+    depth = frame.depth.clone()
+    depth[0, :4], depth[0, 4:6], depth[0, 6:8], depth[0, 8:10] = 0, 12.0, 9.5, 0.011
+    write_lerobot(tmp_path, [[frame.replace(depth=depth)]])
+    got = data.open(tmp_path)[0].depth[0]
+    assert not got[:6].any() and not got[8:10].any()  # never a made-up centimetre
+    torch.testing.assert_close(got[6:8], depth[0, 6:8], atol=2.2e-3, rtol=0)
+    assert bool((got[10:] > 0).all())
+    cut = data.open(tmp_path, depth_range=[0.5, 3.0])[0].depth[0]
+    assert torch.equal(cut, torch.where((got >= 0.5) & (got <= 3), got, torch.zeros_like(got))) and bool(
+        (cut != got).any()
+    )
+
+
+def test_the_mark_of_depth_as_it_was_called_before(tmp_path: Path) -> None:
+    write_lerobot(tmp_path, episodes())
+
+    def older(info: dict[str, Any]) -> None:
+        feature = info["features"].pop(f"{KEY}_depth")
+        feature["info"] = {f"video.{k}" if k == "is_depth_map" else k: v for k, v in feature["info"].items()}
+        info["features"][f"{KEY}_depth"] = feature
+
+    edit(tmp_path, older)
+    same_scene(data.open(tmp_path, episode=0), episodes()[0], STEP["video"])
+
+
+@pytest.mark.parametrize("log", [True, False])
+def test_codes_to_metres(log: bool) -> None:
+    feature = Feature("d", "video", (1, 4096, 1), {"video.depth_min": 0.2, "video.depth_max": 4, "video.use_log": log})
+    metres = lerobot_depth.decode_codes(feature, np.arange(4096, dtype=np.uint16), Path("x"))
+    assert not metres[[0, 1, 4094, 4095]].any() and (np.diff(metres[2:-2]) > 0).all()
+    steps = np.diff(metres[2:-2])
+    assert steps[-1] / steps[0] == pytest.approx((4 + 3.5) / (0.2 + 3.5) if log else 1, rel=0.01)
+    with pytest.raises(FormatError, match="12-bit codes"):
+        lerobot_depth.decode_codes(feature, np.array([4096], dtype=np.uint16), Path("x"))
+    bad = Feature("d", "video", (1, 1), {"video.depth_min": 5.0, "video.depth_max": 4.0})
+    with pytest.raises(FormatError, match="a range of metres"):
+        lerobot_depth.decode_codes(bad, np.zeros((1, 1), np.uint16), Path("x"))
+
+
+def test_writer_codes_by_the_published_rule() -> None:
+    """Step 1.5 mm at 1 m, 1.8 at 2 m, 2.8 at 5 m, 4.4 at 10 m."""
+    z = torch.tensor([[[1.0, 2.0, 5.0, 9.98]]])
+    blank = Frame(torch.zeros(1, 3, 1, 4), z, CAMERA)
+    codes = quantise(blank)
+    feature = Feature("d", "video", (1, 4, 1), {})
+    metres = lerobot_depth.decode_codes(feature, codes + np.array([[0], [1]], dtype=np.uint16), Path("x"))
+    np.testing.assert_allclose(np.diff(metres, axis=0)[0] * 1000, [1.5, 1.8, 2.8, 4.4], atol=0.06)
+
+
+def test_depth_unit_of_pictures(tmp_path: Path) -> None:
+    """Without a unit in the info whole numbers are mm and others m; the info and the option win."""
+    write_lerobot(tmp_path, episodes(), depth="png")
+    exact = data.open(tmp_path, episode=0)[0].depth
+    torch.testing.assert_close(data.open(tmp_path, episode=0, depth_unit="m")[0].depth, exact * 1000)
+    edit(tmp_path, lambda info: info["features"][f"{KEY}_depth"]["info"].update(depth_unit="m"))
+    torch.testing.assert_close(data.open(tmp_path, episode=0)[0].depth, exact * 1000)
+    for unit in ("ft", 1000, ["m"], {"m": 1}):
+        change = {"depth_unit": unit}
+        edit(tmp_path, lambda info, change=change: info["features"][f"{KEY}_depth"]["info"].update(change))
+        with pytest.raises(FormatError, match=r"depth_unit: found .*, expected m or mm"):
+            data.open(tmp_path, episode=0)[0]
+
+
+def edit(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    file = root / "meta" / "info.json"
+    info = json.loads(file.read_text())
+    change(info)
+    file.write_text(json.dumps(info))
+
+
+# -------------------------------------------------------------------------------------------------- intrinsics, depth
+
+
+def test_K_must_come_from_somewhere(tmp_path: Path) -> None:
+    write_lerobot(tmp_path, episodes(), intrinsics=None)
+    with pytest.raises(
+        FormatError, match=r"observation.images.front: found no intrinsics, expected data.fov=69 .*meta/intrinsics.json"
+    ):
+        data.open(tmp_path, episode=0)
+    camera = data.open(tmp_path, episode=0, K=[61.5, 58.25, 33.5, 21.75], distortion=[0.1, 0, 0, 0])[0].camera
+    assert torch.equal(camera.f, CAMERA.f) and torch.equal(camera.c, CAMERA.c) and float(camera.distortion[0, 0]) > 0
+    side = {KEY: {"K": [[50, 0, 30], [0, 50, 20], [0, 0, 1]], "dist": [0.1, 0.01, 0, 0, 0], "K_depth": [[70, 0, 31], [0, 66, 23], [0, 0, 1]]}}  # fmt: skip
+    (tmp_path / "meta" / "intrinsics.json").write_text(json.dumps(side))
+    frame = data.open(tmp_path, episode=0)[0]
+    assert frame.camera.f.tolist() == [[50, 50]] and frame.camera.distortion.shape == (1, 5)
+    assert frame.depth_camera.f.tolist() == [[70, 66]]
+    assert data.open(tmp_path, episode=0, K_depth=[71, 66, 31, 23])[0].depth_camera.f.tolist() == [[71, 66]]
+    with pytest.raises(FormatError, match=r"option intrinsics: found x, expected one of"):
+        data.open(tmp_path, episode=0, intrinsics="x")
+    with pytest.raises(FormatError, match=r"options: found data.K and data.fov, expected one of them"):
+        data.open(tmp_path, episode=0, K=[1, 1, 1, 1], fov=60)
+
+
+def test_one_option_says_K_in_three_ways(tmp_path: Path) -> None:
+    write_lerobot(tmp_path, episodes(), intrinsics=None)
+    four = data.open(tmp_path, episode=0, intrinsics=[61.5, 58.25, 33.5, 21.75])
+    assert torch.equal(four[0].camera.f, CAMERA.f) and not any("guess" in line for line in four.report)
+    with pytest.warns(UserWarning, match="are a guess"):
+        wide = data.open(tmp_path, episode=0, intrinsics=90)
+    assert float(wide[0].camera.f[0, 0]) == pytest.approx(HW[1] / 2) and any("guess" in line for line in wide.report)
+    for bad in (0, 179, True):
+        with pytest.raises(FormatError, match="1 to 179 degrees"):
+            data.open(tmp_path, episode=0, fov=bad)
+
+
+def test_two_cameras_by_name_are_told_apart(tmp_path: Path) -> None:
+    write_lerobot(tmp_path, [episodes()[0]], version=2)
+    info = tmp_path / "meta" / "info.json"
+    said = json.loads(info.read_text())
+    for ending in ("", ".intrinsics"):
+        if KEY + ending in said["features"]:
+            said["features"]["observation.images.left" + ending] = said["features"][KEY + ending]
+    info.write_text(json.dumps(said))
+    (film,) = (tmp_path / "videos").rglob(f"*{KEY}/*.mp4")
+    copy = film.parent.parent / "observation.images.left" / film.name
+    copy.parent.mkdir()
+    copy.write_bytes(film.read_bytes())
+    both = data.open_all(tmp_path, camera=["observation.images.left", KEY], K=[60, 60, 30, 20])
+    assert [r.name.rpartition("/")[2] for r in both] == ["left", "front"]
+    assert torch.equal(both[0][0].image, both[1][0].image)
+
+
+def test_K_may_change_from_frame_to_frame(tmp_path: Path) -> None:
+    lenses = [Camera(CAMERA.f + i, CAMERA.c) for i in range(3)]
+    shots = [render(camera, pose(i), HW, i / 30) for i, camera in enumerate(lenses)]
+    write_lerobot(tmp_path, [episodes()[0], shots])
+    same_scene(data.open(tmp_path, episode=1), shots, STEP["video"])
+
+
+def test_depth_is_the_one_named_like_the_camera(tmp_path: Path) -> None:
+    write_lerobot(tmp_path, episodes(), depth="array")
+    other = {"dtype": "image", "shape": [*HW, 3], "info": {}}
+    edit(tmp_path, lambda info: info["features"].update({"observation.images.wrist": other}))
+    recording = data.open(tmp_path, episode=0, camera=KEY)
+    assert recording.report == () and recording[0].depth.any()
+    edit(tmp_path, lambda info: info["features"].update({"side_depth": info["features"].pop(f"{KEY}_depth")}))
+    recording = data.open(tmp_path, episode=0, camera=KEY)
+    assert recording.report == (f"{KEY}: no depth feature: depth is empty",)
+    assert not recording[0].depth.any() and recording[0].depth.shape == (1, *HW)
+    with pytest.raises(FormatError, match=r"side_depth, expected|columns"):
+        data.open(tmp_path, episode=0, camera=KEY, depth="side_depth")[0]
+    with pytest.raises(FormatError, match=r"option depth: found nothing_there"):
+        data.open(tmp_path, episode=0, camera=KEY, depth="nothing_there")
+
+
+# ------------------------------------------------------------------------------------------------------- rows and time
+
+
+def rewrite(file: Path, change: Callable[[pyarrow.Table], pyarrow.Table]) -> None:
+    parquet.write_table(change(parquet.read_table(file)), file, row_group_size=3)
+
+
+def test_episodes_are_not_told_from_the_stamps(tmp_path: Path) -> None:
+    """In v3 both start at stamp 0 in one table and one video; the boundary stands in meta/episodes alone."""
+    write_lerobot(tmp_path, episodes())
+    file = tmp_path / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
+    name = f"videos/{KEY}/from_timestamp"
+    rewrite(file, lambda t: t.set_column(t.schema.get_field_index(name), name, pyarrow.array([0.0, 1 / 30])))
+    first, second = data.open_all(tmp_path)
+    assert torch.equal(first[0].image, episodes()[0][0].image)
+    assert torch.equal(second[0].image, episodes()[0][1].image)  # as the table says
+    rewrite(file, lambda t: t.set_column(t.schema.get_field_index(name), name, pyarrow.array([0.0, 0.1 + 2e-4])))
+    with pytest.raises(FormatError, match=r"time 0.100200 s: found nearest frame at 0.100000 s, expected one within"):
+        data.open(tmp_path, episode=1)[0]
+    assert torch.equal(data.open(tmp_path, episode=1, tolerance=1e-3)[0].image, episodes()[1][1].image)
+
+
+def test_missing_and_shuffled_rows_are_reported(tmp_path: Path) -> None:
+    write_lerobot(tmp_path, episodes(), version=2)
+    file = tmp_path / "data" / "chunk-000" / "episode_000001.parquet"
+    rewrite(file, lambda t: t.take([0, 1, 3]))
+    recording = data.open(tmp_path, episode=1)
+    assert recording.number.tolist() == [0, 1, 3] and "3 rows, 4 according to meta/episodes" in recording.report[0]
+    assert torch.equal(recording[2].image, episodes()[1][3].image)
+    rewrite(file, lambda t: t.take([0, 2, 1]))
+    recording = data.open(tmp_path, episode=1)
+    assert recording.number.tolist() == [0, 3] and "1 row out of order: left out" in recording.report[0]
+
+
+def test_a_shorter_video_is_an_error_where_it_ends(tmp_path: Path) -> None:
+    write_lerobot(tmp_path, episodes(), version=2, depth=None)
+    file = tmp_path / "videos" / "chunk-000" / KEY / "episode_000001.mp4"
+    pictures = [frame.image[0].permute(1, 2, 0).numpy() for frame in episodes()[1][:3]]
+    write_lossless(file, pictures, "rgb24")
+    recording = data.open(tmp_path, episode=1)
+    assert torch.equal(recording[2].image, episodes()[1][2].image)
+    with pytest.raises(FormatError, match=r"episode_000001.mp4: time 0.100000 s: found nearest frame at 0.066667 s"):
+        recording[3]
+
+
+def test_opening_decodes_no_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_lerobot(tmp_path, episodes(), image="image", depth="tiff")
+    asked: list[str] = []
+    read = codec_parquet._columns
+    monkeypatch.setattr(codec_parquet, "_columns", lambda f, t, c, r: asked.extend(c) or read(f, t, c, r))
+    recording = data.open(tmp_path, episode=1)
+    assert KEY not in asked
+    for frame in recording:
+        assert frame.depth.any()
+    assert asked.count(KEY) == 2 == asked.count(f"{KEY}_depth")  # four rows in two row groups
+
+
+# ---------------------------------------------------------------------------------------------------------- bad input
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("data_path", "../{chunk_index:03d}.parquet"),
+        ("data_path", "/etc/{chunk_index:03d}.parquet"),
+        ("data_path", "{chunk_index.__class__}.parquet"),
+        ("data_path", "{chunk_index:0999999999d}.parquet"),
+        ("data_path", "{other}.parquet"),
+        ("video_path", "{video_key:03d}"),
+        ("codebase_version", "v1.6"),
+        ("fps", 0),
+        ("fps", None),
+        ("chunks_size", 0),
+        ("features", []),
+    ],
+)
+def test_bad_info(tmp_path: Path, key: str, value: object) -> None:
+    write_lerobot(tmp_path, episodes(), depth=None)
+    edit(tmp_path, lambda info: info.update({key: value}))
+    with pytest.raises(FormatError, match=rf"info.json: {key}"):
+        data.open_all(tmp_path)
+
+
+def test_pages_that_unpack_into_too_much_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Megabytes of zeros in a few kilobytes: honest in the footer, then claimed by a page alone."""
+    file = tmp_path / "x.parquet"
+    parquet.write_table(pyarrow.table({"x": [bytes(3 << 20)] * 2}), file, compression="zstd", use_dictionary=False)
+    assert file.stat().st_size < 10_000 and len(codec_parquet.read_columns(file, ["x"])["x"][1]) == 3 << 20
+    monkeypatch.setattr(codec_parquet, "_MAX_UNPACKED", 4 << 20)
+    with pytest.raises(FormatError, match=r"x.parquet: x: found \d+ bytes, expected at most 4194304"):
+        codec_parquet.read_columns(file, ["x"])
+    parquet.write_table(pyarrow.table({"x": np.arange(100)}), file, use_dictionary=False, compression="none")
+    assert codec_parquet.read_columns(file, ["x"])["x"].tolist() == list(range(100))
+    good = file.read_bytes()
+    assert good[4:7] == b"\x15\x00\x15", "Thrift's compact form: field 1, a data page, then field 2, its size unpacked"
+    size = ((good[7] & 127) | good[8] << 7) // 2  # zigzag, seven bits a byte
+    coded = [bytes([(2 * n & 127) | 128, 2 * n >> 7]) for n in (size, size + 1000)]
+    file.write_bytes(good.replace(coded[0], coded[1], 1))
+    with pytest.raises(FormatError, match=rf"that unpack into {size + 1000}"):
+        codec_parquet.read_columns(file, ["x"])
+
+
+def test_columns_that_cannot_be_arrays(tmp_path: Path) -> None:
+    file = tmp_path / "x.parquet"
+    columns = {"hole": [1.0, None], "ragged": [[1.0], [1.0, 2.0]], "text": ["a", "b"], "deep": [[[1, 2]], [[3, 4]]]}
+    parquet.write_table(pyarrow.table(columns), file)
+    for name, message in (("hole", "1 missing values"), ("ragged", "lists of unequal length"), ("none", "columns")):
+        with pytest.raises(FormatError, match=message):
+            codec_parquet.read_columns(file, [name])
+    read = codec_parquet.read_columns(file, ["text", "deep"], (1, 2))
+    assert read["text"] == ["b"] and read["deep"].tolist() == [[[3, 4]]]
+    assert codec_parquet.read_cell(file, "deep", 1).tolist() == [[3, 4]]
+    with pytest.raises(FormatError, match=r"rows: found 2, expected row 2"):
+        codec_parquet.read_cell(file, "deep", 2)
+
+
+def hostile_v3(root: Path) -> None:
+    write_lerobot(root, [episodes()[0], episodes()[1][:2]], depth="video")
+
+
+def hostile_v2(root: Path) -> None:
+    write_lerobot(root, [episodes()[0]], version=2, image="image", depth="tiff", intrinsics="side-car")
+
+
+def test_rows_without_numbers_whose_clock_is_late_keep_their_pictures(tmp_path: Path) -> None:
+    """Times that begin one frame after the video: by time every row would get the next picture."""
+    shots = episodes()[1]
+    write_lerobot(tmp_path, [shots], version=2, depth="tiff")
+    (file,) = (tmp_path / "data").rglob("*.parquet")
+    table = parquet.read_table(file)
+    late = pyarrow.array(np.asarray(table.column("timestamp").to_numpy() + 1 / 30, np.float32))
+    table = table.set_column(table.column_names.index("timestamp"), "timestamp", late).drop_columns(["frame_index"])
+    parquet.write_table(table, file)
+    recording = data.open(tmp_path)
+    assert (
+        len(recording) == 4 and "times begin at 0.03333 s: pictures taken by the order of rows" in recording.report[0]
+    )
+    for i, shot in enumerate(shots):
+        assert float((recording[i].image.float() - shot.image.float()).abs().mean()) < 5
+    assert recording.times is not None and float(recording.times[0]) == 0
+
+
+def test_a_camera_that_is_only_declared_is_none(tmp_path: Path) -> None:
+    write_lerobot(tmp_path, [episodes()[0]], version=2)
+    info = tmp_path / "meta" / "info.json"
+    said = json.loads(info.read_text())
+    said["features"]["observation.images.ghost"] = said["features"]["observation.images.front"]
+    info.write_text(json.dumps(said))
+    assert len(data.open_all(tmp_path)) == 1
+    with pytest.raises(FormatError):
+        data.open_all(tmp_path, camera="observation.images.ghost")[0][0]
+
+
+def test_a_set_without_intrinsics_can_be_looked_at(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_lerobot(tmp_path / "x", [episodes()[0]], version=2, intrinsics=None, depth=None, poses=False)
+    assert run.main(["inspect", str(tmp_path / "x"), "--out", str(tmp_path / "out")]) == 0
+    out = capsys.readouterr().out
+    assert "no intrinsics: nothing can be measured" in out and "frames " in out and "field of view" not in out

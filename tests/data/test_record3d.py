@@ -1,0 +1,587 @@
+"""Record3D: its three layouts written from a known room and read back, the real piece, the cable, every trap."""
+
+from __future__ import annotations
+
+import colorsys
+import json
+import math
+import os
+import pickle
+import threading
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from support.box_scene import disagreement, off_wall, own_camera, pose, render, turned_over, world_points
+
+from dhtorch import data
+from dhtorch import pytree as tree
+from dhtorch import testing as writers
+from dhtorch.data.io import decode as files
+from dhtorch.data.io.decode import FormatError
+from dhtorch.data.readers import record3d_video
+from dhtorch.data.readers.record3d_live import LiveFrames
+from dhtorch.geometry import camera as cameras
+from dhtorch.records import Camera, Frame
+
+lzfse = pytest.importorskip("lzfse")
+OpenEXR = pytest.importorskip("OpenEXR")
+pytest.importorskip("av")
+
+ROOT = os.environ.get("DHTORCH_DATA")
+HW, DEPTH_HW = (48, 64), (24, 32)
+
+
+def camera_of(i: int, hw: tuple[int, int] = HW) -> Camera:
+    """Autofocus: another K in every frame."""
+    c = [[33.5 + 0.25 * i, 21.75] if hw == HW else [21.75 + 0.25 * i, 33.5]]
+    return Camera(torch.tensor([[61.5 + i, 58.25 - i]]), torch.tensor(c))
+
+
+def walk(n: int = 3, hw: tuple[int, int] = HW, depth_hw: tuple[int, int] = DEPTH_HW) -> list[Frame]:
+    """Pictures with a smaller depth map, confidence and poses, as a phone with a LiDAR makes them."""
+    frames = []
+    for i in range(n):
+        camera = camera_of(i, hw)
+        shot = render(camera, pose(i), hw, 100 + i / 60)
+        small = render(cameras.resize(camera, hw, depth_hw), pose(i), depth_hw)
+        conf = (torch.arange(math.prod(depth_hw)).view(1, *depth_hw) % 3).to(torch.uint8)
+        frames.append(shot.replace(depth=small.depth, conf=conf))
+    return frames
+
+
+def same_scene(recording: data.Recording, frames: list[Frame], relative: float = 1e-6) -> None:
+    """K, pose and confidence as written, depth to the format's rounding, every point back on its wall."""
+    assert len(recording) == len(frames)
+    for got, want in zip(recording, frames, strict=True):
+        torch.testing.assert_close(got.camera.f, want.camera.f, atol=1e-5, rtol=0)
+        torch.testing.assert_close(got.camera.c, want.camera.c, atol=1e-5, rtol=0)
+        torch.testing.assert_close(got.depth, want.depth, atol=0, rtol=relative)
+        assert got.conf is None or torch.equal(got.conf, want.conf)
+        assert float((got.image.float() - want.image.float()).abs().mean()) < 6  # JPEG
+        assert float((got.time - (want.time - frames[0].time)).abs()) < 1e-9
+        torch.testing.assert_close(got.T_world_from_cam.R, want.T_world_from_cam.R, atol=1e-12, rtol=0)
+        torch.testing.assert_close(got.T_world_from_cam.t, want.T_world_from_cam.t, atol=1e-12, rtol=0)
+        assert float(off_wall(world_points(own_camera(got))).max()) < 2 * relative + 1e-5
+    assert disagreement(own_camera(recording[0]), own_camera(recording[1]))[0] < 0.04
+
+
+def r3d(tmp_path: Path, frames: list[Frame] | None = None, **options: Any) -> Path:
+    writers.write_r3d(tmp_path / "a.r3d", frames or walk(), **options)
+    return tmp_path / "a.r3d"
+
+
+def rewrite(archive: Path, change: Callable[[dict[str, bytes]], None]) -> Path:
+    """The archive with its members changed."""
+    with zipfile.ZipFile(archive) as old:
+        members = {name: old.read(name) for name in old.namelist()}
+    change(members)
+    with zipfile.ZipFile(archive, "w") as new:
+        for name, content in members.items():
+            new.writestr(name, content)
+    return archive
+
+
+def table(**changes: Any) -> Callable[[dict[str, bytes]], None]:
+    """Entries of the metadata replaced; None removes one."""
+
+    def change(members: dict[str, bytes]) -> None:
+        name = "metadata"
+        meta = json.loads(members[name]) | changes
+        members[name] = json.dumps({k: v for k, v in meta.items() if v is not None}).encode()
+
+    return change
+
+
+# ------------------------------------------------------------------------------------------------ written, then read
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
+@pytest.mark.parametrize("portrait", [False, True])
+def test_archive_gives_back_the_scene(tmp_path: Path, portrait: bool, method: int) -> None:
+    turn = slice(None, None, -1 if portrait else None)
+    frames = walk(3, HW[turn], DEPTH_HW[turn])
+    recording = data.open(r3d(tmp_path, frames, compression=method))
+    assert data.recognise(tmp_path / "a.r3d") == ("record3d", ".r3d archive")
+    assert recording.report == () and recording.rate_hz == 60 and recording.number.tolist() == [0, 1, 2]
+    same_scene(recording, frames)
+    assert recording[0].conf is not None and recording[0].hw == HW[turn]
+    copy = pickle.loads(pickle.dumps(recording))
+    assert all(torch.equal(a.depth, b.depth) for a, b in zip(copy, recording, strict=True))
+    assert tree.collate(list(recording)).depth.shape == (3, *DEPTH_HW[turn])
+
+
+def test_unpacked_archive(tmp_path: Path) -> None:
+    archive = r3d(tmp_path)
+    with zipfile.ZipFile(archive) as packed:
+        packed.extractall(tmp_path / "folder")
+    same_scene(data.open(tmp_path / "folder"), walk())
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+def test_exr_folder_gives_back_the_scene(tmp_path: Path, dtype: type) -> None:
+    frames = [f.replace(conf=None, camera=camera_of(0)) for f in walk()]  # one K for all
+    frames = [
+        render(f.camera, f.T_world_from_cam, HW, float(f.time)).replace(
+            depth=render(cameras.resize(f.camera, HW, DEPTH_HW), f.T_world_from_cam, DEPTH_HW).depth
+        )
+        for f in frames
+    ]
+    writers.write_record3d_exr(tmp_path, frames, dtype=dtype)
+    for root in (tmp_path, tmp_path / "EXR_RGBD"):  # rgb/ and depth/ look like another format, too
+        assert data.recognise(root) == ("record3d", "metadata.json, rgb/ and depth/*.exr")
+        recording = data.open(root)
+        assert recording.report == () and recording[0].conf is None
+        same_scene(recording, frames, 2**-11 if dtype is np.float16 else 1e-6)
+
+
+def test_exr_channel(tmp_path: Path) -> None:
+    writers.write_record3d_exr(tmp_path, walk(1), channel="Z")
+    assert float(data.open(tmp_path)[0].depth.min()) > 0.1
+    with pytest.raises(FormatError, match=r"0.exr: channels: found Z, expected far"):
+        data.open(tmp_path, exr_channel="far")[0]
+
+
+# -------------------------------------------------------------------------------------------------- traps of the table
+
+
+def test_frames_count_as_numbers(tmp_path: Path) -> None:
+    frames = walk(12)
+    recording = data.open(r3d(tmp_path, frames))
+    assert recording.number.tolist() == list(range(12))  # "10" comes before "2" as a text
+    same_scene(recording, frames)
+
+
+def test_what_means_nothing_changes_nothing(tmp_path: Path) -> None:
+    """``initPose`` (its meaning is not known; readers pass over it), the icon, a sound track, notes of the system."""
+
+    def change(members: dict[str, bytes]) -> None:
+        table(initPose=[0.5, 0.5, 0.5, 0.5, 1, 2, 3])(members)
+        members |= {"sound.m4a": b"1", "rgbd/.DS_Store": b"1", "rgbd/x.jpg": b"1", "__MACOSX/rgbd/._9.jpg": b"1"}
+
+    same_scene(data.open(rewrite(r3d(tmp_path), change)), walk())
+
+
+def test_K_is_stored_column_after_column(tmp_path: Path) -> None:
+    frames = walk(2)
+    archive = r3d(tmp_path, frames, per_frame=False)
+    K = cameras.to_matrix(frames[0].camera)[0]
+    for frame in data.open(archive):
+        torch.testing.assert_close(cameras.to_matrix(frame.camera)[0], K)
+    rewrite(archive, table(K=K.flatten().tolist()))
+    with pytest.raises(FormatError, match=r"a.r3d/metadata: K: found .*, expected fx 0 0 0 fy 0 cx cy 1"):
+        data.open(archive)
+
+
+def test_intrinsics_of_each_frame_or_of_the_first(tmp_path: Path) -> None:
+    archive = r3d(tmp_path)
+    assert [float(f.camera.f[0, 0]) for f in data.open(archive)] == [61.5, 62.5, 63.5]
+    assert [float(f.camera.f[0, 0]) for f in data.open(archive, per_frame=False)] == [61.5] * 3
+
+
+def test_K_follows_the_true_size_of_the_picture(tmp_path: Path) -> None:
+    frames = walk(2)
+    archive = r3d(tmp_path, frames, declared_hw=(96, 128))
+    with zipfile.ZipFile(archive) as packed:
+        meta = json.loads(packed.read("metadata"))
+    assert (meta["w"], meta["h"]) == (128, 96) and meta["K"][0] == 123
+    same_scene(data.open(archive), frames)
+
+
+@pytest.mark.parametrize("size", [(256, 192), (640, 480), (960, 720)])
+@pytest.mark.parametrize("portrait", [False, True])
+def test_old_files_do_not_say_how_large_depth_is(tmp_path: Path, size: tuple[int, int], portrait: bool) -> None:
+    hw, depth_hw = ((64, 48), size) if portrait else ((48, 64), size[::-1])
+    depth = torch.linspace(0.5, 3, math.prod(size)).view(1, *depth_hw)
+    frames = [f.replace(depth=depth, conf=None) for f in walk(1, hw, (8, 6) if portrait else (6, 8))]
+    assert torch.equal(data.open(r3d(tmp_path, frames, depth_size=False))[0].depth, depth)
+
+
+def test_unknown_depth_size(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match=r"0.depth: depth: found 3072 bytes, expected dw and dh in the metadata"):
+        data.open(r3d(tmp_path, depth_size=False))
+
+
+def test_front_camera_has_neither_confidence_nor_poses(tmp_path: Path) -> None:
+    frames = [f.replace(conf=None, T_world_from_cam=None) for f in walk()]
+    recording = data.open(r3d(tmp_path, frames))
+    assert recording.poses is None and recording[1].T_world_from_cam is None and recording[1].conf is None
+    assert recording.report == ("every pose is the identity: the device had none",)
+    assert data.open(tmp_path / "a.r3d", poses=False).report == ()
+
+
+def test_a_standing_camera_keeps_its_poses(tmp_path: Path) -> None:
+    frames = [f.replace(T_world_from_cam=pose(1)) for f in walk()]
+    recording = data.open(r3d(tmp_path, frames))
+    assert recording.poses is not None and recording.report == ()
+
+
+def test_lost_tracking_and_short_tables(tmp_path: Path) -> None:
+    archive = r3d(tmp_path, walk(6))
+    with zipfile.ZipFile(archive) as packed:
+        meta = json.loads(packed.read("metadata"))
+    rows = meta["poses"]
+    rows[1], rows[3] = [math.nan] * 7, [0.0] * 7
+    rewrite(archive, table(poses=rows[:5]))
+    recording = data.open(archive)
+    assert recording.number.tolist() == [0, 2, 4]
+    torch.testing.assert_close(recording.poses.t[1], pose(2).t[0])
+    assert recording.report == (
+        "frame 5: beyond the metadata's 5 rows: left out",
+        "2 frames (1, 3): its pose is not usable (tracking lost): left out",
+    )
+    assert data.open(archive, poses=False).number.tolist() == [0, 1, 2, 3, 4]
+
+
+def test_time_stamps_that_do_not_increase(tmp_path: Path) -> None:
+    archive = rewrite(r3d(tmp_path), table(frameTimestamps=[5.0, 4.0, 6.0]))
+    recording = data.open(archive)
+    torch.testing.assert_close(recording.times, torch.arange(3).double() / 60)
+    assert recording.report == ("time stamps do not increase: the frame rate counts instead",)
+    recording = data.open(rewrite(archive, table(fps=None)))
+    assert recording.times is None and recording.report == ("time stamps do not increase: there are no times",)
+    recording = data.open(rewrite(archive, table(frameTimestamps=[7.0, 7.5, 9.0])))
+    assert recording.times.tolist() == [0, 0.5, 2] and recording.report == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"w": None, "h": None}, r"metadata: w, h: found nothing, expected the size of the pictures"),
+        ({"w": 1e9}, r"metadata: w: found 1000000000.0"),
+        ({"dw": 0.5}, r"metadata: dw, dh: found 0.5x24, expected whole numbers"),
+        ({"fps": math.inf}, r"metadata: fps: found inf"),
+        ({"poses": [[1, 2, 3]] * 3}, r"metadata: poses: found .*, expected 7 numbers for each frame"),
+        ({"perFrameIntrinsicCoeffs": [[math.nan] * 4] * 3}, r"perFrameIntrinsicCoeffs: found a number that is not"),
+        ({"perFrameIntrinsicCoeffs": [[-1, 1, 1, 1]] * 3}, r"intrinsics of frame 0 focal length: found"),
+        ({"perFrameIntrinsicCoeffs": None, "K": [1, 2]}, r"metadata: K: found \[1.0, 2.0\], expected 9 finite"),
+        ({"poses": [[0, 0, 0, 1, 1e30, 0, 0]] * 3}, r"metadata: pose 0: found .*, expected at most 4e\+07 m"),
+    ],
+)
+def test_unsound_tables(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    archive = rewrite(r3d(tmp_path), table(**change))
+    with pytest.raises(FormatError, match=message):
+        list(data.open(archive))
+
+
+# ----------------------------------------------------------------------------------------------- damage in the middle
+
+
+def test_what_is_missing_or_damaged_is_left_out_and_reported(tmp_path: Path) -> None:
+    def damage(members: dict[str, bytes]) -> None:
+        del members["rgbd/1.depth"], members["rgbd/2.conf"]
+        for part in ("jpg", "depth", "conf"):
+            del members[f"rgbd/3.{part}"]
+        members["rgbd/4.jpg"] = members["rgbd/4.jpg"][:-500]
+        members["rgbd/5.depth"] = members["rgbd/5.depth"][:-7]
+        members["rgbd/6.conf"] = b""
+
+    archive = rewrite(r3d(tmp_path, walk(8)), damage)
+    recording = data.open(archive)
+    assert recording.number.tolist() == [0, 7]
+    assert recording.report == (
+        "frame 1: no depth: left out",
+        "frame 2: no confidence: left out",
+        "frame 3: no file: left out",
+        "3 frames (4, 5, 6): damaged: left out",
+    )
+    torch.testing.assert_close(recording.poses.t[1], pose(7).t[0])
+    torch.testing.assert_close(recording[1].camera.f, camera_of(7).f)
+
+
+def test_damage_inside_is_found_when_read_or_when_verified(tmp_path: Path) -> None:
+    archive = r3d(tmp_path, walk(4))
+    with zipfile.ZipFile(archive) as packed:
+        at = packed.getinfo("rgbd/2.depth").header_offset + 200
+    whole = bytearray(archive.read_bytes())
+    whole[at] ^= 0xFF
+    archive.write_bytes(bytes(whole))
+    recording = data.open(archive)
+    assert len(recording) == 4 and len([recording[i] for i in (0, 1, 3)]) == 3
+    with pytest.raises(FormatError, match=r"a.r3d/rgbd/2.depth: data: found .* check sum"):
+        recording[2]
+    verified = data.open(archive, verify=True)
+    assert verified.number.tolist() == [0, 1, 3] and verified.report == ("frame 2: damaged: left out",)
+
+
+def test_the_first_frame_damaged(tmp_path: Path) -> None:
+    archive = rewrite(r3d(tmp_path), lambda members: members.update({"rgbd/0.jpg": b"\xff\xd8 no picture \xff\xd9"}))
+    assert data.open(archive, verify=True).number.tolist() == [1, 2]
+
+
+def test_depth_without_a_return(tmp_path: Path) -> None:
+    def odd(members: dict[str, bytes]) -> None:
+        depth = np.full(DEPTH_HW, 1.5, "<f4")
+        depth[0, :5] = [np.nan, np.inf, -np.inf, -1, 0]
+        members["rgbd/0.depth"] = lzfse.compress(depth.tobytes())
+        members["rgbd/1.depth"] = depth.tobytes()  # not compressed at all
+        members["rgbd/2.conf"] = lzfse.compress(bytes([3]) * math.prod(DEPTH_HW))
+
+    recording = data.open(rewrite(r3d(tmp_path), odd))
+    for i in (0, 1):
+        depth = recording[i].depth[0]
+        assert depth[0, :5].tolist() == [0] * 5 and bool((depth.flatten()[5:] == 1.5).all())
+    with pytest.raises(FormatError, match=r"2.conf: confidence: found 3, expected 0, 1 or 2"):
+        recording[2]
+
+
+def test_names_that_lead_out_of_the_archive_are_not_frames(tmp_path: Path) -> None:
+    (tmp_path / "secret.jpg").write_bytes(b"secret")
+
+    def lead_out(members: dict[str, bytes]) -> None:
+        for part in ("jpg", "depth", "conf"):
+            members[f"../rgbd/9.{part}"] = members[f"/rgbd/9.{part}"] = members[f"rgbd/0.{part}"]
+
+    archive = rewrite(r3d(tmp_path), lead_out)
+    assert data.open(archive).number.tolist() == [0, 1, 2]
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["a.r3d", "secret.jpg"]
+
+
+def test_opening_decodes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    archive = r3d(tmp_path, walk(5))
+    monkeypatch.setattr(files, "decode_image", lambda *_: pytest.fail("decoded a picture"))
+    monkeypatch.setattr("dhtorch.data.codecs.lzfse.unpack", lambda *_: pytest.fail("unpacked depth"))
+    assert len(data.open(archive)) == 5
+
+
+# --------------------------------------------------------------------------------------------------------- RGBD mp4
+
+
+def film(tmp_path: Path, n: int = 3, **options: Any) -> tuple[Path, list[Frame]]:
+    """A room of 1 to 2.6 m, so that no colour lies near the ends of the range."""
+    hw = (96, 128)
+    camera = cameras.resize(camera_of(0), HW, hw)
+    frames = [render(camera, pose(i), hw, i / 30) for i in range(n)]
+    frames = [f.replace(depth=(f.depth * 0.6).clamp(0.2, 2.7)) for f in frames]
+    writers.write_record3d_mp4(tmp_path / "a.mp4", frames, **options)
+    return tmp_path / "a.mp4", frames
+
+
+@pytest.mark.parametrize("depth_range", [None, (0.0, 4.5), (0.15, 2.9)])
+def test_mp4_gives_back_the_scene(tmp_path: Path, depth_range: tuple[float, float] | None) -> None:
+    file, frames = film(tmp_path, depth_range=depth_range)
+    recording = data.open(file)
+    assert data.recognise(file) == ("record3d", "an mp4 with an intrinsicMatrix at its end")
+    assert recording.poses is None and recording.report == ("no poses in this layout",) and len(recording) == 3
+    torch.testing.assert_close(recording.times, torch.arange(3).double() / 30)
+    for got, want in zip(recording, frames, strict=True):
+        assert torch.equal(got.camera.f, want.camera.f) and torch.equal(got.camera.c, want.camera.c)
+        seen = got.depth > 0
+        assert got.hw == (96, 128) and float(seen.double().mean()) > 0.7
+        error = (got.depth - want.depth).abs()[seen]
+        assert float(error.median()) < 0.006 and float(error.quantile(0.99)) < 0.05  # 2 mm, and the codec
+        assert float((got.image.float() - want.image.float()).abs().mean()) < 8
+
+
+def test_mp4_drops_both_red_ends_jumps_and_grey() -> None:
+    hue = np.linspace(0, 3, 300, endpoint=False, dtype=np.float32)
+    colours = [colorsys.hsv_to_rgb(h / 3, 1, 1) for h in hue.tolist()]
+    rgb = np.tile((255 * np.array(colours)).round().astype(np.uint8), (5, 1, 1))
+    depth = record3d_video.hue_depth(rgb, 0, 3, 0.05)[2]
+    kept = depth > 0
+    np.testing.assert_allclose(depth[kept], hue[kept], atol=0.003)
+    assert hue[kept].min() == pytest.approx(0.1, abs=0.011) and hue[kept].max() == pytest.approx(2.8, abs=0.011)
+    assert kept.sum() >= 268
+    step = np.concatenate((rgb[:, 60:100], rgb[:, 200:240]), 1)
+    beside = record3d_video.hue_depth(step, 0, 3, 0.05)[2] == 0
+    assert np.flatnonzero(beside).tolist() == [39, 40]
+    grey = np.full((3, 3, 3), 128, np.uint8)
+    grey[..., 0] += 20
+    assert not record3d_video.hue_depth(grey, 0, 3, 0.05).any()
+
+
+@pytest.mark.parametrize("stored", ["yuv420p", "yuv420p10le"])
+def test_mp4_colours_are_not_blended_on_the_way(tmp_path: Path, stored: str) -> None:
+    """Colour is stored at half the resolution; interpolated, it would bleed over more columns beside each edge."""
+    depth = torch.ones(1, 64, 96)
+    depth[..., 32:64] = 2
+    frame = render(camera_of(0), pose(0), (64, 96)).replace(depth=depth)
+    writers.write_record3d_mp4(tmp_path / "a.mp4", [frame] * 2, crf=1, stored=stored)
+    got = data.open(tmp_path / "a.mp4")[0].depth[0, 4:-4]
+    kept = (got > 0).all(0)
+    assert torch.nonzero(~kept).flatten().tolist() == [31, 32, 63, 64]
+    torch.testing.assert_close(got[:, kept], depth[0, 4:-4][:, kept], atol=0.02, rtol=0)
+
+
+def test_mp4_intrinsics_beside_it_or_nowhere(tmp_path: Path) -> None:
+    file, frames = film(tmp_path, 2)
+    whole = file.read_bytes()
+    at = whole.rindex(b'{"intrinsicMatrix"')
+    meta = json.loads(whole[at:-1])
+    file.write_bytes(whole[: at - 8])
+    with pytest.raises(FormatError, match=r"format: found a .mp4 file"):
+        data.open(file)
+    with pytest.raises(FormatError, match=r"a.mp4: intrinsicMatrix: found neither in the file nor"):
+        data.open(file, "record3d")
+    (tmp_path / "metadata.json").write_text(json.dumps(meta))
+    assert torch.equal(data.open(file)[1].camera.c, frames[1].camera.c)
+    assert float(data.open(file, depth_range=(0, 6))[0].depth.max()) > 3
+    with pytest.raises(FormatError, match=r"rangeOfEncodedDepth: found 2.0 to 1.0 m"):
+        data.open(file, depth_range=(2, 1))
+
+
+# ------------------------------------------------------------------------------------------------------------- live
+
+
+class Phone:
+    """What the library looks like: one set of buffers, overwritten by every frame, and a thread that calls back."""
+
+    def __init__(self, frames: list[Frame], lidar: bool = True, wait: bool = True) -> None:
+        self.frames, self.lidar, self.wait = frames, lidar, wait
+        h, w = frames[0].hw
+        self.rgb, self.depth = np.zeros((h, w, 3), np.uint8), np.zeros(DEPTH_HW, np.float32)
+        self.conf = np.zeros(DEPTH_HW if lidar else (0, 0), np.uint8)
+        self.taken = threading.Semaphore(0)  # the reader wants another one
+        self.connected = False
+        self.over = threading.Event()
+        self.on_new_frame: Callable[[], None] = lambda: None
+        self.on_stream_stopped: Callable[[], None] = lambda: None
+
+    def get_connected_devices(self) -> list[Any]:
+        return [SimpleNamespace(product_id=1, udid="x")]
+
+    def connect(self, device: Any) -> bool:
+        self.connected = device.udid == "x"
+        threading.Thread(target=self.run, daemon=True).start()
+        return self.connected
+
+    def disconnect(self) -> None:
+        self.connected = False
+        self.taken.release()
+
+    def run(self) -> None:
+        for frame in self.frames:
+            if self.wait:
+                self.taken.acquire(timeout=5)
+            if not self.connected:
+                break
+            self.now = frame
+            self.rgb[:] = frame.image[0].permute(1, 2, 0).numpy()
+            self.depth[:] = frame.depth[0].numpy()
+            if self.lidar:
+                self.conf[:] = frame.conf[0].numpy()
+            self.on_new_frame()
+            self.rgb[:], self.depth[:], self.conf[:] = 7, 7, 2  # gone as soon as the callback returns
+        self.on_stream_stopped()
+        self.over.set()
+
+    def get_rgb_frame(self) -> np.ndarray:
+        return self.rgb
+
+    def get_depth_frame(self) -> np.ndarray:
+        return self.depth
+
+    def get_confidence_frame(self) -> np.ndarray:
+        return self.conf
+
+    def get_intrinsic_mat(self) -> Any:
+        (fx, fy), (tx, ty) = self.now.camera.f[0].tolist(), self.now.camera.c[0].tolist()
+        return SimpleNamespace(fx=fx, fy=fy, tx=tx, ty=ty)
+
+    def get_camera_pose(self) -> Any:
+        c2w = np.eye(4)
+        c2w[:3, :3], c2w[:3, 3] = self.now.T_world_from_cam.R[0], self.now.T_world_from_cam.t[0]
+        c2w = c2w @ np.diag([1.0, -1.0, -1.0, 1.0])  # ARKit's axes
+        row = [*Rotation.from_matrix(c2w[:3, :3]).as_quat(), *c2w[:3, 3]]
+        return SimpleNamespace(**dict(zip(("qx", "qy", "qz", "qw", "tx", "ty", "tz"), row, strict=True)))
+
+    def get_device_type(self) -> int:
+        return int(self.lidar)
+
+
+def test_live_frames_are_copies_with_our_axes() -> None:
+    frames = walk(5)
+    phone = Phone(frames)
+    ticks = iter(range(10, 100))
+    got = []
+    with LiveFrames(phone, clock=lambda: next(ticks)) as live:
+        phone.taken.release()
+        for frame in live:
+            got.append(frame)
+            phone.taken.release()
+        assert live.dropped == 0
+    assert not phone.connected and len(got) == 5
+    for frame, want in zip(got, frames, strict=True):
+        for name in ("image", "depth", "conf"):
+            assert torch.equal(getattr(frame, name), getattr(want, name))
+        assert torch.equal(frame.camera.f, want.camera.f) and torch.equal(frame.camera.c, want.camera.c)
+        torch.testing.assert_close(frame.T_world_from_cam.R, want.T_world_from_cam.R, atol=1e-12, rtol=0)
+        assert float(off_wall(world_points(own_camera(frame))).max()) < 1e-5
+    assert [float(f.time) for f in got] == [0, 1, 2, 3, 4]
+
+
+def test_live_front_camera_and_slow_reader() -> None:
+    phone = Phone(walk(9), lidar=False, wait=False)
+    live = LiveFrames(phone, ahead=2)
+    with live:
+        assert phone.over.wait(5)
+        got = list(live)
+    assert [float(f.camera.f[0, 0]) for f in got] == [68.5, 69.5] and live.dropped == 7
+    assert got[0].conf is None and got[0].T_world_from_cam is None
+
+
+def test_live_failures_reach_the_reader() -> None:
+    phone = Phone(walk(2), wait=False)
+    phone.get_intrinsic_mat = lambda: SimpleNamespace(fx=-1, fy=1, tx=1, ty=1)  # type: ignore[method-assign]
+    with pytest.raises(FormatError, match="record3d:usb: intrinsics focal length"), LiveFrames(phone) as live:
+        next(iter(live))
+    phone = Phone(walk(1))
+    with pytest.raises(FormatError, match=r"frames: found none within 0.05 s"), LiveFrames(phone, timeout=0.05) as live:
+        next(iter(live))
+    assert not phone.connected  # the block leaves the phone alone whatever happens
+    phone.get_connected_devices = lambda: []  # type: ignore[method-assign]
+    with pytest.raises(FormatError, match="devices: found none"), LiveFrames(phone):
+        pass
+    phone.connect = lambda device: False  # type: ignore[method-assign]
+    with pytest.raises(FormatError, match="connection: found refused"), LiveFrames(phone, device=1):
+        pass
+
+
+def test_live_without_the_library(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "record3d", None)
+    with pytest.raises(ImportError, match=r"needs record3d.*pip install 'dhtorch\[live\]'"):
+        LiveFrames()
+
+
+# ------------------------------------------------------------------------------------------------------ real, hostile
+
+
+@pytest.mark.data
+@pytest.mark.skipif(not ROOT, reason="DHTORCH_DATA is not set")
+def test_real_export() -> None:
+    root = Path(str(ROOT)) / "r3d_door"
+    recording = data.open(root)
+    assert (
+        recording.format == "record3d" and recording.report == () and recording.number.tolist() == list(range(100, 131))
+    )
+    meta = json.loads((root / "EXR_RGBD" / "metadata.json").read_text())
+    row = np.array(meta["poses"][100])  # the table keeps all 345 rows
+    np.testing.assert_allclose(recording.poses.t[0], row[4:])
+    assert float(recording.times[0]) == meta["frameTimestamps"][100]
+    a, b = own_camera(recording[0]), own_camera(recording[30])
+    assert a.hw == (1920, 1440) and a.depth.shape == (1, 256, 192)
+    assert a.camera.f.tolist() == [[meta["K"][0], meta["K"][4]]] and a.camera.c.tolist() == [
+        [meta["K"][6], meta["K"][7]]
+    ]
+    assert float(a.depth.min()) > 0.14 and float(a.depth.max()) < 0.43
+    agree, count = disagreement(a, b)
+    assert agree < 0.04 and count > 40_000
+    assert disagreement(turned_over(a), turned_over(b))[0] > 0.15  # so the check above can tell
+
+
+def hostile_archive(root: Path) -> Path:
+    return r3d(root)
+
+
+def hostile_exr(root: Path) -> None:
+    writers.write_record3d_exr(root, walk())
+
+
+def hostile_mp4(root: Path) -> Path:
+    return film(root)[0]

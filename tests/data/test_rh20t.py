@@ -1,0 +1,356 @@
+"""RH20T scenes: written with known geometry, read back, and damaged."""
+
+from __future__ import annotations
+
+import json
+import math
+import pickle
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("av")
+
+from support import damage_harness as hostile
+from support.box_scene import off_wall, pose, render, world_points
+
+from dhtorch import data
+from dhtorch.data.codecs.pickles import read_npy
+from dhtorch.data.codecs.video import close_videos
+from dhtorch.data.io.decode import FormatError
+from dhtorch.data.readers import rh20t, rh20t_robot
+from dhtorch.data.readers.rh20t_robot import ARMS, Stream
+from dhtorch.geometry import se3
+from dhtorch.records import Camera, Frame
+from dhtorch.testing.lossless import write_lossless
+from dhtorch.testing.rh20t import robot_notation, write_rh20t
+
+HW = (36, 64)
+CAMERA = Camera(torch.tensor([[50.0, 48.0]]), torch.tensor([[33.5, 16.75]]))
+FIXED, HAND = "750612070851", ARMS[1].in_hand[0]
+BASE = se3.to_matrix(se3.exp(torch.tensor([[0.4, -0.2, 0.9, 0.7, -0.3, 0.5]]).double()))[0].numpy()
+
+
+@pytest.fixture(autouse=True)
+def _clean() -> Iterator[None]:
+    yield
+    close_videos()
+
+
+# ------------------------------------------------------------------------------------------------------ written scenes
+
+
+def still(n: int = 3, start: float = 1_600_000_100.0) -> list[Frame]:
+    return [render(CAMERA, pose(2), HW, start + i / 10) for i in range(n)]
+
+
+def moving(n: int = 3, start: float = 1_600_000_100.0) -> list[Frame]:
+    return [render(CAMERA, pose(i), HW, start + i / 10) for i in range(n)]
+
+
+def scene(tmp_path: Path, **options: object) -> Path:
+    hand = se3.to_matrix(pose(5, 0.3))[0].numpy()
+    both = {FIXED: still(), HAND: moving()}
+    return write_rh20t(tmp_path, both, **{"T_world_from_base": BASE, "hand_at_calibration": hand, **options})
+
+
+def same_scene(recording: data.Recording, frames: list[Frame]) -> None:
+    assert len(recording) == len(frames)
+    for frame, want in zip(recording, frames, strict=True):
+        assert torch.equal(frame.image, want.image)
+        torch.testing.assert_close(frame.depth, want.depth, atol=0.5e-3 + 1e-6, rtol=0)
+        torch.testing.assert_close(frame.camera.f, want.camera.f, atol=1e-5, rtol=0)
+        torch.testing.assert_close(frame.camera.c, want.camera.c, atol=1e-5, rtol=0)
+        torch.testing.assert_close(frame.T_world_from_cam.R, want.T_world_from_cam.R, atol=1e-9, rtol=0)
+        torch.testing.assert_close(frame.T_world_from_cam.t, want.T_world_from_cam.t, atol=1e-9, rtol=0)
+        torch.testing.assert_close(frame.time, want.time, atol=1e-6, rtol=0)
+        assert float(off_wall(world_points(frame)).max()) < 2e-3
+
+
+# ------------------------------------------------------------------------------------------------ written, then read
+
+
+@pytest.mark.parametrize("configuration", range(1, 8))
+def test_fixed_and_hand_held_cameras_give_back_the_scene(tmp_path: Path, configuration: int) -> None:
+    serials = (FIXED, *ARMS[configuration].in_hand)
+    hand = se3.to_matrix(pose(5, 0.3))[0].numpy()
+    shots = {FIXED: still(), serials[1]: moving()}
+    root = write_rh20t(
+        tmp_path, shots, configuration=configuration, T_world_from_base=BASE, hand_at_calibration=hand
+    )  # fmt: skip
+    recordings = {r.name.split("/")[1]: r for r in data.open_all(root)}
+    assert data.recognise(root)[0] == "rh20t" and recordings.keys() == shots.keys()
+    for serial, frames in shots.items():
+        assert recordings[serial].report == () and recordings[serial].rate_hz == pytest.approx(10)
+        same_scene(recordings[serial], frames)
+    assert len(pickle.dumps(recordings[FIXED])) < 20_000
+
+
+def test_second_camera_on_the_hand_keeps_its_place_beside_the_first(tmp_path: Path) -> None:
+    first, second = ARMS[6].in_hand
+    beside = se3.exp(torch.tensor([[0.1, -0.2, 0.05, 0.06, 0.01, -0.02]]).double())
+    frames = [render(CAMERA, se3.compose(f.T_world_from_cam, beside), HW, float(f.time)) for f in moving()]
+    hand = se3.to_matrix(pose(5, 0.3))[0].numpy()
+    shots = {first: moving(), second: frames}
+    root = write_rh20t(tmp_path, shots, configuration=6, T_world_from_base=BASE, hand_at_calibration=hand)
+    same_scene(data.open(root, serials=[second]), frames)
+
+
+def test_a_hand_camera_taken_for_a_fixed_one_is_wrong(tmp_path: Path) -> None:
+    """So that the test above can tell: its extrinsics hold at calibration alone."""
+    recording = data.open(scene(tmp_path), serials=[HAND], in_hand=[])
+    assert float(off_wall(world_points(recording[1])).median()) > 0.05
+
+
+def test_K_of_the_full_size_follows_the_exact_rule(tmp_path: Path) -> None:
+    root = scene(tmp_path)
+    file = next(tmp_path.glob("calib/*/intrinsics.npy"))
+    K = np.array([[900.0, 0, 639.5, 0], [0, 900, 359.5, 0], [0, 0, 1, 0]])
+    np.save(file, {FIXED: K, HAND: K[:, :3]}, allow_pickle=True)
+    for recording in data.open_all(root):
+        # A centre stays a centre; the plain rule would put it half a pixel off.
+        assert recording[0].camera.c.tolist() == [[31.5, 17.5]] and recording[0].camera.f.tolist() == [[45, 45]]
+    with pytest.raises(FormatError, match=r"intrinsics.npy: image size: found 64x36, expected the shape of 640x480"):
+        data.open(root, serials=[HAND], calibrated_hw=(480, 640))
+
+
+def test_low_bytes_lie_above_high_bytes(tmp_path: Path) -> None:
+    """Codes around the wrap of the low byte: swapped planes would give 0.001 m steps of 256."""
+    frame = still(1)[0]
+    codes = torch.tensor([0, 255, 256, 257, 511, 512, 3000, 65279]).repeat(36, 8)
+    root = write_rh20t(tmp_path, {FIXED: [frame.replace(depth=(codes / 1000)[None].float())]})
+    torch.testing.assert_close(data.open(root)[0].depth[0], codes / 1000, atol=1e-6, rtol=0)
+
+
+def test_depth_in_a_parallel_tree_at_half_the_size(tmp_path: Path) -> None:
+    beside = tmp_path / "RH20T_depth" / "scene"
+    root = scene(tmp_path / "RH20T", depth_root=beside)
+    recording = data.open(root, serials=[FIXED], depth_root=str(beside))
+    same_scene(recording, still())
+    small = [np.full((36, 32), 1, np.uint8) for _ in range(3)]
+    write_lossless(beside / f"cam_{FIXED}" / "depth.mp4", small, "yuvj420p")
+    frame = data.open(root, serials=[FIXED], depth_root=str(beside))[0]
+    assert frame.depth.shape == (1, 18, 32) and float(frame.depth.max()) == pytest.approx(0.257)
+    write_lossless(beside / f"cam_{FIXED}" / "depth.mp4", [x[:, :30] for x in small], "yuvj420p")
+    with pytest.raises(FormatError, match=r"depth.mp4: size: found 30x36"):
+        data.open(root, serials=[FIXED], depth_root=str(beside))
+
+
+def test_missing_depth_is_empty_and_reported(tmp_path: Path) -> None:
+    recording = data.open(scene(tmp_path, depth=False), serials=[FIXED])
+    assert recording.report == (f"camera {FIXED}: no depth.mp4: depth is empty",)
+    assert not recording[0].depth.any() and torch.equal(recording[0].image, still()[0].image)
+
+
+def test_depth_is_paired_by_time(tmp_path: Path) -> None:
+    root = scene(tmp_path, lag=0.015)
+    assert len(data.open(root, serials=[FIXED])) == 3
+    assert len(data.open(root, serials=[FIXED], max_difference=0.016)) == 3
+    with pytest.raises(FormatError, match=r"no depth within 0.01 s of any image"):
+        data.open(root, serials=[FIXED], max_difference=0.01)
+    file = root / f"cam_{FIXED}" / "timestamps.npy"
+    stamps = read_npy(file)
+    stamps["depth"][1] += 40  # nobody's partner now
+    np.save(file, stamps, allow_pickle=True)
+    recording = data.open(root, serials=[FIXED])
+    assert recording.number.tolist() == [0, 2] and "1 image without depth within 0.02 s" in recording.report[0]
+    torch.testing.assert_close(recording[1].depth, still()[2].depth, atol=1e-3, rtol=0)
+
+
+def test_stamps_that_do_not_fit_the_video_are_reported(tmp_path: Path) -> None:
+    root = scene(tmp_path, depth=False)
+    file = root / f"cam_{FIXED}" / "timestamps.npy"
+    stamps = read_npy(file)["color"]
+    np.save(file, {"color": [*stamps, stamps[-1] + 100], "depth": []}, allow_pickle=True)
+    recording = data.open(root, serials=[FIXED])
+    assert len(recording) == 3 and "4 color stamps for 3 frames" in recording.report[1]
+    np.save(file, {"color": [stamps[0], stamps[0], stamps[2]], "depth": []}, allow_pickle=True)
+    recording = data.open(root, serials=[FIXED])
+    assert recording.number.tolist() == [0, 2] and "1 color frame whose stamp is not later" in recording.report[1]
+
+
+def test_outliers_of_a_lossy_high_byte_are_dropped(tmp_path: Path) -> None:
+    frame = still(1)[0]
+    spoilt = frame.depth.clone()
+    spoilt[0, 10, 10] += 0.256
+    spoilt[0, 20, 40] -= 0.256
+    root = write_rh20t(tmp_path, {FIXED: [frame.replace(depth=spoilt)]})
+    assert bool((data.open(root)[0].depth > 0).all())
+    kept = data.open(root, outlier=0.15)[0].depth[0] > 0
+    assert not kept[10, 10] and not kept[20, 40] and int((~kept).sum()) <= 4
+
+
+# -------------------------------------------------------------------------------------------- the robot and its clocks
+
+
+def test_streams_at_their_own_clocks(tmp_path: Path) -> None:
+    streams = rh20t.streams(scene(tmp_path))
+    forces = {"force_torque_base", "force_torque_base_raw", "robot_ft"}
+    forces |= {f"{name}/{serial}" for name in ("force_torque", "force_torque_raw") for serial in (FIXED, HAND)}
+    assert streams.keys() == {"tcp_base", "joint", "gripper_command", "gripper_info"} | forces
+    times = np.array([1_600_000_100.05, 1_600_000_100.15])
+    joint, covered = streams["joint"].at(times)
+    assert covered.all()
+    np.testing.assert_allclose(joint, np.arange(7) + np.array([[0.05], [0.15]]), atol=1e-6)
+    np.testing.assert_allclose(streams["gripper_command"].at(times)[0][:, 0], [49.95, 49.85], atol=1e-6)
+    assert streams["tcp_base"].pose and streams["tcp_base"].values.shape == (3, 7)
+    for name, want in (("force_torque_base", 0.05), (f"force_torque/{HAND}", 0.1), (f"force_torque_raw/{FIXED}", 3.1)):
+        assert not streams[name].pose
+        np.testing.assert_allclose(streams[name].at(times)[0][0], np.full(6, want), atol=1e-6)
+
+
+def test_forces_that_are_none_and_forces_that_cannot_be(tmp_path: Path) -> None:
+    (tmp_path / "transformed").mkdir()
+    file, stamp = tmp_path / "transformed" / "force_torque_base.npy", 1_600_000_000_500
+    entries = [{"timestamp": stamp + i, "zeroed": value} for i, value in enumerate((np.full(6, np.nan), None, [0] * 6))]
+    np.save(file, {FIXED: entries}, allow_pickle=True)
+    streams = rh20t.streams(tmp_path)
+    assert streams.keys() == {"force_torque_base"} and streams["force_torque_base"].values.tolist() == [[0.0] * 6]
+    np.save(file, {FIXED: [{"timestamp": stamp, "zeroed": [0] * 5}]}, allow_pickle=True)
+    with pytest.raises(FormatError, match=r"force_torque_base.npy: zeroed: found 5 numbers, expected 6"):
+        rh20t.streams(tmp_path)
+    np.save(file, {FIXED: [{"zeroed": [0] * 6}]}, allow_pickle=True)
+    with pytest.raises(FormatError, match=r"force_torque_base.npy: entries: found something else, expected objects"):
+        rh20t.streams(tmp_path)
+
+
+@pytest.mark.parametrize("lacking", [(), ("transformed",), ("transformed", "calib")])
+def test_a_human_shows_the_task(tmp_path: Path, lacking: tuple[str, ...]) -> None:
+    """Which arrays such a scene lacks is not documented: without any the cameras that stand still are read in full."""
+    robot = scene(tmp_path)
+    root = robot.rename(robot.with_name(f"{robot.name}_human"))
+    assert data.recognise(root)[0] == "rh20t"
+    for name in lacking:
+        if name == "calib":
+            next(tmp_path.glob("calib/*/tcp.npy")).unlink()
+        else:
+            shutil.rmtree(root / name)
+    recordings = {r.name.split("/")[1]: r for r in data.open_all(root)}
+    same_scene(recordings[FIXED], still())
+    assert recordings[FIXED].report == ()
+    if lacking:
+        what = "tcp.npy" if "calib" in lacking else "tcp_base.npy"
+        assert recordings[HAND].poses is None and rh20t.streams(root) == {}
+        assert recordings[HAND].report == (f"camera {HAND} is on the hand and there is no {what}: no poses",)
+        torch.testing.assert_close(recordings[HAND][1].depth, moving()[1].depth, atol=0.5e-3 + 1e-6, rtol=0)
+    else:
+        same_scene(recordings[HAND], moving())
+
+
+def test_serials_that_begin_with_a_letter_are_in_millimetres_too(tmp_path: Path) -> None:
+    """The authors' tool writes the PNG of these cameras (L515) in quarters of a millimetre; the video is not a PNG."""
+    root = write_rh20t(tmp_path, {"f0172289": still(2)})
+    same_scene(data.open(root), still(2))
+
+
+def test_tcp_of_each_camera_is_a_stream(tmp_path: Path) -> None:
+    entry = {"timestamp": 1_600_000_000_500, "tcp": np.array([1.0, 2, 3, 1, 0, 0, 0]), "robot_ft": np.zeros(6)}
+    lost = {**entry, "timestamp": 1_600_000_000_400, "tcp": np.full(7, np.nan)}
+    (tmp_path / "transformed").mkdir()
+    np.save(tmp_path / "transformed" / "tcp.npy", {FIXED: [entry, lost]}, allow_pickle=True)
+    stream = rh20t.streams(tmp_path)[f"tcp/{FIXED}"]
+    assert stream.times.tolist() == [1_600_000_000.5] and stream.values.tolist() == [[1, 2, 3, 1, 0, 0, 0]]
+
+
+def test_rotations_turn_at_constant_speed_the_short_way() -> None:
+    angle = 2.5
+    end = np.array([2.0, 0, 0, math.cos(angle / 2), 0, 0, math.sin(angle / 2)])
+    end[3:] *= -1  # the same rotation
+    stream = Stream(np.array([0.0, 1.0]), np.stack(([0, 0, 0, 1, 0, 0, 0], end)), pose=True)
+    values, covered = stream.at(np.array([0.0, 0.2, 0.5, 1.0]), max_gap=2)
+    assert covered.all()
+    np.testing.assert_allclose(values[:, 0], [0, 0.4, 1, 2])
+    got = 2 * np.arctan2(values[:, 6], values[:, 3])
+    np.testing.assert_allclose(got % (2 * math.pi), np.array([0, 0.2, 0.5, 1]) * angle, atol=1e-12)
+
+
+def test_gaps_are_not_bridged() -> None:
+    stream = Stream(np.array([0.0, 0.1, 2.0]), np.array([[0.0], [1], [20]]))
+    values, covered = stream.at(np.array([-1.0, 0.05, 0.1, 1.0, 1.9999, 2.5]))
+    assert covered.tolist() == [False, True, True, False, True, False]
+    np.testing.assert_allclose(values[[1, 2, 4], 0], [0.5, 1, 20])
+    one = Stream(np.array([5.0]), np.array([[7.0]]))
+    assert one.at(np.array([4.0, 5.0, 6.0]))[1].tolist() == [False, True, False]
+
+
+def test_frames_in_a_gap_of_the_tcp_are_left_out(tmp_path: Path) -> None:
+    root = scene(tmp_path)
+    file = root / "transformed" / "tcp_base.npy"
+    entries = read_npy(file)
+    np.save(file, {s: e[:2] for s, e in entries.items()}, allow_pickle=True)
+    recording = data.open(root, serials=[HAND])
+    assert recording.number.tolist() == [0, 1] and "1 frame in a gap of the tcp stream" in recording.report[0]
+    same_scene(recording, moving()[:2])
+    file.unlink()
+    recording = data.open(root, serials=[HAND])
+    assert recording.poses is None and "there is no tcp_base.npy: no poses" in recording.report[0]
+
+
+@pytest.mark.parametrize("configuration", [1, 3, 5, 6])
+def test_calibration_tcp_in_the_robots_notation(tmp_path: Path, configuration: int) -> None:
+    arm = ARMS[configuration]
+    for i in range(4):
+        T = se3.to_matrix(pose(3 * i, 0.2))[0].numpy()
+        np.save(tmp_path / "tcp.npy", robot_notation(arm.robot, T))
+        np.testing.assert_allclose(rh20t_robot.calibration_tcp(tmp_path / "tcp.npy", arm), T, atol=1e-12)
+    np.save(tmp_path / "tcp.npy", np.zeros(5))
+    with pytest.raises(FormatError, match=r"tcp.npy: tcp: found"):
+        rh20t_robot.calibration_tcp(tmp_path / "tcp.npy", arm)
+
+
+# ---------------------------------------------------------------------------------------------------------- bad input
+
+
+def test_what_is_missing_is_named(tmp_path: Path) -> None:
+    root = scene(tmp_path)
+    with pytest.raises(FormatError, match=r"option serials: found 7, expected some of 043322070878, 750612070851"):
+        data.open_all(root, serials=["7"])
+    with pytest.raises(FormatError, match=r"option configuration: found 9, expected 1 to 7"):
+        data.open_all(root, configuration=9)
+    (root / f"cam_{HAND}" / "color.mp4").unlink()
+    (recording,) = data.open_all(root)
+    assert recording.report == (f"camera {HAND}: no color.mp4: left out",)
+    with pytest.raises(FormatError, match=r"color.mp4"):
+        data.open(root, serials=[HAND])
+    meta = json.loads((root / "metadata.json").read_text())
+    (root / "metadata.json").write_text(json.dumps({**meta, "bad_calib_view": [FIXED]}))
+    assert data.open(root).report[1] == f"camera {FIXED}: metadata doubts its calibration"
+    for value in (-1, "../../x", None, 1.5):
+        (root / "metadata.json").write_text(json.dumps({"calib": value}))
+        with pytest.raises(FormatError, match=r"metadata.json: calib"):
+            data.open(root)
+
+
+def test_calibrations_elsewhere(tmp_path: Path) -> None:
+    root = scene(tmp_path / "a")
+    shutil.move(tmp_path / "a" / "calib", tmp_path / "calibrations")
+    with pytest.raises(FormatError, match=r"intrinsics.npy: file: found no such file"):
+        data.open_all(root)
+    assert len(data.open_all(root, calibration=str(tmp_path / "calibrations"))) == 2
+
+
+def test_folder_without_a_configuration_is_taken_to_stand_still(tmp_path: Path) -> None:
+    root = scene(tmp_path).rename(tmp_path / "scene")
+    recording = data.open(root, serials=[FIXED])
+    assert "unknown configuration" in recording.report[0]
+    same_scene(data.open(root, serials=[HAND], configuration=1), moving())
+
+
+def hostile_sample(root: Path) -> Path:
+    return write_rh20t(root, {FIXED: still(2), HAND: moving(2)}, T_world_from_base=BASE)
+
+
+def read_all(root: Path) -> None:
+    hostile.read_all(root)
+    rh20t.streams(root)
+
+
+def test_a_large_array_where_a_pose_is_expected_is_named_by_its_shape(tmp_path):
+    file = tmp_path / "tcp.npy"
+    np.save(file, np.zeros((5000, 5000), np.uint8))
+    with pytest.raises(FormatError, match=r"tcp: found an array of shape \(5000, 5000\), expected 7 finite numbers"):
+        rh20t_robot.calibration_tcp(file, rh20t_robot.Arm("ur5", (), *[np.eye(4)] * 3))

@@ -1,0 +1,208 @@
+"""The documentation: it builds without a warning, no link leads nowhere, and what it says comes from the code."""
+
+import html
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+import pytest
+
+from dhtorch import data
+from dhtorch.experiments.report import layouts
+
+REPO = Path(__file__).resolve().parents[2]
+DOCS = REPO / "docs"
+WITHOUT = [name for name in ("mkdocs", "material", "mkdocstrings") if importlib.util.find_spec(name) is None]
+
+
+def script(name):
+    """A script of the documentation as a module."""
+    sys.path.insert(0, str(DOCS))
+    try:
+        return importlib.import_module(name)
+    finally:
+        sys.path.remove(str(DOCS))
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The built site: page → text."""
+    if WITHOUT:
+        pytest.skip(f"needs pip install dhtorch[docs]: {', '.join(WITHOUT)} not found")
+    folder = tmp_path_factory.mktemp("site")
+    env = {**os.environ, "NO_MKDOCS_2_WARNING": "1", "OMP_NUM_THREADS": "1"}  # an advertisement, not a warning of ours
+    build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)]
+    done = subprocess.run(build, cwd=REPO, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "WARNING" not in done.stderr, done.stderr[-3000:]
+    return folder, {p.relative_to(folder).as_posix(): p.read_text(encoding="utf-8") for p in folder.rglob("*.html")}
+
+
+def text_of(page):
+    """What a reader sees of a page, in one line."""
+    body = page[page.index("<article") : page.index("</article>")]
+    return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", body)).split())
+
+
+@pytest.mark.slow
+def test_there_is_a_page_for_every_promise(site):
+    _, pages = site
+    assert {p.relative_to(DOCS).with_suffix(".html").as_posix() for p in DOCS.rglob("*.md")} <= set(pages)
+    for module in ("pair", "stages", "geometry", "transform", "data", "studies", "synthetic"):
+        assert f"api/{module}.html" in pages
+
+
+@pytest.mark.slow
+def test_no_internal_link_leads_nowhere(site):
+    """Pages, anchors, pictures, scripts and styles; other people's sites are not asked."""
+    folder, pages = site
+    targets = {name: set(re.findall(r'\bid="([^"]+)"', text)) for name, text in pages.items()}
+    found = 0
+    for name, text in pages.items():
+        if name == "404.html":  # its links start from the root of a server
+            continue
+        for link in re.findall(r'\b(?:href|src)="([^"]*)"', text):
+            parts = urlsplit(html.unescape(link))
+            if parts.scheme or parts.netloc:
+                continue
+            path = ((folder / name).parent / unquote(parts.path)).resolve() if parts.path else folder / name
+            assert path.exists(), f"{name}: {link}"
+            path = path / "index.html" if path.is_dir() else path
+            if parts.fragment and path.suffix == ".html":
+                page = path.relative_to(folder.resolve() if parts.path else folder).as_posix()
+                assert unquote(parts.fragment) in targets[page] | {"__skip"}, f"{name}: {link}"
+            found += 1
+    assert found > 1000
+
+
+@pytest.mark.slow
+def test_nothing_is_fetched_from_elsewhere(site):
+    """No font, script or style of another host: the site works offline."""
+    _, pages = site
+    for name, text in pages.items():
+        loaded = re.findall(
+            r'<(?:script|img|iframe)[^>]+src="([^"]+)"|<link[^>]+rel="stylesheet"[^>]+href="([^"]+)"', text
+        )
+        assert not [link for pair in loaded for link in pair if link.startswith(("http", "//"))], name
+
+
+@pytest.mark.slow
+def test_every_mark_is_filled(site):
+    _, pages = site
+    assert not [name for name, text in pages.items() if "make:" in text or "<!-- results" in text]
+
+
+@pytest.mark.slow
+def test_docstrings_arrive_whole(site):
+    """Sections, our closing words, shapes from the signature, comments of fields."""
+    _, pages = site
+    two_view = text_of(pages["api/stages.html"])
+    assert "Gradient: depth, sigma, parallax and residual" in two_view and "Gates, first reason wins" in two_view
+    assert "min_parallax_deg ( float | None , default: 0.3 ) – rays closer to parallel" in two_view
+    records = text_of(pages["api/records.html"])
+    assert "(B, N, 3) m in camera 0; NaN where there is no usable return" in records
+    assert ":class:" not in two_view and ":func:" not in text_of(pages["api/transform.html"])
+
+
+@pytest.mark.slow
+def test_every_experiment_has_its_row_and_words(site):
+    _, pages = site
+    asked = script("hooks").asked()
+    shown = text_of(pages["experiments.html"])
+    assert len(asked) >= 20
+    for name, said in asked.items():
+        assert f'href="#{name}"' in pages["experiments.html"]
+        first = said["refutation"].split("`")[0].split()[:6]
+        assert " ".join(first) in shown, name
+
+
+@pytest.mark.slow
+def test_the_command_s_help_is_shown(site):
+    _, pages = site
+    shown = text_of(pages["command.html"])
+    for words in ("dhtorch inspect", "--multirun", "extract.engine", "voxel", "-q, --quiet", "130"):
+        assert words in shown, words
+
+
+def test_nothing_is_said_on_two_pages():
+    """Longer lines of prose stand on one page; what is written from one table or docstring may come twice."""
+    pages = [REPO / "README.md", *sorted(DOCS.rglob("*.md"))]
+    seen: dict[str, str] = {}
+    for page in pages:
+        text = re.sub(r"^<!-- (?!end -->).*?<!-- end -->$", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+        for line in {line.strip() for line in text.splitlines() if len(line.strip()) > 60}:
+            assert line not in seen, (page.name, seen[line], line)
+            seen[line] = page.name
+
+
+def test_the_pages_are_whole_without_the_site():
+    """What is read in the repository holds no mark that is filled elsewhere."""
+    for page in DOCS.rglob("*.md"):
+        for mark, body in re.findall(r"^<!-- (?!end)(.*?) -->\n(.*?)^<!-- end -->$", page.read_text(), re.M | re.S):
+            assert body.strip(), (page.name, mark)
+
+
+def test_a_mark_that_nobody_makes_is_an_error():
+    with pytest.raises(ValueError, match="'wishes', expected one of"):
+        script("hooks").made("wishes")
+
+
+@pytest.mark.parametrize("page", ["methods", "pipelines", "extend"])
+def test_the_examples_run(page, capsys, monkeypatch):
+    blocks = re.findall(r"^```python\n(.*?)^```", (DOCS / f"{page}.md").read_text(encoding="utf-8"), re.M | re.S)
+    names: dict = {}
+    monkeypatch.setattr(data, "FORMATS", dict(data.FORMATS))  # to which an example adds
+    monkeypatch.setattr(layouts, "LAYOUTS", dict(layouts.LAYOUTS))
+    exec(compile("\n".join(blocks), f"{page}.md", "exec"), names)
+    if page == "methods":
+        score = names["estimate"].score
+        assert ((score > 0) == names["estimate"].keep).all() and (score > 0).any()
+    elif page == "extend":
+        said = capsys.readouterr().out
+        assert "3 frames" in said and "torch.Size([1, 24, 32])" in said and "R. Hartley, A. Zisserman" in said
+        assert names["outcome"].verdict in ("supported", "refuted") and names["mine"].track is names["half_size"]
+        kept = names["estimate"].keep
+        assert ((names["estimate"].score > 0) == kept).all() and int(kept.sum()) > 50
+        tracked = names["mine"](names["room"][0], names["room"][6])
+        both = tracked.keep & kept
+        assert float((tracked.depth / names["estimate"].depth - 1).abs()[both].median()) < 0.1, "the half-size tracker"
+    else:
+        assert "torch.Size([80, 10])" in capsys.readouterr().out and names["more"]["task"] == "pick up the cup"
+
+
+def test_options_that_the_pages_name_exist():
+    """Choices of groups in the examples are files of conf/."""
+    for page in DOCS.rglob("*.md"):
+        for group, name in re.findall(
+            r"\b(data|method|experiment|launch|pairs)=([a-z]\w*)\b", page.read_text(encoding="utf-8")
+        ):
+            if name not in ("mine",):
+                assert (REPO / "conf" / group / f"{name}.yaml").is_file(), (page.name, f"{group}={name}")
+
+
+def test_direct_dependencies_have_licences_that_fit():
+    licences = script("licences")
+    for package, groups in licences.requirements().items():
+        found = licences.licence(package)
+        assert found, f"{package}: no licence known"
+        if package in licences.TOOLS:
+            assert (found, groups) == (licences.TOOLS[package], ["dev"]), package
+            used = [
+                p
+                for p in (REPO / "dhtorch").rglob("*.py")
+                if re.search(rf"\bimport {package}|from {package}", p.read_text(encoding="utf-8"))
+            ]
+            assert not used, used
+        else:
+            assert licences.compatible(found), f"{package}: {found}"
+        assert f"| {package} |" in licences.table()
+
+
+def test_an_expression_fits_where_one_of_its_choices_does():
+    fits = script("licences").compatible
+    assert fits("MIT") and fits("MIT OR GPL-3.0-only") and fits("Apache-2.0 AND (BSD-3-Clause)")
+    assert not fits("GPL-3.0-only") and not fits("MIT AND GPL-3.0-only") and not fits("proprietary")

@@ -1,0 +1,175 @@
+"""Depth from defocus: blur of known radius, the thin lens against exact light fields, both ambiguities, the verdict."""
+
+import math
+
+import pytest
+import torch
+
+from dhtorch.experiments.focal import defocus as experiment
+from dhtorch.experiments.focal.blur import Blur, inverse_depth, local_blur, side_by_colour, side_by_height
+from dhtorch.experiments.protocol import Outcome, Settings
+from dhtorch.geometry.filters import gaussian
+from dhtorch.geometry.thin_lens import depth_of_spot, spot_diameter, spot_gain
+from dhtorch.records import Pose
+from dhtorch.synthetic.recording import SyntheticRoom
+from dhtorch.synthetic.thin_lens import lens_of, photograph
+from dhtorch.synthetic.viewpoints import open_viewpoints
+
+
+def edge(angle_deg=0.0, contrast=0.8):
+    """A step edge through the middle of a picture, sampled finely and then averaged."""
+    y, x = torch.meshgrid(torch.arange(384) - 191.5, torch.arange(640) - 319.5, indexing="ij")
+    a = math.radians(angle_deg)
+    step = ((x * math.cos(a) + y * math.sin(a)) > 0).double() * contrast + 0.1
+    return torch.nn.functional.avg_pool2d(step[None, None], 4)
+
+
+@pytest.mark.parametrize("sigma", [1.0, 1.5, 2.0, 3.0])
+@pytest.mark.parametrize("angle", [0.0, 30.0, 90.0])
+@pytest.mark.parametrize("contrast", [0.1, 0.8])
+def test_a_gaussian_blur_of_known_radius_is_recovered(sigma, angle, contrast):
+    blur = local_blur(gaussian(edge(angle, contrast), sigma), noise=0.0, window_px=12.0)
+    assert bool(blur.valid[0, 48, 80])
+    # Between the blur alone and that with a pixel's own square, as the edge falls on the pixels; the window costs 3 %.
+    assert 0.93 * sigma < float(blur.sigma[0, 48, 80]) < 1.02 * math.sqrt(sigma**2 + 1 / 12)
+
+
+def test_noise_is_taken_off():
+    draw = torch.Generator().manual_seed(0)
+    clean = gaussian(edge(), 2.0)
+    noisy = clean + 4 / 255 * torch.randn(clean.shape, generator=draw)
+    found = local_blur(noisy, noise=4 / 255).sigma[0, 40:56, 78:82].median()
+    want = local_blur(clean, noise=0.0).sigma[0, 40:56, 78:82].median()
+    assert float(found) == pytest.approx(float(want), rel=0.08)
+    blind = local_blur(noisy, noise=1e-6).sigma[0, 40:56, 78:82].median()
+    assert float(blind) < float(found), "noise that is not taken off reads as sharpness"
+    flat = 0.5 + 4 / 255 * torch.randn(1, 1, 96, 160, generator=draw)
+    assert float(local_blur(flat, noise=4 / 255).valid.float().mean()) == 0
+
+
+def test_the_spot_follows_the_thin_lens():
+    lens = lens_of(500.0, focal_length_m=0.05, f_number=2.0)
+    near, far = 1.0, 4.0
+    spot = spot_diameter(lens, torch.tensor([[near, 2.0, far, 0.0]]), torch.tensor([2.0]))[0]
+    # From the lens equation itself: images at v(z), the sensor at v(2), similar triangles behind the aperture.
+    v = {z: 1 / (1 / 0.05 - 1 / z) for z in (near, 2.0, far)}
+    for k, z in ((0, near), (2, far)):
+        want = 0.025 * abs(v[2.0] - v[z]) / v[z] / (0.05 / 500)
+        assert abs(float(spot[k])) == pytest.approx(want, rel=1e-4)
+    assert float(spot[0]) < 0 < float(spot[2]) and float(spot[1]) == 0 and bool(spot[3].isnan())
+    back = depth_of_spot(lens, spot[None, :3], torch.tensor([2.0]))[0]
+    torch.testing.assert_close(back, torch.tensor([near, 2.0, far]), rtol=1e-5, atol=0)
+    beyond = 1.01 * spot_gain(lens, torch.tensor([[2.0]])) / 2
+    assert bool(depth_of_spot(lens, beyond, torch.tensor([2.0])).isnan().all()), "no spot is larger than infinity's"
+
+
+def test_a_point_becomes_a_disc_of_its_diameter():
+    lens, depth = lens_of(400.0, f_number=0.7), torch.full((1, 64, 64), 2.0)
+    point = torch.zeros(1, 1, 64, 64)
+    point[..., 32, 32] = 1.0
+    seen = photograph(point, depth, lens, torch.tensor([[1.0]]), gamma=1.0)[0, 0, 0]
+    diameter = float(spot_diameter(lens, torch.tensor([[2.0]]), torch.tensor([1.0])))
+    y, x = torch.meshgrid(torch.arange(64) - 32.0, torch.arange(64) - 32.0, indexing="ij")
+    assert float(seen.sum()) == pytest.approx(1.0, rel=0.1)
+    r = (x * x + y * y).sqrt()
+    inside, half = float(seen[r < diameter / 2 + 0.7].sum()), float(seen[r < diameter / 8**0.5].sum())
+    assert inside > 0.93 and half == pytest.approx(0.5, abs=0.06)  # uniform: half the area holds half the light
+    sharp = photograph(point, depth, lens, torch.tensor([[2.0]]), gamma=1.0)[0, 0]
+    torch.testing.assert_close(sharp, point[0], atol=1e-5, rtol=0)
+
+
+def test_the_lens_covers_what_is_behind_as_an_exact_light_field_does():
+    """The mean of pinhole pictures from all over the aperture is the truth, occlusion included."""
+
+    def pictured(change=lambda room: None):
+        """The room and what a pinhole sees of it, as a share of white."""
+        room = SyntheticRoom(hw=(60, 80), lidar="exact", n_frames=1, image_noise=0.0)
+        change(room)
+        return room, room[0].image.float() / 255
+
+    (room, pinhole), focus = pictured(), 1.6
+    pose, depth = room.true_poses[:1], room.truth(0)["depth"]
+    aperture = 0.15
+    lens = lens_of(float(room.camera.f[0, 0]), f_number=0.035 / aperture)
+    made = photograph(pinhole, depth, lens, torch.tensor([[focus]]))[0, 0]
+    total, count = torch.zeros_like(made), 0
+    for i in range(4):
+        for k in range(4):
+            at = torch.tensor([(i - 1.5) / 4 * aperture, (k - 1.5) / 4 * aperture], dtype=torch.float64)
+            if float(at.norm()) <= aperture / 2:
+
+                def lean(other, at=at):
+                    other.true_poses = Pose(pose.R, pose.t + pose.R @ torch.cat((at, at.new_zeros(1))))
+                    other.camera = room.camera.replace(c=room.camera.c + room.camera.f * at.float() / focus)
+
+                total, count = total + pictured(lean)[1][0] ** 2, count + 1
+    exact = (total / count).sqrt()
+    psnr = [-10 * math.log10(float(((x - exact) ** 2).mean())) for x in (made, pinhole[0])]
+    assert psnr[0] > 32 and psnr[0] > psnr[1] + 6, psnr
+
+
+def test_inverse_depth_needs_the_side():
+    lens, focus = lens_of(400.0, f_number=0.7), torch.tensor([2.0])
+    spot = spot_diameter(lens, torch.tensor([[1.25, 5.0]]), focus)
+    assert float(spot[0, 0]) == pytest.approx(-float(spot[0, 1])), "two depths, one spot"
+    blur = Blur(0.25 * spot.abs()[..., None], torch.ones(1, 2, 1), torch.ones(1, 2, 1, dtype=torch.bool))
+    found = inverse_depth(blur, torch.sign(spot)[..., None], lens, focus)
+    torch.testing.assert_close(found[0, :, 0], torch.tensor([0.8, 0.2]), rtol=1e-5, atol=0)
+    huge = blur.replace(sigma=100 * blur.sigma)
+    assert inverse_depth(huge, torch.ones(1, 2, 1), lens, focus)[0, :, 0].tolist() == [0, 0], "as far as can be"
+    silent = blur.replace(valid=torch.zeros(1, 2, 1, dtype=torch.bool))
+    assert bool(inverse_depth(silent, torch.ones(1, 2, 1), lens, focus).isnan().all())
+
+
+def test_the_two_ambiguities():
+    found = experiment.ambiguities(noise=1 / 255)
+    assert found["blank_wall.sharp_paint_px"] < 0.3 < found["blank_wall.soft_paint_px"], "soft paint looks defocused"
+    assert found["blank_wall.plain_share"] == 0, "a plain wall says nothing"
+    assert found["two_sides.ratio"] == pytest.approx(1, rel=0.1), "near and far of the focus look alike"
+
+
+def test_sides():
+    sigma = torch.full((1, 40, 30), 3.0)
+    sigma[:, 25:28] = 0.2
+    side = side_by_height(Blur(sigma, torch.ones_like(sigma), torch.ones_like(sigma, dtype=torch.bool)))
+    assert bool((side[0, :20] == 1).all()) and bool((side[0, 30:] == -1).all())
+    red_sharp = torch.cat([gaussian(edge().float(), s) for s in (1.0, 1.5, 2.0)], 1)
+    assert (
+        float(side_by_colour(red_sharp)[0, 48, 80]) == 1 and float(side_by_colour(red_sharp.flip(1))[0, 48, 80]) == -1
+    )
+
+
+def test_bad_input():
+    lens, depth = lens_of(400.0), torch.ones(1, 8, 8)
+    with pytest.raises(ValueError, match="depth has shape"):
+        photograph(torch.zeros(1, 1, 8, 9), depth, lens, torch.ones(1, 1))
+    with pytest.raises(ValueError, match="without a value"):
+        photograph(torch.zeros(1, 1, 8, 8), 0 * depth, lens, torch.ones(1, 1))
+    with pytest.raises(ValueError, match="beyond the focal length"):
+        photograph(torch.zeros(1, 1, 8, 8), depth, lens, torch.full((1, 1), 0.01))
+    with pytest.raises(ValueError, match="expected 0 < fine_px < coarse_px"):
+        local_blur(torch.zeros(1, 1, 8, 8), fine_px=2.0, coarse_px=1.0)
+    with pytest.raises(ValueError, match="expected at least 1"):
+        open_viewpoints(0)
+
+
+def test_a_run_and_its_rows():
+    views = open_viewpoints(1, hw=(120, 160))
+    outcome = experiment.run(views, {}, None, Settings(), axial_colour_dpt=0.5)
+    rows = outcome.scenes("oracle_side")
+    assert set(rows) == {"viewpoint_00"} and outcome.verdict in ("supported", "refuted")
+    row = rows["viewpoint_00"]
+    assert row["side_right"] == 1 and row["n_kept"] > 50 and -1 <= row["corr"] <= 1
+    assert outcome.scenes("by_colour")["viewpoint_00"]["side_right"] > 0.5, "better than a guess"
+    assert "two_sides.ratio" in outcome.summary
+
+
+def test_verdict_goes_either_way():
+    def with_r(oracle, deployed, rho=0.2):
+        common = {"scene": "a", "pair": None, "truth": "full", "role": None, "rho_abs": rho}
+        rows = [{**common, "method": m, "corr": r} for m, r in (("oracle_side", oracle), ("by_height", deployed))]
+        return experiment.verdict(Outcome(rows=rows))[0]
+
+    assert with_r(0.66, 0.06) is True
+    assert with_r(0.66, 0.5) is False and with_r(0.2, 0.0) is False and with_r(0.66, 0.06, rho=0.8) is False
+    assert experiment.verdict(Outcome())[0] is None

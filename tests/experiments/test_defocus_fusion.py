@@ -1,0 +1,97 @@
+"""Filling in between returns: planes are exact, guides follow edges, defocus corrects where it must and only there."""
+
+import pytest
+import torch
+
+from dhtorch.experiments.focal import defocus_fusion as experiment
+from dhtorch.experiments.focal.blur import Blur
+from dhtorch.experiments.focal.filling import bilinear, defocus_guided, guided_filter, joint_bilateral
+from dhtorch.experiments.protocol import Outcome, Settings
+from dhtorch.synthetic.viewpoints import open_viewpoints
+
+
+def plane(h=70, w=84):
+    y, x = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
+    return (1.5 + 0.01 * x + 0.005 * y)[None]
+
+
+def step(h=70, w=84):
+    return torch.where(torch.arange(w) < 40, 1.0, 2.0).expand(1, h, w).clone()
+
+
+def test_bilinear_gives_a_plane_back_and_leaves_holes():
+    coarse, whole = experiment.thin_out(plane(), 7)
+    found = bilinear(coarse, (70, 84))
+    torch.testing.assert_close(found[:, 4:-4, 4:-4], whole[:, 4:-4, 4:-4], atol=1e-4, rtol=0)
+    coarse[:, 3:6, 3:6] = 0
+    found = bilinear(coarse, (70, 84))
+    assert float(found[0, 31, 31]) == 0 and float(found[0, 60, 60]) > 0
+    filled = found[found > 0]
+    assert float(filled.min()) >= 1.5 - 1e-4, "a hole pulls nothing towards zero"
+
+
+# The guided filter averages its linear functions over windows: part of the ramp stays.
+@pytest.mark.parametrize(("guided", "left"), [(joint_bilateral, 0.5), (guided_filter, 0.9)])
+def test_guides_sharpen_an_edge_that_the_picture_shows(guided, left):
+    whole = step()
+    coarse, _ = experiment.thin_out(whole, 7)
+    picture = (whole[:, None] - 1) * 0.8 + 0.1
+    plain = bilinear(coarse, (70, 84))
+    found = guided(coarse, picture)
+    error, before = ((z - whole)[:, 8:-8, 30:52].abs().mean() for z in (found, plain))
+    assert float(error) < left * float(before)
+    blind = torch.full_like(picture, 0.5)
+    found = guided(coarse, blind)
+    assert float((found - whole)[:, 8:-8, 30:52].abs().mean()) > 0.8 * float(before), "no edge, no help"
+
+
+def test_exact_defocus_corrects_an_edge_and_useless_defocus_changes_little():
+    whole = step()
+    coarse, _ = experiment.thin_out(whole, 7)
+    plain = bilinear(coarse, (70, 84))
+    everywhere = torch.ones_like(whole, dtype=torch.bool)
+    exact = Blur(0.3 + 4 * (1 / whole - 1).abs(), torch.ones_like(whole), everywhere)  # in focus at 1 m
+    error, before = ((z - whole).abs().mean() for z in (defocus_guided(plain, coarse, exact, reach_px=0.5), plain))
+    assert float(error) < 0.9 * float(before)
+    noise = torch.rand(whole.shape, generator=torch.Generator().manual_seed(0))
+    useless = defocus_guided(plain, coarse, exact.replace(sigma=noise))
+    assert float((useless - whole).abs().mean()) < 1.05 * float(before)
+    nothing = defocus_guided(plain, coarse, exact.replace(valid=~everywhere))
+    assert torch.equal(nothing, plain)
+
+
+def test_bad_input():
+    for bad in (0, 4):
+        with pytest.raises(ValueError, match="expected an odd number from 3"):
+            experiment.run([], {}, None, Settings(), factor=bad)
+    with pytest.raises(ValueError, match="coarse has shape"):
+        bilinear(torch.ones(4, 4), (8, 8))
+    for guided in (guided_filter, joint_bilateral):
+        with pytest.raises(ValueError, match="guide has shape"):
+            guided(torch.ones(1, 4, 4), torch.ones(1, 8, 9))
+
+
+def test_a_run_and_its_rows():
+    outcome = experiment.run(open_viewpoints(1, hw=(120, 160)), {}, None, Settings())
+    rows = {r["method"]: r for r in outcome.rows if r["pair"] is None}
+    assert set(rows) == set(experiment.VARIANTS) and outcome.verdict in ("supported", "refuted")
+    assert len({r["n_candidates"] for r in rows.values()}) == 1, "all are judged on the same pixels"
+    assert rows["bilinear"]["changed_rel"] == 0 and rows["bilinear"]["corr"] > 0.8
+    assert outcome.summary["defocus_guided.mean_rel_ratio"]["value"] == pytest.approx(
+        rows["defocus_guided"]["mean_rel"] / rows["bilinear"]["mean_rel"]
+    )
+
+
+def test_verdict_goes_either_way():
+    def said(*pairs):
+        rows = []
+        for k, (ours, plain) in enumerate(pairs):
+            common = {"scene": str(k), "pair": None, "truth": "left_out", "role": None, "corr": 0.9}
+            rows += [
+                {**common, "method": "defocus_guided", "mean_rel": ours},
+                {**common, "method": "bilinear", "mean_rel": plain},
+            ]
+        return experiment.verdict(Outcome(rows=rows))[0]
+
+    assert said((0.03, 0.02), (0.03, 0.02), (0.01, 0.02)) is True
+    assert said((0.01, 0.02), (0.01, 0.02), (0.03, 0.02)) is False and said() is None

@@ -1,0 +1,183 @@
+"""Dense maps beside their peers: who is judged where, what is divided by what, and peers that are right in a room."""
+
+import pytest
+import torch
+
+from dhtorch import MAP
+from dhtorch.codes import Gate, Source
+from dhtorch.data.pairs import by_gap
+from dhtorch.data.scene import Scene
+from dhtorch.experiments.baselines import filling, stereo
+from dhtorch.experiments.compare import dense_comparison, exact_rooms
+from dhtorch.experiments.protocol import Outcome, Settings
+from dhtorch.geometry import se3
+from dhtorch.metrics.holdout import range_split
+from dhtorch.pipeline import dense
+from dhtorch.records import DepthMap
+from dhtorch.synthetic import SyntheticRoom
+
+NEAR = 2.0
+METHOD = MAP.replace(n=768)
+SWEEP = {"planes": 32, "partners": 2, "size": 160}
+
+
+@pytest.fixture(scope="module")
+def room():
+    return SyntheticRoom(n_frames=12, hw=(120, 160), depth_hw=(120, 160), lidar="exact", image_noise=0.0, name="hall")
+
+
+@pytest.fixture(scope="module")
+def outcome(room):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(filling, "ROUNDS", 3)
+        return dense_comparison.run(
+            [Scene(room, near=NEAR, gap=8)],
+            {"map": METHOD},
+            by_gap,
+            Settings(),
+            sweep=SWEEP,
+            stride=1,
+            anchors=1,
+            indoor=["hall"],
+            rooms=(),
+        )
+
+
+@pytest.fixture(scope="module")
+def pair(room):
+    """An anchor, another view that lies beside it, the motion that the room knows, and a grid of samples."""
+    anchor, other = room[3], room[11]
+    grid = METHOD.backproject(range_split(anchor, NEAR), dense.pixels(anchor, (40, 53)))
+    return range_split(anchor, NEAR), other, exact_rooms.exact_pose(anchor, other, 1).T_1_from_0, grid, anchor
+
+
+def test_every_variant_is_judged_where_it_belongs(outcome):
+    rows = {name: outcome.scenes(name)["hall"] for name in ("sparse", "dense, at samples", "dense", "sgbm", "dis flow")}
+    assert rows["sparse"]["n_candidates"] == rows["dense, at samples"]["n_candidates"]
+    assert rows["dense"]["n_candidates"] == rows["sgbm"]["n_candidates"] > 5 * rows["sparse"]["n_candidates"]
+    assert rows["dense"]["n_dropped"]["texture"] == 0
+    assert "note" in outcome.scenes("sgbm, own calibration")["hall"], "the room is no rectified pair"
+    assert rows["dense"]["ms"].keys() >= {"sparse", "sweep_2", "sweep_1"}
+
+
+def test_the_summary_is_what_its_points_say(outcome):
+    points = {k[1]: p for k, p in outcome.points.items() if k[0] == "hall" and k[2] == "full"}
+    both = points["sparse"].keep & points["dense, at samples"].keep
+    a, b = (float(points[name].error[both].median()) for name in ("dense, at samples", "sparse"))
+    assert outcome.summary["dense.error_ratio_to_sparse"]["value"] == pytest.approx(a / b)
+    share = float(points["dense"].keep.double().mean())
+    assert outcome.summary["dense.answered"]["value"] == pytest.approx(share) and share > 0.3
+    wrong = float((points["dense"].answered().error > 0.2).double().mean())
+    assert outcome.summary["dense.wrong_share"]["value"] == pytest.approx(wrong)
+    indoor = outcome.summary["sparse.coverage_at_5_indoor"]
+    assert indoor["value"] == outcome.scenes("sparse")["hall"]["coverage_at_5"] and indoor["n"] == 1
+    assert outcome.summary["dense.error_ratio_to_sgbm"]["n"] <= 1 and outcome.summary["dense.ause_ratio"]["value"] < 1
+
+
+def test_a_turn_is_counted_by_its_holes():
+    whole = {"scene": "carousel", "method": "dense", "truth": "full", "pair": None, "role": "rotation"}
+    pairs = [whole | {"pair": [k, k + 1], "role": None, "n_holes": 100, "n_recovered": n} for k, n in ((0, 1), (1, 4))]
+    others = [pairs[0] | {"method": "sgbm"}, pairs[0] | {"truth": "rectifiable"}, pairs[0] | {"scene": "hall"}]
+    found = dense_comparison.turned(Outcome(rows=[whole, *pairs, *others]))
+    assert found["value"] == pytest.approx(5 / 200) and found["n"] == 1
+
+
+def test_bars_are_held_one_by_one():
+    fine = {"dense.answered": 0.6, "dense.ause_ratio": 0.4, "dense.within_sigma": 0.7}
+    outcome = Outcome(summary={k: {"value": v} for k, v in fine.items()})
+    holds, why = dense_comparison.verdict(outcome, peers=False)
+    assert holds is None and "3 of 3" in why and "dense.wrong_share" in why
+    outcome.summary["dense.wrong_share"] = {"value": 0.06}
+    holds, why = dense_comparison.verdict(outcome, peers=False)
+    assert holds is False and "dense.wrong_share 0.060 (bar 0.05)" in why
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("tipped", [False, True])
+def test_rectified_matching_is_right_whichever_way_the_other_camera_lies(room, mirrored, tipped):
+    anchor, other = (room[k] for k in ((11, 3) if mirrored else (3, 11)))
+    T = exact_rooms.exact_pose(anchor, other, 1).T_1_from_0
+    if tipped:  # both cameras rolled by a right angle: the other view is above or below
+        anchor, other = (rolled(frame) for frame in (anchor, other))
+        roll = se3.exp(torch.tensor([[0.0, 0.0, torch.pi / 2, 0.0, 0.0, 0.0]]))
+        T = se3.compose(roll, se3.compose(T, se3.invert(roll)))
+    grid = METHOD.backproject(anchor, dense.pixels(anchor, (40, 40)))
+    found = stereo.semi_global(anchor, other, T, grid, nearest_m=torch.tensor([1.4]))
+    truth = _truth(anchor, grid)
+    keep = found.keep & (truth > NEAR)
+    error = ((found.depth - truth).abs() / truth)[keep]
+    assert keep.sum() > 200 and float(error.median()) < 0.05
+
+
+def rolled(frame):
+    """The same view from a camera rolled by a right angle: x is where y was, y where -x was."""
+    f, c = frame.camera.f, frame.camera.c
+    camera = frame.camera.replace(f=f.flip(-1), c=torch.stack([frame.hw[0] - 1 - c[:, 1], c[:, 0]], -1))
+    image, depth = (x.transpose(-1, -2).flip(-1) for x in (frame.image, frame.depth))
+    return frame.replace(image=image, depth=depth, camera=camera, depth_camera=None, conf=None)
+
+
+def test_flow_is_triangulated_and_bilateral_filling_guesses(pair):
+    near, other, T, grid, exact = pair
+    truth = _truth(exact, grid)
+    flow = stereo.flow(near, other, T, grid)
+    keep = flow.keep & (truth > NEAR)
+    assert keep.sum() > 200 and float(((flow.depth - truth).abs() / truth)[keep].median()) < 0.06
+    filled = filling.bilateral(near, grid)
+    at = grid.usable
+    assert bool(filled.keep.all()) and float((filled.depth - truth).abs()[at].median()) < 0.1
+    assert bool((filled.score[at].mean() > filled.score[~at].mean()).all()), "what was carried far is less sure"
+    lost = se3.identity(1, torch.zeros(1)).map(lambda x: x * torch.nan)
+    for silent in (
+        stereo.flow(near, other, lost, grid),
+        stereo.semi_global(near, other, lost, grid, nearest_m=truth[:, 0]),
+    ):
+        assert bool((silent.gate == Gate.NO_POSE).all()) and bool(silent.depth.isnan().all())
+
+
+def test_views_before_each_other_cannot_be_rectified(pair):
+    near, other, _, grid, _ = pair
+    ahead = se3.exp(torch.tensor([[0.0, 0.0, 0.0, 0.01, 0.0, -0.2]]))
+    beside = se3.exp(torch.tensor([[0.0, 0.0, 0.0, 0.2, 0.0, -0.01]]))
+    views = (near.camera, near.hw), (other.camera, other.hw)
+    assert [bool(stereo.epipole_inside(views, T)) for T in (ahead, beside)] == [True, False]
+    silent = stereo.semi_global(near, other, ahead, grid, nearest_m=torch.tensor([1.4]))
+    assert bool((silent.gate == Gate.NO_BASELINE).all())
+
+
+def test_a_map_is_read_at_the_nearest_pixel_and_the_sensor_is_no_answer(pair):
+    near, _, _, grid, _ = pair
+    h, w = 30, 40
+    depth = torch.arange(h * w, dtype=torch.float32).view(1, h, w) + 1
+    source = torch.full((1, h, w), Source.SWEPT, dtype=torch.int32)
+    source[:, :, :20] = Source.SENSOR
+    found = DepthMap(depth, 0.1 * depth, torch.full_like(depth, 0.5), source, torch.zeros_like(source))
+    got = dense_comparison.read(found, grid, near)
+    u, v = ((grid.uv[0, :, k] + 0.5) / 4 - 0.5 for k in (0, 1))
+    right = u > 19.6
+    expected = (v.round().clamp(0, h - 1) * w + u.round().clamp(0, w - 1) + 1)[right]
+    assert torch.equal(got.keep[0], (u + 0.5).floor() > 19.5)
+    inner = got.keep[0][right] & ((u[right] % 1 - 0.5).abs() > 0.01) & ((v[right] % 1 - 0.5).abs() > 0.01)
+    assert torch.equal(got.depth[0][right][inner], expected[inner])
+
+
+def test_rooms_are_judged_where_both_views_see_texture(room):
+    anchor, other = room[3], room[11]
+    odd = torch.zeros(1, 120, 160, dtype=torch.bool)
+    asked = exact_rooms.judged(anchor, other, odd)
+    assert 500 < asked.sum() < 0.9 * asked.numel() and bool((anchor.depth[asked] > NEAR).all())
+    odd[:, :, 80:] = True
+    assert not bool(exact_rooms.judged(anchor, other, odd)[:, :, 76:].any())
+    away = other.replace(depth=0.5 * other.depth)
+    assert not bool(exact_rooms.judged(anchor, away, odd).any()), "another surface stands before it"
+
+
+@pytest.mark.parametrize("option", [{"stride": 0}, {"anchors": 0}, {"stride": 1.5}])
+def test_bad_options_are_refused(option):
+    with pytest.raises(ValueError, match=f"experiment.{next(iter(option))}"):
+        dense_comparison.run([], {"map": METHOD}, by_gap, Settings(), **option)
+
+
+def _truth(exact, grid):
+    u, v = grid.uv[0].round().long().unbind(-1)
+    return exact.depth[:, v.clamp(0, exact.depth.shape[-2] - 1), u.clamp(0, exact.depth.shape[-1] - 1)]

@@ -1,0 +1,50 @@
+"""The first release is written out: no default of a stage can change it, and today's methods still answer as it does."""
+
+import inspect
+import math
+from dataclasses import fields
+from functools import partial
+
+import pytest
+import torch
+
+from dhtorch.experiments.baselines.frozen import MAP_1, WINDOW_1
+from dhtorch.pipeline.method import Method
+from dhtorch.pipeline.presets import MAP, WINDOW
+from dhtorch.synthetic import SyntheticRoom
+
+#: Said by the caller at run time.
+AT_RUN_TIME = {"hint", "device", "dtype", "linear"}
+
+
+def left_open(seat, path):
+    """Options of a function, and of the functions among them, that would follow a default."""
+    function, given = (seat.func, seat.keywords) if isinstance(seat, partial) else (seat, {})
+    for name, parameter in inspect.signature(function).parameters.items():
+        if parameter.kind is not parameter.KEYWORD_ONLY or name in AT_RUN_TIME:
+            continue
+        if name not in given:
+            yield f"{path}.{name}"
+        elif callable(given[name]):
+            yield from left_open(given[name], f"{path}.{name}")
+
+
+@pytest.mark.parametrize("method", [MAP_1, WINDOW_1])
+def test_every_option_is_written_out(method):
+    seats = {f.name: getattr(method, f.name) for f in fields(Method) if callable(getattr(method, f.name))}
+    assert len(seats) >= 8
+    assert not [name for seat, f in seats.items() for name in left_open(f, seat)]
+
+
+def test_an_option_that_follows_a_default_would_be_seen():
+    assert [*left_open(partial(MAP_1.track.func, levels=5), "track")]
+
+
+@pytest.mark.parametrize(("first", "today", "views"), [(MAP_1, MAP, 1), (WINDOW_1, WINDOW, 3)])
+def test_today_s_method_of_that_name_answers_bit_for_bit_as_it_did(first, today, views):
+    room = SyntheticRoom(n_frames=7, hw=(240, 320))
+    others = [room[2 * k + 2] for k in range(views)]
+    a, b = (m(room[0], others if views > 1 else others[0], n=512) for m in (first, today))
+    assert int(a.keep.sum()) > 20
+    for field in ("depth", "sigma", "score", "gate"):
+        assert torch.equal(getattr(a, field).nan_to_num(-math.pi), getattr(b, field).nan_to_num(-math.pi)), field

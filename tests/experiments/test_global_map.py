@@ -1,0 +1,58 @@
+"""The experiment on global maps: what it counts, and that its verdict can go either way."""
+
+import pytest
+from support.rooms import Changed, noted
+from test_protocols import method, rows
+
+from dhtorch.data.pairs import by_gap
+from dhtorch.experiments.paper import global_map as experiment
+from dhtorch.experiments.protocol import Settings
+from dhtorch.synthetic.recording import SyntheticRoom
+
+
+def room(**options):
+    return SyntheticRoom(**{"hw": (240, 320), "n_frames": 4, "step_m": 0.04, "supersample": 1, **options})
+
+
+def asked(recording):
+    return experiment.run([noted(recording, gap=2)], {"paper": method()}, by_gap, Settings(), n=700, voxel=0.03)
+
+
+@pytest.fixture(scope="module")
+def outcome():
+    return asked(room())
+
+
+def test_four_maps_of_one_room(outcome):
+    found = {v: outcome.scenes(v, experiment.TRUTH)["synthetic_room"] for v in experiment.VARIANTS}
+    device, fused = found["sensor device"], found["fused device"]
+    assert device["n_voxels"] > 300 and fused["n_voxels"] > device["n_voxels"] and fused["n_recovered"] > 50
+    assert fused["voxels_vs_sensor"] == fused["n_voxels"] / device["n_voxels"]
+    assert device["right_share"] > 0.99, "what the sensor says with a cutoff it also says without"
+    assert 0.3 < fused["right_share"] < device["right_share"]
+    assert fused["n_fragments"] == 1 and found["fused anchored"]["n_fragments"] >= 1
+    assert [r["pair"] for r in outcome.rows if r["pair"] and r["method"] == "fused device"] == [[0, 2], [1, 3]]
+    links = [r["pair"] for r in outcome.rows if r["pair"] and r["method"] == "fused anchored"]
+    assert links == [[0, 2], [1, 3], [0, 1], [1, 2], [2, 3]]
+
+
+def test_without_a_trajectory_there_are_anchored_maps_alone():
+    blind = Changed(room(n_frames=3), poses=None)
+    found = asked(blind)
+    assert found.verdict == "undecided" and found.why == "no scene with a trajectory"
+    assert found.scenes("fused device", experiment.TRUTH)["synthetic_room"]["note"] == "nothing to ask"
+    assert found.scenes("fused anchored", experiment.TRUTH)["synthetic_room"]["n_voxels"] > 0
+
+
+@pytest.mark.parametrize(
+    ("voxels", "islands", "expected"),
+    [(120, 9, True), (120, 5, True), (120, 4, False), (100, 9, False), (None, 9, None)],
+)
+def test_verdict_goes_either_way(voxels, islands, expected):
+    outcome = rows(
+        ("a", "sensor device", experiment.TRUTH, {"n_voxels": 100, "n_islands": 5}),
+        ("a", "fused device", experiment.TRUTH, {"n_voxels": voxels, "n_islands": islands}),
+        ("a", "fused anchored", experiment.TRUTH, {"n_fragments": 3}),
+    )
+    holds, why = experiment.verdict(outcome)
+    assert holds is expected and ("1.20 times" in why) is (voxels == 120)

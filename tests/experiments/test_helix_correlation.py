@@ -1,0 +1,175 @@
+"""Shifts along spiral arms where they are known: of a signal, of a picture that slides, and of one that grows."""
+
+import math
+
+import pytest
+import torch
+from support.rooms import noted
+from test_protocols import method, room, rows
+
+from dhtorch.data.pairs import by_gap
+from dhtorch.experiments.negative import helix_correlation as experiment
+from dhtorch.experiments.negative.arms import correlate, read_arm
+from dhtorch.experiments.protocol import Settings
+
+HW = (160, 200)
+CENTRE = torch.tensor([99.5, 79.5])
+
+
+def waves(at, seed=0, n=40, shortest=9.0):
+    """A smooth random function of places (…, d) with values in [0, 1]."""
+    generator = torch.Generator().manual_seed(seed)
+    turn = torch.randn(n, at.shape[-1], generator=generator)
+    turn = (
+        turn
+        / turn.norm(dim=-1, keepdim=True)
+        * 2
+        * math.pi
+        / (shortest * (1 + 4 * torch.rand(n, 1, generator=generator)))
+    )
+    phase = 2 * math.pi * torch.rand(n, generator=generator)
+    return 0.5 + (at @ turn.T.to(at) + phase).sin().sum(-1) / (2 * math.sqrt(n) * 2)
+
+
+def picture(move=lambda uv: uv):
+    v, u = torch.meshgrid(torch.arange(float(HW[0])), torch.arange(float(HW[1])), indexing="ij")
+    return waves(move(torch.stack((u, v), -1)), shortest=20.0)[None, None]
+
+
+def signals(*shifts, length=400):
+    x = torch.arange(length).double()[:, None]
+    return torch.stack([waves(x - shift) for shift in shifts])
+
+
+def sites(batch, *at):
+    return torch.tensor(at).expand(batch, -1)
+
+
+def test_a_known_shift_is_found_between_steps():
+    shifts = (0.0, 7.3, -11.6)
+    at = sites(3, 80, 150, 200, 300)
+    found = correlate(signals(0, 0, 0), 0.5 * signals(*shifts) + 0.2, at, at)
+    assert bool(found.valid.all()) and float(found.peak.min()) > 0.97
+    torch.testing.assert_close(found.lag, torch.tensor(shifts).double()[:, None].expand(-1, 4), atol=0.05, rtol=0)
+
+
+def test_the_search_may_start_elsewhere():
+    at = sites(1, 150, 200)
+    found = correlate(signals(0), signals(30.0), at, at + 25, max_lag=10)
+    torch.testing.assert_close(found.lag, torch.full((1, 2), 5.0).double(), atol=0.05, rtol=0)
+
+
+def test_what_cannot_be_found_is_not_valid():
+    at = sites(1, 20, 200, 395)
+    assert correlate(signals(0), signals(0), at, at).valid.tolist() == [[False, True, False]], "windows leave the arm"
+    flat = torch.full((1, 400), 0.3).double()
+    for first, second in ((flat, signals(0)), (signals(0), flat)):
+        found = correlate(first, second, at, at)
+        assert not bool(found.valid.any()) and not bool(found.lag.any()) and not bool(found.peak.any())
+    middle = sites(1, 200)
+    assert not bool(correlate(signals(0), signals(20.0), middle, middle, max_lag=15, min_peak=0.9).valid.any())
+
+
+def test_gradient_moves_the_shift():
+    first, at = signals(0), sites(1, 150, 250)
+    shift = torch.tensor(4.3, dtype=torch.float64, requires_grad=True)
+    x = torch.arange(400).double()[:, None]
+    correlate(first, waves(x - shift)[None], at, at).lag.sum().backward()
+    assert abs(float(shift.grad) - 2) < 0.2, "each of the two lags follows the shift"
+
+
+def test_wrong_options_and_short_signals_say_so():
+    at = sites(1, 5)
+    for options in ({"window": 20}, {"window": 1}, {"max_lag": 0}):
+        with pytest.raises(ValueError, match="expected odd from 3, and from 1"):
+            correlate(signals(0), signals(0), at, at, **options)
+    with pytest.raises(ValueError, match="signals have 30 and 400 steps, expected at least 41 and 121"):
+        correlate(signals(0, length=30), signals(0), at, at)
+
+
+def test_an_arm_reads_between_pixels():
+    ramp = torch.arange(30.0).expand(20, 30)[None, None] / 30 + torch.arange(20.0)[:, None] / 50
+    arm = torch.tensor([[3.25, 4.5], [12.0, 7.75], [29.0, 19.0]])
+    expected = arm[:, 0] / 30 + arm[:, 1] / 50
+    torch.testing.assert_close(read_arm(ramp, arm, blur_px=0)[0], expected)
+    torch.testing.assert_close(read_arm(ramp, arm[1:2])[0], expected[1:2])  # a blur leaves a ramp alone
+    byte = (255 * ramp).round().clamp(0, 255).to(torch.uint8)
+    torch.testing.assert_close(read_arm(byte, arm[:2], blur_px=0)[0], expected[:2], atol=0.005, rtol=0)
+
+
+def test_arms_are_curves_of_even_steps_half_a_turn_apart():
+    first, second = experiment.arms_of(HW, 512, CENTRE)
+    for arm in (first, second):
+        steps = arm.uv.diff(dim=0).norm(dim=-1)
+        assert float(steps.quantile(0.05)) > 0.97 and float(steps.max()) < 1.01
+        torch.testing.assert_close(arm.tangent.norm(dim=-1), torch.ones(len(arm.uv)))
+    k = torch.searchsorted(second.turn, first.turn[700:2500:300])
+    out, back = first.uv[700:2500:300] - CENTRE, second.uv[k] - CENTRE
+    cosine = (out * back).sum(-1) / out.norm(dim=-1) / back.norm(dim=-1)
+    assert float(cosine.max()) < -0.99, "equal turns lie on opposite sides"
+
+
+def test_round_arms_wind_in_circles():
+    for arm in experiment.arms_of(HW, 512, CENTRE, round_arms=True):
+        way = arm.uv[300:] - CENTRE
+        radius = way.norm(dim=-1)
+        assert float(radius.max()) == pytest.approx(79.5, abs=0.5) and bool((radius.diff() > 0).all())
+        assert float(((way / radius[:, None]) * arm.tangent[300:]).sum(-1).abs().max()) < 0.1, "hardly any radial part"
+
+
+def along(move):
+    """Lags along a round arm where they were found, tangents and ways from the centre there."""
+    arm, _ = experiment.arms_of(HW, 512, CENTRE, round_arms=True)
+    at = torch.arange(100, len(arm.uv) - 100, 15)
+    first, second = (read_arm(p, arm.uv) for p in (picture(), picture(move)))
+    found = correlate(first, second, at[None], at[None], window=41, max_lag=15, min_peak=0.8)
+    valid = found.valid[0]
+    assert int(valid.sum()) > 40
+    return found.lag[0, valid], arm.tangent[at[valid]], arm.uv[at[valid]] - CENTRE
+
+
+def test_a_sliding_picture_shifts_along_the_arm_by_its_tangential_part():
+    slide = torch.tensor([2.0, 1.0])
+    lag, tangent, _ = along(lambda uv: uv - slide)
+    wrong = (lag - tangent @ slide).abs()
+    assert float(wrong.median()) < 0.2 * float(slide.norm()) and float(wrong.quantile(0.8)) < 0.6 * float(slide.norm())
+
+
+def test_a_turning_picture_is_seen_and_a_growing_one_is_not():
+    angle = torch.tensor(0.04)
+    turn = torch.stack((torch.stack((angle.cos(), angle.sin())), torch.stack((-angle.sin(), angle.cos()))))
+    seen = {}
+    for name, move in {
+        "turns": lambda uv: CENTRE + (uv - CENTRE) @ turn.T,
+        "grows": lambda uv: CENTRE + (uv - CENTRE) / 1.04,
+    }.items():
+        lag, _, way = along(move)
+        assert float((0.04 * way.norm(dim=-1)).median()) > 1.5, "every point moves"
+        seen[name] = float((lag.abs() / (0.04 * way.norm(dim=-1))).median())
+    assert 0.9 < seen["turns"] < 1.1 and seen["grows"] < 0.35
+
+
+@pytest.mark.slow
+def test_forward_motion_is_not_seen_where_plain_flow_sees_it():
+    base = method()
+    ahead = room(path="forward", step_m=0.03)
+    up = ahead.camera.f[0, 1] * math.tan(math.radians(9))  # the viewer looks 9 degrees below where it goes
+    focus = ahead.camera.c[0] - torch.tensor([0.0, float(up)])
+    gaze = tuple(focus.tolist())
+    outcome = experiment.run([noted(ahead, gap=3)], {"paper": base}, by_gap, Settings(), gaze=gaze, round_arms=True)
+    found = {v: outcome.scenes(v)["synthetic_room"] for v in experiment.VARIANTS}
+    assert found["flow"]["corr"] > 0.6 and found["own_arm"]["corr"] < 0.5 * found["flow"]["corr"]
+    assert found["flow_along_arm"]["flow_share"] < 0.15 and found["own_arm"]["flow_share"] < 0.3
+    assert found["flow_along_arm"]["along_share"] == 1 and found["own_arm"]["along_share"] > 0.5
+    assert found["flow"]["coverage"] > 0.8 and outcome.verdict == "supported"
+    pairs = [r for r in outcome.rows if r["pair"] is not None]
+    assert len(pairs) == 5 * outcome.n_pairs and "own_arm.corr" in outcome.summary
+
+
+@pytest.mark.parametrize(
+    ("helix", "flow", "expected"),
+    [(0.0, 0.3, True), (0.2, 0.3, False), (0.4, 0.3, False), (-0.2, -0.1, None), (None, 0.3, None)],
+)
+def test_verdict_goes_either_way(helix, flow, expected):
+    outcome = rows(("a", "own_arm", "full", {"corr": helix}), ("a", "flow", "full", {"corr": flow}))
+    assert experiment.verdict(outcome)[0] is expected

@@ -1,0 +1,137 @@
+"""Seat 7 with weights learns which answers err, and is judged on rooms it has not seen; the seat alone: test_score.py."""
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+from support.rooms import noted
+
+from dhtorch.cli.run import config_dir
+from dhtorch.data.pairs import by_gap
+from dhtorch.experiments.probes import learned_score
+from dhtorch.experiments.probes.learned_score import Lesson, train
+from dhtorch.experiments.protocol import Settings
+from dhtorch.metrics import bootstrap, holdout, risk
+from dhtorch.metrics.errors import select
+from dhtorch.stages.score import EVIDENCE, LearnedScore
+from dhtorch.synthetic.recording import SyntheticRoom
+
+with initialize_config_dir(str(config_dir()), version_base="1.3"):
+    MAP = instantiate(compose("run", ["method=map", "method.n=512"]).method, _convert_="all")
+
+
+class Room(SyntheticRoom):
+    """One pair of views of the room that other tests draw, too, drawn once."""
+
+    def __init__(self, **options):
+        super().__init__(hw=(120, 160), supersample=1, path="orbit", n_frames=17, **options)
+        self.drawn = {}
+
+    def __getitem__(self, i):
+        if i not in self.drawn:
+            self.drawn[i] = super().__getitem__(i)
+        return self.drawn[i]
+
+
+@pytest.fixture(scope="module")
+def rooms():
+    """Two, which differ in how far their views lie apart."""
+    return [noted(room, gap=16) for room in (Room(name="room0"), Room(name="room1", step_m=0.025))]
+
+
+def held_out(scene, method):
+    """(trace, points) of the pair."""
+    recording = scene.recording
+    frame = recording[0]
+    trace = {}
+    near, other = (holdout.range_split(recording[k], scene.near) for k in (0, 16))
+    estimate = method(near, other, trace=trace)
+    known = frame.replace(depth=recording.truth(0)["depth"], depth_camera=None)
+    truth = holdout.candidates(trace["samples"], holdout.truth_at(known, trace["samples"].uv), scene.near)
+    return trace, select(estimate, truth)
+
+
+def made_up(n=4000, seed=0):
+    """Answers whose mean error is what a score by hand expects, times what the photometric evidence says."""
+    g = torch.Generator().manual_seed(seed)
+    x = torch.randn(n, len(EVIDENCE), generator=g) * 0.5 - 3.5
+    mean = (x[:, 0] + 1.5 * (x[:, 5] + 3.5)).exp()
+    return Lesson(x, -mean * (1 - torch.rand(n, generator=g)).log())
+
+
+def aurc(error, expected):
+    return float(risk.curve(error.clamp(max=1).double(), -expected.double()).mean())
+
+
+def test_it_learns_what_makes_answers_err_and_foresees_the_mean_error():
+    scorer, unseen = train([made_up(seed=0), made_up(seed=1)]), made_up(seed=2)
+    expected = scorer.log_error(unseen.x).exp()
+    assert aurc(unseen.error, expected) < 0.9 * aurc(unseen.error, unseen.x[:, 0])
+    for some in (unseen.x[:, 5] > -3.2, (unseen.x[:, 5] + 3.5).abs() < 0.3, unseen.x[:, 5] < -3.8):
+        assert float(expected[some].mean() / unseen.error[some].clamp(max=1).mean()) == pytest.approx(1, abs=0.15)
+    once, again = (train([made_up(200), made_up(200, seed=1)], steps=3).state_dict() for _ in range(2))
+    assert all(torch.equal(a, b) for a, b in zip(once.values(), again.values(), strict=True))
+    with pytest.raises(ValueError, match="no answer with truth"):
+        train([Lesson(torch.zeros(0, 8), torch.zeros(0))])
+
+
+def test_scenes_weigh_the_same_however_many_answers_they_have():
+    """A large scene whose photometric evidence is right and a small one where it is the wrong way round."""
+    right, wrong = made_up(4000, seed=0), made_up(4000, seed=1)
+    turned = wrong.replace(x=torch.cat((wrong.x[:, :5], -7 - wrong.x[:, 5:6], wrong.x[:, 6:]), 1))
+    probe = torch.full((2, len(EVIDENCE)), -3.5)
+    probe[0, 5], probe[1, 5] = -2.5, -4.5
+    even = train([right, turned[:400]], most=4000, steps=100).log_error(probe)
+    alone = train([right], most=4000, steps=100).log_error(probe)
+    assert float(alone[0] - alone[1]) == pytest.approx(3.0, abs=0.8)
+    assert abs(float(even[0] - even[1])) < 0.5 * float(alone[0] - alone[1])
+
+
+def test_the_experiment_scores_the_same_answers_three_ways(tmp_path, monkeypatch, rooms):
+    taught = []
+
+    def remembered(lessons, **options):
+        taught.append(lessons)
+        return train(lessons, **options)
+
+    monkeypatch.setattr(learned_score, "train", remembered)
+    target = tmp_path / "score.json"
+    outcome = learned_score.run(rooms, {"map": MAP}, by_gap, Settings(), steps=20, save=str(target))
+    rows = {v: outcome.scenes(v) for v in ("paper", "by_error", "learned")}
+    for scene in ("room0", "room1"):
+        for same in ("n_kept", "median_rel", "coverage"):
+            assert len({r[scene][same] for r in rows.values()}) == 1, "only the order differs"
+        assert rows["paper"][scene]["n_kept"] > 20
+        assert len({r[scene]["aurc"] for r in rows.values()}) == 3
+    for_first, for_second, for_all = taught
+    assert len(for_first) == len(for_second) == 1 and len(for_all) == 2
+    assert torch.equal(for_all[0].x, for_second[0].x) and torch.equal(for_all[1].x, for_first[0].x)
+    trace, _ = held_out(rooms[0], MAP.replace(score=train(for_first, steps=20)))
+    scores = outcome.points["room0", "learned", "full"].answered().score
+    assert torch.isin(scores, trace["estimate"].score.double()).all(), "the other room's scorer sat in the seat"
+    saved = LearnedScore.read(target)
+    assert saved.provenance["scenes"] == ["room0", "room1"] and saved.provenance["steps"] == 20
+    assert {"learned.aurc_ratio", "learned.aurc_ratio_by_error", "by_error.aurc_ratio"} <= outcome.summary.keys()
+
+
+def test_one_room_is_not_enough_and_several_views_are_refused(rooms):
+    outcome = learned_score.run(rooms[:1], {"map": MAP}, by_gap, Settings(), steps=2)
+    assert outcome.verdict == "undecided" and "two rooms" in outcome.why
+    (row,) = outcome.scenes("learned").values()
+    assert row["note"] == "no other room to learn from"
+    with pytest.raises(ValueError, match="two views"):
+        learned_score.run(rooms[:1], {"window": MAP.replace(views=3)}, by_gap, Settings())
+
+
+def test_the_verdict_goes_either_way():
+    def decide(paper, by_hand):
+        found = {
+            k: bootstrap.Interval(*v, 9)
+            for k, v in (("learned.aurc_ratio", paper), ("learned.aurc_ratio_by_error", by_hand))
+        }
+        return learned_score.verdict(found)[0]
+
+    assert decide((0.6, 0.5, 0.7), (0.9, 0.85, 0.95)) is True
+    assert decide((0.6, 0.5, 0.7), (0.95, 0.85, 1.02)) is None
+    assert decide((0.6, 0.5, 0.7), (1.01, 0.85, 1.2)) is False
+    assert decide((0.6, None, None), (0.9, None, None)) is None

@@ -1,0 +1,239 @@
+"""The main job and the method comparison, on the exact room and on the real scenes."""
+
+import os
+from functools import cache, partial
+from pathlib import Path
+
+import hydra
+import pytest
+import torch
+from hydra.utils import instantiate
+from support.rooms import noted
+from support.rooms import room as rendered
+
+from dhtorch import data
+from dhtorch.cli.run import config_dir
+from dhtorch.codes import Gate, names
+from dhtorch.data.pairs import by_gap
+from dhtorch.experiments import pair, protocol
+from dhtorch.experiments.compare import opencv_twin
+from dhtorch.runtime import results as archive
+from dhtorch.stages.track import lucas_kanade
+from dhtorch.synthetic.recording import SyntheticRoom
+
+ROOT = os.environ.get("DHTORCH_DATA")
+
+
+@cache
+def composed(name):
+    with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
+        return hydra.compose("run", [f"method={name}"]).method
+
+
+def method(name):
+    return instantiate(composed(name), _convert_="all")
+
+
+def scene_row(outcome, **wanted):
+    (row,) = (r for r in outcome.rows if r["pair"] is None and all(r[k] == v for k, v in wanted.items()))
+    return row
+
+
+def test_exact_room_without_sensor_noise():
+    """Median error of recovered far depth < 1 %, silently wrong < 0.5 %; mirror and window are counted apart."""
+    room = rendered(lidar="exact", image_noise=0.0, hw=(240, 320), n_frames=8, supersample=2)
+    row = scene_row(pair.run([noted(room)], {"paper": method("paper")}, by_gap, pair.Settings()))
+    assert row["n_pairs"] == 2 and row["n_candidates"] > 400
+    assert row["median_rel"] < 0.01 and row["wrong_share"] < 0.005 and row["coverage"] > 0.93, row
+    assert set(row["apart"]) == {"mirror", "window"} and row["apart"]["mirror"]["n_candidates"] > 100
+    assert row["apart"]["mirror"]["wrong_share"] > 0.25, "what is seen in a mirror lies behind it"
+    assert row["n_dropped"]["excluded"] == sum(row["apart"][k]["n_candidates"] for k in ("mirror", "window"))
+
+
+#: What the median error of the built-in room stays below, exact depth and no noise: 1 % does not hold for every seed.
+BOUNDS = {0: 0.02, 1: 0.01, 2: 0.01, 3: 0.011, 4: 0.02}
+
+
+def test_the_committed_rooms_of_five_seeds_keep_their_bounds():
+    result = archive.read(Path(__file__).parents[2] / "benchmarks/results/room_exact.json")
+    wanted = {"method": "paper", "truth": "full", "pair": None}
+    found = {r["scene"]: r["median_rel"] for r in result["rows"] if all(r[k] == v for k, v in wanted.items())}
+    assert set(found) == {f"synthetic_walk_{seed}" for seed in BOUNDS}
+    assert all(found[f"synthetic_walk_{seed}"] < bound for seed, bound in BOUNDS.items())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", BOUNDS)
+def test_the_room_of_every_seed_keeps_its_bound(seed):
+    room = SyntheticRoom(seed=seed, lidar="exact", image_noise=0.0)
+    row = scene_row(pair.run([noted(room)], {"paper": method("paper")}, by_gap, pair.Settings()))
+    assert row["median_rel"] < BOUNDS[seed] and row["wrong_share"] < 0.005 and row["coverage"] > 0.9, row
+
+
+def test_room_with_the_phone_lidar():
+    room = rendered(hw=(240, 320), n_frames=8)
+    outcome = pair.run([noted(room)], {"paper": method("paper")}, by_gap, pair.Settings())
+    row = scene_row(outcome)
+    assert row["coverage"] > 0.9 and row["median_rel"] < 0.03, row
+    shares = row["hole_share"]
+    assert abs(sum(shares.values()) - 1) < 1e-6 and shares["trackable_no_lidar"] > 0.7
+    assert set(row["gate_share"]) == {g.lower() for g in names(Gate).values()}
+    assert outcome.summary["median_rel"]["value"] == row["median_rel"]
+    assert outcome.examples[0].scene == "synthetic_room" and outcome.n_pairs == 2
+
+
+def small(**options):
+    return rendered(hw=(120, 160), n_frames=4, **options)
+
+
+def test_without_a_cutoff_there_is_no_truth():
+    outcome = pair.run(
+        [noted(small())], {"paper": method("paper")}, partial(by_gap, gap=2), pair.Settings(cutoff=float("inf"))
+    )
+    row = scene_row(outcome)
+    assert row["n_candidates"] == 0 and row["median_rel"] is None and row["n_pairs"] == 2
+    assert row["pnp_success"] == 1.0 and row["n_recovered"] > 0
+
+
+def test_pairs_with_few_candidates_are_dropped_and_counted():
+    outcome = pair.run([noted(small())], {"paper": method("paper")}, partial(by_gap, gap=2), pair.Settings(cutoff=50.0))
+    row = scene_row(outcome)
+    assert row["n_few"] == 2 and row["n_pairs"] == 0 and "median_rel" not in row
+
+
+def test_a_rotation_scene_never_enters_the_summary():
+    rotation = small(path="rotation", lidar="exact")
+    outcome = pair.run([noted(rotation)], {"paper": method("paper")}, partial(by_gap, gap=2), pair.Settings())
+    assert scene_row(outcome)["role"] == "rotation" and outcome.summary == {}
+
+
+def test_variants_share_tracks_and_pay_for_them():
+    asked = []
+
+    def track(*args, hint):
+        asked.append(args)
+        return lucas_kanade(*args, hint=hint)
+
+    base = method("paper")
+    variants = {
+        "gated": protocol.Variant(base.replace(track=track)),
+        "other_seed": protocol.Variant(base.replace(track=track), seed=7),
+        "own": protocol.Variant(base),
+    }
+    outcome = protocol.run([noted(small())], protocol.Protocol(variants), partial(by_gap, gap=3), protocol.Settings())
+    assert len(asked) == outcome.n_pairs == 1
+    rows = [scene_row(outcome, method=name) for name in variants]
+    assert rows[0]["ms"]["track"] == pytest.approx(rows[1]["ms"]["track"], rel=0.5)
+    same = [{k: r[k] for k in ("coverage", "median_rel", "n_candidates")} for r in rows]
+    assert same[0] == same[2]
+    assert set(outcome.points) == {("synthetic_room", name, "full") for name in variants}
+
+
+def test_views_of_a_window_are_shared_too():
+    asked = []
+
+    def track(image_0, image_1, uv_0, *, hint):
+        asked.append(hint.start)
+        return lucas_kanade(image_0, image_1, uv_0, hint=hint)
+
+    base = method("window").replace(track=track, views=3)
+    variants = {name: protocol.Variant(base, seed=k) for k, name in enumerate(("first", "second"))}
+    outcome = protocol.run([noted(small())], protocol.Protocol(variants), partial(by_gap, gap=3), protocol.Settings())
+    assert len(asked) == 3 and asked[0] is None and asked[2] is not None, "one search for each view, not for each seed"
+    first, second = (scene_row(outcome, method=name) for name in variants)
+    assert first["ms"]["track"] == pytest.approx(second["ms"]["track"], rel=0.5)
+
+
+def test_a_scene_without_pairs_keeps_a_row_that_says_so():
+    room = small()
+    outcome = protocol.run(
+        [room], protocol.Protocol({"paper": protocol.Variant(method("paper"))}), lambda _: [], protocol.Settings()
+    )
+    assert scene_row(outcome)["note"] == "too short" and outcome.summary["n_pairs"]["value"] == 0
+
+
+def test_curves_of_a_scene_are_what_its_points_say():
+    outcome = pair.run(
+        [noted(small(lidar="exact"))], {"paper": method("paper")}, partial(by_gap, gap=2), pair.Settings()
+    )
+    row, points = scene_row(outcome), outcome.points["synthetic_room", "paper", "full"]
+    curve = row["curves"]["risk_coverage"]
+    five_digits = partial(pytest.approx, rel=1e-4)
+    assert curve["coverage"][-1] == five_digits(row["coverage"])
+    assert curve["median_rel"][-1] == five_digits(row["median_rel"])
+    assert curve["risk"][-1] == five_digits(float(points.answered().error.clamp(max=1).mean()))
+    assert all(a >= b for a, b in zip(curve["risk"], curve["oracle"], strict=True))
+    distance = row["curves"]["distance"]
+    assert distance["depth"] == sorted(distance["depth"]) and len(distance["coverage"]) == 10
+    assert sum(row["curves"]["reliability"]["weight"]) == five_digits(1)
+
+
+def test_candidates_do_not_depend_on_the_method():
+    methods = {name: method(name) for name in ("paper", "opencv")}
+    outcome = opencv_twin.run(
+        [noted(small(lidar="exact"))], {}, partial(by_gap, gap=2), pair.Settings(), methods=methods
+    )
+    for truth in ("raw", "5x5", "full"):
+        a, b = (scene_row(outcome, method=m, truth=truth) for m in methods)
+        assert a["n_candidates"] == b["n_candidates"] and a["n_dropped"] == b["n_dropped"]
+    counts = [scene_row(outcome, method="paper", truth=t)["n_candidates"] for t in ("raw", "5x5", "full")]
+    assert counts[0] > counts[1] > counts[2]
+    assert {"paper.median_rel", "opencv.median_rel", "paper.raw.median_rel"} <= set(outcome.summary)
+    assert outcome.verdict in ("supported", "refuted") and outcome.why
+
+
+def test_verdict_goes_either_way():
+    def row(scene, method, median, coverage):
+        return {
+            "scene": scene,
+            "pair": None,
+            "method": method,
+            "truth": "full",
+            "role": None,
+            "median_rel": median,
+            "coverage": coverage,
+        }
+
+    rows = [
+        row("a", "ours", 0.05, 0.5),
+        row("a", "ref", 0.05, 0.5),
+        row("b", "ours", 0.056, 0.5),
+        row("b", "ref", 0.05, 0.5),
+    ]
+    assert opencv_twin.compare(rows[:2], "ours", "ref", "full", 0.1) == (1, [])
+    compared, worse = opencv_twin.compare(rows, "ours", "ref", "full", 0.1)
+    assert compared == 2 and len(worse) == 1 and "b median_rel" in worse[0]
+    assert opencv_twin.compare([*rows[:1], row("a", "ref", 0.05, 0.6)], "ours", "ref", "full", 0.1)[1]
+    with pytest.raises(ValueError, match=r"experiment\.methods"):
+        opencv_twin.run([], {"paper": method("paper")}, by_gap, pair.Settings())
+
+
+@pytest.mark.data
+@pytest.mark.skipif(not ROOT, reason="DHTORCH_DATA is not set")
+@pytest.mark.parametrize(
+    ("name", "near", "gap", "coverage", "median"),
+    [
+        ("holo_a", 2.5, 3, 0.12, 0.08),
+        ("tum_fr1_desk9", 1.0, 4, 0.5, 0.12),
+        ("middlebury_motorcycle", 2.8, 1, 0.6, 0.05),
+    ],
+)
+def test_real_scenes_give_far_depth(name, near, gap, coverage, median):
+    (scene,) = data.open_capture(Path(ROOT) / name, near=near, gap=gap)
+    stride = 8 if len(scene.recording) > 20 else 1
+    row = scene_row(pair.run([scene], {"paper": method("paper")}, partial(by_gap, stride=stride), pair.Settings()))
+    assert row["coverage"] > coverage and row["median_rel"] < median and row["pnp_success"] > 0.7, row
+
+
+@pytest.mark.data
+@pytest.mark.skipif(not ROOT, reason="DHTORCH_DATA is not set")
+def test_alone_or_in_a_batch_the_rows_of_a_real_scene_are_equal():
+    torch.set_num_threads(1)
+    (scene,) = data.open_capture(Path(ROOT) / "tum_fr1_desk9", near=1.0, gap=4)
+    rows = []
+    for batch, workers in ((1, 0), (5, 2)):
+        settings = pair.Settings(batch=batch, workers=workers)
+        outcome = pair.run([scene], {"paper": method("paper")}, by_gap, settings)
+        assert outcome.n_pairs == 5
+        rows.append([{k: v for k, v in r.items() if k != "ms"} for r in outcome.rows])
+    assert rows[0] == rows[1]

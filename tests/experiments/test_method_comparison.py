@@ -1,0 +1,165 @@
+"""Methods against the paper's, several seeds: what is compared, what is named, and a verdict that goes either way."""
+
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+from hydra import compose as compose_settings
+from hydra import initialize_config_dir
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from support import numbered_frames as stepping
+
+from dhtorch.cli.run import config_dir
+from dhtorch.data.pairs import by_gap
+from dhtorch.experiments import compare_methods as compare
+from dhtorch.experiments.compare import method_comparison
+from dhtorch.experiments.protocol import Settings
+from dhtorch.metrics import errors
+from dhtorch.synthetic.recording import open_rooms
+from dhtorch.synthetic.stress import STRESSES
+
+
+def method(name="paper"):
+    with initialize_config_dir(str(config_dir()), version_base="1.3"):
+        return instantiate(compose_settings("run", [f"method={name}", "method.n=768"]).method, _convert_="all")
+
+
+@pytest.fixture(scope="module")
+def outcome():
+    rooms = open_rooms(("walk", "lateral", "rotation"), n_frames=4, hw=(192, 256), gap=3, lidar="exact")
+    methods = {"paper": method(), "strict": method().replace(triangulate={"max_residual_px": 0.5})}
+    methods["opencv"] = method("opencv")
+    moving = ["synthetic_lateral", "synthetic_rotation", "elsewhere"]
+    return method_comparison.run(rooms, {}, by_gap, Settings(), methods=methods, seeds=2, moving=moving)
+
+
+def test_rows_are_those_of_the_first_seed(outcome):
+    assert {r["method"] for r in outcome.rows} == {"paper", "strict", "opencv"}
+    assert not any("seed" in k for k in outcome.summary)
+    row = outcome.scenes("strict")["synthetic_walk"]
+    numbers = row["against_paper"]
+    assert numbers["median_rel_ratio"] > 0 and "against_paper" not in outcome.scenes("paper")["synthetic_walk"]
+    assert "synthetic_rotation" not in outcome.scenes("strict")
+
+
+def test_summary_has_every_number_of_the_bars(outcome):
+    assert {f"strict.{number}" for number in method_comparison.BARS} <= set(outcome.summary)
+    assert "strict.median_rel_ratio_at_equal_coverage" in outcome.summary
+    assert outcome.summary["strict.median_rel_ratio"]["n"] == 2, "the rotation stays out"
+    assert outcome.verdict == "refuted" and "bars met" in outcome.why
+    ratios = [outcome.scenes("strict")[s]["against_paper"]["median_rel_ratio"] for s in outcome.scenes("strict")]
+    assert outcome.summary["strict.median_rel_ratio"]["value"] == pytest.approx((ratios[0] * ratios[1]) ** 0.5)
+
+
+def test_wrong_answers_where_near_things_move_count_whatever_the_role(outcome):
+    for name in ("paper", "strict"):
+        found = outcome.summary[f"{name}.convoy_wrong"]
+        assert found["n"] == 2, "the rotation is among them"
+        shares = []
+        for scene in ("synthetic_lateral", "synthetic_rotation"):
+            pools = [outcome.points[scene, variant, "full"] for variant in (name, f"{name}, seed 1")]
+            wrong = sum(int((p.keep & (p.error > 0.2)).sum()) for p in pools)
+            shares.append(wrong / sum(p.keep.numel() for p in pools))
+        assert found["value"] == pytest.approx(max(shares))
+    assert "opencv.convoy_wrong" not in outcome.summary
+
+
+def candidates(answered, wrong, silent):
+    depth = torch.tensor([1.0] * answered + [1.3] * wrong + [torch.nan] * silent)
+    return errors.points(depth, torch.ones_like(depth))
+
+
+def test_the_worst_room_is_the_one_with_most_wrong_answers_a_candidate():
+    few = [candidates(0, 1, 9), candidates(0, 3, 7)]  # all that is said is wrong, but little is said
+    many = [candidates(5, 4, 1), candidates(7, 2, 1)]
+    found = method_comparison._convoy_wrong("map", [few, many, [candidates(0, 0, 0)]])
+    assert found["map.convoy_wrong"]["value"] == pytest.approx(0.3) and found["map.convoy_wrong"]["n"] == 2
+    assert method_comparison._convoy_wrong("map", []) == {}
+
+
+def test_the_rooms_of_the_settings_are_those_in_which_a_body_moves():
+    with initialize_config_dir(str(config_dir()), version_base="1.3"):
+        named = compose_settings("run", ["experiment=method_comparison"]).experiment.moving
+    assert [*named] == [f"stress_{name}" for name, of in STRESSES.items() if of.moving]
+
+
+def judged(**changes):
+    good = {"median_rel_ratio": 0.6, "worst_scene_ratio": 1.0, "aurc_ratio": 0.5, "coverage_at_5": 0.3}
+    good |= {"within_sigma": 0.7, "within_2sigma": 0.95, "ece": 0.05, "realised_risk_10": 0.08}
+    values = good | {"realised_risk_5": 0.04} | changes
+    return compare.Comparison(summary={f"map.{k}": {"value": v} for k, v in values.items()})
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [({}, True), ({"within_sigma": 0.76}, False), ({"coverage_at_5": 0.25}, False), ({"aurc_ratio": None}, None)],
+)
+def test_verdict_goes_either_way(changes, expected):
+    assert method_comparison.verdict(judged(**changes), ["map"], set())[0] is expected
+
+
+def test_bars_of_many_views_are_higher():
+    assert method_comparison.verdict(judged(median_rel_ratio=0.65), ["map"], set())[0] is True
+    assert method_comparison.verdict(judged(median_rel_ratio=0.65), ["map"], {"map"})[0] is False
+
+
+def test_silent_and_left_out_scenes_are_named():
+    found = replace(judged(), left_out={"map": ["terrace"]}, silent={"map.5": ["desk"]})
+    why = method_comparison.verdict(found, ["map"], set())[1]
+    assert "without ratio: terrace" in why and "map.5 % risk silences desk" in why
+
+
+def test_nothing_to_compare_is_an_error():
+    with pytest.raises(ValueError, match=r"experiment\.methods: found paper, opencv"):
+        method_comparison.run([], {}, by_gap, Settings(), methods={"paper": method(), "opencv": method("opencv")})
+
+
+@pytest.mark.slow
+def test_a_method_that_chooses_is_offered_the_frames_around_and_held_against_the_window():
+    rooms = open_rooms(("walk", "lateral"), n_frames=7, hw=(192, 256), gap=3, lidar="exact")
+    rooms = [replace(room, room=name) for room, name in zip(rooms, ("hall", "attic"), strict=True)]
+    methods = {"paper": method(), "map": method("map"), "window": method("window").replace(views=2)}
+    methods["auto"] = method("auto").replace(views=3)
+    pairs = partial(by_gap, gap=3, stride=3)
+    found = method_comparison.run(rooms, {}, pairs, Settings(), methods=methods, seeds=1, indoor=["hall"])
+    rows = [r for r in found.rows if r["method"] == "auto" and r["pair"] is not None]
+    assert rows and all(len(r["views"]) == 3 and r["pair"][0] not in r["views"] for r in rows)
+    assert all("views" not in r for r in found.rows if r["method"] == "window")
+    for key in ("error_ratio_to_window", "aurc_full_ratio_to_window", "worst_scene_ratio_to_window"):
+        assert found.summary[f"auto.{key}"]["value"] > 0
+    assert found.summary["auto.coverage_at_5_indoor"]["n"] == 1
+    assert not any(k.startswith("map.error_ratio_to") for k in found.summary)
+    scenes = found.scenes("auto")
+    assert "aurc_full_ratio_to_window" in scenes["synthetic_walk"]
+    assert scenes["synthetic_walk"]["coverage"] > found.scenes("window")["synthetic_walk"]["coverage"] - 0.02
+
+
+def test_what_is_measured_is_held_against_the_first_release():
+    for experiment in ("method_comparison", "part_ablation"):
+        chosen = OmegaConf.load(config_dir() / f"experiment/{experiment}.yaml").defaults
+        named = {k: v for entry in chosen if isinstance(entry, DictConfig) for k, v in entry.items()}
+        assert (named["/method@methods.map"], named["/method@methods.window"]) == ("map_1", "window_1")
+        assert named["/method@methods.auto"] == "auto"
+
+
+def test_streams_are_of_rooms_that_the_shared_scenes_know_and_whose_coverage_is_asked():
+    with initialize_config_dir(str(config_dir()), version_base="1.3"):
+        streams, shared = (compose_settings("run", [f"data={name}"]).data for name in ("streams", "shared_scenes"))
+        indoor = compose_settings("run", ["experiment=method_comparison"]).experiment.indoor
+    rooms, known = ({scene.get("room", scene.path) for scene in data.scenes} for data in (streams, shared))
+    assert rooms == set(indoor) and rooms < known
+
+
+def test_a_scene_of_too_few_candidates_keeps_a_row_and_has_no_ratio():
+    blind = stepping.scene("dark", load=lambda i: stepping.frame(i).replace(depth=torch.zeros(1, 48, 64)))
+    methods = {"paper": stepping.MAP, "window": stepping.MAP.replace(views=2), "auto": stepping.choosing(2, 3)}
+    scenes = [blind, stepping.scene()]
+    pairs = partial(by_gap, stride=4)
+    found = method_comparison.run(
+        scenes, {}, pairs, Settings(), methods=methods, seeds=1, stand_ins={"window": "paper"}
+    )
+    rows = found.scenes("auto")
+    assert rows["dark"]["note"] == "too few candidates" and "aurc_full_ratio_to_window" not in rows["dark"]
+    assert rows["hall"]["aurc_full_ratio_to_window"] > 0

@@ -1,0 +1,384 @@
+"""The experiments of the paper on small rooms: cohorts, variants, what is hidden, and verdicts that go either way."""
+
+from functools import cache
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+from support.rooms import Changed, noted, untold
+from support.rooms import room as rendered
+
+from dhtorch.cli.run import config_dir, main
+from dhtorch.data.pairs import by_gap
+from dhtorch.experiments.cohorts import HeldOut, device_fit, trajectory
+from dhtorch.experiments.paper import (
+    ablation,
+    calibration,
+    device_pose,
+    gate_ablation,
+    heldout,
+    hole_census,
+    motion,
+    range_split,
+    real_holes,
+)
+from dhtorch.experiments.protocol import Batch, Outcome, Settings
+from dhtorch.geometry import se3
+from dhtorch.metrics import holdout
+from dhtorch.metrics.correlation import ranks
+from dhtorch.records import Pose
+from dhtorch.runtime import results as archive
+
+
+@cache
+def composed(name):
+    with initialize_config_dir(str(config_dir()), version_base="1.3"):
+        return compose("run", [f"method={name}", "method.n=1024"]).method
+
+
+def method(name="paper"):
+    return instantiate(composed(name), _convert_="all")
+
+
+def room(**options):
+    """Two pairs."""
+    return rendered(**{"hw": (192, 256), "n_frames": 5, **options})
+
+
+def asked(experiment, *rooms, **options):
+    scenes = [noted(each, gap=3) for each in rooms or [room()]]
+    return experiment.run(scenes, {"paper": method()}, by_gap, Settings(), **options)
+
+
+def scene(outcome, variant, cohort="full"):
+    (row,) = outcome.scenes(variant, cohort).values()
+    return row
+
+
+def batch_of(recording, i=0, j=3):
+    nothing = torch.full((1,), torch.nan)
+    return Batch(
+        noted(recording), [(i, j)], 2.0, recording[i], (recording[j],), recording[i], nothing.view(1, 1, 1), nothing
+    )
+
+
+def test_set_b_is_hidden_from_the_method_and_judged_by_its_returns():
+    recording, seen = room(), {}
+
+    def pose(samples, tracks, *rest, **options):
+        seen.setdefault("xyz", samples.xyz)
+        return base.pose(samples, tracks, *rest, **options)
+
+    base = method()
+    split = HeldOut(base, seed=3)
+    trace = {}
+    variant = split.variant().method.replace(pose=pose)
+    variant(recording[0], recording[3], trace=trace)
+    whole = split.whole(batch_of(recording), trace["samples"].uv)
+    first, second = holdout.half(whole, 3)
+    assert bool(torch.equal(seen["xyz"].isfinite().all(-1) & (whole.trackability >= 1e-5), first))
+    assert not bool((first & second).any()) and 0.4 < float(first.sum() / (first | second).sum()) < 0.6
+    assert not bool(trace["samples"].depth[second].any()), "no stage can read a hidden return"
+    assert not bool((trace["fit"].inlier & second).any())
+    truth = split.heldout(batch_of(recording), trace)
+    assert bool((~truth.ok | second).all()) and int(truth.ok.sum()) > 100
+    naive = split.cyclic(batch_of(recording), trace)
+    assert bool((~naive.ok | trace["fit"].inlier).all()) and not bool((naive.ok & truth.ok).any())
+
+
+def test_heldout_rows_and_strict_line():
+    outcome = asked(heldout, room(lidar="exact"))
+    row = scene(outcome, "paper", "heldout")
+    assert (
+        row["passes"] is True
+        and row["corr"] > 0.93
+        and row["median_rel"] < 0.07
+        and outcome.summary["paper.n_passes"]["value"] == 1
+    )
+    assert outcome.summary["paper.n_scenes"]["value"] == 1
+    assert {"paper.cyclic.median_rel", "paper.median_rel"} <= set(outcome.summary)
+    good = {"n_kept": 10, "corr": 0.81, "median_rel": 0.09, "residual_px": 2.9}
+    assert heldout.passes(good)
+    for worse in ({"n_kept": 9}, {"corr": 0.8}, {"median_rel": 0.1}, {"residual_px": 3.0}, {"corr": None}):
+        assert not heldout.passes(good | worse)
+
+
+def test_recovered_holes_reach_beyond_the_sensor():
+    row = scene(asked(heldout, room(range_limit=2.0)), "paper", "heldout")
+    assert row["n_recovered"] > 300 and row["reach_p95_m"] > 1.3 * row["returns_max_m"] > 1.3 * 1.5
+
+
+def rows(*entries):
+    base = {"pair": None, "role": None}
+    return Outcome(rows=[base | dict(zip(("scene", "method", "truth"), e[:3], strict=True)) | e[3] for e in entries])
+
+
+def test_verdict_of_heldout_goes_either_way():
+    def outcome(naive, honest, passed):
+        return rows(
+            ("a", "m", "cyclic", {"median_rel": naive}), ("a", "m", "heldout", {"median_rel": honest, "passes": passed})
+        )
+
+    assert heldout.verdict(outcome(0.01, 0.03, True), "m")[0] is True
+    assert heldout.verdict(outcome(0.03, 0.01, True), "m")[0] is False
+    assert heldout.verdict(outcome(0.01, 0.03, False), "m")[0] is False
+    assert heldout.verdict(outcome(None, 0.03, False), "m")[0] is None
+
+
+def test_range_split_has_one_cohort_for_all_variants():
+    recording = room(trajectory_axes="gl", trajectory_offset_deg=5.0)
+    outcome = asked(range_split, recording, cutoffs=(1.5,), cutoff_factors=(1.25,))
+    five = ("sensor_only", "device_raw", "device_gl_to_cv", "no_gates", "gated")
+    found = {v: scene(outcome, v) for v in five}
+    assert len({r["n_candidates"] for r in found.values()}) == 1
+    assert found["sensor_only"]["n_kept"] == 0 and found["gated"]["coverage"] > 0.8
+    assert found["device_raw"]["coverage"] < 0.02 and found["device_gl_to_cv"]["coverage"] > 0.8
+    assert found["gated"]["n_kept"] <= found["no_gates"]["n_kept"]
+    assert found["gated"]["gate_share"]["answer"] < found["no_gates"]["gate_share"]["answer"]
+    assert scene(outcome, "gated, cutoff 1.5 m")["cutoff_m"] == 1.5
+    assert scene(outcome, "gated, cutoff x1.25")["cutoff_m"] == 2.5
+    assert {f"{v}.coverage" for v in five} | {"gated, cutoff 1.5 m.pnp_success"} <= set(outcome.summary)
+
+
+@pytest.mark.parametrize(
+    ("changed", "expected"),
+    [
+        ({}, True),
+        ({"gated.coverage": 0.2}, False),
+        ({"device_raw.median_rel": 0.1}, False),
+        ({"no_gates.p90_rel": 0.3}, False),
+        ({"gated.median_rel": None}, None),
+        ({"device_raw.median_rel": None}, True),
+    ],
+)
+def test_verdict_of_range_split_goes_either_way(changed, expected):
+    values = {"gated.coverage": 0.6, "gated.median_rel": 0.1, "gated.p90_rel": 0.3}
+    values |= {"device_raw.median_rel": 1.0, "no_gates.p90_rel": 0.4} | changed
+    assert range_split.verdict({k: {"value": v} for k, v in values.items()})[0] is expected
+
+
+def test_a_scene_without_a_trajectory_or_truth_says_so():
+    blind = Changed(room(), lambda f: f.replace(T_world_from_cam=None), poses=None)
+    outcome = asked(range_split, blind, cutoff_factors=())
+    assert scene(outcome, "device_raw")["note"] == "no device trajectory"
+    assert scene(outcome, "gated")["n_candidates"] > 0
+    outcome = asked(real_holes, untold(room()))
+    assert outcome.verdict == "undecided" and scene(outcome, "gated", "real_holes")["note"] == "no independent truth"
+
+
+def test_real_holes_are_drop_outs_with_known_depth():
+    recording = room()
+    outcome = asked(real_holes, recording)
+    row, hidden = scene(outcome, "gated", "real_holes"), scene(outcome, "gated", "full")
+    assert 0 < row["n_candidates"] < hidden["n_candidates"]
+    assert row["n_dropped"]["excluded"] > 0 and "drop-outs on 1 of 1 scenes" in outcome.why
+
+    def verdict(real, hidden, kept=5):
+        found = rows(("a", "gated", "real_holes", {"n_candidates": 9, "n_kept": kept}))
+        found.summary = {"gated.median_rel": {"value": real}, "gated.full.median_rel": {"value": hidden}}
+        return real_holes.verdict(found)
+
+    assert verdict(0.4, 0.1)[0] is True and verdict(0.1, 0.4)[0] is False and verdict(None, 0.1)[0] is None
+    assert "no answer on a" in verdict(None, 0.1, kept=0)[1]
+
+
+def test_raw_trajectory_forgets_the_conversion_and_nothing_else():
+    recording = room(trajectory_axes="gl")
+    T, raw = trajectory(batch_of(recording)), trajectory(batch_of(recording), raw=True)
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+    assert torch.allclose(raw.R, flip @ T.R @ flip, atol=1e-6) and torch.allclose(raw.t, T.t @ flip, atol=1e-6)
+    as_written = Pose(recording[0].T_world_from_cam.R @ flip, recording[0].T_world_from_cam.t)
+    other = Pose(recording[3].T_world_from_cam.R @ flip, recording[3].T_world_from_cam.t)
+    assert torch.allclose(se3.relative(as_written, other).R, raw.R, atol=1e-5)
+    same = batch_of(room())
+    assert torch.equal(trajectory(same, raw=True).R, trajectory(same).R)
+    none = batch_of(recording)
+    none = Batch(**{**vars(none), "anchor": none.anchor.replace(T_world_from_cam=None)})
+    assert not bool(device_fit(none, 5).ok.any())
+
+
+def test_device_pose_measures_the_disagreement():
+    outcome = asked(device_pose, room(trajectory_offset_deg=15.0, lidar="exact"))
+    anchored, given = (scene(outcome, v, "heldout") for v in ("anchored", "device_gl_to_cv"))
+    assert given["rotation_deg"] == pytest.approx(0, abs=0.05) and given["translation_m"] == pytest.approx(0, abs=1e-5)
+    assert 3.0 < anchored["direction_deg"] < 15.0, "axes turned by 15 degrees turn the baseline by up to as much"
+    assert anchored["median_rel"] < given["median_rel"]
+
+    def verdict(ours, theirs):
+        found = rows(("a", "anchored", "heldout", ours), ("a", "device_gl_to_cv", "heldout", theirs))
+        empty = {f"{v}.{k}": {"value": None} for v in ("device_raw", "device_gl_to_cv", "anchored") for k in ours}
+        found.summary = empty
+        return device_pose.verdict(found)[0]
+
+    good, bad = {"corr": 0.9, "median_rel": 0.1}, {"corr": 0.5, "median_rel": 0.2}
+    assert verdict(good, bad) is True and verdict(bad, good) is False
+    assert verdict(good, {"corr": None, "median_rel": None}) is None
+
+
+def test_gates_and_gaps():
+    outcome = asked(gate_ablation, room(n_frames=7), gaps=(16,), factors=(2.0,))
+    both, free = (scene(outcome, v, "heldout") for v in ("both gates", "parallax gate off"))
+    assert both["n_candidates"] == free["n_candidates"] and both["n_kept"] <= free["n_kept"]
+    assert both["gate_share"]["parallax"] > 0 == free["gate_share"]["parallax"]
+    assert both["gate_share"]["answer"] < free["gate_share"]["answer"]
+    assert scene(outcome, "gap 16", "heldout")["note"] == "too short"
+    assert scene(outcome, "gap x2", "heldout")["n_pairs"] == 1
+
+    def verdict(both, parallax, residual):
+        names = ("both gates", "parallax gate off", "reprojection gate off")
+        values = zip(names, (both, parallax, residual), strict=True)
+        return gate_ablation.verdict({f"{n}.corr": {"value": v} for n, v in values})[0]
+
+    assert verdict(0.8, 0.1, 0.7) is True and verdict(0.8, 0.75, 0.5) is False and verdict(0.8, None, 0.1) is None
+
+
+@pytest.mark.slow
+def test_recovery_rises_with_the_baseline():
+    rooms = [
+        noted(Changed(room(n_frames=6, hw=(144, 192), path=path), name=f"synthetic_{path}"), gap=2)
+        for path in ("walk", "static")
+    ]
+    outcome = asked(motion, *rooms, factors=(0.5, 1.0, 2.0))
+    walking = [r for r in outcome.rows if r["scene"] == "synthetic_walk" and r["pair"] is None]
+    still = [r for r in outcome.rows if r["scene"] == "synthetic_static" and r["pair"] is None]
+    baselines = [r["baseline_m"] for r in walking]
+    assert (
+        baselines == sorted(baselines)
+        and walking[0]["rank_corr_recovered"] > 0.6
+        and walking[0]["rank_corr_error"] < -0.4
+    )
+    assert walking[0]["recovered_share"] < walking[1]["recovered_share"]
+    assert len(still) == 3 and all(r["coverage"] < 0.02 for r in still), (
+        "a static camera has no parallax to answer from"
+    )
+    assert outcome.verdict == "supported" and not any(k.startswith("synthetic_static") for k in outcome.summary)
+
+    def verdict(recovered, error):
+        row = {"rank_corr_recovered": recovered, "rank_corr_error": error}
+        return motion.verdict(rows(("a", "gap x1", "heldout", row)))[0]
+
+    assert verdict(0.5, -0.5) is True and verdict(None, None) is None
+    assert verdict(-0.5, -0.5) is False and verdict(0.5, 0.5) is False
+
+
+def test_ranks_share_ties():
+    assert ranks(torch.tensor([3.0, 1.0, 3.0, 2.0])).tolist() == [2.5, 0.0, 2.5, 1.0]
+
+
+def test_census_counts_every_class_once():
+    outcome = hole_census.run([room()], {"paper": method()}, by_gap, Settings(), stride=2)
+    row = next(r for r in outcome.rows if r["pair"] is None)
+    frames = [r for r in outcome.rows if r["pair"] is not None]
+    assert len(frames) == 3 and row["n_samples"] == 3 * 1024
+    for group in ("hole_share", "route_share"):
+        assert sum(row[group].values()) == pytest.approx(1)
+    assert row["hole_rate"] == pytest.approx(sum(r["n_holes"] for r in frames) / row["n_samples"])
+    assert outcome.summary["hole_share.trackable_no_lidar"]["value"] == row["hole_share"]["trackable_no_lidar"]
+    for share, hole, expected in ((0.9, 1.0, True), (0.4, 1.0, False), (0.9, 0.05, False), (None, 1.0, None)):
+        values = {"hole_share.trackable_no_lidar": share, "trackability_hole": hole, "trackability_valid": 1.0}
+        assert hole_census.verdict({k: {"value": v} for k, v in values.items()})[0] is expected
+    full = hole_census.run([room(lidar="exact", hw=(96, 128))], {"paper": method()}, by_gap, Settings(), stride=5)
+    assert full.verdict == "undecided", "no hole, no census"
+
+
+def test_calibration_reads_thresholds_off_the_same_answers():
+    thresholds = (0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.5)
+    outcome = asked(calibration, room(lidar="exact"), thresholds=thresholds)
+    row = scene(outcome, "paper")
+    points = outcome.points["synthetic_room", "paper", "full"]
+    counts = [int((points.answered().score >= t).sum()) for t in thresholds]
+    assert [row[f"at_{t}"]["n_kept"] for t in thresholds] == counts and len({*counts}) > 2
+    shares = [row[f"at_{t}"]["coverage"] for t in thresholds]
+    assert shares == pytest.approx([n / len(points.error) for n in counts])
+    assert {"ece", "heldout.ece", "at_0.1.median_rel", "paper.ece_pooled"} <= {
+        k.removeprefix("paper.") if "ece_pooled" not in k else k for k in outcome.summary
+    }
+    assert outcome.summary["paper.ece_pooled"]["value"] == pytest.approx(row["ece"])
+
+    def verdict(aurc, ece):
+        found = rows(("a", "m", "full", {"aurc": aurc, "mean_risk": 0.1, "ece": ece, "monotonicity": 1.0}))
+        return calibration.verdict(found, "m")[0]
+
+    assert verdict(0.05, 0.3) is True and verdict(0.05, 0.05) is False and verdict(0.2, 0.3) is False
+
+
+def test_ablation_changes_one_thing_at_a_time():
+    outcome = asked(ablation, room(lidar="exact"), n=(256,), windows=(15,), others={"opencv": method("opencv")})
+    variants = {r["method"] for r in outcome.rows}
+    assert variants == {"paper", "sampler grid", "sampler vogel", "n 256", "window 15", "opencv", "cutoff x0.5"}
+    assert scene(outcome, "n 256")["n_candidates"] < scene(outcome, "paper")["n_candidates"]
+    ratio = outcome.summary["window 15.median_rel_ratio"]["value"]
+    ours, base = (scene(outcome, v)["median_rel"] for v in ("window 15", "paper"))
+    assert ratio == pytest.approx(ours / base)
+    assert ablation.verdict({"a": 0.95, "cutoff x0.5": 0.2})[0] is True
+    assert ablation.verdict({"a": 0.8})[0] is False and ablation.verdict({"a": None})[0] is None
+
+
+def test_drop_outs_and_halves_refuse_wrong_shapes():
+    frame, samples = (
+        room()[0],
+        HeldOut(method(), 0).whole(
+            batch_of(room()), torch.rand(1, 9, 2, generator=torch.Generator().manual_seed(0)) * 100
+        ),
+    )
+    truth = holdout.truth_at(frame, samples.uv)
+    with pytest.raises(ValueError, match="drop_outs"):
+        holdout.drop_outs(frame, samples, truth[:, :5])
+    with pytest.raises(ValueError, match=r"holdout.share: found 1"):
+        holdout.half(samples, 0, share=1)
+    with pytest.raises(ValueError, match="without_returns"):
+        holdout.without_returns(samples, torch.zeros(1, 4, dtype=torch.bool))
+
+
+#: Where the built-in rooms are not what an experiment asks for, or its own sizes are those of a measurement.
+SMALLER = {
+    "ablation": ["experiment.n=[128]", "experiment.windows=[15]"],
+    "defocus": ["data=synthetic_views"],
+    "defocus_fusion": ["data=synthetic_views"],
+    "focus_stack": ["data=synthetic_views", "experiment.slices=5"],
+    "anchor_study": ["experiment.anchors=1", "experiment.size=64", "experiment.faults=[simulated]"],
+    "dense_comparison": [
+        *("experiment.anchors=1", "experiment.sweep.planes=16", "experiment.sweep.size=128", "experiment.rooms=[]"),
+        *("experiment.rotations.hw=[96,128]", "experiment.rotations.n_frames=4", "experiment.rotations.gap=2"),
+    ],
+    "icp": ["experiment.n=256", "experiment.links=2"],
+    "latency": [
+        *("experiment.sizes=[[96,128]]", "experiment.n=128", "experiment.rounds=1", "experiment.peak=false"),
+        *("experiment.front_end_repeats=1", "experiment.pair_repeats=1", "experiment.dinov2_repeats=1"),
+        *(
+            "experiment.warm_up=0",
+            "experiment.dinov2.hidden=24",
+            "experiment.dinov2.layers=1",
+            "experiment.dinov2.heads=2",
+        ),
+    ],
+    "method_comparison": ["experiment.seeds=1"],
+    "part_ablation": ["experiment.seeds=1"],
+    "rh20t_probe": [
+        *("data=rh20t_synthetic", "data.hw=[72,128]", "data.tasks=3", "data.n_frames=12"),
+        *("experiment.dinov2=null", "experiment.n_folds=3"),
+    ],
+    "views_study": [
+        *("experiment.anchors=1", "experiment.rotation_gaps=[1,3]", "experiment.rotations.hw=[96,128]"),
+        *("experiment.rotations.n_frames=4", "experiment.rotations.gap=2"),
+    ],
+    "vo_probe": [
+        *("data=synthetic", "data.n_frames=12", "data.gap=3", "data.supersample=1"),
+        *("experiment.dinov2=null", "experiment.min_pairs=2", "experiment.blocks=3"),
+    ],
+}
+NAMES = sorted(path.stem for path in (config_dir() / "experiment").glob("*.yaml"))
+QUICK = ("heldout", "hole_census")
+
+
+@pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in NAMES])
+def test_every_experiment_of_the_settings_runs_from_the_command(name, tmp_path, capsys):
+    small = ["data.hw=[96,128]", "figures=false", "method.n=256", f"output={tmp_path}", *SMALLER.get(name, ())]
+    if not any(option.startswith("data=") for option in small):
+        small += ["data.n_frames=4", "data.gap=2", "data.supersample=1"]
+    assert main([f"experiment={name}", *small]) == 0, capsys.readouterr().err
+    assert "wrote" in capsys.readouterr().out
+    result = archive.read(tmp_path / "result.json")
+    assert result["experiment"] == name and result["rows"]
+    assert name in ("pair",) or result["verdict"] in ("supported", "refuted", "undecided")

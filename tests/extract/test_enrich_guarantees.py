@@ -1,0 +1,531 @@
+"""What dhtorch enrich promises: killed anywhere it ends alike, whoever works; the source stays; the past alone counts."""
+
+import hashlib
+import io
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tracemalloc
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("pyarrow")
+pytest.importorskip("av")
+
+from PIL import Image
+from pyarrow import parquet
+from test_enrich import map_of, rows, tree
+
+from dhtorch import data
+from dhtorch import testing as writers
+from dhtorch.cli.run import main
+from dhtorch.data.codecs import tfrecord
+from dhtorch.data.readers.rlds import Described
+from dhtorch.data.recording import Recording
+from dhtorch.data.scene import Scene
+from dhtorch.extract import cut, plan
+from dhtorch.extract.enriched import MapRows, View, camera_feature, camera_key, columns
+from dhtorch.extract.instants import Ahead
+from dhtorch.extract.nerf_target import NerfTarget
+from dhtorch.extract.origin import NO_RATE, RobotSet, rate
+from dhtorch.extract.robot_target import RobotTarget
+from dhtorch.extract.step_set import StepSet
+from dhtorch.extract.targets import Tally
+from dhtorch.pipeline.presets import PAPER
+from dhtorch.runtime import file_lock as lock
+from dhtorch.synthetic.recording import SyntheticRoom
+from dhtorch.synthetic.two_cameras import open_two_cameras
+
+HW, LENGTHS = (48, 64), (3, 2)
+FRONT = "observation.images.front"
+ASKED = ["method=paper", "method.n=64", "method.hypotheses=10", "gap=1", "dense=false", "shard_rows=2"]
+
+
+@cache
+def room():
+    """Frames of the synthetic room, whose sensor sees no farther than 2.5 m."""
+    rendered = SyntheticRoom(hw=HW, n_frames=7, lidar="exact", supersample=1)
+    frames = [rendered[i] for i in range(len(rendered))]
+    return [frame.replace(depth=torch.where(frame.depth <= 2.5, frame.depth, 0.0)) for frame in frames]
+
+
+def shots(length, first=0):
+    return room()[first : first + length]
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    root = tmp_path_factory.mktemp("robot") / "set"
+    root.mkdir()
+    writers.write_lerobot(root, [shots(n, 3 * k) for k, n in enumerate(LENGTHS)], depth="tiff")
+    return root
+
+
+def digest(root):
+    return {name: hashlib.sha256(content).hexdigest() for name, content in tree(root).items()}
+
+
+def enrich(source, out, *more):
+    assert main(["enrich", str(source), str(out), *ASKED, *more]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def whole(robot, tmp_path_factory):
+    return enrich(robot, tmp_path_factory.mktemp("whole") / "set")
+
+
+def strike(robot, folder, moments):
+    script = Path(__file__).parents[1] / "support" / "kill_enrich.py"
+    words = [sys.executable, str(script), str(robot), str(folder), str(moments), "--", *ASKED]
+    done = subprocess.run(
+        words, capture_output=True, text=True, check=False, env={**os.environ, "OMP_NUM_THREADS": "1"}
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+@pytest.mark.parametrize("moments", [2, pytest.param(0, marks=[pytest.mark.slow, pytest.mark.timeout(1800)])])
+def test_killed_at_any_moment_or_out_of_disk_it_ends_with_the_same_bytes(moments, robot, whole, tmp_path):
+    before = digest(robot)
+    found = strike(robot, tmp_path, moments)
+    assert found["whole"] == [0, ""] and found["total"] > 20
+    want = digest(whole)
+    assert digest(tmp_path / "whole") == want
+    assert len(found["ends"]) == (moments or found["total"])
+    for moment, killed, after in found["ends"]:
+        assert (killed, after) == (-9, [0, ""]), moment
+        assert digest(tmp_path / str(moment)) == want, moment
+    code, said = found["full"]
+    assert code == 2 and said.count("\n") == 1
+    assert "too large" in said and str(tmp_path / "full") in said and "the same command does the rest" in said
+    assert found["after"] == [0, ""] and digest(tmp_path / "full") == want
+    assert digest(robot) == before
+    left = [p.name for p in tmp_path.iterdir() if p.name.startswith(".")]
+    assert not left, "locks and unfinished files are gone"
+
+
+def test_workers_give_the_same_bytes(robot, whole, tmp_path):
+    assert tree(enrich(robot, tmp_path / "set", "workers=2")) == tree(whole)
+
+
+@pytest.mark.slow
+def test_a_cluster_gives_the_same_bytes(robot, whole, tmp_path):
+    pytest.importorskip("ray.data")
+    assert tree(enrich(robot, tmp_path / "set", "engine=ray")) == tree(whole)
+
+
+def test_a_changed_source_is_another_set(robot, whole, tmp_path, capsys):
+    source = tmp_path / "source"
+    shutil.copytree(robot, source)
+    out = enrich(source, tmp_path / "set")
+    table = next((source / "data").rglob("*.parquet"))
+    changed = parquet.read_table(table)
+    place = changed.column_names.index("timestamp")
+    parquet.write_table(changed.set_column(place, "timestamp", [np.asarray(changed["timestamp"]) + 1e-7]), table)
+    assert main(["enrich", str(source), str(out), *ASKED]) == 2
+    said = capsys.readouterr().err
+    assert "another enriched set" in said and "data" in said and said.count("\n") == 1
+
+
+@pytest.mark.parametrize("format", ["lerobot", "nerfstudio"])
+def test_an_episode_made_with_other_settings_is_not_whole(format, robot, tmp_path):
+    out = enrich(robot, tmp_path / "set", "data=lerobot", "data.episode=0", f"format={format}")
+    key = json.loads((out / "meta" / "dhtorch.json").read_text())["key"]
+    views = {FRONT: View(FRONT, HW, HW, posed=True)}
+
+    def own(key, k=0):
+        if format == "nerfstudio":
+            return NerfTarget(out, views, [{FRONT: ""}, {FRONT: "1"}], key).own(k)
+        return RobotTarget(out, 3, views, origin=None, numbers=[0, 1], step=0.0, fps=30.0, task=None, key=key).own(k)
+
+    assert own(key)["length"] == LENGTHS[0]
+    assert own(f"{key}x") is None
+    assert own(key, 1) is None, "not there"
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_tasks_that_are_noted_for_an_episode_are_kept(version, tmp_path):
+    """Of several that describe it, the rows bear one."""
+    source = tmp_path / "source"
+    source.mkdir()
+    writers.write_lerobot(source, [shots(2)], depth="tiff", version=version)
+    noted = ["look", "look carefully"]
+    if version == 2:
+        file = source / "meta" / "episodes.jsonl"
+        file.write_text(json.dumps({**json.loads(file.read_text()), "tasks": noted}) + "\n")
+    else:
+        file = next((source / "meta" / "episodes").rglob("*.parquet"))
+        table = parquet.read_table(file)
+        parquet.write_table(table.set_column(table.column_names.index("tasks"), "tasks", [[noted]]), file)
+    out = enrich(source, tmp_path / "set")
+    (table,) = (out / "meta" / "episodes").rglob("*.parquet")
+    assert parquet.read_table(table)["tasks"].to_pylist() == [noted]
+    assert {row["task_index"] for row in rows(out)} == {0}
+
+
+def test_splits_are_in_the_new_numbers(tmp_path):
+    source = tmp_path / "source"
+    source.mkdir()
+    writers.write_lerobot(source, [shots(2), shots(2, 2), shots(2, 4)], depth="tiff")
+    info = source / "meta" / "info.json"
+    info.write_text(json.dumps(json.loads(info.read_text()) | {"splits": {"train": "0:2", "val": "2:3"}}))
+
+    def splits(out, *more):
+        return json.loads((enrich(source, out, *more) / "meta" / "info.json").read_text())["splits"]
+
+    assert splits(tmp_path / "all") == {"train": "0:2", "val": "2:3"}
+    assert splits(tmp_path / "one", "data=lerobot", "data.episode=2") == {"val": "0:1"}
+
+
+def test_a_video_that_no_episode_has_is_no_feature_of_the_new_set(tmp_path):
+    source = tmp_path / "source"
+    source.mkdir()
+    writers.write_lerobot(source, [shots(2)], depth="tiff", version=2)
+    info = source / "meta" / "info.json"
+    about = json.loads(info.read_text())
+    about["features"]["observation.images.wrist"] = about["features"][FRONT]
+    info.write_text(json.dumps(about))
+    found = RobotSet.open(source, [0])
+    assert set(found.features) == set(about["features"]) - {"observation.images.wrist"}
+    assert set(found.clips(0, 2)) == {FRONT}
+
+
+def test_a_nerfstudio_folder_holds_frames_with_a_pose_and_is_sure_of_its_own_depth_alone(tmp_path, monkeypatch):
+    """It has no pose that is not known, and no step beyond 65.534 m."""
+    made, in_metres = MapRows.features, []
+
+    def lost(self, opened, i):
+        row = made(self, opened, i)
+        in_metres.append(np.array(Image.open(io.BytesIO(row["depth"]))))
+        return {**row, "pose": np.full(16, np.nan)} if i == 1 else row
+
+    monkeypatch.setattr(MapRows, "features", lost)
+    source = tmp_path / "source"
+    source.mkdir()
+    writers.write_lerobot(source, [[shot.replace(depth=40 * shot.depth) for shot in shots(3)]], depth="tiff")
+    out = enrich(source, tmp_path / "set", "format=nerfstudio", "method.n=256")
+    found = json.loads((out / "transforms.json").read_text())["frames"]
+    assert [Path(frame["file_path"]).stem for frame in found] == ["frame_000000", "frame_000002"]
+    depth, sure = (np.array(Image.open(out / found[0][f"{name}_file_path"])) for name in ("depth", "confidence"))
+    held = (in_metres[0] > 0) & (in_metres[0] < 65.5)
+    assert 0 < held.sum() < (in_metres[0] > 0).sum()
+    assert np.array_equal(depth > 0, held) and np.array_equal(sure > 0, held)
+
+
+def test_two_writers_do_not_share_a_folder(robot, whole, tmp_path, capsys):
+    with lock.held(tmp_path / ".set.lock", "out"):
+        assert main(["enrich", str(robot), str(tmp_path / "set"), *ASKED]) == 2
+    assert "one writer" in capsys.readouterr().err and not (tmp_path / "set").exists()
+
+
+def test_the_past_alone_counts_and_of_the_same_episode(robot, whole, tmp_path):
+    keys = [f"{FRONT}_depth_enriched", f"{FRONT}_dhtorch_source"]
+    every = rows(whole)
+    short = rows(enrich(robot, tmp_path / "short", "frames=2"))
+    assert [row["episode_index"] for row in short] == [0, 0, 1, 1]
+    assert [row["source.index"] for row in short] == [0, 1, 3, 4] and [row["index"] for row in short] == [0, 1, 2, 3]
+    for row, same in zip(short, [every[0], every[1], every[3], every[4]], strict=True):
+        assert all(row[key]["bytes"] == same[key]["bytes"] for key in keys), "a later frame changed an earlier one"
+    second = rows(enrich(robot, tmp_path / "second", "data=lerobot", "data.episode=1"))
+    assert [row[keys[0]]["bytes"] for row in second] == [row[keys[0]]["bytes"] for row in every[3:]]
+    recovered = [int((map_of(row, keys[1]) == 2).sum()) for row in every]
+    assert recovered[0] == recovered[3] == 0 and sum(recovered) > 0
+    both = rows(enrich(robot, tmp_path / "both", "causal=false", "gap=auto"))
+    assert int((map_of(both[0], keys[1]) == 2).sum()) > 0, "looking ahead the first frame has an answer too"
+
+
+def test_samples_alone(whole):
+    for row in rows(whole):
+        found = map_of(row, f"{FRONT}_depth_enriched") > 0
+        assert 0 < found.sum() <= 64
+
+
+def test_an_older_version_of_the_format(robot, whole, tmp_path):
+    one = tmp_path / "older"
+    one.mkdir()
+    writers.write_lerobot(one / "set", [shots(n, 3 * k) for k, n in enumerate(LENGTHS)], depth="tiff", version=2)
+    out = enrich(one / "set", tmp_path / "out", "format=same")
+    about = json.loads((out / "meta" / "info.json").read_text())
+    assert about["codebase_version"] == "v2.1" and about["total_videos"] == len(LENGTHS)
+    lines = [json.loads(line) for line in (out / "meta" / "episodes_stats.jsonl").read_text().splitlines()]
+    assert [line["episode_index"] for line in lines] == [0, 1]
+    depth = lines[1]["stats"][f"{FRONT}_depth_enriched"]
+    for name, entry in lines[1]["stats"].items():  # what LeRobot 0.3 asks of them
+        wanted = (3, 1, 1) if "image" in name else np.shape(entry["min"])
+        assert {np.shape(v) for k, v in entry.items() if k != "count"} == {wanted}, name
+    assert depth["mean"][0] == depth["mean"][1] == depth["mean"][2]
+    again = data.open_all(out, depth=f"{FRONT}_depth_enriched")
+    assert [len(each) for each in again] == list(LENGTHS)
+    for a, b in zip(rows(out), rows(whole), strict=True):
+        assert a[f"{FRONT}_depth_enriched"]["bytes"] == b[f"{FRONT}_depth_enriched"]["bytes"]
+
+
+def test_the_whole_is_never_held(tmp_path, monkeypatch):
+    content = os.urandom(300_000)
+    made = MapRows.features
+
+    def large(self, opened, i):
+        if not hasattr(large, "row"):
+            large.row = made(self, opened, i)
+        return {**large.row, "picture": content + bytes([i % 256])}
+
+    monkeypatch.setattr(MapRows, "features", large)
+    tracemalloc.start()
+    words = ["data=synthetic", "data.hw=[48,64]", "data.n_frames=60", "data.supersample=1", "report=false"]
+    assert main(["enrich", f"out={tmp_path / 'set'}", *words, *ASKED]) == 0
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 0.5 * 60 * len(content)
+    (table,) = (tmp_path / "set" / "data").rglob("*.parquet")
+    counted = parquet.read_table(table, columns=["index", "frame_index", "timestamp"]).to_pydict()
+    assert counted["index"] == counted["frame_index"] == list(range(60)), "over all parts"
+    assert np.allclose(counted["timestamp"], np.arange(60) / 30)
+
+
+# ---------------------------------------------------------------------------------------------------- other sources
+
+
+def test_steps_of_robots_keep_what_they_say(tmp_path):
+    """RLDS: numbers, texts, splits, and pictures as they are encoded."""
+    source = tmp_path / "1.0.0"
+    writers.write_rlds(source, [shots(3), shots(2, 3)], split="train")
+    writers.write_rlds(source, [shots(2, 5)], split="val")
+    before = tree(source)
+    out = enrich(source, tmp_path / "out", "data=rlds")
+    assert tree(source) == before
+    found = rows(out)
+    assert [row["episode_index"] for row in found] == [0, 0, 0, 1, 1, 2, 2]
+    assert [row["index"] for row in found] == list(range(7)) and [row["frame_index"] for row in found][:3] == [0, 1, 2]
+    assert [row["action"] for row in found[:3]] == np.arange(21.0).reshape(3, 7).tolist()
+    assert [row["is_last"] for row in found] == [False, False, True, False, True, False, True]
+    about = json.loads((out / "meta" / "info.json").read_text())
+    assert about["splits"] == {"train": "0:2", "val": "2:3"} and about["features"]["is_last"]["dtype"] == "bool"
+    picture = np.array(Image.open(io.BytesIO(found[0]["observation.images.image_0"]["bytes"])))
+    assert np.array_equal(picture, shots(1)[0].image[0].permute(1, 2, 0).numpy())
+    inside = (source / "tiny_robot-train.tfrecord-00000-of-00001").read_bytes()
+    assert found[0]["observation.images.image_0"]["bytes"] in inside, "not encoded again"
+    said = [json.loads(line) for line in (out / "meta" / "source_episodes.jsonl").read_text().splitlines()]
+    assert [(row["split"], row["number"], row["episode_id"]) for row in said] == [
+        ("train", 0, -1),
+        ("train", 1, -1),
+        ("val", 0, -1),
+    ]
+    again = data.open_all(out, depth="observation.images.image_0_depth")
+    assert [len(each) for each in again] == [3, 2, 2]
+
+
+def test_the_record_of_an_episode_is_read_once(tmp_path, monkeypatch):
+    writers.write_rlds(tmp_path / "1.0.0", [shots(7), shots(5)])
+    recordings = data.open_all(tmp_path / "1.0.0")
+    read, opened = [], []
+    record, stream = tfrecord.read_record, tfrecord.opened
+    monkeypatch.setattr(tfrecord, "read_record", lambda file, span: read.append(span) or record(file, span))
+    monkeypatch.setattr(tfrecord, "opened", lambda file: opened.append(file) or stream(file))
+    held = [recordings[0], recordings[1]]
+    read.clear(), opened.clear()
+    steps = StepSet(held, [0, 1], 30.0)
+    tables = [list(steps.batches(k, [])) for k in (0, 1)]
+    assert [sum(t.num_rows for t in found) for found in tables] == [7, 5] and steps.about(1)["split"] == "train"
+    assert len(read) == 2, "one an episode"
+    columns = sum(len(t.column_names) for found in tables for t in found)
+    assert len(opened) <= 2 + columns, "one a column and group at most, not one a step"
+
+
+class Told(NamedTuple):
+    """Steps of an episode made by hand, as dhtorch.data.readers.rlds_steps.Steps has them."""
+
+    features: dict[str, Described]
+    each: dict[str, list]  # feature → value of every step
+    instruction: str = "language_instruction"
+    n: int = 12
+
+    def values(self, name, steps):
+        found = [self.each[name][i] for i in steps]
+        return np.reshape(found, (len(found), -1)) if self.features[name].kind == "tensor" else found
+
+
+def test_steps_tell_their_time_their_task_and_how_pictures_are_encoded():
+    """Twelve steps, of which eight come together; a feature that is called as a column of every table stands apart."""
+    jpeg, png = b"\xff\xd8\xff\xe0", b"\x89PNG"
+    features = {
+        "language_instruction": Described("text", "string", ()),
+        "timestamp": Described("tensor", "float32", ()),
+        "observation/image_0": Described("image", "uint8", (48, 64, 3)),
+    }
+    each = {
+        "language_instruction": ["reach"] * 9 + ["grasp"] * 3,
+        "timestamp": [100.0 + k for k in range(12)],
+        "observation/image_0": [jpeg, png] * 6,
+    }
+    tasks = ["place", "reach"]  # of an episode before
+    tables = list(StepSet([], [0], 5.0, held={0: Told(features, each)}).batches(0, tasks))
+    found = [row for table in tables for row in table.to_pylist()]
+    assert [table.num_rows for table in tables] == [8, 4]
+    assert [row["timestamp"] for row in found] == pytest.approx([k / 5 for k in range(12)])
+    assert [row["source.timestamp"] for row in found] == each["timestamp"]
+    assert tasks == ["place", "reach", "grasp"] and [row["task_index"] for row in found] == [1] * 9 + [2] * 3
+    ends = [row["observation.images.image_0"]["path"].rpartition(".")[2] for row in found]
+    assert ends == ["jpg", "png"] * 6
+
+
+def test_counts_of_an_episode_are_sums_and_shares_along_it():
+    tally = Tally()
+    for k in range(48):  # two to a part; the second half is all recovered
+        pixels = [6, 0, 2] if k < 24 else [0, 0, 8]
+        row = {"depth": b"x", "pixels": pixels, "silent": [pixels[0], 0], "refuted": 0, "moments": np.ones(25)}
+        tally.add(row)
+    tally.add(None)
+    found = tally.summary()
+    assert found["pixels"].tolist() == [144, 0, 240] and found["silent"].tolist() == [144, 0]
+    assert np.allclose(found["over_time"], [[0.75, 0, 0.25]] * 12 + [[0, 0, 1]] * 12)
+    assert np.allclose(found["silent_over_time"], [[0.75, 0]] * 12 + [[0, 0]] * 12)
+    assert (found["frames"], found["unread"]) == (48, 1)
+
+
+def test_an_episode_of_which_nothing_can_be_read_is_said(tmp_path, capsys):
+    source = tmp_path / "source"
+    source.mkdir()
+    writers.write_lerobot(source, [shots(2), shots(2, 2)], depth="tiff", version=2)
+    gone = source / "videos" / "chunk-000" / FRONT / "episode_000001.mp4"
+    gone.unlink()
+    for more, helps in (((), "on_error=flag the rest"), (("on_error=flag",), "the video of episode 1")):
+        assert main(["enrich", str(source), str(tmp_path / "set"), *ASKED, *more]) == 2
+        said = capsys.readouterr().err
+        assert gone.name in said and helps in said and said.count("\n") == 1, said
+        shutil.rmtree(tmp_path / "set")
+
+
+def pair_of_cameras():
+    rig = open_two_cameras(n_frames=3, hw=(96, 128), depth_hw=(48, 64), supersample=1)[0].recording
+    fields = ("name", "format", "number", "times", "poses", "rate_hz")
+    return [
+        Recording(**{k: getattr(each, k) for k in fields}, load=each.load, camera_name=each.name.rpartition("/")[2])
+        for each in rig.load.recordings
+    ]
+
+
+def test_another_camera_of_the_instant_is_another_view():
+    scenes = [Scene(each) for each in pair_of_cameras()]
+    whole = plan.make(scenes, "auto", 1, rigs=True)
+    assert whole.episodes == (0, 0) and whole.beside(0) == [1] and whole.beside(1) == [0]
+    views = {v.key: v for v in (View.of(scene, 64) for scene in scenes)}
+    assert list(views) == ["observation.images.left", "observation.images.right"]
+    options = {"method": PAPER.replace(n=128), "gap": "auto", "step": 0.0, "views": views, "dense": False}
+    alone = MapRows(scenes, whole, columns(pictures=False), **options)[0]
+    beside = MapRows(scenes, whole, columns(pictures=False), beside=True, pose="pose", **options)
+    left, right = beside[0], beside[3]
+    assert alone.features["pixels"][2] == 0, "the first frame has nothing before it"
+    assert left.features["pixels"][2] > 0 and right.features["pixels"][2] > 0
+    assert camera_key(cut.shorter(scenes[1].recording, 2)) == "observation.images.right"
+
+
+@pytest.mark.parametrize(
+    ("name", "key"),
+    [
+        ("image_0", "image_0"),
+        ("observation/image_0", "image_0"),
+        ("observation/images/front", "front"),
+        ("hand/left/rgb", "hand_left_rgb"),
+    ],
+)
+def test_a_camera_of_another_format_is_a_feature_whose_name_is_no_path(name, key):
+    assert camera_feature(name) == f"observation.images.{key}"
+
+
+def test_a_frame_of_another_size_or_lens_than_the_first_is_said():
+    plain = SyntheticRoom(hw=HW, n_frames=1, supersample=1)[0]
+    lens = torch.tensor([[0.1, 0.0, 0.0, 0.0]])
+    frames = [
+        plain,
+        plain.replace(image=plain.image[..., :-8, :]),
+        plain.replace(camera=plain.camera.replace(distortion=lens)),
+        plain,
+    ]
+    scene = Scene(Recording(name="mixed", format="x", load=frames.__getitem__, number=torch.arange(4)))
+    view = View.of(scene, 64)
+    options = {"method": PAPER.replace(n=64), "gap": 1, "step": 0.0, "views": {view.key: view}, "dense": False}
+    made = MapRows([scene], plan.make([scene], 1, 1), columns(pictures=False), **options)
+    said = [made[i].complaint for i in range(4)]
+    assert "picture of 40x64, expected 48x64 as of the first frame" in said[1]
+    assert "expected none as of the first frame" in said[2]
+    assert said[0] == said[3] == ""
+
+
+def test_frames_that_were_skipped_do_not_slow_a_recording_down():
+    number = torch.tensor([0, 2, 4, 5])
+    known = {"name": "a", "format": "x", "load": shots(1).__getitem__, "number": number}
+    assert rate(Recording(**known, times=number.double() / 10)) == 10
+    assert rate(Recording(**known, times=number.double() / 10, rate_hz=15.0)) == 15
+    assert rate(Recording(**known)) == NO_RATE
+
+
+def test_a_row_is_taken_by_its_own_frame_alone():
+    rows = Ahead(iter([{"frame_index": 3}, {"frame_index": 5}]))
+    assert rows.take(2) is None and rows.take(4) is None, "it lies ahead, or behind"
+    assert rows.take(3) == {"frame_index": 3}
+    assert rows.take(5) == {"frame_index": 5} and rows.take(6) is None
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["cameras=true"], "two or more of one size"),
+        (["pose_sigma=[0.01,0.02]"], "pose=near"),
+        (["pose=device", "pose_sigma=[0.01]"], "pose_sigma"),
+        (["frames=0"], "frames"),
+        (["fps=0"], "fps"),
+        (["pose=robot"], "near, device, start"),
+    ],
+)
+def test_options_that_cannot_be(more, said, robot, tmp_path, capsys):
+    assert main(["enrich", str(robot), str(tmp_path / "x"), *ASKED, *more]) == 2
+    text = capsys.readouterr().err
+    assert said in text and text.count("\n") == 1 and not (tmp_path / "x").exists()
+
+
+def test_the_sources_poses_are_used(robot, tmp_path):
+    out = enrich(robot, tmp_path / "set", "pose=device")
+    recovered = [int((map_of(row, f"{FRONT}_dhtorch_source") == 2).sum()) for row in rows(out)]
+    assert recovered[1] > 0 and recovered[0] == 0
+
+
+def test_poses_that_near_returns_refute_are_said_everywhere_with_their_reading(tmp_path, capsys):
+    source, out = tmp_path / "source", tmp_path / "set"
+    poses = [shot.T_world_from_cam for shot in shots(3)]
+    in_mm = [shot.replace(T_world_from_cam=T.replace(t=1000 * T.t)) for shot, T in zip(shots(3), poses, strict=True)]
+    source.mkdir()
+    writers.write_lerobot(source, [in_mm], depth="tiff")
+    enrich(source, out, "method.n=256", "pose=device")
+    said = "front: the poses given contradict the near returns in 2 of 3 frames; they look like millimetres"
+    assert said in capsys.readouterr().out
+    about = json.loads((out / "meta" / "report.json").read_text())
+    (camera,) = (episode["cameras"]["front"] for episode in about["episodes"])
+    alone = [code for code, name in about["codes"]["silent"].items() if name == "NO_OTHER_VIEW"]
+    assert sum(camera["silent"]) == camera["pixels"][0] and 0 < camera["silent"][int(*alone)] < camera["pixels"][0]
+    assert camera["refuted"] == {"millimetres": 2} and camera["frames"] == 3
+    page = (out / "meta" / "report.html").read_text()
+    assert "millimetres" in page and "Poses given that the near returns contradict" in page
+    assert (
+        "there was no other view" in page
+        and "the poses given contradict the near returns" in page
+        and "no track" not in page
+    )
+
+
+def test_a_name_that_leads_elsewhere_is_refused(robot, tmp_path, capsys):
+    source = tmp_path / "source"
+    shutil.copytree(robot, source)
+    info = source / "meta" / "info.json"
+    about = json.loads(info.read_text())
+    about["features"]["../../../gone"] = {"dtype": "video", "shape": [48, 64, 3], "names": None}
+    info.write_text(json.dumps(about))
+    assert main(["enrich", str(source), str(tmp_path / "a" / "b" / "set"), *ASKED]) == 2
+    assert capsys.readouterr().err.count("\n") == 1 and not (tmp_path / "gone").exists()

@@ -1,0 +1,223 @@
+"""``dhtorch extract`` in this process, with recordings of a few pixels and a method that is told what to say."""
+
+import json
+from types import SimpleNamespace
+
+import pytest
+import torch
+from support.stub_samples import N, Stub, Told
+from test_plan import Load, recording
+
+pytest.importorskip("pyarrow")
+
+from dhtorch import extract
+from dhtorch.extract import Features, shards
+from dhtorch.runtime import results as archive
+from dhtorch.transforms import SampleError
+
+
+@pytest.fixture
+def made(tmp_path, capsys):
+    """Runs an extraction of two episodes of three frames; what it said, and the loops it asked to be shown."""
+
+    def call(recordings=None, out="out", options=None, **settings):
+        if recordings is None:
+            recordings = [recording(3, gap=1), recording(3, name="two", load=Load(30), gap=1)]
+        shown = []
+
+        def progress(items, text, total):
+            shown.append((text, total))
+            yield from items
+
+        asked = {"shard_rows": 4, "tokens_hw": (28, 42), "gap": None, **(options or {})}
+        plain = {"data": {"name": "made"}, "method": {"n": 6}, "seed": 0, "workers": 0, "out": str(tmp_path / out)}
+        parts = {"data": recordings, "method": Stub(answer=Told(), n=N), "extract": extract.ExtractOptions(**asked)}
+        code = extract.run({**plain, "choices": {"data": "made"}, **settings}, parts, progress=progress)
+        return SimpleNamespace(code=code, said=capsys.readouterr().out, shown=shown, folder=tmp_path / out)
+
+    return call
+
+
+def bytes_of(folder):
+    return {p.name: p.read_bytes() for p in shards.shard_files(folder)}
+
+
+def test_every_frame_is_a_row(made):
+    done = made()
+    features = Features(done.folder)
+    assert done.code == 0 and features.place["episode_index"].tolist() == [0, 0, 0, 1, 1, 1]
+    assert features.place["frame_index"].tolist() == [0, 1, 2] * 2
+    assert [int(row["dhtorch.problem"]) for row in features] == [1, 0, 0] * 2, "no view goes across episodes"
+    assert [p.name for p in sorted(done.folder.iterdir())] == ["shard-00000.parquet", "shard-00001.parquet"]
+    size = sum(p.stat().st_size for p in done.folder.iterdir())
+    assert done.said == (
+        f"{done.folder}: 2 shards, 6 rows, {size / 1e6:.1f} MB\nframes with a problem: 2 no second view\n"
+    )
+    assert done.shown == [("6 frames", 6)]
+
+
+def test_what_a_killed_run_left_is_gone(made, tmp_path):
+    (tmp_path / "out").mkdir()
+    left = tmp_path / "out" / ".shard-00007.parquet.tmp"
+    left.write_bytes(b"PAR1")
+    assert made().code == 0 and not left.exists()
+
+
+def test_one_recording_need_not_be_a_list(made):
+    done = made(recording(3), options={"gap": 0})
+    assert done.said.startswith(f"{done.folder}: 1 shard, 3 rows") and "3 no second view" in done.said
+
+
+def test_options_reach_the_rows(made):
+    whole = Features(made(options={"gap": 2, "patch": 7}).folder)
+    assert [int(row["dhtorch.problem"]) for row in whole] == [1, 1, 0] * 2
+    assert whole[0]["dhtorch.tokens"].shape == (24, 10) and whole.about["grid"] == [4, 6]
+    tall = {"tokens_hw": (98, 28)}
+    fits = [Features(made(out=fit, options={"fit": fit, **tall}).folder)[2] for fit in ("stretch", "pad", "crop")]
+    one, two, three = (row["dhtorch.tokens"] for row in fits)
+    assert one.shape == (14, 10) and not any(torch.equal(*pair) for pair in ((one, two), (two, three), (one, three)))
+    few = Features(made(out="few", options={"columns": ["depth"], "half": True}).folder)
+    assert few.columns == ("depth", "problem") and few.about["columns"]["depth"]["kind"] == "float16"
+    assert torch.allclose(few[2]["dhtorch.depth"], whole[2]["dhtorch.depth"], rtol=2**-11)
+    bad = [recording(2, load=Load(bad={1}))]
+    with pytest.raises(ValueError, match="one, frame 1: position 1 is damaged"):
+        made(bad, out="bad", options={"gap": 0})
+
+
+def test_the_same_question_is_answered_once(made):
+    first = made()
+    before = bytes_of(first.folder)
+    torn = shards.shard_files(first.folder)[1]
+    torn.write_bytes(torn.read_bytes()[:-100])
+    (first.folder / ".shard-00001.parquet.tmp").write_bytes(b"PAR1")
+    again = made()
+    assert "2 shards (1 left untouched), 6 rows" in again.said and again.shown == [("6 frames", 2)]
+    assert bytes_of(first.folder) == before and not list(first.folder.glob(".*"))
+    third = made()
+    assert "2 shards (2 left untouched), 6 rows" in third.said and "2 no second view" in third.said
+    assert third.shown == [], "nothing is asked for"
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"seed": 1}, "seed 0 there, 1 here"),
+        ({"method": {"n": 7}}, "method.n 6 there, 7 here"),
+        ({"data": {"name": "made", "gap": 1}}, "data.gap None there, 1 here"),
+        ({"options": {"shard_rows": 5}}, "extract.shard_rows 4 there, 5 here"),
+        ({"options": {"half": True}}, "extract.half False there, True here"),
+        ({"options": {"on_error": "skip"}}, "extract.on_error raise there, skip here"),
+        ({"options": {"columns": ["uv"]}}, r"extract.columns None there, \['uv'\] here"),
+        ({"options": {"gap": 2}}, "extract.gap None there, 2 here"),
+        ({"choices": {"data": "other"}}, "other code"),
+    ],
+)
+def test_another_question_is_not_mixed_in(made, changes, said):
+    folder = made().folder
+    before = bytes_of(folder)
+    with pytest.raises(FileExistsError, match=said):
+        made(**changes)
+    assert bytes_of(folder) == before
+
+
+def test_where_and_how_fast_rows_are_made_is_no_other_question(made):
+    made()
+    for changes in ({"options": {"address": "head:1"}}, {"traceback": True}):
+        assert "(2 left untouched)" in made(**changes).said
+
+
+def test_other_data_is_another_question(made, tmp_path):
+    root = tmp_path / "set"
+    root.mkdir()
+    (root / "a.bin").write_bytes(b"one")
+    folder = made([recording(root=root)], options={"gap": 0}).folder
+    assert "1 left untouched" in made([recording(root=root)], options={"gap": 0}).said
+    shared, _ = shards.described(folder / "shard-00000.parquet")
+    assert str(tmp_path) not in json.dumps(shared), "no place of this machine"
+    (root / "a.bin").write_bytes(b"two")
+    with pytest.raises(FileExistsError, match="other data"):
+        made([recording(root=root)], options={"gap": 0})
+    weights = tmp_path / "net.pt"
+    weights.write_bytes(b"w")
+    made(out="learned", method={"weights": str(weights)})
+    assert "left untouched" in made(out="learned", method={"weights": str(weights)}).said
+    weights.write_bytes(b"v")
+    with pytest.raises(FileExistsError, match="other data"):
+        made(out="learned", method={"weights": str(weights)})
+    assert bytes_of(folder)
+
+
+def test_a_shard_tells_where_it_comes_from(made):
+    folder = made(seed=3, options={"engine": "local"}).folder
+    shared, own = shards.described(shards.shard_files(folder)[1])
+    meta = archive.meta(device="cpu", dtype="float32", threads=1, seed=3)
+    assert shared["format"] == 1 and shared["git"] == meta["git"] and shared["versions"] == meta["versions"]
+    assert shared["version"] == meta["versions"]["dhtorch"]
+    assert shared["data"]["name"] == "made" and (shared["data"]["recordings"], shared["data"]["frames"]) == (2, 6)
+    assert shared["config"]["data"] == {"name": "made"} and shared["config"]["seed"] == 3
+    asked = shared["config"]["extract"]
+    assert (
+        "engine" not in asked and "address" not in asked and asked["shard_rows"] == 4 and asked["tokens_hw"] == [28, 42]
+    )
+    uv = shared["columns"]["uv"]
+    assert (uv["kind"], uv["shape"], uv["unit"]) == ("float32", [6, 2], "px") and len(shared["channels"]) == 10
+    assert shared["grid"] == [2, 3] and shared["codes"]["hole"]["4"] == "TOO_DARK"
+    assert own == {"number": 1, "of": 2, "counts": {"none": 2, "skipped": 0}}
+    assert json.loads(json.dumps(shared)) == shared and str(folder) not in json.dumps(shared)
+
+
+BAD = {"load": Load(bad={1, 2}), "numbers": [10, 11, 12, 13, 14]}
+
+
+def test_a_bad_frame_ends_the_run_unless_told_otherwise(made):
+    expected = r"^one, frame 11: position 1 is damaged \(with extract.on_error=skip or flag the rest goes on\)$"
+    with pytest.raises(SampleError, match=expected):
+        made([recording(**BAD)], options={"gap": 1, "shard_rows": 1})
+
+
+def test_skipped_and_flagged_frames_are_counted_and_said(made):
+    skipped = made([recording(**BAD)], out="skip", options={"gap": 1, "on_error": "skip"})
+    assert Features(skipped.folder).place["frame_index"].tolist() == [10, 13, 14]
+    assert ", 3 rows," in skipped.said and "frames with a problem: 2 no second view, 2 skipped\n" in skipped.said
+    assert skipped.said.endswith("  one, frame 11: position 1 is damaged\n  one, frame 12: position 2 is damaged\n")
+    flagged = made([recording(**BAD)], out="flag", options={"gap": 1, "on_error": "flag"})
+    assert ", 5 rows," in flagged.said and "frames with a problem: 2 no second view, 2 unreadable\n" in flagged.said
+    rows = list(Features(flagged.folder))
+    assert [int(row["dhtorch.problem"]) for row in rows] == [1, 3, 3, 1, 0]
+    assert Features(flagged.folder).place["frame_index"].tolist() == [10, 11, 12, 13, 14]
+    assert all(not v.any() for k, v in rows[1].items() if k != "dhtorch.problem")
+
+
+def test_only_three_bad_frames_are_named(made):
+    many = made([recording(6, load=Load(bad={0, 1, 2, 3}))], options={"gap": 0, "on_error": "skip"})
+    assert many.said.count("is damaged") == 3 and many.said.endswith("  and 1 more\n")
+    three = made([recording(6, load=Load(bad={0, 1, 2}))], out="three", options={"gap": 0, "on_error": "skip"})
+    assert three.said.count("is damaged") == 3 and "more" not in three.said
+
+
+def test_an_interrupted_run_says_what_stays(made, monkeypatch):
+    real, calls = shards.write, []
+
+    def interrupted(*args):
+        calls.append(1)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return real(*args)
+
+    monkeypatch.setattr(shards, "write", interrupted)
+    with pytest.raises(KeyboardInterrupt, match=r"^1 of 2 shards in .*out are whole and stay; the same command does"):
+        made()
+    assert "1 left untouched" in made().said
+
+
+def test_the_folder_and_the_workers_are_checked_first(made, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(NotADirectoryError, match=r"out: .*file is a file, expected a folder, or a place for one"):
+        made(out="file")
+    for workers in (-1, 1.5, None):
+        with pytest.raises(ValueError, match=f"workers: found {workers}, expected a whole number of at least 0"):
+            made(workers=workers)
+    with pytest.raises(ValueError, match="found a picture of 7x7, expected at least one patch of 14"):
+        made(options={"tokens_hw": (7, 7)})
+    assert not (tmp_path / "out").exists()
+    assert made(out="deep/er").code == 0 and (tmp_path / "deep" / "er" / "shard-00000.parquet").exists()

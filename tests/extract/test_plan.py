@@ -1,0 +1,281 @@
+"""Which rows an extraction has, and what each is made of: recordings of a few pixels, a method that is told what to say."""
+
+import pickle
+from pathlib import Path
+from types import SimpleNamespace
+from typing import ClassVar
+
+import numpy as np
+import pytest
+import torch
+from support.stub_samples import H, K, N, Stub, Told, W, added, tiny
+
+from dhtorch import extract
+from dhtorch.data import Recording, Scene
+from dhtorch.extract import columns, plan
+from dhtorch.extract.dataset import Rows
+from dhtorch.records import Camera, Frame
+
+P = 6
+
+
+def frame(seed, confidence=False, bent=False, own=False):
+    """A picture of its own, depth in metres, a camera of its own."""
+    g = torch.Generator().manual_seed(seed)
+    image = torch.randint(0, 256, (1, 3, H, W), generator=g, dtype=torch.uint8)
+    depth = 0.5 + torch.rand(1, H, W, generator=g)
+    camera = Camera(torch.tensor([[K[0] + seed, K[1]]]), torch.tensor([K[2:]]))
+    if bent:
+        camera = camera.replace(distortion=torch.tensor([[0.01 * seed, 0.0, 0.0, 0.0]]))
+    conf = torch.randint(0, 3, (1, H, W), generator=g).to(torch.uint8) if confidence else None
+    return Frame(
+        image, depth, camera, Camera(torch.tensor([[9.0, 8.0]]), torch.tensor([[7.0, 6.0]])) if own else None, conf
+    )
+
+
+class Load:
+    """Frames by position; ``bad`` ones cannot be decoded. Counts what is asked for."""
+
+    def __init__(self, first=0, bad=(), error=OSError, **options):
+        self.first, self.bad, self.error, self.options = first, set(bad), error, options
+
+    def __call__(self, i):
+        if i in self.bad:
+            raise self.error(f"position {i}\n  is   damaged")
+        return frame(self.first + i, **self.options)
+
+
+def recording(n=4, numbers=None, name="one", load=None, gap=None, levels=None, **options):
+    number = torch.tensor(numbers if numbers is not None else list(range(n)))
+    made = Recording(name=name, format="made", load=load or Load(), number=number, **options)
+    return Scene(made, gap=gap, levels=levels)
+
+
+def rows(recordings, gap, method=None, wanted=None, **options):
+    method = Stub(answer=method or Told(), n=N)
+    found = columns.columns(N, P)
+    made = plan.make(recordings, gap, 1)
+    return Rows(recordings, made, wanted or found, method=method, gap=gap, tokens_hw=(H, W), **options)
+
+
+class Seen:
+    """A method that notes its two views, and answers as it was told."""
+
+    calls: ClassVar[list] = []
+
+    def __call__(self, anchor, other, *, n=N, seed=0, trace=None):
+        Seen.calls.append((anchor, other, seed))
+        return Told()(anchor, other, n=n, seed=seed, trace=trace)
+
+
+@pytest.fixture(autouse=True)
+def forgotten():
+    Seen.calls = []
+
+
+# ---------------------------------------------------------------------------------------------------- the plan
+
+
+def test_positions_and_places():
+    whole = plan.Plan(order=(2, 0, 1), episodes=(0, 4, 9), ends=(3, 4, 8), roots=())
+    assert len(whole) == 8
+    assert [whole.place(i) for i in range(8)] == [
+        (2, 0, 0),
+        (2, 0, 1),
+        (2, 0, 2),
+        (0, 4, 0),
+        *((1, 9, i) for i in range(4)),
+    ]
+
+
+def test_shards_cut_the_rows_in_equal_pieces():
+    whole = plan.Plan(order=(0,), episodes=(0,), ends=(8,), roots=())
+    for size, pieces in ((3, [3, 3, 2]), (4, [4, 4]), (8, [8]), (9, [8]), (1, [1] * 8)):
+        shards = whole.shards(size)
+        assert [len(s.rows) for s in shards] == pieces and [i for s in shards for i in s.rows] == list(range(8))
+        assert [(s.number, s.of) for s in shards] == [(k, len(pieces)) for k in range(len(pieces))]
+    assert [s.name for s in whole.shards(3)] == [f"shard-0000{k}.parquet" for k in range(3)]
+    assert plan.Shard(123, 200, range(1)).name == "shard-00123.parquet"
+
+
+def test_the_plan_is_sorted_by_episode():
+    made = plan.make(
+        [recording(2, name="c", episode=5), recording(3, name="a", episode=1), recording(4, name="b", episode=0)], 1, 1
+    )
+    assert (made.order, made.episodes, made.ends) == ((2, 1, 0), (0, 1, 5), (4, 7, 9))
+    unnumbered = plan.make([recording(2), recording(3, name="two")], 0, 1)
+    assert (unnumbered.order, unnumbered.episodes, unnumbered.ends) == ((0, 1), (0, 1), (2, 5))
+
+
+def test_roots_are_named_once_in_order():
+    roots = [Path("/b"), None, Path("/a"), Path("/b")]
+    made = plan.make([recording(root=r, name=str(k)) for k, r in enumerate(roots)], 0, 1)
+    assert made.roots == (Path("/b"), Path("/a"))
+
+
+def test_two_recordings_of_one_episode_are_refused():
+    with pytest.raises(ValueError, match="data: left and right are one episode, expected one camera of it"):
+        plan.make([recording(name="left", episode=3), recording(name="x"), recording(name="right", episode=3)], 0, 1)
+
+
+def test_steps_go_back_by_the_gap_evenly_for_many_views():
+    own, none = SimpleNamespace(name="r", gap=7), SimpleNamespace(name="r", gap=None)
+    assert plan.steps_back(own, 3, 1) == [3] and plan.steps_back(own, None, 1) == [7]
+    assert plan.steps_back(own, 0, 1) == plan.steps_back(none, 0, 3) == []
+    assert plan.steps_back(own, 6, 3) == [2, 4, 6] and plan.steps_back(own, None, 2) == [4, 7]
+    with pytest.raises(ValueError, match=r"extract\.gap: r knows no gap of its own, expected a number.*0 = front end"):
+        plan.steps_back(none, None, 1)
+    with pytest.raises(ValueError, match="views: found 4"):
+        plan.make([recording(gap=3)], None, 4)
+
+
+# ---------------------------------------------------------------------------------------------------- rows
+
+
+def test_a_row_looks_back_by_frame_number_inside_its_episode():
+    first = recording(numbers=[0, 1, 2, 5, 6, 7], load=Load(10), episode=3)
+    second = recording(3, name="two", load=Load(50), episode=1)
+    made = rows([first, second], 2, Seen())
+    pairs = {}
+    for position in range(len(made)):
+        Seen.calls = []
+        answer = made[position]
+        where = answer.place["episode_index"], answer.place["frame_index"]
+        assert answer.features["problem"] == (0 if Seen.calls else 1)
+        for anchor, other, _ in Seen.calls:
+            pairs[where] = [next(s for s in range(60) if torch.equal(frame(s).image, x.image)) for x in (other, anchor)]
+    assert pairs == {(1, 2): [50, 52], (3, 2): [10, 12], (3, 7): [13, 15]}
+
+
+def test_a_row_says_where_it_belongs():
+    made = rows(
+        [recording(numbers=[4, 9], times=torch.tensor([0.5, 2.5], dtype=torch.float64), name="x", episode=7)], 0
+    )
+    assert len(made) == 2
+    assert made[1].place == {"episode_index": 7, "frame_index": 9, "timestamp": 2.5, "recording": "x"}
+    assert list(made[0].place) == list(columns.PLACE) and made[0].complaint == ""
+    assert np.isnan(rows([recording()], 0)[2].place["timestamp"])
+
+
+def test_features_are_those_of_the_transform_in_the_types_of_the_columns():
+    one = recording(load=Load(confidence=True))
+    made = rows([one], 1, Told(), seed=4)
+    answer = made[2]
+    before, now = frame(1, confidence=True), frame(2, confidence=True)
+    given = {"image": now.image[0], "before": before.image[0], "depth": now.depth[0], "conf": now.conf[0]}
+    given |= {"intrinsics": [K[0] + 2, *K[1:]], "K_before": [K[0] + 1, *K[1:]]}
+    options = {"depth_unit": "m", "confidence": "conf", "other_intrinsics": "K_before", "seed": 4}
+    wanted = added(tiny(**options)(given))
+    assert answer.features.keys() == wanted.keys()
+    for name, value in wanted.items():
+        assert np.array_equal(answer.features[name], value.numpy()), name
+        assert answer.features[name].dtype == columns.columns(N, P)[name].kind
+    few = rows([one], 1, wanted=columns.choose(columns.columns(N, P, half=True), ["depth"]))[2]
+    assert list(few.features) == ["depth", "problem"] and few.features["depth"].dtype == np.float16
+
+
+def test_a_method_is_given_what_the_frames_know():
+    one = recording(load=Load(20, confidence=True, bent=True, own=True))
+    answer = rows([one], 2, Seen(), seed=9)[3]
+    ((anchor, other, seed),) = Seen.calls
+    before, now = frame(21, True, True, True), frame(23, True, True, True)
+    assert seed == 9 and answer.features["problem"] == 0
+    for mine, theirs in ((anchor, now), (other, before)):
+        assert torch.equal(mine.image, theirs.image) and torch.equal(mine.camera.f, theirs.camera.f)
+        assert torch.equal(mine.camera.c, theirs.camera.c)
+        assert torch.allclose(mine.camera.distortion, theirs.camera.distortion)
+    assert torch.equal(anchor.depth, now.depth) and torch.equal(anchor.conf, now.conf)
+    assert torch.equal(anchor.depth_camera.f, now.depth_camera.f)
+    mixed = recording(load=lambda i: frame(i, bent=i == 3))
+    rows([mixed], 1, Seen())[3]
+    anchor, other, _ = Seen.calls[-1]
+    assert (
+        torch.allclose(anchor.camera.distortion, torch.tensor([[0.03, 0, 0, 0]])) and not other.camera.distortion.any()
+    )
+
+
+def test_what_readers_give_is_trusted():
+    """Metres and intrinsics are the readers' own: no depth is too far, no principal point too far off."""
+    far = Frame(
+        frame(1).image, 5000 + frame(1).depth, Camera(torch.tensor([[30.0, 30]]), torch.tensor([[400.0, -300]]))
+    )
+    near = far.replace(depth=far.depth * 1e-8)
+    for odd in (far, near):
+        assert rows([recording(load=lambda i, odd=odd: odd)], 0)[0].features is not None
+
+
+def test_a_frame_that_cannot_be_read_says_so_and_is_no_other_view():
+    made = rows([recording(5, load=Load(bad={2}), numbers=[10, 11, 12, 13, 14])], 1)
+    bad = made[2]
+    assert bad.features is None and bad.complaint == "one, frame 12: position 2 is damaged"
+    assert [int(made[i].features["problem"]) for i in (0, 1, 3, 4)] == [1, 0, 1, 0]
+    short = rows([recording(load=Load(bad={1}, error=MemoryError))], 1)
+    for position in (1, 2):
+        with pytest.raises(MemoryError):
+            short[position]
+    with pytest.raises(torch.OutOfMemoryError):
+        rows([recording(load=Load(bad={1}, error=torch.OutOfMemoryError))], 0)[1]
+
+
+def test_many_views_are_the_nearest_first_and_the_anchor_pads():
+    method = Stub(answer=Seen(), n=N, views=2)
+    one = recording(6)
+    made = Rows([one], plan.make([one], 4, 2), columns.columns(N, P), method=method, gap=4, tokens_hw=(H, W))
+    for position, views in ((5, (3, 1)), (3, (1, 3))):
+        made[position]
+        _, other, _ = Seen.calls[-1]
+        assert other.image.shape == (2, 1, 3, H, W)
+        assert all(torch.equal(other.image[k], frame(v).image) for k, v in enumerate(views))
+    assert len(Seen.calls) == 2 and made[1].features["problem"] == 1 and len(Seen.calls) == 2
+
+
+def test_a_row_chooses_among_the_earlier_frames_that_can_be_read():
+    first, alone = recording(5, load=Load(bad={1})), recording(1, name="alone", load=Load(30))
+    method = Stub(answer=Seen(), n=N)
+    made = Rows([first, alone], plan.make([first, alone], "auto", 5), columns.columns(N, P), method=method, gap="auto",
+                tokens_hw=(H, W))  # fmt: skip
+    asked = {}
+    for position in (0, 2, 3, 4, 5):
+        Seen.calls = []
+        answer = made[position]
+        assert answer.features["problem"] == (0 if Seen.calls else 1)
+        for _, other, _ in Seen.calls:
+            views = other.image if other.image.dim() == 5 else other.image[None]
+            asked[position] = [next(s for s in range(9) if torch.equal(frame(s).image, x)) for x in views]
+    assert asked == {2: [0], 3: [0, 2], 4: [2, 3]}, "steps 1, 2, 3, 5 back; frame 1 is damaged, the first has none"
+
+
+def test_rows_are_the_same_in_any_order_and_after_a_pickle():
+    both = [recording(3, load=Load(0)), recording(3, name="two", load=Load(30))]
+    made = rows(both, 1)
+    forth = [made[i] for i in range(6)]
+    twin = pickle.loads(pickle.dumps(made))
+    for i in (5, 0, 4, 1, 3, 2):
+        assert twin[i].place["recording"] == forth[i].place["recording"]
+        assert all(np.array_equal(v, twin[i].features[k]) for k, v in forth[i].features.items())
+
+
+# ---------------------------------------------------------------------------------------------------- options, the run
+
+
+def test_options_of_an_extraction_are_checked():
+    for options, message in (
+        ({"engine": "dask"}, "extract.engine: found 'dask', expected one of local, ray"),
+        ({"on_error": "ignore"}, "extract.on_error: found 'ignore', expected one of raise, skip, flag"),
+        ({"fit": "squash"}, "extract.fit: found 'squash', expected one of stretch, pad, crop"),
+        ({"gap": -1}, "extract.gap: found -1, expected a whole number of at least 0"),
+        ({"gap": 1.5}, "extract.gap: found 1.5"),
+        ({"gap": "car"}, "extract.gap: found 'car'"),
+        ({"patch": 0}, "extract.patch: found 0, expected a whole number of at least 1"),
+        ({"patch": None}, "extract.patch: found None"),
+        ({"shard_rows": 0}, "extract.shard_rows: found 0, expected a whole number of at least 1"),
+        ({"shard_rows": None}, "extract.shard_rows: found None"),
+        ({"tokens_hw": None}, "extract.tokens_hw: found None, expected height and width"),
+        ({"tokens_hw": (1, 2, 3)}, "extract.tokens_hw: found"),
+        ({"tokens_hw": 224}, "extract.tokens_hw: found 224"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            extract.ExtractOptions(**options)
+    assert (
+        extract.ExtractOptions(gap=0, patch=1, shard_rows=1).gap == 0 and extract.ExtractOptions(gap=None).gap is None
+    )

@@ -1,0 +1,508 @@
+"""Files of rows: what a column is, what a shard says of itself, what is torn or of another extraction, reading back."""
+
+import json
+import os
+import sys
+from collections import Counter
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("pyarrow")
+
+import pyarrow
+from pyarrow import parquet
+
+from dhtorch.codes import Flag, Gate, Hole, PoseCode, Source, names
+from dhtorch.data import FormatError
+from dhtorch.extract import Features, JoinedDataset, columns, engines, shards
+from dhtorch.extract.dataset import Extracted
+from dhtorch.extract.plan import Shard
+from dhtorch.transforms import CHANNELS, ExtendDepth, SampleProblem
+
+N, P = 5, 6
+SHARED = {
+    "key": "k" * 64,
+    "config": {"seed": 0, "method": {"n": 5}},
+    "data": {"digest": "d"},
+    "git": "v1-2-gab",
+    "version": "0.1",
+    "columns": dict.fromkeys(columns.columns(N, P)),
+    "codes": {"problem": {"0": "NONE", "1": "NO_SECOND_VIEW", "2": "NO_DEPTH", "3": "UNREADABLE"}},
+}
+
+
+def row(k, wanted=None, episode=0, problem=0):
+    rng = np.random.default_rng(k)
+    found = columns.columns(N, P) if wanted is None else wanted
+    values = {}
+    for name, column in found.items():
+        values[name] = (
+            rng.integers(0, 2, column.shape) if column.kind in ("uint8", "bool") else rng.normal(size=column.shape)
+        )
+    place = {"episode_index": episode, "frame_index": k, "timestamp": k / 10, "recording": f"r{episode}"}
+    return {**values, **place, "problem": problem}
+
+
+def written(folder, pieces, wanted=None, shared=SHARED, of=None):
+    """Shards of some rows each."""
+    wanted = columns.columns(N, P) if wanted is None else wanted
+    shared = {**shared, "columns": dict.fromkeys(wanted)}
+    folder.mkdir(exist_ok=True)
+    first = 0
+    for number, piece in enumerate(pieces):
+        shard = Shard(number, of or len(pieces), range(first, first + len(piece)))
+        shards.write(folder, shard, piece, wanted, shared)
+        first += len(piece)
+    return folder
+
+
+# ---------------------------------------------------------------------------------------------------- columns
+
+
+def test_columns_have_the_shapes_types_and_units_that_they_are_known_by():
+    f, byte, flag, code = "float32", "uint8", "bool", "code"
+    wanted = {
+        "episode_index": ("int64", (), "1"),
+        "frame_index": ("int64", (), "1"),
+        "timestamp": ("float64", (), "s"),
+        "recording": ("str", (), "1"),
+        "uv": (f, (N, 2), "px"),
+        "xyz": (f, (N, 3), "m"),
+        "depth": (f, (N,), "m"),
+        "sigma": (f, (N,), "m"),
+        "score": (f, (N,), "1"),
+        "valid": (flag, (N,), "1"),
+        "source": (byte, (N,), code),
+        "flag": (byte, (N,), "bits"),
+        "hole": (byte, (N,), code),
+        "gate": (byte, (N,), code),
+        "T_1_from_0": (f, (4, 4), "1, m"),
+        "pose_cov": (f, (6, 6), "rad², rad m, m²"),
+        "pose_ok": (flag, (), "1"),
+        "pose_code": (byte, (), code),
+        "tokens": (f, (P, 10), "1/m, 1/m, share"),
+        "tokens_valid": (flag, (P,), "1"),
+        "problem": (byte, (), code),
+    }
+    found = columns.columns(N, P)
+    assert {k: (c.kind, c.shape, c.unit) for k, c in found.items()} == wanted and list(found) == list(wanted)
+    half = columns.columns(N, P, half=True)
+    assert {k for k in half if half[k] != found[k]} == {"xyz", "depth", "sigma", "score", "tokens"}
+    assert all(half[k] == found[k]._replace(kind="float16") for k in half if half[k] != found[k])
+
+
+def test_every_key_of_the_transform_has_a_column():
+    lost = {"image": torch.zeros(3, 28, 42), "depth": "x"}
+    extender = ExtendDepth(depth_unit="m", n=N, on_error="flag", prefix="far.")
+    with pytest.warns(UserWarning, match="flagged"):
+        blank = {k.removeprefix("far."): v for k, v in extender(lost).items() if k not in lost}
+    found = columns.columns(N, P)
+    assert set(found) == set(columns.PLACE) | set(blank)
+    kinds = {torch.float32: "float32", torch.bool: "bool", torch.int32: "uint8"}
+    assert {k: (found[k].shape, found[k].kind) for k in blank} == {
+        k: (tuple(v.shape), kinds[v.dtype]) for k, v in blank.items()
+    }
+
+
+def test_codes_fit_a_byte_and_are_named():
+    tables = columns.code_tables()
+    wanted = {
+        "source": Source,
+        "flag": Flag,
+        "hole": Hole,
+        "gate": Gate,
+        "pose_code": PoseCode,
+        "problem": SampleProblem,
+        "source_map": Source,
+        "gate_map": Gate,
+    }
+    assert tables == {k: names(t) for k, t in wanted.items()}
+    assert sum(tables["flag"]) == 255 and max(max(t) for t in tables.values()) == 128
+    assert tables["problem"] == {0: "NONE", 1: "NO_SECOND_VIEW", 2: "NO_DEPTH", 3: "UNREADABLE"}
+
+
+def test_chosen_columns_keep_place_problem_and_order():
+    found = columns.columns(N, P)
+    place = ["episode_index", "frame_index", "timestamp", "recording"]
+    assert list(columns.choose(found, None)) == list(found) and list(columns.PLACE) == place
+    assert list(columns.choose(found, ["tokens", "uv"])) == [*place, "uv", "tokens", "problem"]
+    assert list(columns.choose(found, [])) == [*place, "problem"]
+    with pytest.raises(
+        ValueError, match=r"extract\.columns: found 'colour', expected some of episode_index, .*problem$"
+    ):
+        columns.choose(found, ["uv", "colour"])
+
+
+def test_a_blank_row_is_zeros_and_a_problem():
+    blank = columns.blank(columns.choose(columns.columns(N, P, half=True), ["xyz", "pose_ok", "gate"]))
+    assert {k: (v.dtype, v.shape) for k, v in blank.items()} == {
+        "xyz": (np.float16, (N, 3)),
+        "gate": (np.uint8, (N,)),
+        "pose_ok": (np.bool_, ()),
+        "problem": (np.uint8, ()),
+    }
+    assert blank.pop("problem") == 3 and not any(v.any() for v in blank.values())
+
+
+def test_a_table_holds_the_numbers_row_by_row():
+    wanted = columns.columns(N, P)
+    layout = columns.schema(wanted, {"a": "b"})
+    given = [row(k, problem=k % 4) for k in range(3)]
+    table = columns.table(iter(given), wanted, layout)
+    assert table.num_rows == 3 and table.schema.metadata == {b"a": b"b"} and table.column_names == list(wanted)
+    for name, column in wanted.items():
+        field = table.schema.field(name)
+        assert field.metadata == {b"unit": column.unit.encode(), b"about": column.about.encode()} and not field.nullable
+        for k, one in enumerate(table.column(name).to_pylist()):
+            if column.kind == "str":
+                assert one == given[k][name]
+            else:
+                assert np.array_equal(np.asarray(one), np.asarray(given[k][name]).astype(column.kind)), name
+    assert layout.field("uv").type == pyarrow.list_(pyarrow.list_(pyarrow.float32(), 2), N)
+    assert layout.field("tokens").type == pyarrow.list_(pyarrow.list_(pyarrow.float32(), len(CHANNELS)), P)
+    assert layout.field("recording").type == pyarrow.string() and layout.field("pose_ok").type == pyarrow.bool_()
+
+
+# ---------------------------------------------------------------------------------------------------- shards
+
+
+def test_a_shard_says_what_it_holds(tmp_path):
+    wanted = columns.columns(N, P)
+    given = [row(k, problem=(0, 1, 1, 3)[k]) for k in range(4)]
+    counts = shards.write(tmp_path, Shard(2, 7, range(8, 14)), given, wanted, SHARED)
+    assert counts == {"none": 1, "no_second_view": 2, "unreadable": 1, "skipped": 2}
+    path = tmp_path / "shard-00002.parquet"
+    assert [p.name for p in tmp_path.iterdir()] == [path.name], "nothing else is left"
+    shared, own = shards.described(path)
+    assert shared == SHARED and own == {"number": 2, "of": 7, "counts": dict(counts)}
+    metadata = parquet.read_metadata(path)
+    assert metadata.num_rows == 4 and metadata.row_group(0).column(0).compression == "ZSTD"
+    assert list(json.loads(metadata.metadata[b"dhtorch.shard"])["counts"]) == sorted(counts)
+    assert json.loads(metadata.metadata[b"dhtorch"]) == SHARED
+
+
+def test_rows_are_stored_in_groups_of_sixteen(tmp_path):
+    few = columns.choose(columns.columns(N, P), ["pose_ok"])
+    shards.write(tmp_path, Shard(0, 1, range(35)), (row(k, few) for k in range(35)), few, SHARED | {"columns": few})
+    metadata = parquet.read_metadata(tmp_path / "shard-00000.parquet")
+    assert [metadata.row_group(k).num_rows for k in range(metadata.num_row_groups)] == [16, 16, 3]
+    features = Features(tmp_path)
+    for k in (0, 15, 16, 31, 32, 34):
+        assert features.at(0, k)["dhtorch.pose_ok"] == bool(row(k, few)["pose_ok"])
+
+
+def test_halves_and_fewer_columns_are_smaller_files(tmp_path):
+    whole, half = columns.columns(N, P), columns.columns(N, P, half=True)
+    few = columns.choose(half, ["tokens"])
+    size = [
+        sum(
+            p.stat().st_size
+            for p in shards.shard_files(written(tmp_path / name, [[row(k) for k in range(16)]], wanted))
+        )
+        for name, wanted in (("whole", whole), ("half", half), ("few", few))
+    ]
+    numbers = [
+        sum(np.dtype(c.kind).itemsize * int(np.prod(c.shape)) for c in wanted.values() if np.dtype(c.kind).kind == "f")
+        for wanted in (whole, half, few)
+    ]
+    for k in (0, 1):  # noise of double precision cannot be packed: what a narrower row lacks, its file lacks
+        assert size[k] - size[k + 1] > 0.8 * 16 * (numbers[k] - numbers[k + 1]) > 0
+
+
+def test_the_same_rows_are_the_same_bytes(tmp_path):
+    one, two = (written(tmp_path / name, [[row(0), row(1)], [row(2)]]) for name in "ab")
+    for path in shards.shard_files(one):
+        assert path.read_bytes() == (two / path.name).read_bytes()
+
+
+def test_a_shard_that_is_not_finished_leaves_nothing(tmp_path):
+    def broken():
+        yield row(0)
+        assert [p.name for p in tmp_path.iterdir()] == [".shard-00000.parquet.tmp"], (
+            "not under its name before it is whole"
+        )
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        shards.write(tmp_path, Shard(0, 1, range(2)), broken(), columns.columns(N, P), SHARED)
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_a_killed_writer_left_is_cleared(tmp_path):
+    for name in (
+        ".shard-00003.parquet.tmp",
+        "shard-00001.parquet",
+        ".other.tmp",
+        "shard-00001.parquet.tmp",
+        ".shard-x",
+    ):
+        (tmp_path / name).write_bytes(b"PAR1")
+    shards.clear(tmp_path)
+    assert {p.name for p in tmp_path.iterdir()} == {
+        "shard-00001.parquet",
+        ".other.tmp",
+        "shard-00001.parquet.tmp",
+        ".shard-x",
+    }
+    assert [p.name for p in shards.shard_files(tmp_path)] == ["shard-00001.parquet"]
+
+
+def test_finished_shards_are_whole_and_of_this_extraction(tmp_path):
+    folder = written(tmp_path / "out", [[row(0)], [row(1, problem=1), row(2)], [row(3)]])
+    assert shards.finished(folder, SHARED) == {
+        "shard-00000.parquet": Counter(none=1),
+        "shard-00001.parquet": Counter(none=1, no_second_view=1),
+        "shard-00002.parquet": Counter(none=1),
+    }
+    torn = folder / "shard-00001.parquet"
+    torn.write_bytes(torn.read_bytes()[:-50])
+    assert sorted(shards.finished(folder, SHARED)) == ["shard-00000.parquet", "shard-00002.parquet"]
+    parquet.write_table(pyarrow.table({"a": [1]}), torn)
+    assert len(shards.finished(folder, SHARED)) == 2, "a table of somebody else's"
+    with pytest.raises(FormatError, match=r"shard-00001.parquet: metadata: found KeyError.*a shard of dhtorch extract"):
+        shards.described(torn)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"config": {"seed": 3, "method": {"n": 5}}}, "seed 0 there, 3 here"),
+        ({"config": {"seed": 0, "method": {"n": 9}}}, "method.n 5 there, 9 here"),
+        ({"config": {"seed": 1, "method": {"n": 9}}}, "method.n 5 there, 9 here"),
+        ({"config": {"method": {"n": 5}}}, "seed 0 there, None here"),
+        ({"config": {"seed": 0, "method": {"n": 5}, "z": 1}}, "z None there, 1 here"),
+        ({"data": {"digest": "e"}}, "other data"),
+        ({"git": "v2"}, "other code: v1-2-gab there, v2 here"),
+        ({"git": None}, "other code: v1-2-gab there, 0.1 here"),
+        ({}, "other code"),
+    ],
+)
+def test_the_first_difference_between_two_extractions_is_said(tmp_path, change, said):
+    folder = written(tmp_path / "out", [[row(0)]])
+    ours = {**SHARED, **change, "key": "x" * 64}
+    expected = rf"shard-00000.parquet: found a shard of another extraction \({said}\), expected one of this, or another"
+    with pytest.raises(FileExistsError, match=expected):
+        shards.finished(folder, ours)
+    assert shards.finished(folder, {**SHARED, **change}), "the key alone decides"
+
+
+# ---------------------------------------------------------------------------------------------------- reading back
+
+
+def test_rows_come_back_in_the_types_of_the_transform(tmp_path):
+    half = columns.columns(N, P, half=True)
+    given = [[row(0), row(1)], [row(4)], [row(0, episode=2), row(3, episode=2)]]
+    features = Features(written(tmp_path / "out", given, half))
+    flat = [one for piece in given for one in piece]
+    assert len(features) == 5 and features.columns == tuple(k for k in half if k not in columns.PLACE)
+    kinds = {"float32": torch.float32, "float16": torch.float32, "bool": torch.bool, "uint8": torch.int32}
+    for one, mine in zip(flat, features, strict=True):
+        assert mine.keys() == {f"dhtorch.{k}" for k in features.columns}
+        for name in features.columns:
+            value = mine[f"dhtorch.{name}"]
+            assert value.dtype == kinds[half[name].kind] and tuple(value.shape) == half[name].shape
+            wanted = np.asarray(one[name]).astype(half[name].kind).astype(np.float64)
+            assert np.array_equal(value.double().numpy(), wanted), name
+    assert features.place["episode_index"].tolist() == [0, 0, 0, 2, 2]
+    assert features.place["frame_index"].tolist() == [0, 1, 4, 0, 3]
+    assert features.place["timestamp"].tolist() == [0.0, 0.1, 0.4, 0.0, 0.3]
+    assert features.about["key"] == SHARED["key"]
+
+
+def test_a_row_is_found_by_place_and_by_episode_and_frame(tmp_path):
+    folder = written(tmp_path / "out", [[row(0), row(1)], [row(0, episode=2), row(7, episode=2)]])
+    features = Features(folder, ["depth", "gate"], prefix="far.")
+    assert features.at(2, 7).keys() == {"far.depth", "far.gate"}
+    for i, key in enumerate(((0, 0), (0, 1), (2, 0), (2, 7))):
+        mine = features.at(*key)
+        assert all(torch.equal(mine[k], features[i][k]) and torch.equal(mine[k], features[i - 4][k]) for k in mine)
+        assert np.array_equal(mine["far.depth"], row(key[1])["depth"].astype(np.float32))
+    for i in (4, -5):
+        with pytest.raises(IndexError):
+            features[i]
+    with pytest.raises(KeyError, match="no features of frame 1 of episode 2"):
+        features.at(2, 1)
+    features[0]["far.depth"].zero_()
+    assert features[0]["far.depth"].any(), "a copy of its own"
+
+
+def test_a_rewritten_file_is_read_again(tmp_path):
+    folder = written(tmp_path / "out", [[row(0)]])
+    first = Features(folder)[0]
+    written(folder, [[row(0) | {"depth": np.full(N, 8.0)}]])
+    os.utime(folder / "shard-00000.parquet", ns=(10**18, 10**18))
+    assert not torch.equal(first["dhtorch.depth"], torch.full((N,), 8.0))
+    assert torch.equal(Features(folder)[0]["dhtorch.depth"], torch.full((N,), 8.0))
+
+
+def test_a_folder_without_a_whole_extraction_is_refused(tmp_path):
+    with pytest.raises(FormatError, match="shards: found none, expected a folder that dhtorch extract wrote"):
+        Features(tmp_path)
+    folder = written(tmp_path / "out", [[row(0)], [row(1)]], of=3)
+    with pytest.raises(
+        FormatError, match="shards: found 2, expected 3: the same dhtorch extract once more makes those"
+    ):
+        Features(folder)
+    whole = written(tmp_path / "whole", [[row(0)]])
+    for wrong in ("colour", "timestamp"):
+        with pytest.raises(FormatError, match=f"columns: found {wrong}, expected some of uv, xyz, .*problem$"):
+            Features(whole, ["uv", wrong])
+
+
+def test_items_are_joined_by_the_numbers_of_episode_and_frame(tmp_path):
+    features = Features(written(tmp_path / "out", [[row(0), row(1), row(0, episode=1)]]), ["depth"])
+    items = [
+        {"episode_index": torch.tensor(1), "frame_index": 0, "x": 1},
+        {"episode_index": 0, "frame_index": 1, "x": 2},
+    ]
+    joined = JoinedDataset(items, features)
+    assert len(joined) == 2 and joined[0]["x"] == 1 and joined[1].keys() == {*items[1], "dhtorch.depth"}
+    assert torch.equal(joined[1]["dhtorch.depth"], features[1]["dhtorch.depth"])
+    nested = JoinedDataset([{"m": {"e": 0, "f": 1}}], features, episode_key="m.e", frame_key="m/f")
+    assert torch.equal(nested[0]["dhtorch.depth"], features[1]["dhtorch.depth"])
+    with pytest.raises(KeyError, match="frame 5 of episode 0"):
+        JoinedDataset([{"episode_index": 0, "frame_index": 5}], features)[0]
+
+
+def test_a_joined_data_set_goes_through_a_loader(tmp_path):
+    features = Features(written(tmp_path / "out", [[row(k) for k in range(4)]]), ["tokens", "tokens_valid"])
+    joined = JoinedDataset([{"episode_index": 0, "frame_index": k} for k in (3, 1, 0, 2)], features)
+    (batch,) = torch.utils.data.DataLoader(joined, batch_size=4, num_workers=1, multiprocessing_context="fork")
+    assert batch["dhtorch.tokens"].shape == (4, P, 10) and batch["frame_index"].tolist() == [3, 1, 0, 2]
+    assert all(
+        torch.equal(batch["dhtorch.tokens"][k], features[i]["dhtorch.tokens"]) for k, i in enumerate((3, 1, 0, 2))
+    )
+
+
+# ---------------------------------------------------------------------------------------------------- engines
+
+
+class Counted(torch.utils.data.Dataset):
+    """Answers that tell their position, and how they were made."""
+
+    def __len__(self):
+        return 50
+
+    def __getitem__(self, i):
+        return Extracted({"at": i, "threads": torch.get_num_threads()}, None, str(i))
+
+
+class Ray:
+    """The little of Ray and Ray Data that is used, in this process."""
+
+    def __init__(self):
+        self.log, self.context = [], SimpleNamespace(execution_options=SimpleNamespace())
+        self.DataContext = SimpleNamespace(get_current=lambda: self.context)
+
+    def init(self, **options):
+        self.log.append(("init", options))
+
+    def put(self, value):
+        return [value]
+
+    def get(self, reference):
+        return reference[0]
+
+    def shutdown(self):
+        self.log.append(("shutdown", {}))
+
+    def from_numpy(self, blocks):
+        self.log.append(("blocks", [len(b) for b in blocks]))
+        self.blocks = blocks
+        return self
+
+    def map_batches(self, task, *, batch_size, num_cpus):
+        assert batch_size is None and num_cpus == 1
+        self.task = task
+        return self
+
+    def iter_batches(self, *, batch_size, prefetch_batches):
+        assert batch_size is None and prefetch_batches == 1
+        return (self.task({"data": block}) for block in self.blocks)
+
+
+@pytest.fixture
+def ray(monkeypatch):
+    fake = Ray()
+    monkeypatch.setitem(sys.modules, "ray", fake)
+    monkeypatch.setitem(sys.modules, "ray.data", fake)
+    return fake
+
+
+def test_answers_come_in_the_order_of_their_positions():
+    order = [7, 3, 3, 20]
+    answers = list(engines.here(Counted(), order, 0))
+    assert [a.place["at"] for a in answers] == order and {a.place["threads"] for a in answers} == {1}
+    assert all(type(a) is Extracted and a.features is None and a.complaint == str(a.place["at"]) for a in answers)
+
+
+def test_arrays_of_an_answer_come_as_they_are():
+    class Arrays(Counted):
+        def __getitem__(self, i):
+            return super().__getitem__(i)._replace(features={"depth": np.full(3, i)})
+
+    (answer,) = engines.here(Arrays(), [2], 0)
+    assert type(answer.features["depth"]) is np.ndarray and answer.features["depth"].tolist() == [2, 2, 2]
+
+
+def test_an_error_that_is_no_dead_worker_stays_what_it_is():
+    class Broken(Counted):
+        def __getitem__(self, i):
+            raise RuntimeError("shapes do not fit")
+
+    with pytest.raises(RuntimeError, match=r"^shapes do not fit"):
+        list(engines.here(Broken(), [0], 0))
+
+
+def test_ray_is_given_blocks_and_gives_the_same_answers(ray):
+    order = list(range(49, 9, -1))
+    answers = list(engines.on_ray(Counted(), order, None))
+    assert [a.place["at"] for a in answers] == order and all(type(a) is Extracted for a in answers)
+    assert [name for name, _ in ray.log] == ["init", "blocks", "shutdown"] and ray.log[1][1] == [16, 16, 8]
+    options = ray.log[0][1]
+    assert options["address"] is None and options["include_dashboard"] is False and options["log_to_driver"] is False
+    assert options["object_store_memory"] == 300_000_000
+    assert ray.context.execution_options.preserve_order is True and ray.context.enable_progress_bars is False
+
+
+def test_a_cluster_that_is_there_is_joined_and_left(ray, monkeypatch):
+    asked = []
+    monkeypatch.setattr(
+        engines.socket,
+        "create_connection",
+        lambda where, timeout: asked.append((where, timeout)) or SimpleNamespace(close=int),
+    )
+    for address, where in (
+        ("ray://head:10001", [("head", 10001)]),
+        ("10.0.0.1:6379", [("10.0.0.1", 6379)]),
+        ("auto", []),
+    ):
+        asked.clear()
+        ray.log.clear()
+        assert len(list(engines.on_ray(Counted(), [1, 2], address))) == 2
+        assert [w for w, _ in asked] == where and all(timeout == 10 for _, timeout in asked)
+        assert ray.log[0][1]["address"] == address and "object_store_memory" not in ray.log[0][1]
+        assert ray.log[-1][0] == "shutdown"
+
+
+def test_a_cluster_that_does_not_answer_is_said(ray, monkeypatch):
+    def refused(where, timeout):
+        raise ConnectionRefusedError("refused")
+
+    monkeypatch.setattr(engines.socket, "create_connection", refused)
+    with pytest.raises(ConnectionError, match=r"address: nothing answers at ray://head:1 \(refused\), expected a clu"):
+        list(engines.on_ray(Counted(), [1], "ray://head:1"))
+    assert not ray.log
+    monkeypatch.setattr(ray, "init", lambda **_: (_ for _ in ()).throw(ValueError("no node")))
+    with pytest.raises(ConnectionError, match=r"engine=ray: no node"):
+        list(engines.on_ray(Counted(), [1], None))
+
+
+def test_ray_is_left_when_a_reader_stops_early(ray):
+    answers = engines.on_ray(Counted(), range(40), None)
+    assert next(answers).place["at"] == 0
+    answers.close()
+    assert ray.log[-1][0] == "shutdown"

@@ -1,0 +1,294 @@
+"""Where to look first: coarse motion of whole pictures, against motions that are known."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from dhtorch.geometry import coarse_flow as start
+from dhtorch.geometry import lucas_kanade as lk
+from dhtorch.geometry.determinism import LANES
+from dhtorch.geometry.pyramid import build_pyramid
+from dhtorch.records import TrackHint, Tracks
+from dhtorch.stages import track
+from dhtorch.stages.track import MIN_EIGENVALUE, lucas_kanade, lucas_kanade_affine
+
+H, W = 240, 320
+
+
+def _texture(seed: int) -> Tensor:
+    """(1, 1, 3 H, 3 W) grey values with detail of every size."""
+    g = torch.Generator().manual_seed(seed)
+    total = torch.zeros(1, 1, 3 * H, 3 * W)
+    for size in (4, 12, 36, 108, 324):
+        noise = torch.rand(1, 1, 3 * H // size + 2, 3 * W // size + 2, generator=g)
+        total = total + size**0.5 * F.interpolate(noise, (3 * H, 3 * W), mode="bicubic", align_corners=False)
+    total = total - total.amin()
+    return total / total.amax()
+
+
+def _pair(
+    seed: int, shift: tuple[float, float], turn_deg: float = 0.0, zoom: float = 1.0
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Two pictures of one texture, and where (H, W, 2) each pixel of the first lies in the second."""
+    world = _texture(seed)
+    a = math.radians(turn_deg)
+    A = zoom * torch.tensor([[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]])
+    middle = torch.tensor([(W - 1) / 2, (H - 1) / 2])
+    v, u = torch.meshgrid(torch.arange(float(H)), torch.arange(float(W)), indexing="ij")
+    uv = torch.stack([u, v], -1)
+    there = (uv - middle) @ A.T + middle + torch.tensor(shift)
+    back = (uv - middle - torch.tensor(shift)) @ torch.linalg.inv(A).T + middle
+
+    def seen(at: Tensor) -> Tensor:
+        place = (at + torch.tensor([float(W), float(H)]) + 0.5) / torch.tensor([1.5 * W, 1.5 * H]) - 1
+        return F.grid_sample(world, place[None], mode="bilinear", align_corners=False)
+
+    return seen(uv), seen(back), there
+
+
+def _share_near(flow: start.Flow, there: Tensor, limit_px: float) -> float:
+    """Share of the pixels still in sight whose start is closer than that to where they went."""
+    v, u = torch.meshgrid(torch.arange(8, H - 8, 8), torch.arange(8, W - 8, 8), indexing="ij")
+    uv = torch.stack([u, v], -1).reshape(1, -1, 2)
+    true = there[v, u].reshape(-1, 2)
+    inside = ((true > 8) & (true < torch.tensor([W - 8.0, H - 8.0]))).all(-1)
+    miss = (flow.at(uv.float())[0] - true).norm(dim=-1)
+    return float((miss[inside] < limit_px).float().mean())
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (80.0, 0.0), (-75.0, 40.0), (10.0, -70.0)])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_shift_of_a_quarter_of_the_width_is_found(seed: int, shift: tuple[float, float]) -> None:
+    a, b, there = _pair(seed, shift)
+    flow = start.coarse_flow(a, b)
+    assert torch.equal(flow.linear[0], torch.eye(2))
+    assert _share_near(flow, there, 8.0) > 0.9
+
+
+@pytest.mark.parametrize(
+    "turn_deg, zoom", [(30.0, 1.0), (-15.0, 1.0), (0.0, 1.4), (0.0, 1 / 1.4), (20.0, 1.3), (-25.0, 0.75)]
+)
+@pytest.mark.parametrize("seed", [2, 3])
+def test_turn_and_zoom_are_found(seed: int, turn_deg: float, zoom: float) -> None:
+    a, b, there = _pair(seed, (20.0, -12.0), turn_deg, zoom)
+    assert _share_near(start.coarse_flow(a, b), there, 10.0 * max(1.0, zoom)) > 0.9
+
+
+@pytest.mark.parametrize("gain, bias", [(0.25, 0.0), (0.5, 0.3), (1.0, 0.0)])
+def test_exposure_makes_no_difference(gain: float, bias: float) -> None:
+    a, b, there = _pair(4, (40.0, 20.0))
+    assert _share_near(start.coarse_flow(a, gain * b + bias), there, 8.0) > 0.9
+    assert _share_near(start.coarse_flow(gain * a + bias, b), there, 8.0) > 0.9
+
+
+def test_pictures_of_different_things_have_no_start() -> None:
+    flow = start.coarse_flow(
+        _pair(5, (0.0, 0.0))[0], torch.rand(1, 1, H, W, generator=torch.Generator().manual_seed(1))
+    )
+    assert flow.uv_1.isnan().all() and torch.equal(flow.linear[0], torch.eye(2))
+    flat = torch.full((1, 1, H, W), 0.5)
+    assert start.coarse_flow(flat, flat).at(torch.zeros(1, 3, 2)).isnan().all()
+
+
+def test_sizes_may_differ() -> None:
+    a, b, there = _pair(6, (30.0, 10.0))
+    flow = start.coarse_flow(a, F.interpolate(b, scale_factor=2, mode="bilinear", align_corners=False))
+    assert _share_near(flow, (there + 0.5) * 2 - 0.5, 10.0) > 0.95
+
+
+def test_a_picture_of_another_size_is_searched_at_the_size_of_the_first() -> None:
+    a, b, there = _pair(6, (30.0, 10.0))
+    large = F.interpolate(b, scale_factor=2, mode="bicubic", align_corners=False).clamp(0, 1)
+    assert torch.equal(start.coarse_flow(a, large).linear[0], 2 * torch.eye(2))
+    assert torch.equal(start.coarse_flow(large, a).linear[0], 0.5 * torch.eye(2))
+    known = start.coarse_flow(a, large, linear=2 * torch.eye(2)[None])
+    assert torch.equal(known.uv_1, start.coarse_flow(a, large).uv_1)
+    uv = torch.tensor([[[100.0, 100.0], [150.0, 120.0], [90.0, 160.0], [200.0, 60.0]]])
+    true = 2 * there[uv[0, :, 1].long(), uv[0, :, 0].long()] + 0.5
+    tracks = lucas_kanade_affine(a, large, uv, start=start.coarse_flow)
+    assert tracks.valid.all() and float((tracks.uv_1[0] - true).norm(dim=-1).max()) < 0.3
+
+
+def test_neighbours_tell_what_a_repeated_pattern_cannot() -> None:
+    a, b, there = _pair(8, (40.0, 0.0))
+    v, u = torch.meshgrid(torch.arange(float(H)), torch.arange(float(W)), indexing="ij")
+
+    def papered(image: Tensor, shift: float) -> Tensor:
+        stripes = 0.5 + 0.3 * torch.sin((u - shift) * (2 * math.pi / 40)) * torch.cos(v * (2 * math.pi / 48))
+        inside = ((u - shift - W / 2).abs() < 80) & ((v - H / 2).abs() < 60)
+        return torch.where(inside, stripes, image)
+
+    flow = start.coarse_flow(papered(a, 0.0), papered(b, 40.0))
+    assert _share_near(flow, there, 10.0) > 0.9
+
+
+def test_cells_hear_from_above_and_below_as_from_left_and_right() -> None:
+    V = torch.randint(0, 1 << 14, (1, 2, 4, 5, 7, 7), generator=torch.Generator().manual_seed(0)).float()
+    told, turned = start._told(V), start._told(V.transpose(2, 3)).transpose(2, 3)
+    assert torch.equal(told, turned)
+    for quiet in ((slice(1, None), slice(None)), (slice(None), slice(1, None))):  # one row, one column alone speaks
+        alone = V.clone()
+        alone[:, :, quiet[0], quiet[1]] = 0
+        assert bool((start._told(alone)[:, :, -1, -1] != 0).any())
+
+
+def test_what_is_upright_was_read_where_its_pixels_lie() -> None:
+    v, u = torch.meshgrid(torch.arange(float(H)), torch.arange(float(W)), indexing="ij")
+    a = math.radians(20.0)
+    linear = 0.7 * torch.tensor([[[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]]])
+    at = start.turned(linear, torch.stack([u, v], -1).reshape(1, -1, 2), (H, W)).reshape(H, W, 2)
+    inside = ((at >= 0) & (at <= torch.tensor([W - 1.0, H - 1.0]))).all(-1)
+    for axis, ramp in enumerate((u, v)):
+        seen = start.upright((ramp / W)[None, None], linear, torch.tensor([0.5]))
+        torch.testing.assert_close(seen[0, 0][inside] * W * 0.5, at[..., axis][inside], atol=2e-3, rtol=0)
+    same = start.upright(u[None, None] / W, torch.eye(2)[None], torch.ones(1))
+    assert torch.equal(same[0, 0], u / W)
+    places = 300 * torch.rand(1, 500, 2, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(start.turned(torch.eye(2)[None], places, (H, W)), places)
+
+
+def test_one_pair_is_answered_as_in_a_batch() -> None:
+    pairs = [_pair(k, shift)[:2] for k, shift in enumerate([(30.0, 5.0), (-60.0, 0.0), (4.0, 50.0)])]
+    a, b = (torch.cat(x) for x in zip(*pairs, strict=True))
+    whole = start.coarse_flow(a, b)
+    for k in range(3):
+        one = start.coarse_flow(a[k : k + 1], b[k : k + 1])
+        for name in ("uv_0", "uv_1", "support", "linear"):
+            assert torch.equal(getattr(one, name)[0], getattr(whole, name)[k])
+
+
+@pytest.mark.parametrize("long", [16, 60, 64, 400])
+def test_a_small_picture_says_where_its_pixels_lie(long: int) -> None:
+    v, u = torch.meshgrid(torch.arange(float(H)), torch.arange(float(W)), indexing="ij")
+    for ramp, axis in ((u, 0), (v, 1)):
+        picture = start.small((ramp / W)[None, None], long)
+        h, w = picture.grey.shape[-2:]
+        assert max(h, w) <= long or picture.scale == 1
+        at = torch.stack(torch.meshgrid(torch.arange(float(w)), torch.arange(float(h)), indexing="xy"), -1)
+        torch.testing.assert_close(picture.grey[0, 0] * W, picture.to_image(at)[..., axis], atol=1e-3, rtol=1e-5)
+
+
+MOTIONS = [
+    ((80.0, 10.0), 0.0, 1.0),
+    ((20.0, -12.0), 30.0, 1.0),
+    ((20.0, -12.0), -22.0, 1.0),
+    ((10.0, 5.0), 0.0, 1.5),
+    ((10.0, 5.0), 0.0, 0.7),
+]
+
+
+@pytest.mark.parametrize("shift, turn_deg, zoom", MOTIONS)
+def test_a_tracker_with_a_start_follows_what_one_without_loses(
+    shift: tuple[float, float], turn_deg: float, zoom: float
+) -> None:
+    a, b, there = _pair(3, shift, turn_deg, zoom)
+    b = 0.3 * b + 0.1
+    v, u = torch.meshgrid(torch.arange(20, H - 20, 20), torch.arange(20, W - 20, 20), indexing="ij")
+    uv = torch.stack([u, v], -1).reshape(1, -1, 2)
+    true = there[uv[0, :, 1], uv[0, :, 0]]
+    inside = ((true > 10) & (true < torch.tensor([W - 10.0, H - 10.0]))).all(-1)
+    search = partial(lucas_kanade, levels=5, normalise="bias")
+    share = {}
+    for name, begin in (("without", None), ("with", start.coarse_flow)):
+        tracks = lucas_kanade_affine(a, b, uv.float(), levels=5, track=search, start=begin)
+        miss = (tracks.uv_1[0] - true).norm(dim=-1)
+        share[name] = float((tracks.valid[0] & (miss < 0.2))[inside].float().mean())
+        assert float((tracks.valid[0] & (miss > 1.0))[inside].float().mean()) < (0.03 if begin else 0.3)
+    assert share["with"] > 0.85 and share["with"] > share["without"] + 0.2
+
+
+def test_the_way_back_starts_from_its_own_estimate() -> None:
+    """A start that is wrong on one way only is found out by the other."""
+    a, b, _ = _pair(7, (60.0, 0.0))
+    uv = torch.tensor([[[100.0, 100.0], [150.0, 120.0], [90.0, 160.0]]])
+    right = start.coarse_flow(a, b), start.coarse_flow(b, a)
+    track = partial(lucas_kanade, a, b, uv, levels=2)
+    assert track(hint=TrackHint(flows=right)).valid.all()
+    wrong = right[1].replace(uv_1=right[1].uv_1 + 90.0)
+    assert not track(hint=TrackHint(flows=(right[0], wrong))).valid.any()
+    assert not track().valid.any()  # two levels do not reach so far
+    silent = right[0].replace(uv_1=torch.full_like(right[0].uv_1, torch.nan))
+    nowhere = track(hint=TrackHint(flows=(silent, silent)))
+    assert torch.equal(nowhere.uv_1, track().uv_1) or not nowhere.valid.any()
+
+
+def test_a_pair_that_is_not_turned_is_tracked_beside_a_turned_one_as_alone() -> None:
+    turned, plain = _pair(3, (20.0, -12.0), 30.0)[:2], _pair(4, (33.0, 7.0))[:2]
+    a, b = (torch.cat(x) for x in zip(turned, plain, strict=True))
+    places = torch.rand(1, 300, 2, generator=torch.Generator().manual_seed(0))
+    uv = (15 + places * torch.tensor([W - 30.0, H - 30.0])).expand(2, -1, -1)
+    both = lucas_kanade(a, b, uv, levels=3, start=start.coarse_flow)
+    for k in range(2):
+        alone = lucas_kanade(a[k : k + 1], b[k : k + 1], uv[:1], levels=3, start=start.coarse_flow)
+        for name in ("uv_1", "error", "photometric", "cov", "valid"):
+            assert torch.equal(getattr(both, name)[k], getattr(alone, name)[0]), name
+
+
+def test_the_gradient_of_a_turned_track_is_finite_and_leaves_its_place() -> None:
+    a, b, _ = _pair(3, (20.0, -12.0), 30.0)
+    uv = torch.tensor([[[150.0, 110.0], [170.0, 130.0]]])
+    plain = lucas_kanade(a, b, uv, levels=3, start=start.coarse_flow)
+    b = b.clone().requires_grad_()
+    tracks = lucas_kanade(a, b, uv, levels=3, start=start.coarse_flow)
+    torch.testing.assert_close(tracks.uv_1.detach(), plain.uv_1)
+    tracks.uv_1.sum().backward()
+    assert b.grad is not None and bool(b.grad.isfinite().all()) and bool((b.grad != 0).any())
+
+
+def test_a_start_spares_the_levels_it_does_not_need_and_no_others() -> None:
+    """A point that was told where to look is searched for there and nowhere else; one that was not, everywhere."""
+    a, b, _ = _pair(5, (40.0, 0.0))
+    source, target = build_pyramid(a, 5, 21), build_pyramid(b, 5, 21)
+    o = lk.SearchOptions(21, 30, 0.01, MIN_EIGENVALUE, "bias")
+    x = (60 + 200 * torch.rand(2, LANES * 8, generator=torch.Generator().manual_seed(1))).clamp_max(H - 60)
+    expected = torch.tensor([[40.0], [0.0]]).expand_as(x)
+    every, none = torch.ones_like(x[0], dtype=torch.bool), torch.zeros_like(x[0], dtype=torch.bool)
+
+    def share(d: Tensor, begun: Tensor, near_levels: int) -> float:
+        found, ok, _ = lk.search(
+            source, target, o, x, d, torch.zeros_like(x[0], dtype=torch.long), known=every, alike=False,
+            begun=begun, near_levels=near_levels,
+        )  # fmt: skip
+        right = ok & ((found - expected).square().sum(0).sqrt() < 0.5)
+        return float(right.float().mean())
+
+    zero = torch.zeros_like(x)
+    assert share(zero, none, 2) == share(zero, every, 5) > 0.8, "from nothing, by all levels"
+    assert share(zero, every, 2) < 0.3, "told to look near, where it is not"
+    assert share(expected + 6.0, every, 2) > 0.8
+    half = torch.arange(x.shape[1]) % 2 == 0
+    assert share(torch.where(half, expected + 6.0, zero), half, 2) > 0.8, "each by its own"
+
+
+@pytest.mark.parametrize(("width", "levels"), [(320, 2), (640, 2), (1280, 3), (1920, 4)])
+def test_a_larger_picture_needs_more_levels_from_a_start(width: int, levels: int) -> None:
+    cells = torch.zeros(1, 10, 13)
+    uv = torch.zeros(1, 10, 13, 2)
+    flow = start.Flow(uv, uv, cells, torch.eye(2)[None], torch.ones(1))
+    assert track._reaching(flow, (width * 3 // 4, width), 21) == levels
+
+
+def test_what_is_found_in_the_upright_picture_is_told_of_the_image():
+    """Noise turns and grows with the picture, what was found beyond the image is not in it, and a start is undone."""
+    turn = 1.3 * torch.tensor([[math.cos(0.5), -math.sin(0.5)], [math.sin(0.5), math.cos(0.5)]])
+    linear = torch.stack([turn, torch.eye(2)])
+    middle = torch.tensor([[[W / 2, H / 2]]]).expand(2, 1, 2)
+    none = start.Flow(middle[:, None], middle[:, None], torch.ones(2, 1, 1), linear, torch.ones(2))
+    image = torch.rand(2, 1, H, W, generator=torch.Generator().manual_seed(0))
+    undone = track._Upright(image, (none, none))
+    uv = torch.tensor([[150.0, 110.0], [2.0, 3.0], [-3.0, 3.0]]).expand(2, 3, 2)
+    cov = torch.tensor([[4.0, 1.0], [1.0, 0.5]]).expand(2, 3, 2, 2)
+    known = torch.ones(2, 3, dtype=torch.bool)
+    tracks = Tracks(uv_0=uv, uv_1=uv, cov=cov, valid=known, error=torch.zeros(2, 3), photometric=torch.zeros(2, 3))
+    told = undone.to_image(tracks)
+    assert torch.allclose(told.cov[0], turn @ cov[0] @ turn.T) and torch.equal(told.cov[1], cov[1])
+    centre = torch.tensor([(W - 1) / 2, (H - 1) / 2])
+    assert torch.allclose(told.uv_1[0], (uv[0] - centre) @ turn.T + centre, atol=1e-3)
+    assert told.valid.tolist() == [[True, False, False], [True] * 3], "a picture that is not turned is judged elsewhere"
+    assert torch.allclose(undone.begin(uv, told.uv_1), uv, atol=1e-3)

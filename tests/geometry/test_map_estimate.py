@@ -1,0 +1,274 @@
+"""Noise, choices and the covariance of the most probable pose, against the same written out (``support/dense_reprojection.py``) and scipy."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import minimize
+from support import dense_reprojection as dense
+from test_map_pose import pairs
+
+from dhtorch.geometry import se3
+from dhtorch.geometry.map_estimate import (
+    MAX_NOISE_PX,
+    MEDIAN_1D,
+    MEDIAN_2D,
+    MIN_NOISE_PX,
+    FitOptions,
+    Solution,
+    most_probable,
+    noise_scale,
+    pose_covariance,
+)
+
+D = torch.float64
+
+
+def problem(batch=1, near=12, far=20, isotropic=0.2, seed=0, **options):
+    """Tracks as planes, the true unknowns."""
+    args, T, turn, _ = pairs(batch, near, far, seed=seed, **options)
+    return dense.problem_of(args, isotropic), dense.unknowns(T.R, T.t, turn)
+
+
+# ------------------------------------------------------------------------------------------------ noise
+
+
+def plain_noise(problem, at, b, rounds=3):
+    """(near, far) px², by sorting."""
+    near, far = 1.0, 1.0
+    for _ in range(rounds):
+        scale = torch.where(problem.far, far, near)
+        tracks = dense.tracks(problem, at, scale, b)
+        size = [
+            sorted(x.square**0.5 for x in tracks if x.front and kind(x)) for kind in (lambda x: x.near, lambda x: x.far)
+        ]
+        middle = [s[(len(s) - 1) // 2] if s else 1.0 for s in size]
+        of_near, of_far = middle[0] / 1.17741, middle[1] / 0.67449
+        if not any(x.far for x in tracks):
+            of_far = of_near
+        near, far = (min(max(v * k * k, 0.01), 25.0) for v, k in ((near, of_near), (far, of_far)))
+    return near, far
+
+
+@pytest.mark.parametrize("noise", [0.004, 0.6, 9.0])
+def test_the_noise_is_that_of_medians_of_near_and_of_far_residuals(noise):
+    """Near and far apart, three rounds, between a tenth of a pixel and five; unused tracks and those behind count not."""
+    tracks, at = problem(2, noise=noise, depth=0.004)
+    tracks.near[0, 2], tracks.far[1, -3] = False, False
+    tracks.ray[1, :, 3:5] *= -1
+    found = noise_scale(tracks, at)
+    for b in range(2):
+        near, far = plain_noise(tracks, at, b)
+        np.testing.assert_allclose(found[b, tracks.near[b]], near, rtol=1e-7)
+        np.testing.assert_allclose(found[b, tracks.far[b]], far, rtol=1e-7)
+        if noise < 0.6:
+            assert near == far == pytest.approx(MIN_NOISE_PX**2)
+        if noise > 5:
+            assert near == far == pytest.approx(MAX_NOISE_PX**2)
+        if noise == 0.6:
+            assert 0.2 < near != far < 3
+    rounds = [noise_scale(tracks, at, rounds=k)[0, 0] for k in (1, 2, 3)]
+    if noise == 0.6:
+        assert len(set(map(float, rounds))) == 3 and rounds[2] == found[0, 0]
+
+
+def test_without_far_tracks_their_noise_is_that_of_the_near_ones():
+    tracks, at = problem(1, 12, 8)
+    alone = tracks.replace(far=tracks.far & False)
+    found = noise_scale(alone, at)
+    near, far = plain_noise(alone, at, 0)
+    assert near == far and np.allclose(found, near, rtol=1e-9)
+
+
+def test_medians_are_those_of_normal_noise():
+    r = np.random.default_rng(0).standard_normal((400_000, 2))
+    assert np.median(np.linalg.norm(r, axis=1)) == pytest.approx(MEDIAN_2D, rel=4e-3)
+    assert np.median(np.abs(r[:, 0])) == pytest.approx(MEDIAN_1D, rel=4e-3)
+
+
+# ------------------------------------------------------------------------------------------------ covariance
+
+
+def plain_covariance(problem, solution, o, b):
+    """A⁻¹ M A⁻¹ with a column for every inverse depth, eliminated from both."""
+    tracks = dense.tracks(problem, solution.at, solution.noise, b)
+    bread, meat = [0.0] * len(tracks), [0.0] * len(tracks)
+    for kind, omega, size in (("near", 1.0, 2), ("far", float(solution.far_weight[b]), 1)):
+        used = [k for k, x in enumerate(tracks) if getattr(x, kind) and x.front]
+        square = np.array([tracks[k].square for k in used])
+        w, bend = (np.array([dense.weight(s, o.kernel, o.bend)[i] for s in square]) for i in (1, 2))
+        rise = w + bend * square * 2 / size  # of psi = w r, mean over directions
+        n = len(used)
+        spent = size * n / max(size * n - 6, 1)
+        few = 1 + 6 / (size * n) * rise.var() / max(rise.mean() ** 2, 0.01)
+        slope = max(rise.mean() / w.mean(), 0.1) / few
+        scatter = (w**2 * square).sum() / size / (w**2).sum() * spent**2
+        for k, x in zip(used, w, strict=True):
+            bread[k], meat[k] = omega * x * slope, omega**2 * x**2 * scatter
+    A, M = dense.reduced(tracks, bread)[0], dense.reduced(tracks, meat)[0]
+    known = np.diag([0.0] * 6 + [o.turn_sigma**-2 if o.turn_sigma else 1e18] * 3)
+    inverse = np.linalg.inv(A + known)
+    return inverse @ (M + known) @ inverse
+
+
+@pytest.mark.parametrize(
+    "o",
+    [
+        FitOptions(far_weight=0.1),
+        FitOptions(far_weight=0.7, kernel="huber", bend=1.0, turn_sigma=1e-3),
+        FitOptions(far_weight=1.0, kernel="cauchy", bend=1.5, turn_sigma=0.0),
+        FitOptions(far_weight=0.3, kernel=None, turn_sigma=0.1),
+        FitOptions(far_weight=0.3, kernel="geman_mcclure", bend=0.3),  # all residuals beyond the bend
+    ],
+)
+def test_the_covariance_is_the_sandwich_of_an_m_estimator(o):
+    tracks, at = problem(2, 9, 16, noise=0.5, turn=0.003, seed=3)
+    tracks.near[0, 2], tracks.far[1, -3] = False, False
+    tracks.uv[:, :, 11] += 30.0  # a mistrack
+    tracks.ray[0, :, 4] *= -1  # behind the camera
+    noise = torch.where(tracks.far, 0.5, 0.3).to(D) * torch.tensor([[1.0], [1.7]], dtype=D)
+    far = torch.tensor([o.far_weight, 0.25 * o.far_weight], dtype=D)
+    solution = Solution(at, noise, far, torch.full((2,), 7.0, dtype=D), torch.ones(2) > 0)
+    cov, ok = pose_covariance(tracks, solution, o)
+    assert ok.all() and torch.equal(cov, cov.mT)
+    for b in range(2):
+        wanted = plain_covariance(tracks, solution, o, b)
+        scale = np.sqrt(np.outer(np.diag(wanted), np.diag(wanted)))
+        np.testing.assert_allclose(cov[b].numpy() / scale, wanted / scale, rtol=0, atol=1e-6)
+
+
+def test_a_pose_that_is_not_determined_has_no_covariance():
+    tracks, at = problem(2, 9, 16)
+    tracks.near[1], tracks.far[1] = False, False
+    tracks.near[1, 0] = True
+    noise = torch.full_like(tracks.inverse, 0.1)
+    one = torch.ones(2, dtype=D)
+    cov, ok = pose_covariance(tracks, Solution(at, noise, one, one, one > 0), FitOptions())
+    assert ok.tolist() == [True, False] and cov[0].any() and not cov[1].any()
+
+
+# ------------------------------------------------------------------------------------------------ choices
+
+#: Enough steps that what is compared are optima.
+LONG = {"near_steps": 12, "steps": 12}
+
+
+def costs(problem, at, noise, o, far_weight, only_near=False, b=0):
+    tracks = dense.tracks(problem, at, noise, b)
+    if only_near:
+        tracks = [x for x in tracks if x.near]
+    return dense.cost(tracks, far_weight, o.kernel, o.bend)
+
+
+def contradiction():
+    """Few tracks, whose far ones have turned on their own: the near cost rises by some tens of per cent."""
+    tracks, at = problem(1, 12, 60, noise=0.3, depth=0.003, baseline=0.3, seed=4)
+    shift = torch.tensor([[[3.3], [2.1]]], dtype=D) * tracks.far[:, None]
+    return tracks.replace(uv=tracks.uv + shift), at
+
+
+def test_far_tracks_are_believed_up_to_the_rise_of_the_near_cost_that_is_allowed():
+    tracks, at = contradiction()
+    o = FitOptions(far_weight=0.5, turn_sigma=0.0, **LONG)
+    near, both = (most_probable(tracks, at.T, o._replace(max_rise=x)) for x in (-9.0, 1e9))
+    assert float(near.far_weight) == 0 and float(both.far_weight) == 0.5
+    noise = noise_scale(tracks, both.at)
+    before, after = (costs(tracks, x.at, noise, o, 0.5, only_near=True) for x in (near, both))
+    rise = (after - 1.0) / before - 1
+    assert 0.1 < rise < 3, "a case that depends on the option, and on one unit of slack"
+    for share, believed in ((0.97, False), (1.03, True)):
+        found = most_probable(tracks, at.T, o._replace(max_rise=share * rise))
+        wanted = both if believed else near
+        assert float(found.far_weight) == float(wanted.far_weight)
+        torch.testing.assert_close(found.at.T.t, wanted.at.T.t, rtol=0, atol=1e-12)
+
+
+def test_a_turn_is_believed_from_the_share_of_the_cost_that_is_asked():
+    tracks, at = problem(1, 30, 40, noise=0.3, depth=0.003, turn=0.002, seed=6)
+    o = FitOptions(far_weight=0.5, max_rise=1e9, turn_sigma=0.003, translation_gain=-1e9, **LONG)
+    rigid, turned = (most_probable(tracks, at.T, o._replace(turn_gain=x)) for x in (1e9, -1e9))
+    assert float(rigid.turn_precision) > 1e12 and rigid.at.turn.abs().max() < 1e-9
+    assert float(turned.turn_precision) == pytest.approx(0.003**-2) and turned.at.turn.abs().max() > 1e-4
+    noise = noise_scale(tracks, rigid.at)
+    held = float((turned.at.turn**2).sum()) / 0.003**2
+    before, after = costs(tracks, rigid.at, noise, o, 0.5), costs(tracks, turned.at, noise, o, 0.5) + held
+    gain = (before - after - 1.0) / before
+    assert 0.05 < gain < 0.9
+    for share, believed in ((0.97, True), (1.03, False)):
+        found = most_probable(tracks, at.T, o._replace(turn_gain=share * gain))
+        torch.testing.assert_close(found.at.turn, (turned if believed else rigid).at.turn, rtol=0, atol=1e-9)
+
+
+def test_a_prior_holds_the_turn_to_its_standard_deviation():
+    tracks, at = problem(1, 30, 40, noise=0.3, depth=0.003, turn=0.002, seed=6)
+    sizes = []
+    for sigma in (1e-4, 1e-3, 0.1):
+        o = FitOptions(turn_sigma=sigma, turn_gain=-1e9, max_rise=1e9, **LONG)
+        sizes.append(float(most_probable(tracks, at.T, o).at.turn.norm()))
+    assert sizes[0] < 0.2 * sizes[1] < 0.2 * sizes[2]
+
+
+def test_a_translation_is_believed_from_the_share_that_no_rotation_takes_away():
+    """The best pure rotation by scipy, from the written-out cost."""
+    tracks, at = problem(1, 14, 30, noise=0.5, depth=0.003, baseline=0.004, seed=8)
+    o = FitOptions(far_weight=0.5, max_rise=1e9, turn_sigma=0.0, **LONG)
+    solution = most_probable(tracks, at.T, o)
+    noise = noise_scale(tracks, solution.at)
+    ray, uv, xx_xy_yy = (getattr(tracks, k)[0].numpy() for k in ("ray", "uv", "shape"))
+    W = np.linalg.inv(xx_xy_yy[[0, 1, 1, 2]].T.reshape(-1, 2, 2) * noise[0].numpy()[:, None, None])
+
+    def rotated(w):
+        Y = (se3.exp(torch.tensor([[*w, 0.0, 0.0, 0.0]], dtype=D)).R @ solution.at.T.R)[0].numpy() @ ray
+        r = tracks.f[0].numpy()[:, None] * Y[:2] / Y[2] + tracks.c[0].numpy()[:, None] - uv
+        square = np.einsum("in,nij,jn->n", r, W, r)
+        return (square / (1 + square / 4) * np.where(tracks.far[0], 0.5, 1.0)).sum()
+
+    found = minimize(rotated, np.zeros(3), method="BFGS", options={"gtol": 1e-3})
+    gain = (found.fun - costs(tracks, solution.at, noise, o, 0.5) - 1.0) / found.fun
+    assert 0.05 < gain < 0.9
+    for share, believed in ((0.98, True), (1.02, False)):
+        again = most_probable(tracks, at.T, o._replace(translation_gain=share * gain))
+        assert bool(again.translates) is believed
+
+
+def test_steps_are_counted():
+    """From a start off the truth: none of them, one, enough."""
+    tracks, at = problem(1, 12, 20, noise=0.0, depth=0.0)
+    start = se3.retract(at.T, torch.full((1, 6), 0.01, dtype=D))
+
+    def off(**options):
+        found = most_probable(tracks, start, FitOptions(turn_sigma=0.0, max_rise=1e9, **options)).at.T
+        return float((found.t - at.T.t).norm())
+
+    still = off(near_steps=0, steps=0)
+    assert still == pytest.approx(float((start.t - at.T.t).norm()), rel=1e-12)
+    by_near = [off(near_steps=k, steps=0) for k in (1, 2, 4)]
+    by_all = [off(near_steps=0, steps=k) for k in (1, 2, 4)]
+    for one, two, four in (by_near, by_all):
+        assert 1e-4 * still < one < still and two < 0.2 * one and four < 1e-3 * two
+
+
+def test_where_they_stand_and_who_stands_beside_them_does_not_matter_to_tracks():
+    """Unused tracks among the used ones, near ones behind far ones: the answer is that of the used ones alone."""
+    tracks, at = problem(2, 12, 20, seed=5)
+    order = torch.randperm(640, generator=torch.Generator().manual_seed(0))
+    place = lambda x: torch.cat([x] * 20, -1)[..., order] if x.shape[-1] == 32 else x  # noqa: E731
+    wide = tracks.map(place)
+    empty = order >= 32
+    wide = wide.replace(near=wide.near & ~empty, far=wide.far & ~empty)
+    plain, mixed = most_probable(tracks, at.T, FitOptions()), most_probable(wide, at.T, FitOptions())
+    torch.testing.assert_close(mixed.at.T.t, plain.at.T.t, rtol=0, atol=1e-9)
+    torch.testing.assert_close(mixed.noise[:, ~empty], plain.noise[:, order[~empty]], rtol=1e-6, atol=0)
+    noise = noise_scale(tracks, plain.at)
+    near, far = (torch.where(kind, noise, 0).amax(-1, keepdim=True) for kind in (tracks.near, tracks.far))
+    torch.testing.assert_close(plain.noise, torch.where(tracks.far, far, near), rtol=1e-9, atol=0)
+    assert (mixed.noise[:, empty] == mixed.noise[:, wide.near[0]][:, :1]).all() and (near != far).all()
+
+
+def test_a_few_near_tracks_behind_very_many_far_ones_are_the_first_to_be_solved():
+    tracks, at = problem(1, 12, 300, seed=5)
+    turned = tracks.map(lambda x: x.flip(-1) if x.shape[-1] == 312 else x)
+    o = FitOptions(max_rise=-9.0, turn_sigma=0.0)  # the near tracks alone are answered
+    first, last = most_probable(tracks, at.T, o), most_probable(turned, at.T, o)
+    alone = most_probable(tracks.replace(far=tracks.far & False), at.T, o)
+    for found in (first, last):
+        torch.testing.assert_close(found.at.T.t, alone.at.T.t, rtol=0, atol=1e-9)

@@ -1,0 +1,269 @@
+"""Near and far tracks in one problem, against the same written out track by track (``support/dense_reprojection.py``) and autograd."""
+
+import numpy as np
+import pytest
+import torch
+from support import dense_reprojection as dense
+
+from dhtorch.geometry import reprojection_problem as near_far
+from dhtorch.geometry import se3
+from dhtorch.geometry.reprojection_problem import Problem, Unknowns
+
+D = torch.float64
+N = 16
+NOISE = torch.linspace(0.05, 0.4, N, dtype=D).expand(2, N)
+#: What tracks 8 to 15 are.
+FAR, BEYOND, EPIPOLE, NEARLY, BEHIND, UNUSED = (8, 9, 10), 11, 12, 13, 14, 15
+
+
+def scene(off=0.5, turn=0.02, seed=0):
+    """Two pairs with near tracks 0 to 7 and far ones, each ``off`` px beside where it belongs."""
+    g = torch.Generator().manual_seed(seed)
+    rand = lambda *s: torch.rand(*s, generator=g, dtype=D)  # noqa: E731
+    randn = lambda *s: torch.randn(*s, generator=g, dtype=D)  # noqa: E731
+    f, c = 400 + 90 * rand(2, 2), 300 + 20 * rand(2, 2)
+    T = se3.exp(torch.cat((0.1 * randn(2, 3), torch.tensor([[0.3, 0.1, 0.05], [-0.2, 0.2, 0.1]], dtype=D)), -1))
+    turn = turn * randn(2, 3)
+    ray = torch.cat((1.2 * rand(2, 2, N) - 0.6, torch.ones(2, 1, N, dtype=D)), 1)
+    ray = ray * (1 + (torch.arange(N) < 8) * rand(2, 1, N))  # rays of any length
+    q = 0.4 + 0.6 * rand(2, N)
+    q[:, 8:] = 0.2 * rand(2, 8)
+    nearest = q[:, :8].amax(-1)
+    q[:, EPIPOLE], q[:, NEARLY] = 2.1 * nearest, 1.9 * nearest
+    true = torch.where(torch.arange(N) == BEYOND, -0.3, q)
+    Y = T.R @ ray + true[:, None] * T.t[..., None]
+    height = (ray[:, 1] / ray[:, 2])[:, None]
+    Y = Y + torch.linalg.cross(height * turn[..., None], Y, dim=1)  # the rows turn
+    uv = Y[:, :2] / Y[:, 2:] * f[..., None] + c[..., None]
+    ray[:, :, BEHIND] *= -1
+    L = torch.tril(randn(2, N, 2, 2)) + torch.eye(2, dtype=D)
+    S = L @ L.mT
+    uv = uv + off * randn(2, 2, N)
+    number = torch.arange(N).expand(2, N)
+    near, far = (number < 8) | (number == BEHIND), (number >= 8) & (number < BEHIND)
+    variance = (0.02 * (1 + rand(2, N))) ** 2
+    variance[:, 3] = 0
+    shape = torch.stack((S[..., 0, 0], S[..., 0, 1], S[..., 1, 1]), 1)
+    return Problem(f, c, ray, uv, q, variance, shape, near, far), Unknowns(T, turn)
+
+
+def every(problem, at):
+    return [dense.tracks(problem, at, NOISE, b) for b in range(2)]
+
+
+# ------------------------------------------------------------------------------------------------ one track
+
+
+def test_pixels_are_turned_back_by_their_row():
+    problem, at = scene()
+    y = problem.ray[:, 1] / problem.ray[:, 2]
+    found = near_far.straighten(problem.uv, problem.f, problem.c, y, at.turn)
+    for b in range(2):
+        for k in range(N):
+            ray = np.append(((problem.uv[b, :, k] - problem.c[b]) / problem.f[b]).numpy(), 1.0)
+            ray = ray - float(y[b, k]) * np.cross(at.turn[b], ray)
+            wanted = ray[:2] / ray[2] * problem.f[b].numpy() + problem.c[b].numpy()
+            np.testing.assert_allclose(found[b, :, k], wanted, rtol=1e-12)
+    f = torch.ones(1, 2, dtype=D)
+    wild = [[0.0, 0.8], [0.0, 1.0], [0.0, 1.2], [0.0, 0.95]]  # z = 1 - 0.8, 0, -0.2 and 0.05
+    edge = near_far.straighten(
+        torch.tensor([[[1.0] * 4, [0.0] * 4]], dtype=D),
+        f,
+        0 * f,
+        torch.tensor([[-w[1] for w in wild]], dtype=D),
+        torch.tensor([[0.0, 1.0, 0.0]], dtype=D),
+    )
+    assert edge.isfinite().all()
+    torch.testing.assert_close(edge[0, 0], torch.tensor([1.8 / 0.2, 2 / 0.1, 2.2 / -0.2, 1.95 / 0.1], dtype=D))
+
+
+def test_tracks_are_linearised_at_their_inverse_depths():
+    problem, at = scene()
+    linear = near_far.linearise_tracks(problem, at)
+    for b, tracks in enumerate(every(problem, at)):
+        f = problem.f[b].numpy()
+        assert linear.front[b].tolist() == [x.front for x in tracks]
+        assert [k for k in range(UNUSED) if not tracks[k].front] == [EPIPOLE, BEHIND]
+        assert [k for k in range(UNUSED) if tracks[k].v == 0] == [3, BEYOND]
+        for k, x in enumerate(tracks):
+            if x.front:
+                np.testing.assert_allclose(linear.u[b, :6, k], x.J[0, :6] / f[0], rtol=1e-9, atol=1e-12)
+                np.testing.assert_allclose(linear.v[b, :6, k], x.J[1, :6] / f[1], rtol=1e-9, atol=1e-12)
+                np.testing.assert_allclose([linear.u[b, 6, k], linear.v[b, 6, k]], x.r / f, rtol=1e-7, atol=1e-12)
+                np.testing.assert_allclose(linear.slope[b, :, k], x.s / f, rtol=1e-9)
+                assert (np.inf if linear.free[b, k] else float(linear.fixed.variance[b, k])) == x.v
+    assert all(x.isfinite().all() for x in (linear.u, linear.v, linear.slope))
+
+
+def test_far_tracks_are_not_believed_without_a_near_one_to_bound_them():
+    problem, at = scene()
+    alone = problem.replace(near=problem.near & False)
+    assert not near_far.linearise_tracks(alone, at).front[:, list(FAR)].any()
+
+
+def test_whitened_rows_have_the_gram_matrix_of_the_eliminated_problem():
+    """Six columns of the pose, three of the turn and the residual; far, near, known and unbounded inverse depths."""
+    problem, at = scene()
+    linear = near_far.linearise_tracks(problem, at)
+    rows, squares = near_far.residuals(problem, linear, NOISE), near_far.squares(problem, linear, NOISE)
+    for b, tracks in enumerate(every(problem, at)):
+        for k, x in enumerate(tracks):
+            if x.front:
+                gram = rows[b, :, :, k] @ rows[b, :, :, k].T
+                np.testing.assert_allclose(gram, x.gram, rtol=1e-6, atol=1e-9 * np.abs(x.gram).max())
+            np.testing.assert_allclose(float(squares[b, k]), x.square, rtol=1e-6)
+    assert squares[0, BEHIND] == squares[0, EPIPOLE] == near_far.BEHIND
+
+
+def test_without_baseline_a_pixel_tells_nothing_of_depth_and_counts_in_full():
+    problem, at = scene()
+    at = at._replace(T=se3.Pose(at.T.R, 0 * at.T.t))
+    linear = near_far.linearise_tracks(problem, at)
+    squares = near_far.squares(problem, linear, NOISE)
+    for b in range(2):
+        for k in (*range(8), *FAR):
+            r = np.array([linear.u[b, 6, k], linear.v[b, 6, k]]) * problem.f[b].numpy()
+            xx, xy, yy = problem.shape[b, :, k].tolist()
+            S = float(NOISE[b, k]) * np.array([[xx, xy], [xy, yy]])
+            np.testing.assert_allclose(float(squares[b, k]), r @ np.linalg.inv(S) @ r, rtol=1e-9)
+    assert near_far.residuals(problem, linear, NOISE).isfinite().all()
+
+
+def test_a_baseline_of_a_tenth_of_a_millimetre_is_one():
+    """The inverse depth of a far track is then free by metres, and yet eliminated."""
+    problem, at = scene(off=0.0, turn=0.0)
+    at = at._replace(T=se3.Pose(at.T.R, 3e-4 * at.T.t))
+    Y = at.T.R @ problem.ray + problem.inverse[:, None] * at.T.t[..., None]
+    uv = Y[:, :2] / Y[:, 2:] * problem.f[..., None] + problem.c[..., None]
+    problem = problem.replace(uv=uv)
+    rows = near_far.residuals(problem, near_far.linearise_tracks(problem, at), NOISE)
+    for b, tracks in enumerate(every(problem, at)):
+        for k in FAR:
+            assert tracks[k].front and tracks[k].v == np.inf and tracks[k].s @ tracks[k].W @ tracks[k].s < 0.1
+            gram = rows[b, :, :, k] @ rows[b, :, :, k].T
+            np.testing.assert_allclose(gram, tracks[k].gram, rtol=0, atol=1e-6 * np.abs(tracks[k].gram).max())
+
+
+# ------------------------------------------------------------------------------------------------ all tracks
+
+
+def test_without_a_turn_the_equations_are_those_of_the_pose_at_a_turn_of_zero():
+    problem, at = scene(turn=0.0)
+    weight, precision = torch.tensor([0.3, 0.7], dtype=D), torch.tensor([2e3, 5e4], dtype=D)
+    normal, cost = near_far.equations(problem, NOISE, weight, precision, kernel="cauchy", bend=1.5)
+    still = at._replace(turn=torch.zeros_like(at.turn))
+    whole, pose = normal(still), normal(at._replace(turn=None))
+    torch.testing.assert_close(pose.H, whole.H[:, :6, :6], rtol=1e-12, atol=1e-9)
+    torch.testing.assert_close(pose.g, whole.g[:, :6], rtol=1e-12, atol=1e-9)
+    assert torch.equal(pose.cost, whole.cost)
+    for x in (at, still, at._replace(turn=None)):
+        assert torch.equal(cost(x), normal(x).cost)
+    moved, ok = near_far.step(at._replace(turn=None), pose.H, pose.g)
+    assert moved.turn is None and ok.all() and not torch.equal(moved.T.R, at.T.R)
+
+
+@pytest.mark.parametrize("kernel", [None, "huber", "cauchy", "geman_mcclure"])
+def test_normal_equations_are_the_schur_complement_of_one_with_all_inverse_depths(kernel):
+    problem, at = scene()
+    weight, precision = torch.tensor([0.3, 0.7], dtype=D), torch.tensor([2e3, 5e4], dtype=D)
+    cost, H, g = near_far.normal(problem, at, NOISE, weight, precision, kernel=kernel, bend=1.5)
+    for b, tracks in enumerate(every(problem, at)):
+        share = [(x.near + float(weight[b]) * x.far) * dense.weight(x.square, kernel, 1.5)[1] for x in tracks]
+        wanted_H, wanted_g = dense.reduced(tracks, share)
+        known = np.diag([0.0] * 6 + [float(precision[b])] * 3)
+        turn = np.append(np.zeros(6), at.turn[b].numpy())
+        np.testing.assert_allclose(H[b], wanted_H + known, rtol=1e-6, atol=1e-7 * np.abs(wanted_H).max())
+        np.testing.assert_allclose(g[b], wanted_g + known @ turn, rtol=1e-6, atol=1e-7 * np.abs(wanted_g).max())
+        wanted = dense.cost(tracks, float(weight[b]), kernel, 1.5) + turn @ known @ turn
+        np.testing.assert_allclose(float(cost[b]), wanted, rtol=1e-7)
+
+
+@pytest.mark.parametrize("kernel", [None, "geman_mcclure"])
+def test_the_gradient_is_half_that_of_the_cost(kernel):
+    """By autograd, with a turn and a prior that holds it; exact where near depths are, to first order in the turn."""
+    for turn, rtol in ((0.0, 1e-6), (0.003, 0.03)):
+        problem, at = scene(off=0.3, turn=turn)
+        calm = problem.far & (torch.arange(N) != BEYOND)  # residuals of a pixel or less
+        problem = problem.replace(variance=0 * problem.variance, far=calm)
+        precision = torch.tensor([3e5, 1e6], dtype=D)
+
+        def cost(x, problem=problem, at=at, precision=precision):
+            moved = Unknowns(se3.retract(at.T, x[:, :6]), at.turn + x[:, 6:])
+            return near_far.normal(
+                problem, moved, NOISE, torch.ones(2, dtype=D), precision, kernel=kernel, bend=2.0
+            ).cost.sum()
+
+        half = 0.5 * torch.autograd.functional.jacobian(cost, torch.zeros(2, 9, dtype=D))
+        g = near_far.normal(problem, at, NOISE, torch.ones(2, dtype=D), precision, kernel=kernel, bend=2.0).g
+        parts = (slice(0, 3), slice(3, 6), slice(6, 9)) if turn else (slice(0, 3), slice(3, 6))
+        for part in parts:
+            torch.testing.assert_close(g[:, part], half[:, part], rtol=0, atol=rtol * float(half[:, part].abs().max()))
+
+
+def test_a_prior_adds_its_own_cost_gradient_and_information_and_nothing_else():
+    problem, at = scene()
+    one, precision = torch.ones(2, dtype=D), torch.tensor([1e4, 3e5], dtype=D)
+    free, held = (near_far.normal(problem, at, NOISE, one, p, kernel="cauchy", bend=2.0) for p in (0 * one, precision))
+    torch.testing.assert_close(held.cost - free.cost, precision * (at.turn**2).sum(-1))
+    torch.testing.assert_close((held.g - free.g)[:, 6:], precision[:, None] * at.turn)
+    torch.testing.assert_close(held.H - free.H, torch.diag_embed(near_far.prior(precision)), rtol=1e-9, atol=1e-6)
+    assert not (held.g - free.g)[:, :6].any()
+    assert near_far.prior(precision)[1].tolist() == [0.0] * 6 + [3e5] * 3
+
+
+def test_elimination_is_the_schur_complement_of_the_whole_problem():
+    """Every residual of pixels and depths as one function of pose, turn and inverse depths, differentiated as a whole."""
+    problem, at = scene(off=1e-3, turn=0.0)
+    used = [k for k in range(N) if k not in (3, BEYOND, EPIPOLE, BEHIND, UNUSED)]
+    problem = problem.map(lambda x: x[..., used] if x.shape[-1] == N else x)
+    noise, n = NOISE[:, used], len(used)
+    _, H, g = near_far.normal(
+        problem, at, noise, torch.ones(2, dtype=D), torch.zeros(2, dtype=D), kernel=None, bend=1.0
+    )
+    for b in range(2):
+        ray, near = problem.ray[b].T, problem.near[b]
+        xx, xy, yy = problem.shape[b] * noise[b]
+        whiten = torch.linalg.inv(torch.linalg.cholesky(torch.stack((xx, xy, xy, yy), -1).view(n, 2, 2)))
+
+        def every_residual(x, b=b, ray=ray, near=near, whiten=whiten):
+            pose, q = se3.retract(at.T[b : b + 1], x[None, :6]), x[9:]
+            Y = ray @ pose.R[0].T + q[:, None] * pose.t[0]
+            Y = Y + torch.linalg.cross((ray[:, 1:2] / ray[:, 2:]) * x[6:9], Y)
+            miss = Y[:, :2] / Y[:, 2:] * problem.f[b] + problem.c[b] - problem.uv[b].T
+            prior = (q - problem.inverse[b]) / problem.variance[b].sqrt()
+            return torch.cat(((whiten @ miss[..., None]).flatten(), prior[near]))
+
+        x = torch.cat((torch.zeros(9, dtype=D), problem.inverse[b]))
+        for _ in range(8):  # far tracks at their optimum, near ones where the sensor says
+            J, r = torch.func.jacrev(every_residual)(x), every_residual(x)
+            step = torch.linalg.solve(J[:, 9:].T @ J[:, 9:], J[:, 9:].T @ r)
+            x = torch.cat((x[:9], torch.where(near, x[9:], x[9:] - step)))
+        J, r = torch.func.jacrev(every_residual)(x), every_residual(x)
+        A, v = J.T @ J, J.T @ r
+        back = A[:9, 9:] @ torch.linalg.inv(A[9:, 9:])
+        reduced, right = A[:9, :9] - back @ A[9:, :9], v[:9] - back @ v[9:]
+        torch.testing.assert_close(H[b], reduced, rtol=0, atol=1e-7 * float(reduced.abs().max()))
+        torch.testing.assert_close(g[b], right, rtol=0, atol=1e-5 * float(right.abs().max()))
+
+
+# ------------------------------------------------------------------------------------------------ steps
+
+
+@pytest.mark.parametrize("step", [near_far.step, near_far.trial_step])
+def test_a_step_solves_for_the_pose_and_the_turn(step):
+    g = torch.Generator().manual_seed(0)
+    A, v = torch.randn(3, 9, 12, generator=g, dtype=D), torch.randn(3, 9, generator=g, dtype=D) * 0.1
+    at = Unknowns(se3.exp(torch.randn(3, 6, generator=g, dtype=D)), torch.randn(3, 3, generator=g, dtype=D))
+    H = A @ A.mT
+    H[1] = 0
+    moved, ok = step(at, H, v)
+    assert ok.tolist() == [True, False, True]
+    for b in (0, 2):
+        xi = -np.linalg.solve(H[b].numpy(), v[b].numpy())
+        W = 0.5 * dense.hat(xi[:3])
+        turn = np.linalg.inv(np.eye(3) - W) @ (np.eye(3) + W)
+        np.testing.assert_allclose(moved.T.R[b], turn @ at.T.R[b].numpy(), rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(moved.T.t[b], turn @ at.T.t[b].numpy() + xi[3:6], rtol=1e-9)
+        np.testing.assert_allclose(moved.turn[b], at.turn[b].numpy() + xi[6:], rtol=1e-9)
+    if step is near_far.step:
+        assert torch.equal(moved.turn[1], at.turn[1]) and torch.equal(moved.T.R[1], at.T.R[1])

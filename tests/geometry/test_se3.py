@@ -1,0 +1,253 @@
+"""Rigid motions against exact series, matrix exponentials and kornia; functions whose rounding is steady."""
+
+import math
+from fractions import Fraction
+
+import pytest
+import torch
+from kornia.geometry.liegroup import Se3, So3
+
+from dhtorch.geometry import se3
+from dhtorch.geometry.determinism import LANES, filled, steady
+from dhtorch.geometry.se3 import Pose
+
+#: Rotation angles on both sides of where the series end (0.1 rad), up to beyond half a turn.
+BELOW = [0.0, 1e-160, 1e-9, 1e-4, 0.01, 0.03, *(0.09 + 0.0005 * k for k in range(20)), 0.0999999]
+ABOVE = [0.1000001, *(0.102 + 0.002 * k for k in range(20)), 0.5, 1.5, 3.0, 3.3, 6.0]
+
+
+def double(*values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def drawn(batch=4, seed=0, scale=1.0):
+    return scale * torch.randn(batch, 6, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def poses(batch=4, seed=0):
+    """Poses that owe nothing to the code under test."""
+    xi = drawn(batch, seed)
+    return Pose(torch.linalg.matrix_exp(cross_matrix(xi[:, :3])), xi[:, 3:])
+
+
+def cross_matrix(v):
+    """v × each of the three axes, as columns."""
+    eye = torch.eye(3, dtype=v.dtype)
+    return torch.stack([torch.linalg.cross(v, eye[k].expand_as(v)) for k in range(3)], -1)
+
+
+def generators(xi):
+    """(B, 4, 4) whose matrix exponential is the motion."""
+    top = torch.cat((cross_matrix(xi[:, :3]), xi[:, 3:, None]), -1)
+    return torch.cat((top, torch.zeros_like(top[:, :1])), 1)
+
+
+def series(theta, first):
+    """Σ (−1)ᵏ θ²ᵏ / (2k + first)! in exact fractions: sin θ/θ, (1 − cos θ)/θ², (θ − sin θ)/θ³ for first = 1, 2, 3."""
+    square = Fraction(theta) ** 2
+    return float(sum((-square) ** k / math.factorial(2 * k + first) for k in range(22)))
+
+
+def coefficients(theta):
+    """The three coefficients as exp uses them, each read from an entry of R or t where it stands alone."""
+    theta = double(*theta)
+    zero, one = torch.zeros_like(theta), torch.ones_like(theta)
+    p, q = 0.6 * theta, 0.8 * theta
+    flat = se3.exp(torch.stack((p, q, zero, zero, one, zero), -1))  # an axis in the plane of x and y
+    return flat.R[:, 0, 2] / q, flat.R[:, 0, 1] / (p * q), flat.t[:, 0] / (p * q)
+
+
+# ------------------------------------------------------------------------------------------------ exponential map
+
+
+@pytest.mark.parametrize(("angles", "rtol"), [(BELOW[2:], (5e-14, 8e-15, 2e-15)), (ABOVE, (5e-15, 1e-13, 4e-13))])
+def test_every_coefficient_is_that_of_the_exact_series(angles, rtol):
+    """Near the switch a single wrong factor of a series differs by more than 2e-13; what they leave out is less."""
+    for k, found in enumerate(coefficients(angles)):
+        exact = double(*(series(theta, k + 1) for theta in angles))
+        torch.testing.assert_close(found, exact, rtol=rtol[k], atol=0)
+
+
+def test_the_whole_motion_is_the_matrix_exponential():
+    for scale in (1e-3, 0.03, 1.0, 2.0):
+        xi = drawn(scale=scale)
+        torch.testing.assert_close(
+            se3.to_matrix(se3.exp(xi)), torch.linalg.matrix_exp(generators(xi)), rtol=0, atol=1e-13
+        )
+
+
+def test_it_is_kornia_s_map_of_the_reordered_vector():
+    for scale in (0.01, 1.0):
+        xi = drawn(scale=scale)
+        T = se3.exp(xi)
+        torch.testing.assert_close(se3.to_matrix(T), Se3.exp(xi.roll(3, -1)).matrix(), rtol=0, atol=1e-12)
+        torch.testing.assert_close(T.R, So3.exp(xi[:, :3]).matrix(), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("theta", [0.0, 1e-7, 0.05, 0.0999, 0.1001, 1.0, 3.0])
+def test_the_derivative_turns_by_the_left_jacobian(theta):
+    """exp(ω + δ) = exp(J δ) exp(ω) to first order, and J is what multiplies the translation."""
+    omega = theta * double(2 / 3, -1 / 3, 2 / 3)
+    J = torch.stack([se3.exp(torch.cat((omega, e))[None]).t[0] for e in torch.eye(3, dtype=torch.float64)], -1)
+    slope = torch.func.jacrev(lambda w: se3.exp(torch.cat((w, 0 * w))[None]).R[0])(omega)
+    R = se3.exp(torch.cat((omega, 0 * omega))[None]).R[0]
+    for k in range(3):
+        torch.testing.assert_close(slope[..., k], cross_matrix(J[:, k]) @ R, rtol=0, atol=3e-13)
+
+
+def test_gradients_at_zero_are_exact_up_to_the_second():
+    zero, eye = torch.zeros(6, dtype=torch.float64), torch.eye(3, dtype=torch.float64)
+    G = torch.stack([cross_matrix(e) for e in eye])  # generators of rotations
+
+    def R(xi):
+        return se3.exp(xi[None]).R[0]
+
+    def t(xi):
+        return se3.exp(xi[None]).t[0]
+
+    by_rotation = torch.func.jacrev(R)(zero)
+    assert torch.equal(by_rotation[..., :3], G.movedim(0, -1)) and not by_rotation[..., 3:].any()
+    by_translation = torch.func.jacrev(t)(zero)
+    assert torch.equal(by_translation[:, 3:], eye) and not by_translation[:, :3].any()
+    curved = torch.func.jacfwd(torch.func.jacrev(R))(zero)[..., :3, :3]
+    torch.testing.assert_close(curved, (torch.einsum("iab,jbc->acij", G, G) + torch.einsum("jab,ibc->acij", G, G)) / 2)
+    mixed = torch.func.jacfwd(torch.func.jacrev(t))(zero)[:, :3, 3:]  # half the cross product
+    torch.testing.assert_close(mixed, G.permute(1, 0, 2) / 2)
+
+
+def test_single_precision_is_as_good_as_it_can_be():
+    xi = drawn(64, scale=0.1)
+    exact, found = se3.exp(xi), se3.exp(xi.float())
+    assert found.R.dtype == torch.float32
+    assert (found.R - exact.R).abs().max() < 2e-7 and (found.t - exact.t).abs().max() < 2e-7
+
+
+def test_a_retraction_acts_from_the_left():
+    T, xi = poses(), drawn(seed=1)
+    expected = torch.linalg.matrix_exp(generators(xi)) @ se3.to_matrix(T)
+    torch.testing.assert_close(se3.to_matrix(se3.retract(T, xi)), expected)
+
+
+def test_a_rotation_that_drifted_is_one_again_and_keeps_its_first_row():
+    R = poses(seed=5).R
+    torch.testing.assert_close(se3.orthonormal(R), R, rtol=0, atol=1e-14)
+    drifted = R + 1e-3 * drawn(12, seed=6).view(-1, 3, 3)[:4]
+    found = se3.orthonormal(drifted)
+    torch.testing.assert_close(found @ found.mT, torch.eye(3, dtype=R.dtype).expand(4, 3, 3), rtol=0, atol=1e-14)
+    torch.testing.assert_close(torch.linalg.det(found), torch.ones(4, dtype=R.dtype))
+    torch.testing.assert_close(found[:, 0], torch.nn.functional.normalize(drifted[:, 0], dim=-1))
+    assert (found - R).abs().max() < 5e-3
+
+
+# ------------------------------------------------------------------------------------------------ motions as matrices
+
+
+def test_motions_are_products_of_matrices():
+    A, B = poses(seed=2), poses(seed=3)
+    for T in (A, B):
+        assert torch.equal(se3.to_matrix(T)[:, :3], torch.cat((T.R, T.t[..., None]), -1))
+        assert torch.equal(se3.to_matrix(T)[:, 3], double(0, 0, 0, 1).expand(4, 4))
+    matrix = se3.to_matrix
+    torch.testing.assert_close(matrix(se3.compose(A, B)), matrix(A) @ matrix(B))
+    torch.testing.assert_close(matrix(se3.invert(A)), torch.linalg.inv(matrix(A)))
+    torch.testing.assert_close(matrix(se3.relative(A, B)), torch.linalg.inv(matrix(B)) @ matrix(A))
+    for rows in (3, 4):
+        again = se3.from_matrix(matrix(A)[:, :rows])
+        assert torch.equal(again.R, A.R) and torch.equal(again.t, A.t)
+
+
+def test_points_are_turned_then_moved():
+    T, xyz = poses(), drawn(4 * 5, seed=4)[:, :3].reshape(4, 5, 3)
+    torch.testing.assert_close(se3.rotate(T.R, xyz), torch.einsum("bij,bnj->bni", T.R, xyz))
+    torch.testing.assert_close(se3.apply(T, xyz), torch.einsum("bij,bnj->bni", T.R, xyz) + T.t[:, None])
+
+
+def test_one_motion_is_not_repeated_for_the_points_of_two_pairs():
+    for R, xyz in (((1, 3, 3), (2, 5, 3)), ((2, 3, 3), (2, 5, 2)), ((2, 3, 4), (2, 5, 3))):
+        with pytest.raises(ValueError, match=r"se3.apply.*expected"):
+            se3.apply(Pose(torch.zeros(R), torch.zeros(R[0], 3)), torch.zeros(xyz))
+    with pytest.raises(ValueError, match=r"se3.exp.*expected \(B 6\)"):
+        se3.exp(torch.zeros(2, 7))
+
+
+def test_identities_do_nothing_and_look_like_their_model():
+    T = se3.identity(3, torch.zeros(1, dtype=torch.float16))
+    assert T.R.dtype == T.t.dtype == torch.float16
+    assert torch.equal(se3.to_matrix(T), torch.eye(4, dtype=torch.float16).expand(3, 4, 4))
+
+
+def test_hat_is_the_cross_product():
+    v, w = drawn(6, seed=5)[:, :3], drawn(6, seed=6)[:, :3]
+    torch.testing.assert_close((se3.hat(v) @ w[..., None])[..., 0], torch.linalg.cross(v, w))
+    assert se3.hat(v.view(2, 3, 3)).shape == (2, 3, 3, 3)
+
+
+# ------------------------------------------------------------------------------------------------ angles
+
+
+def turn(axis, angle):
+    """Rodrigues' formula with the axis' own unit length."""
+    axis = axis / axis.norm()
+    return (
+        math.cos(angle) * torch.eye(3, dtype=torch.float64)
+        + math.sin(angle) * cross_matrix(axis)
+        + (1 - math.cos(angle)) * axis[:, None] * axis
+    )
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-6, 0.3, math.pi / 2, 2.0, math.pi - 1e-6, math.pi - 1e-9, math.pi])
+def test_the_angle_of_a_rotation_is_accurate_everywhere(angle):
+    R = torch.stack(
+        [turn(double(*axis), angle) for axis in ((1, 2, 3), (-1, 0, 0.2), (0, 0, 1), (0, -1, 0), (1, 0, 0))]
+    )
+    found = se3.rotation_angle(R.view(5, 1, 3, 3))
+    torch.testing.assert_close(found, torch.full((5, 1), angle, dtype=torch.float64), rtol=1e-12, atol=1e-15)
+
+
+def test_the_gradient_of_an_angle_is_one_along_its_axis():
+    axis = double(2 / 3, -1 / 3, 2 / 3)
+    slope = torch.func.grad(
+        lambda s: se3.rotation_angle(turn(axis, 0.4) @ torch.linalg.matrix_exp(s * cross_matrix(axis)))
+    )
+    assert float(slope(double(0.0)[0])) == pytest.approx(1)
+    for angle in (0.0, math.pi):
+        R = turn(axis, angle).requires_grad_()
+        se3.rotation_angle(R).backward()
+        assert R.grad.isfinite().all()
+
+
+# ------------------------------------------------------------------------------------------------ steady rounding
+
+
+@pytest.mark.parametrize("shape", [(1,), (7, 3), (LANES,), (2, LANES + 1), (0, 3), ()])
+def test_functions_are_handed_whole_strides_in_one_row(shape):
+    """No element is left over for the scalar loop, whose rounding differs."""
+    seen = []
+
+    def fn(a, b):
+        seen.append((a.shape, b.shape))
+        return torch.atan2(a, b)
+
+    a = torch.rand(shape, generator=torch.Generator().manual_seed(0))
+    found = steady(fn, a, 1 + a)
+    count = -(-a.numel() // LANES) * LANES
+    assert seen == [((count,), (count,))]
+    torch.testing.assert_close(found, torch.atan2(a, 1 + a))
+
+
+def test_an_element_s_value_does_not_hang_on_its_place():
+    x = torch.linspace(-6, 6, 203)
+    alone = torch.cat([steady(torch.sigmoid, v[None]) for v in x])
+    assert torch.equal(steady(torch.sigmoid, x), alone)
+    assert LANES % 32 == 0, "two registers of sixteen"
+
+
+def test_unequal_shapes_are_refused():
+    with pytest.raises(ValueError, match=r"shapes are \[\(3,\), \(1,\)\], expected equal shapes"):
+        steady(torch.atan2, torch.ones(3), torch.ones(1))
+    with pytest.raises(ValueError, match="equal shapes"):
+        steady(torch.atan2, torch.ones(2, 3), torch.ones(3, 2))
+
+
+def test_rows_are_filled_up_to_whole_lanes():
+    assert [filled(n, 16) for n in (0, 1, 15, 16, 17, 32)] == [16, 16, 16, 16, 32, 32] and filled(1) == LANES

@@ -1,0 +1,280 @@
+"""``dhtorch integrate``: from a recording to files that other programs read, and a result that counts."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import hydra
+import numpy as np
+import pytest
+import torch
+
+from dhtorch import data
+from dhtorch import testing as writers
+from dhtorch.cli.run import config_dir, main
+from dhtorch.experiments import report
+from dhtorch.integrate import mapping
+from dhtorch.pipeline.presets import METHODS
+from dhtorch.runtime import results as archive
+from dhtorch.synthetic.recording import SyntheticRoom
+from dhtorch.viz.viewer import points
+
+TINY = [
+    "data.hw=[240,320]",
+    "data.n_frames=4",
+    "data.supersample=1",
+    "data.step_m=0.04",
+    "data.gap=3",
+    "pairs=gap",
+    "method=map",
+    "method.n=512",
+    "dense=false",
+    "voxel=0.06",
+]
+SWEPT = [option for option in TINY if option not in ("method=map", "dense=false")]
+FILES = {"map.ply", "map.glb", "points.ply", "map.png", "cameras.txt", "images.txt", "points3D.txt"}
+
+
+@pytest.fixture(scope="module")
+def job(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("map")
+    env = {k: v for k, v in os.environ.items() if k != "DHTORCH_DATA"}
+    command = [sys.executable, "-m", "dhtorch", "integrate", *TINY, "cutoff=2.0", "output=here"]
+    done = subprocess.run(command, check=False, cwd=folder, env=env, capture_output=True, text=True, timeout=290)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == "", "neither warnings nor a progress bar"
+    return folder / "here", done.stdout
+
+
+def test_every_file_is_written_and_named(job):
+    folder, said = job
+    assert {p.name for p in (folder / "synthetic_room").rglob("*") if p.is_file()} == FILES
+    assert said.count("here/synthetic_room/") == len(FILES) and "here/result.json" in said
+    for words in ("2 of 2 frames placed by device poses, 1 fragment;", "voxels of 6 cm", "times the sensor's", "MiB"):
+        assert words in said
+    newest = max((folder / "synthetic_room").rglob("*.*"), key=lambda p: p.stat().st_mtime_ns)
+    assert (folder / "result.json").stat().st_mtime_ns >= newest.stat().st_mtime_ns, "written last"
+
+
+def test_the_result_counts_what_was_widened(job):
+    folder, _ = job
+    result = archive.read(folder)
+    assert result["experiment"] == "integrate" and result["question"] is None and result["verdict"] is None
+    pair, scene = result["rows"]
+    assert pair["pair"] == [0, 3] and pair["placed"] == 1 and scene["n_frames"] == 2 and scene["n_fragments"] == 1
+    assert scene["n_voxels"] > scene["n_voxels_sensor"] > 100
+    assert scene["voxels_vs_sensor"] == scene["n_voxels"] / scene["n_voxels_sensor"]
+    assert result["summary"]["map.n_voxels"]["value"] == scene["n_voxels"]
+    assert report.tables(result), "the report shows it as any other"
+
+
+def test_plyfile_and_trimesh_read_the_map(job):
+    folder, _ = job
+    plyfile, trimesh = pytest.importorskip("plyfile"), pytest.importorskip("trimesh")
+    row = archive.read(folder)["rows"][-1]
+    vertex = plyfile.PlyData.read(folder / "synthetic_room" / "map.ply")["vertex"]
+    assert len(vertex) == row["n_points"] and set(np.unique(vertex["source"])) == {1, 2}
+    assert bool((vertex["sigma"] > 0).all()) and bool(((vertex["score"] >= 0) & (vertex["score"] <= 1.001)).all())
+    points = plyfile.PlyData.read(folder / "synthetic_room" / "points.ply")["vertex"]
+    assert set(np.unique(points["source"])) == {1, 2}
+    assert bool((points["class"][points["source"] == 2] > 0).all()), "what was recovered fills a hole"
+    scene = trimesh.load(folder / "synthetic_room" / "map.glb")
+    assert set(scene.geometry) == {"surface", "recovered"}
+    assert len(scene.geometry["recovered"].vertices) == int((points["source"] == 2).sum())
+
+
+def test_colmap_reads_views_and_tracks(job):
+    folder, _ = job
+    pycolmap = pytest.importorskip("pycolmap")
+    model = pycolmap.Reconstruction(str(folder / "synthetic_room" / "colmap"))
+    assert len(model.images) == 2 and len(model.cameras) == 1
+    assert len(model.points3D) == archive.read(folder)["rows"][0]["n_kept"] > 30
+    (camera,) = model.cameras.values()
+    misses = [
+        np.linalg.norm(camera.img_from_cam(image.cam_from_world() * model.points3D[p.point3D_id].xyz) - p.xy)
+        for image in model.images.values()
+        for p in image.points2D
+    ]
+    assert len(misses) == 2 * len(model.points3D) and np.median(misses) < 1.0, "poses, lens and half pixels agree"
+
+
+@pytest.fixture
+def command(tmp_path, monkeypatch, capsys):
+    """The command in this process, from an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("NO_COLOR", "1")
+
+    def call(*args):
+        try:
+            code = main(["integrate", *args])
+        except SystemExit as stop:
+            code = stop.code
+        return code, *capsys.readouterr()
+
+    return call
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        ("poses=gps", "poses: found 'gps', expected device or anchored"),
+        ("voxel=0", "voxel: found 0, expected a positive number"),
+        ("truncation=0.001", "expected 0 < voxel <= truncation"),
+        ("min_weight=-1", "min_weight: found -1, expected a number of at least 0"),
+        ("dtype=int32", "dtype: found 'int32', expected float32 or float64"),
+        ("cutoff=-1", "cutoff: found -1, expected a positive number, or null"),
+        ("pairs.gap=99", "pairs.gap: found 99"),
+        ("voxle=1", "voxle"),
+        ("dense=often", "dense: found 'often', expected true, false or options as"),
+        ("dense={planse: 32}", "dense: found 'planse', expected some of partners"),
+        ("dense={planes: few}", "dense.planes: found 'few', expected a whole number"),
+        ("min_maps=0", "min_maps: found 0, expected a whole number of at least 1"),
+    ],
+)
+def test_wrong_options_end_in_one_line_and_no_file(command, tmp_path, option, words):
+    code, out, err = command(*TINY, option, "output=here")
+    assert code == 2 and out == "" and words in err and err.count("\n") == 1
+    assert not (tmp_path / "here").exists()
+
+
+def test_a_recording_without_a_trajectory_asks_for_anchored_poses(command, tmp_path):
+    room = SyntheticRoom(hw=(240, 320), n_frames=4, supersample=1, step_m=0.04, lidar="exact")
+    folder = tmp_path / "walk"
+    writers.write_tum(folder, [room[i] for i in range(4)])
+    (folder / "groundtruth.txt").unlink()
+    own = ["data=tum", f"data.root={folder}", "pairs.gap=3", "method=map", "method.n=512", "voxel=0.06", "output=here"]
+    code, _, err = command(*own)
+    assert code == 2 and "walk has no trajectory of its own, expected poses=anchored" in err
+    code, out, err = command(*own, "poses=anchored", "mesh=false")
+    assert code == 0, err
+    assert "2 of 2 frames placed by anchored poses, 1 fragment" in out and "triangles" not in out
+
+
+def test_ctrl_c_keeps_the_scenes_that_are_whole(tmp_path, monkeypatch):
+    made = []
+
+    def make(source, *_args, **_options):
+        if made:
+            raise KeyboardInterrupt
+        made.append(source)
+        row = {"seconds": 0.0, "scene": source.name, "method": "map", "truth": "device"}
+        return mapping.MappedScene(source.recording, [], None, None, None, row)
+
+    monkeypatch.setattr(mapping, "make", make)
+    monkeypatch.setattr(mapping, "write", lambda *_: [])
+    settings = {"output": str(tmp_path), "dtype": "float32", "poses": "device", "mesh": None, "threads": None}
+    settings |= {"voxel": 0.1, "truncation": None, "min_weight": 0.0, "cutoff": None, "dense": False, "min_maps": 2}
+    rooms = [SyntheticRoom(n_frames=2), SyntheticRoom(n_frames=2)]
+    with pytest.raises(KeyboardInterrupt, match=f"1 of 2 scenes in {tmp_path} are whole and stay"):
+        mapping.run(settings, {"data": rooms, "method": None, "pairs": None}, progress=lambda items, _text, _n: items)
+    assert not (tmp_path / "result.json").exists()
+
+
+def test_help_shows_every_option(command):
+    code, out, _ = command("--help")
+    assert code == 0
+    for word in (
+        "poses",
+        "voxel",
+        "truncation",
+        "sensor_sigma_rel",
+        "min_weight",
+        "mesh",
+        "anchored",
+        "dense",
+        "min_maps",
+        "Exit code",
+    ):
+        assert word in out
+
+
+def test_a_dense_map_says_what_the_sweep_added(command, tmp_path):
+    code, out, err = command(*SWEPT, "cutoff=2.0", "dense={planes: 32, size: 160}", "mesh=false", "output=here")
+    assert code == 0, err
+    assert "times those without a sweep" in out
+    here = tmp_path / "here"
+    assert {p.name for p in here.rglob("*") if p.is_file()} == {*FILES, "result.json"}, "the maps' file is gone"
+    result = archive.read(here)
+    pair, scene = result["rows"]
+    assert pair["map_hw"] == [120, 160] and pair["n_swept"] == scene["n_swept"] > 1000
+    assert scene["n_voxels"] > scene["n_voxels_sparse"] > scene["n_voxels_sensor"]
+    assert scene["voxels_vs_sparse"] == scene["n_voxels"] / scene["n_voxels_sparse"]
+    assert result["summary"]["auto.voxels_vs_sparse"]["value"] == scene["voxels_vs_sparse"]
+    assert result["config"]["dense"] == {"planes": 32, "size": 160}
+    words = (here / "synthetic_room" / "map.ply").read_bytes()[:400]
+    assert b"source: 0 none, 1 sensor, 2 recovered, 3 swept" in words
+    (shot,) = points.read(here / "synthetic_room" / "map.ply").shots
+    assert len(shot.swept.xyz) > 200 and len(shot.swept.xyz) + len(shot.samples["xyz"]) == scene["n_points"]
+    glb = (here / "synthetic_room" / "map.glb").read_bytes()
+    assert b'"name":"swept"' in glb and b'"_SOURCE"' in glb
+
+
+def composed(*overrides, word="integrate"):
+    """Settings of a word, and the choices of groups."""
+    with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
+        cfg = hydra.compose(word, list(overrides), return_hydra_config=True)
+    return cfg, cfg.hydra.runtime.choices
+
+
+def test_the_built_in_room_shows_what_views_add_and_a_recording_hides_nothing():
+    room, _ = composed()
+    assert room.cutoff == room.data.near == 2.0 and room.dense is True and room.pairs.stride == 2
+    own, _ = composed("data=auto", "data.root=x")
+    assert own.cutoff is None and own.dense is False and own.pairs.stride is None
+    plain, _ = composed("dense={size: 99}", "cutoff=null", "pairs.stride=1")
+    assert plain.cutoff is None and plain.dense == {"size": 99} and plain.pairs.stride == 1, "what is said wins"
+
+
+@pytest.mark.parametrize("word", ["integrate", "view"])
+def test_what_sweeps_is_a_method_of_several_views_unless_another_is_said(word):
+    assert composed("dense=true", word=word)[1].method == "auto"
+    assert composed("dense=true", "method=map", word=word)[1].method == "map"
+    assert METHODS[composed(word=word)[1].method].views > 1
+
+
+@pytest.mark.data
+@pytest.mark.skipif("DHTORCH_DATA" not in os.environ, reason="DHTORCH_DATA is unset")
+@pytest.mark.parametrize(
+    ("name", "least", "most"),
+    [
+        ("holo_a", 0.005, 0.02),
+        ("tum_fr1_desk9", 0.0025, 0.01),
+        ("r3d_door", 0.005, 0.005),
+        ("7s_redkitchen_000", 0.004, 0.012),
+    ],
+)
+def test_a_voxel_is_two_pixels_of_the_sensor(name, least, most):
+    recording = data.open(Path(os.environ["DHTORCH_DATA"]) / name)
+    voxel = mapping.voxel_of(recording)
+    assert least <= voxel <= most and voxel == float(f"{voxel:.2g}")
+    frames = [recording[k] for k in (0, len(recording) // 2, len(recording) - 1)]
+    sizes = []
+    for frame in frames:
+        depth = frame.depth[0].double().numpy()
+        side = float((frame.depth_camera or frame.camera).f.mean())
+        side *= 1 if frame.depth_camera is not None else depth.shape[1] / max(frame.hw[1], 1)
+        sizes.append(float(np.median(depth[np.isfinite(depth) & (depth > 0)])) / side)
+    assert voxel == pytest.approx(max(0.005, 2 * sorted(sizes)[1]), rel=0.06), "two digits"
+
+
+@pytest.mark.data
+@pytest.mark.skipif("DHTORCH_DATA" not in os.environ, reason="DHTORCH_DATA is unset")
+def test_a_real_desk_becomes_a_map(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    root = os.path.join(os.environ["DHTORCH_DATA"], "tum_fr1_desk9")  # noqa: PTH118
+    options = [
+        "data=tum",
+        f"data.root={root}",
+        "pairs.gap=4",
+        "pairs.stride=4",
+        "method.n=512",
+        "voxel=0.04",
+        "output=here",
+    ]
+    assert main(["integrate", *options, "mesh=false"]) == 0
+    (scene,) = [r for r in archive.read(tmp_path / "here")["rows"] if r["pair"] is None]
+    assert scene["n_frames"] == 3 and scene["n_voxels"] > 1000 and scene["largest_island"] > 0.2
+    assert torch.get_num_threads() == 1 and "tum_fr1_desk9: 3 of 3 frames" in capsys.readouterr().out
+    shutil.rmtree(tmp_path / "here")

@@ -1,0 +1,1175 @@
+"""Compiled code answers as torch does, the sweep bit for bit, a search for points and the registration of their windows
+up to the rounding of sums; nothing is compiled, loaded or used that nobody asked for."""
+
+import inspect
+import pickle
+import platform
+import shutil
+import subprocess
+import sys
+import warnings
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import test_map_pose
+import test_reprojection_problem
+import torch
+from torch.autograd import forward_ad
+from torch.utils._pytree import tree_leaves
+
+from dhtorch import PAPER, WINDOW
+from dhtorch.codes import PoseCode, Source
+from dhtorch.geometry import (
+    affine_alignment as affine,
+)
+from dhtorch.geometry import (
+    least_squares,
+    p3p,
+    pyramid,
+    ransac,
+    se3,
+)
+from dhtorch.geometry import lucas_kanade as lk
+from dhtorch.geometry import (
+    patches as lookup,
+)
+from dhtorch.geometry import (
+    plane_sweep as sweep,
+)
+from dhtorch.geometry import (
+    reprojection_problem as near_far,
+)
+from dhtorch.geometry import (
+    windows as neighbours,
+)
+from dhtorch.geometry.camera import Camera, from_matrix, project, unproject
+from dhtorch.geometry.filters import gaussian
+from dhtorch.geometry.reprojection_problem import Problem
+from dhtorch.metrics.holdout import range_split
+from dhtorch.ops import loader as native
+from dhtorch.pipeline import dense
+from dhtorch.pipeline import surface as stereo
+from dhtorch.pipeline.pair import merge
+from dhtorch.records import NO_HINT, Frame, Map, PoseFit, Samples, Shutter, TrackHint, Tracks
+from dhtorch.stages import sample
+from dhtorch.stages.backproject import backproject
+from dhtorch.stages.holes import classify, min_eigenvalue
+from dhtorch.stages.pose import SEARCH_POINTS, map_pose, pnp_ransac
+from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
+from dhtorch.synthetic import SyntheticRoom
+from dhtorch.transforms import ExtendDepth, ExtendedDataset, patch_tokens
+from dhtorch.transforms.sample_access import SampleError
+from dhtorch.transforms.sample_spec import CAMERAS, UNITS, Views
+from dhtorch.transforms.status import SampleProblem
+from dhtorch.transforms.tokens import FITS
+
+COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
+needs_compiler = pytest.mark.skipif(COMPILER is None or sys.platform == "win32", reason="no C++ compiler here")
+
+
+@pytest.fixture(autouse=True)
+def unused(monkeypatch):
+    """Every test begins and ends without compiled code."""
+    monkeypatch.delenv("DHTORCH_NATIVE", raising=False)
+    monkeypatch.setattr(native, "_loaded", [])
+
+
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory):
+    """A folder with the compiled file; one of a process, in which operations are registered once."""
+    folder = tmp_path_factory.mktemp("cache")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DHTORCH_CACHE", str(folder))
+        native.build()
+    return folder
+
+
+@pytest.fixture
+def loaded(cache, monkeypatch):
+    monkeypatch.setenv("DHTORCH_CACHE", str(cache))
+    native.load()
+
+
+def volume(*shape, most, seed=0):
+    return torch.randint(0, most, shape, generator=torch.Generator().manual_seed(seed), dtype=torch.uint8)
+
+
+def both_ways(call, monkeypatch):
+    """What compiled code answers, and torch."""
+    assert native._loaded
+    found = call()
+    with monkeypatch.context() as patch:
+        patch.setattr(native, "_loaded", [])
+        return found, call()
+
+
+@needs_compiler
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("kind", [torch.uint8, torch.float32])
+@pytest.mark.parametrize(("hw", "gradients"), [((61, 83), True), ((72, 96), False)])
+def test_pyramids_agree_up_to_one_rounding(loaded, monkeypatch, channels, kind, hw, gradients):
+    image = volume(2, channels, *hw, most=256)
+    image = image if kind == torch.uint8 else image.float() / 255
+    ours, torchs = both_ways(lambda: pyramid.build_pyramid(image, 3, 11, gradients=gradients), monkeypatch)
+    assert len(ours.levels) == len(torchs.levels) == 3 and ours.pad == torchs.pad
+    for a, b in zip(ours.levels, torchs.levels, strict=True):
+        assert a.shape == b.shape and (a - b).abs().max() <= 2.0**-23
+    assert not torch.equal(ours.levels[0][0], ours.levels[0][1])
+
+
+@needs_compiler
+@pytest.mark.parametrize("layout", ["interleaved", "planar", "grey", "bgr of rgba"])
+@pytest.mark.parametrize(("block", "n"), [(3, 301), (7, 301), (9, 301), (7, 2500)])
+def test_numbers_about_windows_agree_textures_up_to_rounding(loaded, monkeypatch, layout, block, n):
+    """Of 2,173 pixels: where most are asked windows of all are found first."""
+    image = volume(2, 1 if layout == "grey" else 3, 41, 53, most=256)
+    if layout == "interleaved":
+        image = image.contiguous(memory_format=torch.channels_last)
+    if layout == "bgr of rgba":
+        image = volume(2, 41, 53, 4, most=256).permute(0, 3, 1, 2)[:, [2, 1, 0]]
+    depth = 4 * torch.rand(2, 41, 53, generator=torch.Generator().manual_seed(1)) - 1
+    depth[:, ::7, ::5], depth[0, 3], depth[1, :, 9] = torch.nan, torch.inf, -torch.inf
+    uv = torch.rand(2, n, 2, generator=torch.Generator().manual_seed(2)) * 70 - 8  # the border and beyond
+    uv[0, 0] = torch.nan
+    camera = Camera(f=torch.full((2, 2), 50.0), c=torch.full((2, 2), 20.0))
+    frame = Frame(image=image, depth=depth, camera=camera, conf=None)
+    at_once, alone = ["places", "samples"], ["window_extremes", "window_brightness"] if n == 301 else []
+    for options, reads in ({}, at_once), ({"search_px": 1}, alone):  # a search for returns is torch's
+        calls = counted(monkeypatch, *at_once, *alone, "window_texture", "holes")
+        ours, torchs = both_ways(
+            lambda options=options: classify(frame, backproject(frame, uv, **options), block=block), monkeypatch
+        )
+        assert calls == [*reads, "window_texture", "holes"]
+        for name in ("depth", "confidence", "flag", "trackability", "hole"):
+            a, b = getattr(ours, name), getattr(torchs, name)
+            rounds = name == "trackability" and (a - b).abs().max() < 1e-7
+            assert torch.equal(a.nan_to_num(7), b.nan_to_num(7)) or rounds, name
+        assert ours.flag.unique().numel() > (3 if reads is at_once else 2) and ours.trackability.unique().numel() > 100
+
+
+def counted(monkeypatch, *names):
+    """Operations by name, which note in the list that they were called."""
+    calls = []
+    for name in names:
+        was = getattr(torch.ops.dhtorch, name).default
+        noted = SimpleNamespace(default=lambda *a, was=was, name=name: (calls.append(name), was(*a)))
+        monkeypatch.setattr(torch.ops.dhtorch, name, noted)
+    return calls
+
+
+def a_view(*, hw=(61, 83), map_hw=(48, 64), seed=0):
+    """Two views with levels of confidence, returns of every kind, bright and dark places, and cameras of their own."""
+    image = (volume(2, 3, *hw, most=256, seed=seed) // 4 + 120).contiguous(memory_format=torch.channels_last)
+    image[0, :, :20], image[1, :, :, :30], image[:, :, 40, 40:50] = 255, 5, 255
+    depth = 4 * torch.rand(2, *map_hw, generator=torch.Generator().manual_seed(seed)) - 0.4
+    depth[:, ::7, ::5], depth[0, 3], depth[1, :, 9] = torch.nan, torch.inf, -torch.inf
+    K = torch.tensor([[[70.0, 0, 40], [0, 71, 30], [0, 0, 1]], [[64, 0, 41.5], [0, 66, 29], [0, 0, 1]]])
+    return Frame(image=image, depth=depth, camera=from_matrix(K), conf=volume(2, *map_hw, most=3, seed=seed + 1))
+
+
+@needs_compiler
+def test_pixels_are_the_same(loaded, monkeypatch):
+    uv = torch.rand(2, 50, 2, generator=torch.Generator().manual_seed(3)) * 40 - 5
+    uv[0, :8, 0] = torch.tensor([torch.nan, torch.inf, -torch.inf, 3e9, -3e9, 0.5, -0.5, 1.5])
+    calls = counted(monkeypatch, "pixels")
+    ours, torchs = both_ways(lambda: lookup.pixels(uv), monkeypatch)
+    assert calls == ["pixels"] and ours.dtype == torchs.dtype and torch.equal(ours, torchs)
+    assert lookup.pixels(uv.double()).dtype == torch.int32 and len(calls) == 1
+
+
+@needs_compiler
+@pytest.mark.parametrize("n", [301, 1000, 6000], ids=["a few", "most of the map", "most of the picture"])
+@pytest.mark.parametrize("lens", ["none", "of the map", "bent", "bent map"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"near_limit": 1.7, "min_conf": 2, "sigma_m": 0.004},
+        {"min_conf": 0, "edge_rel": 0.6, "dark": 0.5, "saturated": 0.6, "highlight": 0.4, "sigma_rel": 0.03},
+    ],
+)
+def test_samples_and_holes_are_the_same_bits(loaded, monkeypatch, lens, options, n):
+    frame = a_view(map_hw=(61, 83) if lens == "bent" else (48, 64))
+    own = Camera(f=frame.camera.f * 0.7, c=frame.camera.c * 0.8)
+    bent = torch.tensor([[0.2, -0.1, 0.001, 0.002, 0.0]]).expand(2, 5)
+    if lens == "bent":
+        frame = frame.replace(camera=frame.camera.replace(distortion=bent), conf=None)
+    if lens in ("of the map", "bent map"):
+        frame = frame.replace(depth_camera=own.replace(distortion=bent if lens == "bent map" else None))
+    uv = torch.rand(n, 2, generator=torch.Generator().manual_seed(2)) * torch.tensor([99.0, 75.0]) - 7
+    uv[:5] = torch.tensor([torch.nan, torch.inf, -torch.inf, 3e9, -3e9])[:, None]
+    calls = counted(monkeypatch, "places", "samples", "holes")
+    ours, torchs = both_ways(lambda: classify(frame, backproject(frame, uv, **options)), monkeypatch)
+    assert calls == [*(["places"] if "bent" not in lens else []), "samples", "holes"]
+    assert (ours.sigma - torchs.sigma).abs().le(2.0**-23 * torchs.sigma).all(), "but for the rounding of a root"
+    for name in ("uv", "depth", "xyz", "confidence", "flag", "hole"):
+        a, b = getattr(ours, name), getattr(torchs, name)
+        assert a.dtype == b.dtype and torch.equal(a.nan_to_num(7), b.nan_to_num(7)), name
+        assert torch.equal(a.isnan(), b.isnan()), name
+    assert ours.flag.unique().numel() > 8 and ours.hole.unique().numel() > 4 and ours.usable.any()
+
+
+@needs_compiler
+def test_samples_that_compiled_code_does_not_take_are_torchs(loaded, monkeypatch):
+    calls = counted(monkeypatch, "samples")
+    frame, uv = a_view(), torch.rand(50, 2, generator=torch.Generator().manual_seed(2)) * 50
+    backproject(frame, uv)
+    assert calls.pop() == "samples"
+    backproject(frame, uv, search_px=2)
+    backproject(frame.replace(sparse=torch.tensor([True, False])), uv)
+    backproject(frame, uv, min_conf=-1)
+    backproject(frame.replace(conf=frame.conf.long()), uv)
+    backproject(frame.replace(depth=frame.depth.half()), uv)
+    backproject(frame.replace(image=frame.image.float() / 255), uv)
+    backproject(frame, uv.double())
+    backproject(frame.map(lambda x: x.double() if x.dtype == torch.float32 else x), uv.double())
+    leaf = frame.depth.nan_to_num(1, 1, 1).requires_grad_()
+    found = backproject(frame.replace(depth=leaf), uv)
+    (slope,) = torch.autograd.grad(found.xyz.nan_to_num().sum(), [leaf])
+    assert slope.abs().sum() > 0
+    focal = frame.camera.f.clone().requires_grad_()
+    found = backproject(frame.replace(camera=frame.camera.replace(f=focal)), uv)
+    assert torch.autograd.grad(found.xyz.nan_to_num().sum(), [focal])[0].abs().sum() > 0
+    assert backproject(frame, uv.clone().requires_grad_()).xyz.requires_grad
+    assert not calls
+
+
+@needs_compiler
+def test_windows_that_compiled_code_cannot_read_are_torchs(loaded, monkeypatch):
+    for name in ("extremes", "brightness", "texture"):
+        monkeypatch.setattr(torch.ops.dhtorch, f"window_{name}", None)
+    image, uv = torch.rand(1, 3, 31, 32), torch.rand(1, 9, 2) * 30
+    assert min_eigenvalue(image, uv).shape == (1, 9), "numbers that are no bytes"
+    assert min_eigenvalue((255 * image).byte(), uv, block=15).shape == (1, 9), "a window of 17 pixels"
+    (slope,) = torch.autograd.grad(min_eigenvalue(image.requires_grad_(), uv).sum(), [image])
+    assert slope.abs().sum() > 0
+
+
+@needs_compiler
+def test_pyramids_that_compiled_code_cannot_build_are_torchs(loaded, monkeypatch):
+    calls = []
+    monkeypatch.setattr(torch.ops.dhtorch, "pyramid_level", lambda *_: calls.append(1))
+    image = torch.rand(1, 3, 48, 64)
+    pyramid.build_pyramid(image.double(), 2, 11)
+    pyramid.build_pyramid(image.transpose(-1, -2), 1, 11)
+    (slope,) = torch.autograd.grad(
+        pyramid.build_pyramid(image.requires_grad_(), 2, 11).levels[1].square().sum(), [image]
+    )
+    assert not calls and slope.abs().sum() > 0
+    pyramid.build_pyramid(image.detach(), 2, 11)
+    assert len(calls) == 2
+
+
+@needs_compiler
+@pytest.mark.parametrize("kind", [torch.uint16, torch.int16])
+@pytest.mark.parametrize(("unit", "bounds"), [("mm", (0.0, torch.inf)), ("m", (0.0, torch.inf)), ("mm", (0.4, 9.0))])
+def test_whole_depths_in_metres_are_the_same_bits(loaded, monkeypatch, kind, unit, bounds):
+    every = torch.arange(-(1 << 15), 1 << 15, dtype=torch.int32).to(torch.int16).view(kind).view(2, 128, 256)
+    calls = counted(monkeypatch, "metres")
+    views = Views(depth_unit="mm", depth_range=bounds)
+    if unit == "m":  # another divisor than the one that is written for
+        monkeypatch.setitem(UNITS, "mm", 5000.0)
+    ours, torchs = both_ways(lambda: views.metres(list(every)), monkeypatch)
+    assert len(calls) == 2 and ours.dtype == torchs.dtype == torch.float32
+    assert torch.equal(ours, torchs) and ours.unique().numel() > 8000 and ours.amin() == 0
+
+
+@needs_compiler
+def test_depths_that_compiled_code_does_not_take_are_torchs(loaded, monkeypatch):
+    calls = counted(monkeypatch, "metres", "probe")
+    whole = torch.arange(6000).view(1, 60, 100)
+    for x in (whole.int(), whole.float(), whole.double(), whole.to(torch.uint8)):
+        assert (Views(depth_unit="mm").metres([x])[0] - x / 1000.0).abs().max() < 1e-6
+    assert Views(depth_unit=0.002).metres([whole.to(torch.int16)])[0, 0, 59, 99] == 5999 * 0.002
+    with pytest.raises(SampleError, match="is the unit mm"):
+        Views(depth_unit="m").metres([whole.to(torch.int16)])
+    Views(depth_unit="m")._probed(whole.double())
+    assert not calls
+
+
+@needs_compiler
+def test_what_some_depths_say_is_what_torch_says(loaded, monkeypatch):
+    views, random = Views(depth_unit="m"), torch.Generator().manual_seed(5)
+    depth = 3 * torch.rand(6, 60, 80, generator=random)
+    depth[0, ::2], depth[1], depth[2], depth[3, :40] = 0, 0, 0, 300.0
+    depth[2, 31, 17], depth[4] = 1.5, 0.004
+    depth[5, :, ::3] = torch.nan
+    calls = counted(monkeypatch, "probe")
+    for some in ([0, 5], [0, 1], [2], [3], [4], [5], [0, 3, 4]):
+        ours, torchs = both_ways(lambda some=some: views._probed(depth[some]), monkeypatch)
+        assert torch.equal(ours[0], torchs[0]) and ours[0].dtype == torchs[0].dtype
+        assert ours[0].tolist() == [k != 1 for k in some]
+        bad = [
+            torch.stack([b for b, _, _ in said]).any(0).tolist() if said else [False] * len(some)
+            for _, said in (ours, torchs)
+        ]
+        assert bad[0] == bad[1] == [k in (3, 4) for k in some]
+    assert len(calls) == 7
+
+
+@needs_compiler
+def test_the_sensors_own_map_is_the_same_bits(loaded, monkeypatch):
+    frame = a_view()
+    uv = torch.rand(301, 2, generator=torch.Generator().manual_seed(2)) * torch.tensor([99.0, 75.0]) - 7
+    samples = classify(frame, backproject(frame, uv, near_limit=2.5, min_conf=1))
+    samples = samples.replace(xyz=torch.where(samples.depth[..., None] < 0.5, torch.inf, samples.xyz))
+    calls = counted(monkeypatch, "sensed")
+    ours, torchs = both_ways(lambda: merge(samples, None), monkeypatch)
+    assert calls == ["sensed"] and 0 < (ours.source == Source.SENSOR).sum() < ours.source.numel()
+    for name in ("uv", "depth", "sigma", "score", "source"):
+        a, b = getattr(ours, name), getattr(torchs, name)
+        assert a.dtype == b.dtype and torch.equal(a.nan_to_num(7), b.nan_to_num(7)), name
+    leaf = samples.depth.clone().requires_grad_()
+    assert merge(samples.replace(depth=leaf), None).depth.requires_grad
+    assert merge(samples.map(lambda x: x.double() if x.is_floating_point() else x), None).depth.dtype == torch.float64
+    assert calls == ["sensed"]
+
+
+def sparse(batch, n, seed=0):
+    """Samples, some outside of a picture of 60x80 and some that are no numbers, and their holes."""
+    random = torch.Generator().manual_seed(seed)
+    uv, depth, sigma = (torch.rand(batch, n, *k, generator=random) for k in ((2,), (), ()))
+    uv = uv * torch.tensor([90.0, 70.0]) - 5
+    uv[:, ::7, 1], depth[:, ::5], sigma[:, ::11], depth[:, ::13] = torch.nan, 0, torch.nan, torch.inf
+    source, hole = (torch.randint(0, k, (batch, n), generator=random, dtype=torch.int32) for k in (3, 8))
+    return Map(uv, depth, sigma, torch.ones_like(depth), source), hole - 1  # -1: of no class
+
+
+@needs_compiler
+@pytest.mark.parametrize("fit", ["stretch", "pad", "crop"])
+@pytest.mark.parametrize(("batch", "n", "size"), [(1, 5000, None), (3, 400, (42, 70)), (2, 0, (28, 28))])
+def test_tokens_are_the_same_bits(loaded, monkeypatch, fit, batch, n, size):
+    found, hole = sparse(batch, n)
+    asked = {"patch": 7, "tokens_hw": size, "fit": fit}
+    ours, torchs = both_ways(lambda: patch_tokens(found, hole, (60, 80), **asked), monkeypatch)
+    assert all(torch.equal(a, b) and a.dtype == b.dtype for a, b in zip(ours, torchs, strict=True))
+    assert n == 0 or (ours[0] > 0).any(1).all()
+
+
+@needs_compiler
+def test_tokens_that_compiled_code_cannot_pool_are_torchs(loaded, monkeypatch):
+    found, hole = sparse(1, 50)
+    calls = []
+    monkeypatch.setattr(torch.ops.dhtorch, "patch_tokens", lambda *_: calls.append(1))
+    patch_tokens(found.to(torch.float64), hole, (60, 80))
+    patch_tokens(found, hole.long(), (60, 80))
+    patch_tokens(found.replace(uv=found.uv.nan_to_num().int()), hole, (60, 80))
+    patch_tokens(found.map(lambda x: x.requires_grad_() if x.is_floating_point() else x), hole, (60, 80))
+    assert not calls
+    patch_tokens(found.detach(), hole, (60, 80))
+    assert calls
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("shape", "views", "most"),
+    [
+        ((2, 7, 5, 48), (1, 3), 31),
+        ((1, 1, 9, 3), (8,), 249),
+        ((1, 6, 1, 4), (2,), 2),
+        ((3, 5, 4, 130), (1, 2, 8), 255),
+        ((4, 6, 7, 96), (1, 2, 3, 5), 31),
+        ((1, 3, 3, 600), (1,), 20),
+    ],
+)
+def test_surfaces_and_rivals_are_equal(loaded, monkeypatch, shape, views, most):
+    """In numbers as small as costs allow: bytes where four paths fit into one, or two, or one, and larger ones."""
+    C, views = volume(*shape, most=most), torch.tensor(views)
+    (found, some), (expected, few) = both_ways(lambda: sweep.surface(C, views), monkeypatch)
+    for a, b in zip((*found, some), (*expected, few), strict=True):
+        assert torch.equal(a, b) and a.dtype == b.dtype
+    for reach in (0.0, 2.0, 1e4):
+        far = torch.full((len(C),), reach)
+        a, b = both_ways(lambda far=far: sweep.rivals(some, found, far), monkeypatch)
+        assert torch.equal(a, b)
+
+
+@needs_compiler
+def test_costs_are_equal_also_where_a_place_lies_behind_the_other_view(loaded, monkeypatch):
+    """One pair sideways and turned, one straight ahead through what it sees; a view that only one of them wants."""
+    pictures = gaussian(torch.rand(2, 2, 30, 41, generator=torch.Generator().manual_seed(0)), 1.0)
+    camera = Camera(torch.tensor([[40.0, 41.0], [35.0, 35.0]]), torch.tensor([[19.5, 14.0], [21.0, 15.5]]))
+    motion = torch.tensor([[0.02, -0.1, 0.2, -0.3, 0.1, 0.05], [0.0, 0.0, 0.0, 0.1, 0.0, -1.4]])
+    base = sweep.base(pictures[:, :1], camera)
+    view = sweep.View(pictures[:, 1:], camera, se3.exp(motion))
+    q = torch.linspace(0, 1, 37).square() * torch.tensor([[1.0], [0.9]])
+
+    def costs():
+        C = torch.zeros(2, *base.hw, 37, dtype=torch.uint8).movedim(-1, 1)
+        for wanted in ([True, False], [True, True]):
+            sweep.add_costs(C, base, view, q, torch.tensor(wanted))
+        return C
+
+    assert bool((sweep.travel(base, view).c * q < -1).any()), "behind the other view"
+    found, expected = both_ways(costs, monkeypatch)
+    assert torch.equal(found, expected) and len(found.unique()) > 20
+
+
+@needs_compiler
+@pytest.mark.parametrize("turning", [False, True])
+def test_places_codes_and_smooth_maps_are_equal(loaded, monkeypatch, turning):
+    g = torch.Generator().manual_seed(1)
+    picture = torch.rand(2, 1, 6, 21, generator=g).mul(9).round() / 9  # equal neighbours are not darker
+    assert torch.equal(*both_ways(lambda: sweep.census(picture), monkeypatch))
+    ray = torch.rand(2, 500, 3, generator=g) - 0.5
+    camera = Camera(torch.tensor([[40.0, 41.0], [35.0, 35.0]]), torch.tensor([[19.5, 14.0], [21.0, 15.5]]))
+    motion = se3.exp(0.5 * torch.randn(2, 6, generator=g))
+    view = sweep.View(
+        torch.zeros(2, 1, 4, 4), camera, motion, 0.1 * torch.randn(2, 3, generator=g) if turning else None
+    )
+    found, expected = both_ways(
+        lambda: sweep.seen_at(view, ray, torch.rand(2, 500, generator=g.manual_seed(2))), monkeypatch
+    )
+    assert torch.equal(found[0], expected[0]) and torch.equal(found[1], expected[1]) and not bool(found[1].all())
+    for shape in ((2, 30, 17), (2, 3, 5), (2, 1, 1)):
+        q = torch.rand(*shape, generator=g)
+        smooth = both_ways(lambda q=q: neighbours.smooth(q, torch.tensor([0.2, 0.5])), monkeypatch)
+        assert torch.equal(*smooth)
+
+
+@needs_compiler
+@pytest.mark.parametrize("lens", [False, True])
+@pytest.mark.parametrize("hw", [(41, 53), (6, 70), (9, 3)])
+def test_fitted_windows_agree_up_to_rounding(loaded, monkeypatch, lens, hw):
+    """Pairs turned and moved, pixels that leave the other picture or lie behind it, and one without texture."""
+    g = torch.Generator().manual_seed(3)
+    pictures = gaussian(torch.rand(3, 2, *hw, generator=g), 1.2)
+    pictures[2, 0] = 0.4
+    f = torch.full((3, 2), float(max(hw)))
+    lens = torch.tensor([[0.05, -0.01, 0.001, -0.002]]).expand(3, -1) if lens else None
+    camera = Camera(f, torch.tensor([[hw[1] / 2, hw[0] / 2]]).expand(3, -1), lens)
+    motion = se3.exp(0.05 * torch.randn(3, 6, generator=g) + torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, -0.4]))
+    base = sweep.base(pictures[:, :1], camera)
+    view = sweep.View(pictures[:, 1:], camera, motion)
+    q = 0.2 + 0.1 * gaussian(torch.rand(3, 1, *hw, generator=g), 2.0)[:, 0]
+    q[:, 0] = 4.0  # behind
+    picture = sweep.with_gradients(view.image)
+    found, expected = both_ways(lambda: sweep.fit_windows(base, view, picture, q), monkeypatch)
+    assert torch.equal(found.seen, expected.seen) and not bool(found.seen.all()) and bool(found.seen.any())
+    for name in ("step", "contrast", "noise", "correlation", "motion"):
+        a, b = getattr(found, name), getattr(expected, name)
+        scale = b.abs().flatten(1).mean(1).clamp_min(1e-6)[:, None]
+        assert a.shape == b.shape and ((a - b).flatten(1).abs() <= 1e-4 * (scale + b.flatten(1).abs())).all(), name
+    assert found.correlation[:2].abs().mean() > 0.05
+
+
+@needs_compiler
+@pytest.mark.parametrize("turning", [False, True])
+def test_what_hides_and_how_sure_motions_are_agrees(loaded, monkeypatch, turning):
+    g = torch.Generator().manual_seed(8)
+    grey = torch.rand(2, 1, 13, 50, generator=g)
+    camera = Camera(torch.tensor([[40.0, 41.0], [35.0, 35.0]]), torch.tensor([[24.5, 6.0], [21.0, 5.5]]))
+    T = se3.exp(torch.tensor([[0.02, -0.1, 0.2, -0.6, 0.1, 0.05], [0.0, 0.0, 0.0, 0.1, 0.0, -1.4]]))
+    base, view = sweep.base(grey, camera), sweep.View(grey, camera, T)
+    q = torch.rand(2, 13, 50, generator=g)
+    near = torch.tensor([0.01, 0.3])
+    found, expected = both_ways(lambda: sweep.hidden(sweep.travel(base, view), q, near), monkeypatch)
+    assert torch.equal(found, expected) and 0.05 < found.float().mean() < 0.9
+    half = torch.randn(2, 9 if turning else 6, 9 if turning else 6, generator=g)
+    cov = 1e-4 * half @ half.mT
+    none = torch.zeros(2)
+    shutter = Shutter(torch.zeros(2, 3), cov) if turning else None
+    code = torch.tensor([PoseCode.OK, PoseCode.KEPT_PNP], dtype=torch.int32)
+    fit = PoseFit(T, cov[:, :6, :6], none[:, None] > 1, none.long(), none, none, none, code, shutter)
+    motion = torch.randn(2, 13, 50, 2, generator=g)
+    motion[0, :2] = 0.0
+    found, expected = both_ways(lambda: stereo.pose_variance(base, view, fit, q, motion), monkeypatch)
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=0.0)
+    for code in (PoseCode.OK, PoseCode.TOO_FEW):
+        lost = fit.replace(code=torch.full_like(fit.code, code), cov=fit.cov * torch.nan, shutter=None)
+        a, b = both_ways(lambda lost=lost: stereo.pose_variance(base, view, lost, q, motion), monkeypatch)
+        assert torch.equal(a, b) and not a.any(), "what is not known is no number"
+
+
+@needs_compiler
+@pytest.mark.parametrize("partners", [1, 2])
+def test_maps_agree_to_far_less_than_their_sigma(loaded, monkeypatch, partners):
+    room = SyntheticRoom(n_frames=9, hw=(96, 128), depth_hw=(48, 64))
+    anchor, *others = (range_split(room[k], 2.0) for k in (1, 6, 8))
+    with monkeypatch.context() as patch:
+        patch.setattr(native, "_loaded", [])
+        trace = {}
+        asked = dense.views_asked(WINDOW(anchor, others, trace=trace), others, trace)
+    found, expected = both_ways(
+        lambda: dense.swept(anchor, asked, partners=partners, planes=48, max_sigma_rel=0.5), monkeypatch
+    )
+    assert (found.gate != expected.gate).float().mean() <= 0.005 and torch.equal(found.gate == 0, found.depth > 0)
+    both = (found.source == Source.SWEPT) & (expected.source == Source.SWEPT)
+    assert both.float().mean() > 0.1
+    assert ((found.depth - expected.depth)[both].abs() / expected.sigma[both]).quantile(0.99) <= 0.1
+    torch.testing.assert_close(found.sigma[both].median(), expected.sigma[both].median(), rtol=1e-3, atol=0.0)
+
+
+@needs_compiler
+def test_windows_of_another_size_or_type_or_with_a_graph_are_fitted_by_torch(loaded, monkeypatch):
+    monkeypatch.setattr(sweep, "_compiled_fit", None)
+    grey = torch.rand(1, 2, 12, 14, generator=torch.Generator().manual_seed(4))
+    camera = Camera(torch.full((1, 2), 20.0), torch.tensor([[6.5, 5.5]]))
+    motion = se3.exp(torch.tensor([[0.0, 0.0, 0.0, 0.1, 0.0, 0.0]]))
+
+    def fitted(grey, **options):
+        base = sweep.base(grey[:, :1], camera.to(grey.dtype))
+        view = sweep.View(grey[:, 1:], camera.to(grey.dtype), motion.to(grey.dtype))
+        q = torch.full_like(grey[:, 0], 0.5)
+        return sweep.fit_windows(base, view, sweep.with_gradients(view.image), q, **options)
+
+    fitted(grey.double())
+    fitted(grey, radius=2)
+    graph = grey.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(fitted(graph).step.sum(), [graph])
+    assert bool(slope.isfinite().all()) and slope.abs().sum() > 0
+    with pytest.raises(TypeError):
+        fitted(grey)
+
+
+@pytest.fixture(scope="module")
+def seen_twice():
+    """Two pictures, each seen again moved by a few pixels and lit otherwise; points in, at the border of and beside it."""
+    g = torch.Generator().manual_seed(5)
+    rough, fine = (gaussian(torch.rand(2, 1, 120, 150, generator=g), s) - 0.5 for s in (3.0, 0.8))
+    wide = 2.5 * rough + fine + 0.5
+    here, there = wide[..., 10:-10, 10:-10], 0.8 * wide[..., 13:-7, 5:-15] + 0.1
+    there = there + 0.004 * torch.randn(there.shape, generator=g)
+    uv = torch.rand(2, 300, 2, generator=g) * torch.tensor([134.0, 104.0]) - 2
+    uv[:, 0], uv[0, 1], uv[1, 1] = torch.nan, torch.inf, 1e30
+    return here.clamp(0, 1), there.clamp(0, 1), uv
+
+
+def agree(found, expected, exact=None):
+    """The same verdicts but for one in 200 (or as many as single precision itself changes of ``exact`` ones), and valid
+    places alike to far less than their sigma."""
+    unsure = 0.0 if exact is None else (exact.valid != expected.valid).float().mean()
+    assert (found.valid != expected.valid).float().mean() <= max(0.005, unsure)
+    both = found.valid & expected.valid
+    assert both.float().mean() > 0.5
+    apart = (found.uv_1 - expected.uv_1)[both].norm(dim=-1)
+    sigma = expected.cov[both].diagonal(dim1=-1, dim2=-2).amax(-1).sqrt()
+    assert apart.median() <= 1e-4 and (apart / sigma).quantile(0.99) <= 0.1
+    for name in ("error", "photometric", "cov"):
+        a, b = (getattr(x, name)[both].flatten() for x in (found, expected))
+        assert (a - b).abs().median() <= 1e-3 * b.abs().median()
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("normalise", "window", "levels"), [("none", 21, 4), ("bias", 15, 3), ("gain_bias", 11, 3), ("none", 33, 1)]
+)
+def test_a_search_for_points_agrees_up_to_rounding(loaded, monkeypatch, seen_twice, normalise, window, levels):
+    here, there, uv = seen_twice
+    if normalise != "gain_bias":
+        there = (there - there.mean()) * here.std() / there.std() + here.mean()
+    options = {"normalise": normalise, "window": window, "levels": levels}
+    far = torch.tensor([[[4.0, -4.0]]])
+    if normalise == "gain_bias":  # more of them: single precision itself is unsure of some
+        here, there, uv = (torch.cat(4 * [x]) for x in (here, there, uv))
+        far = torch.tensor([[4.0, -4.0], [4.0, -3.0], [3.0, -4.0], [5.0, -2.0]]).repeat_interleave(2, 0)[:, None]
+    for hint in (NO_HINT, TrackHint(start=(uv + far).nan_to_num(posinf=1e30))):
+        if hint is not NO_HINT or levels > 1:
+            wide = lucas_kanade(here.double(), there.double(), uv.double(), hint=hint, **options)
+            agree(*both_ways(lambda h=hint: lucas_kanade(here, there, uv, hint=h, **options), monkeypatch), wide)
+
+
+def test_compiled_code_has_the_constants_of_torchs():
+    """It reads past the end of a row: a level has a row more than a window at its border reaches."""
+    source = native.SOURCES[1].read_text()
+    for line in (
+        f"STEPS = {lk.STEPS}, LEAP = {lk.LEAP}, MARGIN = {pyramid.MARGIN};",
+        f"RATIO = {lk.RATIO[1]}f, LEAST_GAIN = {lk.GAIN[0]}f, MOST_GAIN = {lk.GAIN[1]}f;",
+        f"{{ {', '.join(lk.NORMALISE).upper()} }}",
+    ):
+        assert line in source
+    source = native.SOURCES[2].read_text()
+    for line in (
+        f"REACH = {pyramid.REACH}, MARGIN = {pyramid.MARGIN};",
+        f"AHEAD = {affine.AHEAD}f, LEAST_GAIN = {affine.GAIN[0]}f, MOST_GAIN = {affine.GAIN[1]}f;",
+        "NOISE = 2.0 / 255 / 2, DAMPING = NOISE * NOISE, MIN_PIVOT = 1e-6;",
+    ):
+        assert line in source
+    for line in (
+        f"RADIUS = {sweep.FIT_RADIUS};",
+        f"LEAST_GAIN = {sweep.GAIN[0]}f, MOST_GAIN = {sweep.GAIN[1]}f, FLAT = 1e-8f;",
+    ):
+        assert line in native.SOURCES[4].read_text()
+    for line in (
+        f"MIN_HEIGHT = {p3p.MIN_HEIGHT}, MAX_COSINE = 1 - 1e-12;".replace("0.001", "1e-3"),
+        f"MIN_DEPTH = {least_squares.MIN_DEPTH:g}f, DAMPING = 1e-4f;".replace("e-06", "e-6"),
+        f"SEARCH_POINTS = {SEARCH_POINTS}, PREVIEW = 32, SHORTLIST = 32, KEEP = 2;",
+    ):
+        assert line in native.SOURCES[7].read_text()
+    kept = f"MAX_NEARER = {near_far.MAX_NEARER}f, BEHIND = 1e4f, MIN_DEPTH = 1e-6f;"
+    assert kept in native.SOURCES[8].read_text() and near_far.BEHIND == 1e4 and least_squares.MIN_DEPTH == 1e-6
+    searched, minimised = (inspect.signature(f).parameters for f in (ransac.search, least_squares.minimise))
+    assert [searched[k].default for k in ("preview", "shortlist", "keep")] == [32, 32, 2]
+    assert minimised["damping"].default == 1e-4 and p3p.MAX_COSINE == 1 - 1e-12
+    assert sweep.FLAT == 1e-8
+    assert affine.DAMPING == (2 / 255 / 2) ** 2 and least_squares.MIN_PIVOT == 1e-6
+    assert lk.RATIO[0] == -lk.RATIO[1] and {*lk.TOP, *lk.BETWEEN, *lk.FINEST} <= {1, 2}
+    assert pyramid.REACH >= pyramid.MARGIN + 2 + 2, "the largest radius, and the row"
+
+
+def registered(here, there, uv, **options):
+    """Windows at ``uv`` registered from three pixels left and five below, which is where they moved to but for 0.2 px."""
+    window = options.get("window", 21)
+    views = pyramid.build_pyramid(here, 1, window), pyramid.build_pyramid(there, 2, window, gradients=False)
+    moved = torch.tensor([5.2, -2.8]) if "linear" not in options else torch.tensor([0.2, 0.2])
+    return affine.register(*views, uv, uv + moved.to(uv), **options)
+
+
+def register_alike(found, expected, most_apart=0.1):
+    """The same verdicts but for one in 200, and windows alike to far less than their sigma."""
+    assert (found.ok != expected.ok).float().mean() <= 0.005
+    both = found.ok & expected.ok
+    assert both.float().mean() > 0.5
+    apart = (found.uv_1 - expected.uv_1)[both].norm(dim=-1)
+    sigma = expected.cov[both].diagonal(dim1=-1, dim2=-2).amax(-1).sqrt()
+    assert apart.median() <= 1e-4 and (apart / sigma).quantile(0.99) <= most_apart
+    for name in ("linear", "rms", "cov", "shift_px"):
+        a, b = (getattr(x, name)[both] for x in (found, expected))
+        assert (a - b).abs().median() <= 1e-3 * b.abs().median(), name
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    "options", [{}, {"window": 9, "iterations": 3}, {"iterations": 0}, {"epsilon_px": 0.3}], ids=str
+)
+def test_a_registration_agrees_up_to_rounding(loaded, monkeypatch, seen_twice, options):
+    here, there, uv = seen_twice
+    found, expected = both_ways(lambda: registered(here, there, uv, **options), monkeypatch)
+    register_alike(found, expected)
+    assert not torch.equal(found.cov, expected.cov), "not compiled"
+
+
+@needs_compiler
+def test_a_magnified_window_is_registered_on_the_half_size_level_alike(loaded, monkeypatch):
+    g = torch.Generator().manual_seed(6)
+    small = gaussian(torch.rand(1, 1, 60, 80, generator=g), 1.5)
+    small = (small - small.mean()) * 2 + 0.5
+    large = torch.nn.functional.interpolate(small, scale_factor=2, mode="bicubic", align_corners=False)
+    uv = 15 + torch.rand(1, 100, 2, generator=g) * torch.tensor([50.0, 30.0])
+
+    def magnified():
+        views = pyramid.build_pyramid(small, 1), pyramid.build_pyramid(large, 2)
+        return affine.register(*views, uv, 2 * uv + 0.7, linear=1.9 * torch.eye(2)[None])
+
+    found, expected = both_ways(magnified, monkeypatch)
+    register_alike(found, expected)
+    assert (found.linear.det()[found.ok] > affine.HALVE**2).all()
+
+
+@needs_compiler
+def test_a_registration_is_told_the_same_in_any_company_and_without_texture_nothing(loaded, monkeypatch, seen_twice):
+    here, there, uv = seen_twice
+    together = registered(here, there, uv)
+    some = torch.rand(uv.shape[:2], generator=torch.Generator().manual_seed(7)) < 0.3
+    chosen = registered(here, there, uv, wanted=some)
+    for name in affine.Registration._fields:
+        whole = getattr(together, name)
+        assert torch.equal(getattr(chosen, name)[some & together.ok], whole[some & together.ok]), name
+        alone = getattr(registered(here[1:], there[1:], uv[1:, ::3]), name)
+        assert torch.equal(alone[0][together.ok[1, ::3]], whole[1, ::3][together.ok[1, ::3]]), name
+    for found, expected in zip(*both_ways(lambda: registered(0 * here, there, uv), monkeypatch), strict=True):
+        assert torch.allclose(found, expected, equal_nan=True)
+    assert not found.any(), "no texture"
+
+
+@needs_compiler
+def test_a_registration_in_another_type_or_reaching_past_the_padding_is_torchs(loaded, monkeypatch, seen_twice):
+    here, there, uv = seen_twice
+    monkeypatch.setattr(affine, "_compiled", None)
+    registered(here.double(), there.double(), uv.double())
+    narrow = pyramid.build_pyramid(here, 1, 9), pyramid.build_pyramid(there, 1, 9)
+    usable = (uv > 20).all(-1) & (uv < 80).all(-1)
+    affine.register(*narrow, uv, uv, wanted=usable, window=11)
+    with pytest.raises(TypeError):
+        registered(here, there, uv)
+
+
+@needs_compiler
+def test_a_registration_keeps_its_gradient(loaded, monkeypatch, seen_twice):
+    here, there, uv = seen_twice
+    start = TrackHint(start=(uv[1:] + torch.tensor([5.0, -3.0])))
+
+    def slope():
+        seen = there[1:].clone().requires_grad_()
+        tracks = lucas_kanade_affine(here[1:], seen, uv[1:], hint=start)
+        (slope,) = torch.autograd.grad(tracks.uv_1[tracks.valid & (tracks.error < 0.5)].sum(), seen)
+        return slope
+
+    found, expected = both_ways(slope, monkeypatch)
+    assert expected.abs().max() > 0 and (found - expected).norm() < 0.02 * expected.norm()
+
+
+@needs_compiler
+def test_a_registration_of_pixels_that_are_no_numbers_is_rejected_alike(loaded, monkeypatch, seen_twice):
+    here, there, uv = seen_twice
+    here, there = here.clone(), there.clone()
+    here[0, 0, 30:33, 60:63], there[1, 0, 70:72, :20] = torch.nan, torch.inf
+    found, expected = both_ways(lambda: registered(here, there, uv), monkeypatch)
+    register_alike(found, expected)
+    assert torch.equal(found.cov.isfinite(), expected.cov.isfinite()) and not bool(found.cov.isfinite().all())
+    assert bool(found.cov[found.ok].isfinite().all())
+
+
+def near_pairs(batch, n, wrong, seed=0):
+    """Points 0.5 to 2.5 m away seen again with 0.3 px of noise, a share of them anywhere: what seat 5 is asked with."""
+    g = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape):
+        return torch.rand(*shape, generator=g)
+
+    camera = Camera(500 + 50 * uniform(batch, 2), 300 + 20 * uniform(batch, 2))
+    uv_0, depth = 640 * uniform(batch, n, 2), 0.5 + 2 * uniform(batch, n)
+    xyz = unproject(camera, uv_0, depth)
+    T = se3.exp(0.1 * torch.randn(batch, 6, generator=g))
+    uv_1 = project(camera, se3.apply(T, xyz)) + 0.3 * torch.randn(batch, n, 2, generator=g)
+    uv_1 = torch.where(uniform(batch, n, 1) < wrong, 640 * uniform(batch, n, 2), uv_1)
+    zero, code = torch.zeros(batch, n), torch.zeros(batch, n, dtype=torch.int32)
+    samples = Samples(uv_0, depth, 0.01 * depth, xyz, zero, code, zero, code)
+    tracks = Tracks(uv_0, uv_1, zero, zero, torch.eye(2).expand(batch, n, 2, 2), uniform(batch, n) < 0.9)
+    return samples, tracks, camera, camera, uniform(batch, 64, 3)
+
+
+def poses_alike(found, expected):
+    assert torch.equal(found.code, expected.code)
+    assert (found.inlier != expected.inlier).float().mean() <= 0.001
+    sigma = expected.cov.diagonal(dim1=1, dim2=2).sqrt()
+    turn, shift = (getattr(found.T_1_from_0, k) - getattr(expected.T_1_from_0, k) for k in ("R", "t"))
+    apart = torch.cat((turn.abs().flatten(1) / sigma[:, :3].amax(1, keepdim=True), shift.abs() / sigma[:, 3:]), 1)
+    assert apart[expected.ok].quantile(0.99) <= 0.01
+    return int(expected.ok.sum())  # poses
+
+
+@needs_compiler
+@pytest.mark.parametrize(("batch", "n", "wrong"), [(3, 700, 0.3), (20, 100, 0.4), (40, 12, 0.2)])
+def test_a_pose_from_near_points_agrees_up_to_rounding(loaded, monkeypatch, batch, n, wrong):
+    args = near_pairs(batch, n, wrong)
+    found, expected = both_ways(lambda: pnp_ransac(*args), monkeypatch)
+    assert poses_alike(found, expected) > batch // 2
+    for options in ({"local_optimisation": 0, "polish_steps": 0}, {"polish_steps": 3, "threshold_px": 1.5}):
+        poses_alike(*both_ways(lambda o=options: pnp_ransac(*args, **o), monkeypatch))
+    alone = [pnp_ransac(*(x[k : k + 1] for x in args)) for k in range(2)]
+    for one, k in zip(alone, range(2), strict=True):
+        assert torch.equal(one.T_1_from_0.R[0].nan_to_num(), found.T_1_from_0.R[k].nan_to_num()), "its company is told"
+
+
+@needs_compiler
+def test_what_leaves_no_pose_is_told_alike(loaded, monkeypatch):
+    samples, tracks, *rest = near_pairs(7, 60, 0.2)
+    xyz, uv_1, valid = samples.xyz.clone(), tracks.uv_1.clone(), tracks.valid.clone()
+    valid[0] = False
+    valid[1, 2:] = False
+    xyz[2] = torch.nan
+    xyz[3] = torch.linspace(1, 2, 60)[:, None] * torch.tensor([0.1, 0.2, 1.0])  # a line
+    xyz[4] = xyz[4, :1]
+    uv_1[5] = torch.inf
+    args = (samples.replace(xyz=xyz), tracks.replace(uv_1=uv_1, valid=valid), *rest)
+    found, expected = both_ways(lambda: pnp_ransac(*args), monkeypatch)
+    assert torch.equal(found.code, expected.code)
+    assert found.code.tolist()[:3] == [PoseCode.TOO_FEW] * 3 and found.code[6] == PoseCode.OK
+    assert bool(found.T_1_from_0.R[:6].isnan().all())
+
+
+@needs_compiler
+def test_poses_in_another_type_by_a_kernel_or_with_a_graph_are_torchs(loaded, monkeypatch):
+    samples, tracks, camera, _, draws = near_pairs(2, 90, 0.2)
+    asked, pose = [], torch.ops.dhtorch.robust_pose
+    monkeypatch.setattr(torch.ops.dhtorch, "robust_pose", lambda **given: (asked.append(1), pose(**given)))
+    pnp_ransac(samples, tracks, camera, camera, draws)
+    assert asked == [1]
+    pnp_ransac(samples, tracks, camera, camera, draws, kernel="huber")
+    pnp_ransac(*(x.to(torch.float64) for x in (samples, tracks, camera, camera)), draws)
+    assert asked == [1]
+    leaf = tracks.uv_1.clone().requires_grad_()
+
+    def shift():
+        (grad,) = torch.autograd.grad(
+            pnp_ransac(samples, tracks.replace(uv_1=leaf), camera, camera, draws).T_1_from_0.t.sum(), leaf
+        )
+        return grad
+
+    torch.testing.assert_close(*both_ways(shift, monkeypatch), atol=1e-6, rtol=1e-3)
+
+
+def every_track(turning):
+    """Tracks of every kind, as many as compiled code takes; their unknowns and noise."""
+    problem, at = test_reprojection_problem.scene()
+    problem = Problem(problem.f, problem.c, *(x.repeat(*[1] * (x.ndim - 1), 16) for x in tree_leaves(problem)[2:]))
+    noise = test_reprojection_problem.NOISE.repeat(1, 16)
+    return (
+        problem.to(torch.float32),
+        at._replace(T=at.T.to(torch.float32), turn=at.turn.float() if turning else None),
+        noise.float(),
+    )
+
+
+@needs_compiler
+@pytest.mark.parametrize("turning", [False, True])
+def test_equations_of_tracks_agree_up_to_rounding(loaded, monkeypatch, turning):
+    problem, at, noise = every_track(turning)
+    told = (problem, noise, torch.tensor([0.1, 0.7]), torch.tensor([1e4, 10.0]))
+    asked, call = [], torch.ops.dhtorch.track_equations
+    monkeypatch.setattr(torch.ops.dhtorch, "track_equations", lambda **given: (asked.append(1), call(**given)))
+
+    def ask(kernel="geman_mcclure", told=told, at=at):
+        normal, cost = near_far.equations(*told, kernel=kernel, bend=2.0)
+        return (*normal(at), cost(at))
+
+    found, expected = both_ways(ask, monkeypatch)
+    assert len(asked) == 2
+    for a, b in zip(found, expected, strict=True):
+        assert a.shape == b.shape and (a - b).abs().amax() <= 2e-4 * b.abs().amax()
+    for i in range(6):  # each column, whatever its unit
+        torch.testing.assert_close(found[1][:, i, i], expected[1][:, i, i], rtol=1e-3, atol=0)
+    ask(kernel="cauchy")
+    wide = [x.to(torch.float64) for x in told]
+    ask(told=wide, at=at._replace(T=at.T.to(torch.float64), turn=None if at.turn is None else at.turn.double()))
+    leaf = at.T.t.clone().requires_grad_()
+    assert ask(at=at._replace(T=at.T.replace(t=leaf)))[0].requires_grad
+    assert len(asked) == 2, "in torch"
+    (square, front), (wanted, ahead) = both_ways(lambda: near_far.squares_at(problem, at)(noise), monkeypatch)
+    assert torch.equal(front, ahead) and 0 < front.float().mean() < 1
+    torch.testing.assert_close(square, wanted, rtol=1e-3, atol=1e-3)
+
+
+@needs_compiler
+def test_a_pose_from_all_tracks_agrees_to_far_less_than_its_sigma(loaded, monkeypatch):
+    args, _, _, _ = test_map_pose.pairs(6, near=80, far=220, turn=0.01)
+    args = [x.to(torch.float32) for x in args]
+    found, expected = both_ways(lambda: map_pose(*args), monkeypatch)
+    assert poses_alike(found, expected) == 6
+    assert not torch.equal(found.T_1_from_0.t, expected.T_1_from_0.t), "not compiled"
+    alone = map_pose(*(x[2:3] for x in args))
+    assert torch.equal(alone.T_1_from_0.t[0], found.T_1_from_0.t[2]), "its company is told"
+
+
+@needs_compiler
+def test_a_point_is_told_the_same_in_any_company(loaded, seen_twice):
+    here, there, uv = seen_twice
+    together = lucas_kanade(here, there, uv)
+    for k in range(len(uv)):
+        alone = lucas_kanade(here[k : k + 1], there[k : k + 1], uv[k : k + 1].flip(1))
+        for name in ("uv_1", "cov", "error", "photometric", "valid"):
+            assert torch.equal(getattr(alone, name)[0].flip(0), getattr(together, name)[k]), name
+
+
+@needs_compiler
+def test_pixels_that_are_no_numbers_hurt_only_the_windows_they_are_in(loaded, monkeypatch, seen_twice):
+    here, there, uv = seen_twice
+    here, there = here.clone(), there.clone()
+    here[0, 0, 30:33, 60:63], there[1, 0, 70:72, :20] = torch.nan, torch.inf
+    found, expected = both_ways(lambda: lucas_kanade(here, there, uv, normalise="bias", levels=2), monkeypatch)
+    agree(found, expected)
+    assert bool(found.cov.isfinite().all() and found.uv_1.isfinite().all())
+
+
+@needs_compiler
+def test_a_search_in_another_type_or_with_a_graph_is_torchs(loaded, monkeypatch, seen_twice):
+    here, there, uv = seen_twice
+    found, expected = both_ways(lambda: lucas_kanade(here.double(), there.double(), uv.double()), monkeypatch)
+    assert torch.equal(found.uv_1, expected.uv_1)
+    monkeypatch.setattr(lk, "_compiled", None)
+    lucas_kanade(here.double(), there.double(), uv.double())
+    with pytest.raises(TypeError):
+        lucas_kanade(here, there, uv)
+
+
+@needs_compiler
+def test_what_compiled_code_cannot_do_is_left_to_torch(loaded, monkeypatch):
+    x = torch.zeros(2, 3, 4, 5)
+    assert native.serves(x, x.to(torch.uint8))
+    assert not native.serves(x.double()) and not native.serves(x.half()) and not native.serves(x.mT)
+    assert not native.serves(x.to("meta")) and not native.serves(torch.nn.Parameter(x))
+    with torch.no_grad():
+        assert not native.serves(torch.nn.Parameter(x)), "no plain tensor"
+        assert native.serves(x.clone().requires_grad_())
+    told = []
+    torch.vmap(lambda y: (told.append(native.serves(y)), y)[1])(x)
+    assert told == [False]
+    C = volume(2, 4, 5, 6, most=31)
+    assert torch.equal(sweep.surface(C.int(), torch.tensor(1))[1], sweep.surface(C, torch.tensor(1))[1]), (
+        "other numbers"
+    )
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
+    assert not native.serves(x)
+
+
+@needs_compiler
+def test_tangents_are_carried_though_compiled_code_is_loaded(loaded):
+    image, tangent = torch.rand(2, 1, 3, 48, 64)
+    with forward_ad.dual_level():
+        top = pyramid.build_pyramid(forward_ad.make_dual(image, tangent), 2, 11).levels[1]
+        found = forward_ad.unpack_dual(top).tangent
+    expected = pyramid.build_pyramid(tangent, 2, 11).levels[1]  # linear in the image
+    assert found is not None and torch.allclose(found, expected, atol=1e-6)
+    assert native.serves(image)
+
+
+@needs_compiler
+def test_the_environment_asks_for_it(cache, monkeypatch):
+    monkeypatch.setenv("DHTORCH_CACHE", str(cache))
+    assert not native.serves(torch.zeros(1))
+    monkeypatch.setenv("DHTORCH_NATIVE", "0")
+    assert not native.serves(torch.zeros(1)) and not native._loaded
+    monkeypatch.setenv("DHTORCH_NATIVE", "1")
+    assert native.serves(torch.zeros(1)) and native._loaded == [native.library()]
+    assert list(cache.iterdir()) == [native.library()], "nothing unfinished stays"
+    monkeypatch.setattr(native, "processor", lambda: "another one")
+    assert not native.library().exists()
+
+
+def test_nothing_is_compiled_silently(tmp_path, monkeypatch):
+    monkeypatch.setenv("DHTORCH_CACHE", str(tmp_path / "none"))
+    monkeypatch.setenv("DHTORCH_NATIVE", "1")
+    with pytest.raises(FileNotFoundError, match=f"not compiled .*; {native.COMMAND} does it"):
+        sweep.surface(volume(1, 2, 2, 3, most=31), torch.tensor(1))
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.skipif(platform.machine().lower() not in ("x86_64", "amd64"), reason="levels are those of x86-64")
+def test_a_torch_held_to_narrower_vectors_has_a_file_of_its_own(monkeypatch):
+    monkeypatch.delenv("ATEN_CPU_CAPABILITY", raising=False)
+    own, flags = native.library(), native._vectors()
+    monkeypatch.setenv("ATEN_CPU_CAPABILITY", "avx2")
+    assert (flags, native._vectors()) == (("-march=native",), ("-march=x86-64-v3",))
+    assert native.library() != own
+
+
+def test_another_torch_and_another_processor_have_a_file_of_their_own(monkeypatch):
+    files = [native.library()]
+    with monkeypatch.context() as other:
+        other.setattr(torch, "__version__", "1.0")
+        files.append(native.library())
+    monkeypatch.setattr(native, "processor", lambda: "another, AVX2")
+    assert len({*files, native.library()}) == 3
+
+
+def test_a_compiler_that_is_missing_or_fails_is_told(tmp_path, monkeypatch):
+    monkeypatch.setenv("DHTORCH_CACHE", str(tmp_path))
+    monkeypatch.setenv("CXX", "no-such-compiler-7")
+    asked = [sys.executable, "-m", "dhtorch.ops.loader"]
+    said = subprocess.run(asked, capture_output=True, text=True, check=False)
+    assert said.returncode == 2 and "no-such-compiler-7: no such C++ compiler" in said.stderr
+    if shutil.which("false"):
+        monkeypatch.setenv("CXX", "false --kind")
+        with pytest.raises(OSError, match=r"false --kind .*exit code 1"):
+            native.build()
+        assert not list(tmp_path.iterdir())
+
+
+# ------------------------------------------------------------------------------------------------ a view alone, at once
+
+
+def decoded(kind, unit, *, hw=(61, 83), map_hw=(61, 83), channels=3, seed=0):
+    """A sample as a decoder hands it over: bytes, and returns of every kind."""
+    random = np.random.default_rng(seed)
+    image = (random.integers(0, 256, (*hw, channels)) // 4 + 120).astype(np.uint8)
+    image[:, :20], image[30:, 60:], image[40:41, 40:50] = 255, 5, 255
+    mm = random.integers(0, 4000, map_hw)
+    mm[random.random(map_hw) < 0.3], mm[:12, :12] = 0, 1500
+    depth = (mm if unit == "mm" else mm / 1000).astype(kind)
+    if depth.dtype.kind != "u":
+        depth[2, ::3] = -7
+    if depth.dtype.kind == "f":
+        depth[::9, 1], depth[1::9, 1], depth[2::9, 1] = np.nan, np.inf, -np.inf
+    K = np.array([[70.0, 0, hw[1] / 2 + seed % 3], [0, 71, hw[0] / 2], [0, 0, 1]])
+    return {"image": image, "depth": depth, "intrinsics": K, "index": seed}
+
+
+def by_stages(transform, monkeypatch, *calls):
+    """The same calls, of which the stages are asked."""
+    with monkeypatch.context() as patch:
+        patch.setattr(transform._alone, "limits", None)
+        return [call() for call in calls]
+
+
+def equal(ours, theirs):
+    """Two dicts of numbers hold the same bits, types and shapes."""
+    assert ours.keys() == theirs.keys()
+    for key in ours:
+        a, b = (torch.as_tensor(x[key]) for x in (ours, theirs))
+        assert a.dtype == b.dtype and a.shape == b.shape and torch.equal(a.nan_to_num(7), b.nan_to_num(7)), key
+        assert a.is_contiguous() or not a.numel()
+
+
+SEATS = [
+    {},
+    {"backproject": {"near_limit": 1.7, "sigma_m": 0.004, "min_conf": 2}, "classify": {"block": 3}},
+    {"backproject": {"edge_rel": 0.6, "dark": 0.5, "saturated": 0.6, "highlight": 0.4}, "sample": sample.vogel},
+    {"backproject": {"min_conf": 0}, "classify": {"min_trackability": 1e-3, "block": 9}, "sample": {"foveation": 0.5}},
+]
+
+
+@needs_compiler
+@pytest.mark.parametrize(("kind", "unit"), [("uint16", "mm"), ("int16", "mm"), ("float32", "m"), ("float32", "mm")])
+@pytest.mark.parametrize("seats", SEATS)
+@pytest.mark.parametrize(
+    ("hw", "map_hw", "layout"),
+    [
+        ((61, 83), (61, 83), "hwc"),
+        ((61, 83), (48, 64), "chw"),
+        ((12, 180), (4, 60), "hwc"),
+        ((60, 80), (240, 320), "hwc"),
+    ],
+)
+def test_a_view_alone_at_once_is_what_the_stages_say(loaded, monkeypatch, kind, unit, seats, hw, map_hw, layout):
+    transform = ExtendDepth(depth_unit=unit, method=PAPER.replace(**seats, n=50), patch=2, layout=layout)
+    samples = [decoded(kind, unit, hw=hw, map_hw=map_hw, seed=seed) for seed in range(3)]
+    samples += [decoded(kind, unit, hw=hw, map_hw=map_hw, seed=seed) for seed in range(3)]
+    if layout == "chw":
+        samples = [{**s, "image": s["image"].transpose(2, 0, 1).copy()} for s in samples]
+    calls, seen = counted(monkeypatch, "look"), []
+    for one in samples:
+        ours = transform(one)
+        seen.append([ours[f"dhtorch.{key}"] for key in ("valid", "hole", "flag")])
+        (stages,) = by_stages(transform, monkeypatch, lambda one=one: transform(one))
+        equal(ours, stages)
+    assert len(calls) == len(samples) and len(transform._alone.kept) == 3
+    assert transform.report()["no_second_view"] == 2 * len(samples)
+    valid, hole, flag = (torch.stack(x) for x in zip(*seen, strict=True))
+    most = 2 if hw[0] > 20 else 1  # a narrow picture has no middle of the bright and dark ones
+    assert 0 < valid.sum() < valid.numel() and hole.unique().numel() > most and flag.unique().numel() > most
+
+
+@needs_compiler
+@pytest.mark.parametrize("fit", FITS)
+def test_a_view_alone_has_tokens_of_the_size_that_the_network_sees(loaded, monkeypatch, fit):
+    transform = ExtendDepth(depth_unit="mm", n=200, tokens_hw=(28, 28), fit=fit)
+    one, calls = decoded("uint16", "mm"), counted(monkeypatch, "look")
+    ours = transform(one)
+    (stages,) = by_stages(transform, monkeypatch, lambda: transform(one))
+    equal(ours, stages)
+    assert calls == ["look"] and ours["dhtorch.tokens"].shape == (4, 10)
+
+
+@needs_compiler
+@pytest.mark.parametrize("consumed", [(), ("image", "depth")])
+def test_a_batch_of_views_alone_need_not_be_collated_first(loaded, monkeypatch, consumed):
+    items = [decoded("uint16", "mm", seed=seed) for seed in range(5)]  # three cameras in one batch
+    transform = ExtendDepth(depth_unit="mm", n=99, batched=True)
+    dataset = ExtendedDataset(items, transform, by_batch=True, consumed=consumed)
+    calls = counted(monkeypatch, "look", "samples")
+    ours = dataset.collate(items)
+    assert calls == ["look"] * 5
+    (stages,) = by_stages(transform, monkeypatch, lambda: dataset.collate(items))
+    assert calls[5:] == ["samples"]
+    ours["dhtorch.uv"] = ours["dhtorch.uv"].contiguous()
+    stages["dhtorch.uv"] = stages["dhtorch.uv"].contiguous()
+    equal(ours, stages)
+    assert ours["dhtorch.uv"].data_ptr() != transform._alone.kept[next(iter(transform._alone.kept))].uv.data_ptr()
+    with pytest.raises(RuntimeError, match="equal size"):  # as torch says it of pictures of two sizes
+        dataset.collate([items[0], decoded("uint16", "mm", hw=(48, 64))])
+
+
+@needs_compiler
+def test_the_layouts_of_a_map_are_one(loaded, monkeypatch):
+    transform, plain = ExtendDepth(depth_unit="mm", n=50), decoded("uint16", "mm")
+    calls, expected = counted(monkeypatch, "look"), None
+    for depth in (plain["depth"], plain["depth"][None], plain["depth"][..., None], torch.from_numpy(plain["depth"])):
+        found = {k: v for k, v in transform({**plain, "depth": depth}).items() if k.startswith("dhtorch.")}
+        expected = expected or found
+        equal(found, expected)
+    nested = {"obs": plain, "info": {"K": plain["intrinsics"]}}
+    keys = {"image": "obs/image", "depth": "obs.depth", "intrinsics": "info.K"}
+    found = ExtendDepth(depth_unit="mm", n=50, **keys)(nested)
+    equal({k: v for k, v in found.items() if k.startswith("dhtorch.")}, expected)
+    assert len(calls) == 5
+
+
+@needs_compiler
+def test_what_is_not_as_usual_is_asked_of_the_stages(loaded, monkeypatch):
+    calls, plain = counted(monkeypatch, "look"), decoded("uint16", "mm")
+
+    def said(sample, unit="mm", **options):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            ExtendDepth(depth_unit=unit, **{"n": 50, **options})(sample)
+        return calls
+
+    assert said(plain) == ["look"] and not calls.clear()
+    levels = {**plain, "conf": np.ones((61, 83), np.uint8)}
+    said(levels, confidence="conf")
+    said({**plain, "image_is_pad": torch.tensor([False])})
+    said({**plain, "depth in metres": plain["depth"].astype(np.float32) / 500})
+    said({**plain, "own": plain["intrinsics"]}, depth_intrinsics="own")
+    said({**plain, "image": plain["image"].astype(np.float32) / 255})
+    said({**plain, "image": np.stack([plain["image"]] * 2)})
+    said({**plain, "image": torch.from_numpy(np.repeat(plain["image"], 2, 1))[:, ::2]})
+    said({**plain, "depth": plain["depth"].astype(np.int32)})
+    said({**plain, "depth": plain["depth"].astype(np.float64)})
+    said({**plain, "depth": torch.from_numpy(plain["depth"].astype(np.float32)).requires_grad_()})
+    said({**plain, "intrinsics": torch.from_numpy(plain["intrinsics"]).requires_grad_()})
+    said({**plain, "intrinsics": plain["intrinsics"].tolist()})
+    said(plain, sparse=True)
+    said(plain, depth_range=(0.0, 3.0))
+    said(plain, unit=0.001)
+    said(plain, distortion=(0.1, 0.0, 0.0, 0.0))
+    said(plain, index_key="index")
+    said(plain, dense=True)
+    said(plain, n=5000)
+    said({**plain, "before": plain["image"]}, other_image="before")
+    said(plain, method=PAPER.replace(sample=lambda hw, n, **o: sample.grid(hw, n)))
+    said(plain, method=PAPER.replace(backproject=lambda *looked: backproject(*looked, min_conf=1)))
+    said(plain, method=PAPER.replace(backproject={"search_px": 2}))
+    said(plain, method=PAPER.replace(classify={"block": 15}))
+    with forward_ad.dual_level():
+        said(plain)
+    monkeypatch.setattr(native, "_loaded", [])
+    said(plain)
+    assert not calls
+
+
+@needs_compiler
+@pytest.mark.parametrize("on_error", ["raise", "skip", "flag"])
+def test_what_contradicts_its_unit_is_told_as_the_stages_tell_it(loaded, monkeypatch, on_error):
+    transform, plain = ExtendDepth(depth_unit="mm", n=50, on_error=on_error), decoded("uint16", "mm")
+    none, wrong = np.zeros((61, 83), np.uint16), plain["depth"] // 500
+    transform(plain)
+    calls = counted(monkeypatch, "samples")
+    assert transform({**plain, "depth": none})["dhtorch.problem"] == SampleProblem.NO_DEPTH and calls == ["samples"]
+    if on_error == "raise":
+        with pytest.raises(SampleError, match="are the numbers metres"):
+            transform({**plain, "depth": wrong})
+        with pytest.raises(SampleError, match="depth: found no such key"):
+            transform({k: v for k, v in plain.items() if k != "depth"})
+        for _ in range(2):
+            with pytest.raises(SampleError, match="sizes off the centre"):
+                transform({**plain, "intrinsics": plain["intrinsics"] * 3})
+        with pytest.raises(SampleError, match="expected a dict"):
+            transform(plain["image"])
+    else:
+        with pytest.warns(UserWarning, match="are the numbers metres"):
+            told = transform({**plain, "depth": wrong})
+        assert (told is None) == (on_error == "skip") and transform.report()["unreadable"] == 1
+
+
+@needs_compiler
+def test_words_of_a_kind_that_was_seen_in_metres_are_still_asked_for_their_unit(loaded):
+    transform = ExtendDepth(depth_unit="m", n=50)
+    transform(decoded("float32", "m"))
+    words = decoded("uint16", "mm")
+    with pytest.raises(SampleError, match="is the unit mm"):
+        transform({**words, "depth": words["depth"] // 100})  # which might be metres
+
+
+@needs_compiler
+def test_what_samples_of_a_kind_share_is_kept_but_not_for_all_and_is_nobodys_to_change(loaded, monkeypatch):
+    transform, plain = ExtendDepth(depth_unit="mm", n=50), decoded("uint16", "mm")
+    with torch.inference_mode():
+        transform(plain)
+    assert not transform._alone.kept, "tensors of inference mode are of no use outside it"
+    first = transform(plain)
+    expected = {k: torch.as_tensor(v).clone() for k, v in first.items()}
+    for value in first.values():
+        if isinstance(value, torch.Tensor):
+            value.zero_()
+    equal(transform(plain), expected)
+    twin = pickle.loads(pickle.dumps(transform))
+    equal(twin(plain), expected)
+    for k in range(70):
+        K = plain["intrinsics"] + k * np.diag([1.0, 1, 0])
+        (stages,) = by_stages(transform, monkeypatch, lambda K=K: transform({**plain, "intrinsics": K}))
+        equal(transform({**plain, "intrinsics": K}), stages)
+    assert len(transform._alone.kept) == CAMERAS
+    transform.method = transform.method.replace(n=20)
+    assert transform(plain)["dhtorch.uv"].shape == (20, 2), "a method that somebody puts in is the one that is asked"

@@ -1,0 +1,146 @@
+"""Degenerate and adversarial pairs: nothing raises, every promise is kept, and a broken promise would be seen."""
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from dhtorch.codes import PoseCode
+from dhtorch.geometry import camera, ransac, se3
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
+import degenerate
+from degenerate_pairs import HW, KINDS, make
+
+N = 3 * len(KINDS)
+
+
+def alone(number, pair=None):
+    """One pair as a batch of its own; ``pair`` in place of its own content."""
+    kind, own = make(number)
+    pair = pair or own
+    return degenerate.join([(number, kind, pair)])
+
+
+@pytest.fixture(scope="module")
+def rows():
+    return degenerate.run(N)
+
+
+def test_nothing_raises_and_every_promise_is_kept(rows):
+    assert {(r["name"], r["method"]) for r in rows} == {(k, m) for k in KINDS for m in ("map", "paper")}
+    assert all(r["n_pairs"] == N // len(KINDS) for r in rows)
+    faults = {(r["name"], r["method"]): (r["faults"], r["examples"]) for r in rows if r["faults"]}
+    assert not faults
+    degenerate.show(rows)
+
+
+def test_the_hopeless_stay_silent_and_the_healthy_answer(rows):
+    answered = {(r["name"], r["method"]): r["answered"] for r in rows}
+    hopeless = ("no near points", "one near point", "three near points", "duplicated points", "all depth NaN")
+    hopeless += ("constant images", "black view 1", "all pixels NaN", "stripes")
+    assert all(answered[kind, method] == 0 for kind in hopeless for method in ("map", "paper"))
+    still = ("identical frames", "pure rotation", "unrelated images", "upside down", "noise images", "random depth")
+    assert all(answered[kind, "map"] <= 0.02 for kind in still)
+    healthy = degenerate.join([(number, *make(number)) for number in range(0, 5 * len(KINDS), len(KINDS))])
+    assert set(healthy.kinds) == {"nothing wrong"}
+    share = {method: float(healthy.ask(method)[0].keep.float().mean()) for method in ("map", "paper")}
+    assert share["map"] > 0.2 and share["paper"] > 0.5
+
+
+def test_truth_is_what_both_views_show():
+    """A healthy pair: the anchor's pixels, carried over by depth and motion, look the same in view 1."""
+    _, pair = make(0)
+    v, u = torch.meshgrid(*(torch.arange(n, dtype=torch.float32) for n in HW), indexing="ij")
+    at = camera.Camera(pair.f[0][None], pair.c[0][None])
+    xyz = camera.unproject(at, torch.stack((u, v), -1).view(1, -1, 2), pair.truth.view(1, -1))
+    uv = camera.project(at, se3.apply(pair.motion.to(torch.float32), xyz))
+    grid = torch.stack(((uv[..., 0] + 0.5) / HW[1] * 2 - 1, (uv[..., 1] + 0.5) / HW[0] * 2 - 1), -1)[:, None]
+    seen = torch.nn.functional.grid_sample(pair.image_1[None], grid, align_corners=False)[0, :, 0]
+    inside = (grid.abs() < 0.95).all(-1).flatten()
+    off = (seen - pair.image_0.flatten(1)).abs().mean(0)[inside].median()
+    assert inside.sum() > 5000 and off < 0.03 < 0.1 < (pair.image_1 - pair.image_0).abs().median()
+
+
+def test_a_pair_depends_on_its_number_alone():
+    one, two = make(53)[1], make(53)[1]
+    assert torch.equal(one.image_1, two.image_1) and torch.equal(one.depth, two.depth)
+    assert not torch.equal(one.image_1, make(53, seed=1)[1].image_1)
+
+
+def test_every_broken_promise_is_seen():
+    """Spoil one number after the other in a good answer: the promise about it is reported, for that pair alone."""
+    estimate, trace = alone(2 * len(KINDS)).ask("paper")
+    assert estimate.keep.any() and trace["fit"].ok.all()
+    assert not any(v.any() for v in degenerate.broken(estimate, trace).values())
+    said = estimate.keep & estimate.keep.cumsum(-1).eq(1)
+    silent = ~estimate.keep & (~estimate.keep).cumsum(-1).eq(1)
+
+    def put(record, name, where, value):
+        return record.replace(**{name: torch.where(where, value, getattr(record, name))})
+
+    spoilt = {
+        "an answer is a depth with a sigma": put(estimate, "sigma", said, 0.0),
+        "the shared part is no more than sigma": put(estimate, "sigma_shared", said, 1e3),
+        "silence is NaN with score 0": put(estimate, "depth", silent, 1.0),
+        "score in [0, 1]": put(estimate, "score", said, torch.nan),
+        "a gate of the table": put(estimate, "gate", silent, 77),
+        "parallax and residual are numbers": put(estimate, "residual_px", silent, torch.inf),
+        "one or two views": put(estimate, "n_views", silent, 0),
+    }
+    for promise, wrong in spoilt.items():
+        assert degenerate.broken(wrong, trace)[promise].all(), promise
+    fit = trace["fit"]
+    T, nothing = fit.T_1_from_0, fit.replace(code=torch.full_like(fit.code, PoseCode.TOO_FEW))
+    poses = {
+        "a code of the table": fit.replace(code=fit.code + 50),
+        "a pose is made of numbers": fit.replace(t_snr=fit.t_snr * torch.nan),
+        "no pose is NaN throughout": nothing,
+        "an inlier is a near point of a pose": nothing,
+        "R is a rotation": fit.replace(T_1_from_0=T.replace(R=-T.R)),
+        "variances are positive": fit.replace(cov=-fit.cov),
+    }
+    for promise, wrong in poses.items():
+        assert degenerate.broken(estimate, {**trace, "fit": wrong})[promise].all(), promise
+    tracks = trace["tracks"]
+    wrong = {**trace, "tracks": tracks.replace(cov=tracks.cov * torch.nan)}
+    assert degenerate.broken(estimate, wrong)["a valid track is a place with a covariance"].all()
+    wrong = {**trace, "samples": trace["samples"].replace(sigma=trace["samples"].sigma * torch.inf)}
+    assert degenerate.broken(estimate, wrong)["the map is a number everywhere"].all()
+
+
+def test_an_exception_is_counted_for_its_pair_alone(monkeypatch):
+    batch = next(degenerate.batches(3, size=3))
+    honest = degenerate.METHODS["map"]
+
+    def raises(frame_0, frame_1, **options):
+        if (frame_0.depth.flatten(1).amax(1) == 0).any():  # pair 1 has no near points
+            raise RuntimeError("boom")
+        return honest(frame_0, frame_1, **options)
+
+    monkeypatch.setitem(degenerate.METHODS, "map", raises)
+    tallies = {kind: degenerate.Tally() for kind in KINDS}
+    degenerate.answer(batch, "map", tallies)
+    assert {k: t.exceptions.total() for k, t in tallies.items() if t.n_pairs} == dict(
+        zip(batch.kinds, (0, 1, 0), strict=True)
+    )
+
+
+@pytest.mark.parametrize("sky", [1e10, 3e38])
+def test_one_return_of_the_sky_does_not_make_a_line(sky):
+    """Renderers write 1e10 where nothing is: a point so far away is a direction, the others are no line for it."""
+    xyz = torch.rand(1, 3, 20, generator=torch.Generator().manual_seed(0)) + torch.tensor([0.0, 0.0, 1.0])[:, None]
+    xyz[..., 3] *= sky / xyz[..., 3].amax()
+    used = torch.ones(1, 20, dtype=torch.bool)
+    assert not ransac.collinear(xyz, used).item()
+    line = xyz[..., :1] + torch.linspace(0, 1, 20) * torch.tensor([0.3, 0.1, 0.5])[:, None]
+    line[..., 3] = xyz[..., 3]
+    assert ransac.collinear(line, used).item()
+    _, pair = make(2 * len(KINDS))
+    at = pair.uv.round().long()[3]
+    codes = []
+    for value in (0.0, sky):
+        pair.depth[at[1], at[0]] = value
+        codes.append(int(alone(2 * len(KINDS), pair).ask("map")[1]["fit"].code))
+    assert codes[0] == codes[1] == PoseCode.OK

@@ -1,0 +1,309 @@
+"""Every pixel: right where the room's truth says so, silent where nothing can be known, and the promises of a stage."""
+
+import pytest
+import torch
+from support.board_scenes import Board, look
+
+from dhtorch import MAP
+from dhtorch.calibration.monotone import Sigmoid, Table
+from dhtorch.calibration.score_calibration import Calibration, SigmaModel
+from dhtorch.codes import Gate, Source
+from dhtorch.experiments.compare.exact_rooms import exact_pose
+from dhtorch.metrics.holdout import range_split
+from dhtorch.pipeline.dense import complete, resized, sensed, swept, views_asked
+from dhtorch.pytree import collate, stack
+from dhtorch.synthetic import SyntheticRoom
+
+#: Where returns end in these tests, m.
+NEAR = 2.0
+FAST = {"method": MAP.replace(n=512), "planes": 48}
+
+
+@pytest.fixture(scope="module")
+def room():
+    return SyntheticRoom(n_frames=12, hw=(240, 320), depth_hw=(240, 320), lidar="exact", image_noise=0.0)
+
+
+@pytest.fixture(scope="module")
+def views(room):
+    """An anchor whose returns end at two metres, another view, and what is true of all pixels."""
+    return range_split(room[3], NEAR), range_split(room[11], NEAR), room[3].depth
+
+
+@pytest.fixture(scope="module")
+def found(views):
+    with torch.no_grad():
+        return complete(views[0], views[1], **FAST)
+
+
+def exact(room, i, j, n=1):
+    """The pose from the room itself."""
+    return exact_pose(room[i], room[j], n)
+
+
+def test_far_pixels_of_the_room_are_found_and_know_how_well(views, found):
+    depth = views[2]
+    far = (depth > NEAR) & (found.source == Source.SWEPT)
+    error = (found.depth - depth).abs() / depth
+    assert far.sum() > 0.6 * (depth > NEAR).sum()
+    assert float(error[far].median()) < 0.015 and float((error[far] > 0.2).float().mean()) < 0.1  # a mirror hangs there
+    within = (error[far] <= found.sigma[far] / found.depth[far]).float().mean()
+    assert 0.4 < float(within) < 0.95
+    sure = error[far][found.score[far].argsort(descending=True)]
+    assert float(sure[: len(sure) // 2].mean()) < 0.7 * float(sure.mean()), "the score ranks"
+
+
+def test_under_the_true_motion_textured_pixels_are_within_hundredths(room, views):
+    """Exact pose and depth: what both views show and bears texture."""
+    fit = exact(room, 3, 11, n=512)
+    with torch.no_grad():
+        got = complete(views[0], views[1], fit=fit, method=FAST["method"], planes=96)
+    depth, picture = views[2], resized(views[0], 640)[0][:, 0]
+    mean = torch.nn.functional.avg_pool2d(picture, 9, 1, 4)
+    contrast = (torch.nn.functional.avg_pool2d(picture.square(), 9, 1, 4) - mean.square()).clamp_min(0).sqrt()
+    low = -torch.nn.functional.max_pool2d(-depth, 11, 1, 5)
+    smooth = torch.nn.functional.max_pool2d(depth, 11, 1, 5) < 1.05 * low  # no edge within a window
+    asked = (depth > NEAR) & (contrast > 0.02) & smooth & (got.source == Source.SWEPT)
+    error = (got.depth - depth).abs() / depth
+    assert asked.sum() > 3000
+    assert float(error[asked].median()) < 0.006
+    assert float((error[asked] < 0.01).float().mean()) > 0.7 and float((error[asked] < 0.02).float().mean()) > 0.82
+
+
+def test_the_sensor_speaks_where_it_answers_and_is_no_input(views, found):
+    anchor, other, depth = views
+    sensed = anchor.depth > 0
+    assert bool((found.source[sensed] == Source.SENSOR).all()) and torch.equal(found.depth[sensed], depth[sensed])
+    assert bool((found.source[~sensed] != Source.SENSOR).all())
+    half = anchor.depth.clone()
+    half[:, :, ::2] = 0  # every other column of returns
+    with torch.no_grad():
+        fewer = complete(anchor.replace(depth=half), other, fit=None, **FAST)
+    swept = sensed & (half == 0) & (fewer.source == Source.SWEPT)
+    assert swept.sum() > 500
+    assert float(((fewer.depth - depth).abs() / depth)[swept].median()) < 0.03, "the sweep knows near surfaces, too"
+
+
+def test_silence_has_reasons_and_no_value(found):
+    silent = ~found.keep
+    assert silent.any() and bool(found.depth[silent].isnan().all()) and bool(found.sigma[silent].isnan().all())
+    assert bool((found.score[silent] == 0).all()) and bool((found.source[silent] == Source.NONE).all())
+    assert set(found.gate.unique().tolist()) <= {Gate.ANSWER, Gate.NO_TRACK, Gate.UNCERTAIN}
+    assert bool((found.depth[found.keep] > 0).all()) and bool((found.sigma[found.keep] > 0).all())
+
+
+def test_a_camera_that_only_turns_gets_the_sensor_alone():
+    room = SyntheticRoom(n_frames=6, hw=(240, 320), depth_hw=(120, 160), path="rotation")
+    with torch.no_grad():
+        got = complete(range_split(room[0], NEAR), range_split(room[4], NEAR), **FAST)
+    assert bool((got.source != Source.SWEPT).all()) and bool((got.source == Source.SENSOR).any())
+    assert bool((got.gate[got.source == Source.NONE] == Gate.NO_BASELINE).all())
+
+
+def test_without_another_view_the_map_is_the_sensors(views):
+    anchor = views[0]
+    got = sensed(anchor, method=FAST["method"])
+    seen = anchor.depth > 0
+    assert torch.equal(got.depth[seen], anchor.depth[seen]) and bool((got.source[seen] == Source.SENSOR).all())
+    assert bool((got.gate[~seen] == Gate.NO_TRACK).all()) and bool(got.depth[~seen].isnan().all())
+
+
+def test_a_calibration_changes_swept_pixels_alone(views, found):
+    model = SigmaModel(2.0, 0.0)
+    table = Table(torch.tensor([0.0, 1.0]), torch.tensor([0.0, 0.5]))
+    sigmoid = Sigmoid(torch.tensor(1.0), torch.tensor(0.0))
+    with torch.no_grad():
+        got = complete(views[0], views[1], calibration=Calibration(table, table, sigmoid, model, {}), **FAST)
+    swept = found.source == Source.SWEPT
+    torch.testing.assert_close(got.sigma[swept], 2 * found.sigma[swept])
+    torch.testing.assert_close(got.score[swept], 0.5 * found.score[swept])
+    for name in ("depth", "source", "gate"):
+        torch.testing.assert_close(getattr(got, name), getattr(found, name), equal_nan=True)
+    assert torch.equal(got.score[~swept], found.score[~swept])
+
+
+def test_a_motion_that_the_sensor_refutes_is_not_believed(room, views):
+    """A pose with half as much again of translation: depths in sensor's reach would be wrong by a third."""
+    fit = exact(room, 3, 11, n=512)
+    wrong = fit.replace(T_1_from_0=fit.T_1_from_0.replace(t=1.5 * fit.T_1_from_0.t))
+    with torch.no_grad():
+        got = complete(views[0], views[1], fit=wrong, **FAST)
+    assert not bool((got.source == Source.SWEPT).any())
+    assert bool((got.gate[got.source == Source.NONE] != Gate.ANSWER).all())
+
+
+@pytest.mark.slow
+def test_more_views_say_more(room, views):
+    others = stack([range_split(room[k], NEAR) for k in (0, 11)])
+    method = MAP.replace(n=512, views=2)
+    with torch.no_grad():
+        one = complete(views[0], others, method=method, planes=48, partners=1)
+        two = complete(views[0], others, method=method, planes=48, partners=2)
+    share = [float((m.source == Source.SWEPT).float().mean()) for m in (one, two)]
+    assert share[1] > share[0] > 0.1
+
+
+def test_a_batch_is_a_loop_bit_for_bit():
+    torch.set_num_threads(1)
+    room = SyntheticRoom(n_frames=12, hw=(120, 160), depth_hw=(60, 80))
+    anchors = [range_split(room[k], NEAR) for k in (1, 3)]
+    others = [range_split(room[k], NEAR) for k in (9, 11)]
+    with torch.no_grad():
+        together = complete(collate(anchors), collate(others), **FAST)
+        assert bool((together.source == Source.SWEPT).flatten(1).any(1).all())
+        for b in range(2):
+            alone = complete(anchors[b], others[b], **FAST)
+            for name in ("depth", "sigma", "score", "source", "gate"):
+                x, y = getattr(together, name)[b : b + 1], getattr(alone, name)
+                assert torch.equal(x.nan_to_num(-1), y.nan_to_num(-1)), name
+
+
+def test_depth_carries_gradients_to_pictures_near_depth_and_intrinsics(views):
+    anchor, other, _ = views
+    inputs = [anchor.image.float(), other.image.float(), anchor.depth, anchor.camera.f]
+    if anchor.image.dtype == torch.uint8:
+        inputs[:2] = [x / 255 for x in inputs[:2]]
+    image_0, image_1, depth, f = (x.clone().requires_grad_() for x in inputs)
+    asked = anchor.replace(image=image_0, depth=depth, camera=anchor.camera.replace(f=f))
+    got = complete(asked, other.replace(image=image_1), **FAST)
+    swept = got.source == Source.SWEPT
+    got.depth[swept].sum().backward()
+    for x in (image_0, image_1, depth, f):
+        assert bool(x.grad.isfinite().all()) and bool((x.grad != 0).any())
+    # all near depths longer by a hundredth: a longer motion, and every depth longer by as much
+    longer = float((depth.grad * depth.detach()).sum() / got.depth[swept].detach().sum())
+    assert longer == pytest.approx(1.0, abs=0.03)
+
+
+def test_double_precision_goes_in_beside_pictures_of_bytes():
+    room = SyntheticRoom(n_frames=8, hw=(60, 80), depth_hw=(60, 80), lidar="exact")
+    anchor, other = (range_split(room[i], NEAR).to(torch.float64) for i in (1, 6))
+    for as_given in (lambda x: (255 * x).byte(), lambda x: x.float()):
+        asked, view = (frame.replace(image=as_given(frame.image)) for frame in (anchor, other))
+        assert complete(asked, view, **FAST).depth.dtype == torch.float64
+
+
+def test_half_precision_goes_in_and_single_comes_out(views, found):
+    anchor, other, depth = views
+
+    def half(frame):
+        image = frame.image.float() / 255 if frame.image.dtype == torch.uint8 else frame.image
+        return frame.replace(image=image.half(), depth=frame.depth.half())
+
+    with torch.no_grad():
+        got = complete(half(anchor), half(other), **FAST)
+    assert got.depth.dtype == got.sigma.dtype == torch.float32
+    swept = (got.source == Source.SWEPT) & (found.source == Source.SWEPT)
+    assert swept.sum() > 0.8 * (found.source == Source.SWEPT).sum()
+    assert float(((got.depth - found.depth).abs() / depth)[swept].median()) < 0.01
+
+
+def test_between_the_returns_of_a_sparse_sensor_places_are_swept_as_near_as_they_are(room):
+    """Returns at every depth, 2 % of the pixels."""
+    told = torch.rand(room[3].depth.shape, generator=torch.Generator().manual_seed(0)) < 0.02
+    anchor = room[3].replace(depth=torch.where(told, room[3].depth, 0.0), sparse=torch.tensor([True]))
+    fit = exact(room, 3, 11, n=512)
+    with torch.no_grad():
+        swept_near, dense_sensor = (
+            complete(one, room[11], fit=fit, **FAST) for one in (anchor, anchor.replace(sparse=None))
+        )
+    near = (room[3].depth < 0.6 * room[3].depth.amax()) & ~told
+    found, missed = (near & (one.source == Source.SWEPT) for one in (swept_near, dense_sensor))
+    assert float(found.sum()) > 2 * float(missed.sum())
+    error = ((swept_near.depth - room[3].depth).abs() / room[3].depth)[found]
+    assert float(found.sum()) > 0.2 * float((near & (swept_near.source != Source.SENSOR)).sum())
+    assert float(error.median()) < 0.02 and float((error > 0.2).float().mean()) < 0.1
+
+
+def test_a_large_picture_is_swept_at_the_size_asked(views):
+    picture, camera = resized(views[0], 160)
+    assert picture.shape == (1, 1, 120, 160)
+    torch.testing.assert_close(camera.f, views[0].camera.f / 2)
+    torch.testing.assert_close(camera.c, (views[0].camera.c + 0.5) / 2 - 0.5)
+    with torch.no_grad():
+        got = complete(views[0], views[1], size=160, **FAST)
+    assert got.depth.shape == (1, 120, 160) and bool((got.source == Source.SWEPT).any())
+
+
+@pytest.mark.parametrize("wrong", [{"partners": 0}, {"partners": 9}, {"planes": 2}, {"size": 8}, {"refinements": -1}])
+def test_options_out_of_range_raise(views, wrong):
+    with pytest.raises(ValueError, match=f"complete: {next(iter(wrong))} is .*, expected at least"):
+        complete(views[0], views[1], **{**FAST, **wrong})
+
+
+def boards(*far):
+    """What the map of two views says of boards beyond the sensor, and what is true: (map, depth, which board)."""
+    near = [Board(1.5, x=(-9, -0.35), seed=7), Board(1.5, y=(0.42, 9), seed=8)]
+    anchor, which = look([*near, *far], (0.0, 0.0, 0.0))
+    other, _ = look([*near, *far], (0.15, 0.02, 0.01), angle=(0.01, -0.02, 0.01))
+    fit = exact_pose(anchor, other, 512)
+    with torch.no_grad():
+        got = complete(range_split(anchor, NEAR), range_split(other, NEAR), fit=fit, method=FAST["method"], planes=64)
+    return got, anchor.depth, torch.where(anchor.depth > NEAR, which - len(near), -1)
+
+
+def judged(got, depth, where):
+    """Share answered of the pixels asked for, relative errors of these answers, and errors in sigmas."""
+    told = where & (got.source == Source.SWEPT)
+    off = (got.depth - depth).abs()[told]
+    return float(told.sum() / where.sum()), off / depth[told], off / got.sigma[told]
+
+
+def test_a_slanted_wall_has_no_steps():
+    got, depth, which = boards(Board(3.0, slope=0.8))
+    share, error, sigmas = judged(got, depth, which == 0)
+    assert share > 0.8 and float(error.median()) < 0.006 and float((error > 0.05).float().mean()) < 0.03
+    assert float((sigmas < 2).float().mean()) > 0.9
+
+
+def test_thin_things_are_right_or_unsaid_and_do_not_bleed():
+    got, depth, which = boards(Board(4.0, seed=1), Board(2.5, x=(0.0, 0.04)), Board(2.5, x=(0.5, 0.58)))
+    for post in (1, 2):
+        share, error, _ = judged(got, depth, which == post)
+        assert share < 1 and float((error > 0.2).float().sum()) < 0.15 * (which == post).sum()
+    share, error, _ = judged(got, depth, which == 0)
+    assert share > 0.7 and float((error > 0.1).float().mean()) < 0.02, "the wall behind keeps its depth"
+
+
+def test_texture_that_repeats_along_the_line_is_left_unsaid():
+    got, depth, which = boards(Board(3.4, stripes=0.1))
+    assert judged(got, depth, which == 0)[0] < 0.02
+    assert bool((got.gate[(which == 0) & ~got.keep] == Gate.UNCERTAIN).float().mean() > 0.8)
+    got, depth, which = boards(Board(3.0, x=(0, 0.8), y=(-0.5, 0.3), stripes=0.15), Board(3.01, seed=2))
+    share, error, _ = judged(got, depth, which == 0)
+    assert share > 0.5 and float((error > 0.05).float().mean()) < 0.02, "its surroundings tell which"
+
+
+def test_where_one_surface_ends_before_another_both_keep_their_depth():
+    got, depth, which = boards(Board(2.2, x=(0.2, 0.6), y=(-0.4, 0.3), seed=5), Board(4.5, seed=6))
+    for board, least in ((0, 0.75), (1, 0.7)):
+        share, error, sigmas = judged(got, depth, which == board)
+        assert share > least and float((error > 0.1).float().mean()) < 0.02
+        assert float((sigmas < 2).float().mean()) > 0.9
+
+
+def test_a_mirror_shows_what_stands_behind_it():
+    """What no two views can tell: the picture in a plane mirror moves as a room behind it would."""
+    got, depth, which = boards(Board(2.5, x=(0, 0.6), mirrored=5.0, seed=3), Board(2.6, seed=4))
+    share, error, _ = judged(got, depth, which == 1)
+    assert share > 0.8 and float((error > 0.05).float().mean()) < 0.03, "the wall beside it is not drawn along"
+    told = (which == 0) & (got.source == Source.SWEPT)
+    assert float((got.depth[told] / 5.0 - 1).abs().median()) < 0.02
+
+
+@pytest.mark.slow
+def test_a_sweep_is_captured_as_one_graph():
+    room = SyntheticRoom(n_frames=12, hw=(60, 80), depth_hw=(60, 80))
+    anchor, other = (range_split(room[k], NEAR) for k in (1, 9))
+    method, trace = MAP.replace(n=256), {}
+    with torch.no_grad():
+        joined = method(anchor, other, trace=trace)
+        asked = views_asked(joined, other, trace)
+
+        def sweep(anchor, asked):
+            return swept(anchor, asked, method=method, planes=16, partners=1)
+
+        plain = sweep(anchor, asked)
+        captured = torch.compile(sweep, fullgraph=True, backend="eager")(anchor, asked)
+    for name in ("depth", "sigma", "score", "source", "gate"):
+        torch.testing.assert_close(getattr(captured, name), getattr(plain, name), rtol=0, atol=0, equal_nan=True)

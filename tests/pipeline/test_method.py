@@ -1,0 +1,219 @@
+"""A method is a record: any function with the seat's signature may sit in a seat, wherever a method is asked."""
+
+import pickle
+from dataclasses import fields
+from functools import partial
+from types import SimpleNamespace
+
+import pytest
+import torch
+from support.rooms import room as rendered
+
+import dhtorch
+from dhtorch import MAP, PAPER, WINDOW, TrackHint
+from dhtorch import pytree as tree
+from dhtorch.data.pairs import by_gap
+from dhtorch.data.scene import Scene
+from dhtorch.experiments import pair as pairs
+from dhtorch.experiments import protocol
+from dhtorch.extract import plan
+from dhtorch.extract.dataset import Rows
+from dhtorch.geometry import camera as cam
+from dhtorch.pipeline.method import Method
+from dhtorch.pipeline.spec import networks
+from dhtorch.stages.backproject import backproject
+from dhtorch.stages.fuse import inverse_variance
+from dhtorch.stages.holes import classify
+from dhtorch.stages.pose import pnp_ransac
+from dhtorch.stages.sample import spiral
+from dhtorch.stages.score import rank
+from dhtorch.stages.track import lucas_kanade
+from dhtorch.stages.triangulate import two_view
+from dhtorch.transforms import ExtendDepth
+
+N = 512
+
+
+def sample(hw, n, *, device=None, dtype=torch.float32):
+    """Seat 1, and so on: plain functions with nothing but what the seat is called with."""
+    return spiral(hw, n, device=device, dtype=dtype)
+
+
+def look(frame, uv):
+    return backproject(frame, uv)
+
+
+def sort(frame, samples):
+    return classify(frame, samples)
+
+
+def track(image_0, image_1, uv_0, *, hint):
+    return lucas_kanade(image_0, image_1, uv_0, hint=hint)
+
+
+def pose(samples, tracks, camera_0, camera_1, draws):
+    return pnp_ransac(samples, tracks, camera_0, camera_1, draws)
+
+
+def triangulate(samples, tracks, fit, camera_0, camera_1):
+    return two_view(samples, tracks, fit, camera_0, camera_1)
+
+
+def score(estimate, samples, tracks, fit):
+    return rank(estimate, samples, tracks, fit)
+
+
+def fuse(estimates):
+    return inverse_variance(estimates)
+
+
+SEATS = {"sample": sample, "backproject": look, "classify": sort, "track": track, "pose": pose}
+SEATS |= {"triangulate": triangulate, "score": score, "fuse": fuse}
+PLAIN, USUAL = PAPER.replace(**SEATS, n=N), PAPER.replace(n=N)
+
+
+@pytest.fixture(scope="module")
+def room():
+    return rendered(hw=(192, 256), n_frames=7)
+
+
+def alike(a, b):
+    return all(
+        torch.equal(getattr(a, f).nan_to_num(), getattr(b, f).nan_to_num()) for f in ("uv", "depth", "gate", "score")
+    )
+
+
+def test_a_plain_function_in_every_seat_answers_as_the_stage_itself(room):
+    assert alike(PLAIN(room[0], room[3]), USUAL(room[0], room[3]))
+    others = tree.stack([room[k] for k in (1, 2, 3)])
+    assert alike(PLAIN(room[0], others, views=3), USUAL(room[0], others, views=3))
+    assert alike(PLAIN(room[0], [room[k] for k in (1, 2, 3)], views=2), USUAL(room[0], others, views=2))
+
+
+@pytest.mark.parametrize("views", [1, 3])
+def test_it_runs_in_the_protocol_with_the_levels_of_the_scene(room, views):
+    scene = Scene(room, near=2.0, levels=2)
+    methods = {"plain": PLAIN.replace(views=views), "usual": USUAL.replace(views=views)}
+    outcome = pairs.run([scene], methods, partial(by_gap, gap=3), protocol.Settings())
+    plain, usual = (
+        {k: v for k, v in outcome.scenes(m)["synthetic_room"].items() if k not in ("ms", "method")} for m in methods
+    )
+    assert plain == usual and plain["n_kept"] > 20
+    direct = PLAIN(protocol.holdout.range_split(room[0], 2.0), room[3], hint=TrackHint(levels=2))
+    other = PLAIN(protocol.holdout.range_split(room[0], 2.0), room[3])
+    assert not alike(direct, other), "two levels of a pyramid see less far than four"
+
+
+def test_it_runs_in_a_transform_and_in_rows_for_a_data_set(room):
+    frame = room[3]
+    sample_of = {"image": torch.cat((room[0].image, frame.image)), "depth": frame.depth[0]}
+    sample_of["intrinsics"] = cam.to_matrix(frame.camera)[0]
+    answers = [ExtendDepth(method=m, depth_unit="m", other_at=0)(sample_of) for m in (PLAIN, USUAL)]
+    for key in ("depth", "gate", "score"):
+        assert torch.equal(*(a[f"dhtorch.{key}"] for a in answers))
+    kinds = {"depth": "float32", "gate": "int32"}
+    columns = {name: SimpleNamespace(kind=kind, shape=(PLAIN.n,)) for name, kind in kinds.items()}
+    rows = [
+        Rows([Scene(room)], plan.make([Scene(room)], 3, 1), columns, method=m, gap=3)[4].features
+        for m in (PLAIN, USUAL)
+    ]
+    assert all((rows[0][k] == rows[1][k]).all() for k in columns)
+
+
+def test_it_runs_in_the_viewer_and_its_result_in_the_report(room, tmp_path):
+    from dhtorch.cli import job  # noqa: PLC0415
+    from dhtorch.experiments import report  # noqa: PLC0415
+    from dhtorch.experiments.exhibits import look  # noqa: PLC0415
+    from dhtorch.runtime import results as archive  # noqa: PLC0415
+
+    shown = look(room, PLAIN, partial(by_gap, gap=3), protocol.Settings())
+    assert len(shown.shots) == 4 and (shown.shots[0].samples["gate"] == 0).sum() > 20
+    settings = {"threads": None, "resume": False, "figures": False, "seed": 0, "device": "cpu", "dtype": "float32"}
+    settings |= {"batch": 1, "workers": 0, "holdout": {"cutoff": None, "truth": "full"}, "method": {}, "data": {}}
+    settings |= {"pairs": {}, "experiment": {}}
+    parts = {"data": Scene(room, near=2.0), "method": PLAIN, "pairs": partial(by_gap, gap=3), "experiment": pairs.run}
+    choices = dict.fromkeys(job.GROUPS, "mine") | {"experiment": "pair", "method": "plain"}
+    ended = job.run(settings, parts, choices, tmp_path, progress=lambda items, *_: items)
+    assert ended.state == "finished"
+    result = archive.read(tmp_path)
+    (row,) = (r for r in result["rows"] if r["pair"] is None)
+    assert row["method"] == "plain" and row["coverage"] > 0.5
+    assert report.main([str(tmp_path), "--html", str(tmp_path / "page.html")]) == 0
+    assert "plain" in (tmp_path / "page.html").read_text(encoding="utf-8")
+
+
+def test_a_method_is_a_frozen_record_that_travels():
+    assert isinstance(PAPER, Method) and dhtorch.extend is PAPER and WINDOW.views == 5 and MAP.views == 1
+    with pytest.raises(AttributeError):
+        PAPER.n = 3
+    assert all(getattr(WINDOW, f.name) is getattr(MAP, f.name) for f in fields(Method) if f.name != "views")
+    again = pickle.loads(pickle.dumps(MAP))
+    assert again.track.keywords == MAP.track.keywords and again.pose is MAP.pose
+
+
+def test_replace_changes_a_seat_or_its_options_and_nothing_else():
+    changed = MAP.replace(n=64, track={"levels": 6}, score=len)
+    assert (changed.n, changed.score) == (64, len) and changed.track.keywords == {"levels": 6}
+    kept = [f.name for f in fields(Method) if f.name not in ("n", "track", "score")]
+    assert all(getattr(changed, k) is getattr(MAP, k) for k in kept) and MAP.track.keywords == {"levels": 5}
+    for wrong in ({"trak": len}, {"seed": 1}):
+        with pytest.raises(TypeError, match=f"found {next(iter(wrong))}, expected seats and options among sample, "):
+            PAPER.replace(**wrong)
+
+
+def test_options_are_the_papers_unless_they_are_changed():
+    assert (PAPER.n, PAPER.hypotheses, PAPER.min_trackability) == (2048, 200, 1e-5)
+    assert (PAPER.views, PAPER.chain) == (1, True)
+
+
+def test_options_are_those_of_what_sits_there_now():
+    seat = PAPER.replace(track=track).replace(track={"hint": TrackHint()}).track
+    assert seat.func is track and PAPER.replace(score={"min_score": 0.5}).score.func is rank
+
+
+def test_a_pose_from_elsewhere_takes_the_place_of_seat_5(room):
+    trace = {}
+    found = USUAL(room[0], room[3], trace=trace)
+
+    def nobody(*_):
+        raise AssertionError("there is a pose")
+
+    assert alike(found, USUAL(room[0], room[3], fit=trace["fit"], pose=nobody))
+
+
+def test_the_front_end_looks_in_the_precision_of_the_intrinsics(room):
+    for dtype in (torch.float32, torch.float64):
+        samples = PAPER.replace(n=16).look(room[0].to(dtype))
+        assert samples.uv.dtype == samples.xyz.dtype == dtype
+        assert torch.equal(samples.uv[0], spiral(room[0].hw, 16, dtype=dtype))
+
+
+def test_options_of_a_call_are_those_of_a_record(room):
+    direct = PAPER(room[0], room[3], n=N, track={"levels": 1})
+    assert alike(direct, PAPER.replace(n=N, track={"levels": 1})(room[0], room[3]))
+    assert not alike(direct, USUAL(room[0], room[3]))
+
+
+def test_a_hint_is_cut_with_its_pairs_and_may_be_ignored(room):
+    seen = []
+
+    def blind(image_0, image_1, uv_0, *, hint):
+        seen.append(hint)
+        return lucas_kanade(image_0, image_1, uv_0)
+
+    many = [tree.collate([room[k]] * 10) for k in (0, 3)]
+    start = torch.arange(10.0).view(10, 1, 1).expand(10, N, 2)
+    found = PAPER(*many, n=N, track=blind, hint=TrackHint(start, levels=3))
+    assert [len(h.start) for h in seen] == [8, 2] and torch.equal(seen[1].start, start[8:])
+    assert all(h.levels == 3 for h in seen) and alike(found[9:], USUAL(room[0], room[3]))
+
+
+def test_networks_of_a_method_are_found_in_partials():
+    net, other = torch.nn.Linear(2, 1), torch.nn.Linear(3, 1)
+    method = PAPER.replace(score=net, pose=partial(partial(pnp_ransac, other), solver=net))
+    assert list(networks(method)) == [other, net, net] and not list(networks(PAPER, MAP))
+
+
+def test_several_views_must_be_some(room):
+    with pytest.raises(ValueError, match="found no other view"):
+        PAPER(room[0], [])

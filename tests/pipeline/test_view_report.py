@@ -1,0 +1,210 @@
+"""Frames offered around an anchor: who chooses, what is chosen, why, and what a job, a map and a word make of it."""
+
+import logging
+import math
+from functools import partial
+
+import pytest
+import torch
+from support.rooms import noted
+
+from dhtorch.cli import run
+from dhtorch.data.pairs import by_choice, by_gap
+from dhtorch.experiments import pair, protocol
+from dhtorch.experiments.exhibits import look
+from dhtorch.experiments.paper import global_map, heldout, range_split
+from dhtorch.integrate import recording as maps
+from dhtorch.pipeline.presets import AUTO, MAP, PAPER, WINDOW
+from dhtorch.pipeline.view_report import Picked, choosing, picked
+from dhtorch.pipeline.view_selection import by_probes
+from dhtorch.pytree import stack
+from dhtorch.records import Choice
+from dhtorch.runtime import results as archive
+from dhtorch.synthetic import SyntheticRoom
+
+N = 256
+SMALL = {"paper": PAPER, "map": MAP, "window": WINDOW.replace(views=2), "auto": AUTO.replace(views=2)}
+SMALL = {name: method.replace(n=N) for name, method in SMALL.items()}
+OFFERED = partial(by_choice, steps=(1, 2, 4), stride=3)  # anchors 0 and 3 of five frames
+
+
+@pytest.fixture(scope="module")
+def room():
+    return SyntheticRoom(hw=(120, 160), n_frames=5, supersample=1, step_m=0.04, lidar="exact")
+
+
+@pytest.fixture(scope="module")
+def outcome(room):
+    return pair.run([noted(room)], SMALL, OFFERED, protocol.Settings(cutoff=math.inf))
+
+
+def test_every_method_chooses_among_what_is_offered(outcome):
+    offered = {0: {1, 2, 4}, 3: {1, 2, 4}}
+    rows = [r for r in outcome.rows if r["pair"] is not None]
+    assert {(r["method"], r["pair"][0]) for r in rows} == {(name, i) for name in SMALL for i in offered}
+    for row in rows:
+        (i, j), views = row["pair"], row["views"]
+        assert len(views) == SMALL[row["method"]].views and set(views) <= offered[i] and views == sorted(views)
+        assert j == views[-1], "tracks and pose of the row are those of the last"
+        assert row["why"]["n_offered"] == 3 and len(row["why"]["worth"]) == len(views)
+        assert max(row["why"]["worth"]) > 0 and 0 <= row["why"]["n_mute"] < 3
+    of = {name: [r["views"] for r in rows if r["method"] == name] for name in SMALL}
+    assert of["paper"] == of["map"] and of["window"] == of["auto"], "all choose alike"
+    assert all(one[0] in two for one, two in zip(of["map"], of["auto"], strict=True)), "the best is chosen first"
+
+
+def test_a_single_view_answers_as_the_pair_does(room):
+    anchor, others = room[0], [room[k] for k in (1, 2, 4)]
+    trace = {}
+    found = choosing(SMALL["map"])(anchor, stack(others), trace=trace)
+    k = int(trace["choice"].index[0, 0])
+    alone = SMALL["map"](anchor, others[k])
+    for name in ("depth", "sigma", "gate", "score"):
+        assert torch.equal(getattr(found, name).nan_to_num(), getattr(alone, name).nan_to_num()), name
+    assert bool(found.keep.any())
+
+
+def test_rows_do_not_depend_on_the_batch(room, outcome):
+    again = pair.run([noted(room)], {"map": SMALL["map"]}, OFFERED, protocol.Settings(cutoff=math.inf, batch=2))
+    assert _told(again) == [row for row in _told(outcome) if row["method"] == "map"]
+
+
+@pytest.mark.slow
+def test_rows_do_not_depend_on_the_workers(room, outcome):
+    again = pair.run([noted(room)], {"map": SMALL["map"]}, OFFERED, protocol.Settings(cutoff=math.inf, workers=2))
+    assert _told(again) == [row for row in _told(outcome) if row["method"] == "map"]
+
+
+def _told(outcome):
+    """Rows of pairs without their times."""
+    return [{k: v for k, v in row.items() if k != "ms"} for row in outcome.rows if row["pair"] is not None]
+
+
+def test_what_chooses_for_itself_is_asked_as_it_is():
+    assert choosing(AUTO) is AUTO
+    for method in (PAPER, MAP, WINDOW):
+        assert choosing(method).choose is by_probes and choosing(method).views == method.views
+        assert not choosing(method).chain, "views lie on both sides: none says where the next search begins"
+
+
+def test_a_seat_may_give_indices_alone(room):
+    last = SMALL["map"].replace(
+        choose=lambda _anchor, others, views, *, fit: torch.full((views, 1), len(others.image) - 1)
+    )
+    trace = {}
+    last(room[0], stack([room[k] for k in (1, 2, 4)]), trace=trace)
+    assert trace["choice"].index.tolist() == [[2]] and trace["choice"].worth is None
+    assert str(picked(0, (1, 2, 4), trace)) == "frame 0: view 4, chosen of 3"
+
+
+def test_why_is_said_in_one_line(caplog):
+    choice = Choice(torch.tensor([[0], [3]]), torch.tensor([[12.345], [310.4]]), torch.tensor([[False]] * 3 + [[True]]))
+    with caplog.at_level(logging.DEBUG, "dhtorch"):
+        found = picked(12, (4, 9, 20, 31), {"choice": choice})
+    line = "frame 12: views 4, 31, chosen of 4 (worth 12.3, 310; 1 had no baseline or no pose)"
+    assert [r.getMessage() for r in caplog.records] == [line] == [str(found)]
+    assert found.row() == {"views": [4, 31], "why": {"n_offered": 4, "worth": [12.35, 310.4], "n_mute": 1}}
+    assert picked(0, (1,), {}) == Picked(0, (1,), 1) and str(picked(0, (1,), {})).endswith("1, all that were offered")
+
+
+def test_each_anchor_of_a_batch_is_told_of_its_own():
+    index, worth = torch.tensor([[0, 1], [3, 2]]), torch.tensor([[1.0, 2.0], [3.0, 4.0]])
+    mute = torch.tensor([[False, True]] * 4)
+    found = picked(7, (4, 9, 20, 31), {"choice": Choice(index, worth, mute)}, b=1)
+    assert found == Picked(7, (9, 20), 4, (2.0, 4.0), 4)
+
+
+def test_what_a_view_adds_and_which_say_nothing(room):
+    choice = by_probes(room[0], stack([room[k] for k in (0, 1, 2, 4)]), 3)  # the anchor itself has no baseline
+    assert choice.mute[0, 0] and not choice.mute[3, 0] and choice.index[:, 0].tolist() == [1, 2, 3]
+    one = by_probes(room[0], stack([room[k] for k in (0, 1, 2, 4)]), 1)
+    best = int(one.index[0, 0])
+    assert float(choice.worth[best - 1, 0]) == float(one.worth[0, 0]) == float(choice.worth.max())
+
+
+def test_experiments_that_cannot_choose_say_what_to_say(room):
+    for run_it in (heldout.run, range_split.run, global_map.run):
+        with pytest.raises(ValueError, match=r"frames to choose among \(pairs=auto\).*pairs=gap"):
+            run_it([noted(room)], {"map": SMALL["map"]}, OFFERED, protocol.Settings(cutoff=math.inf))
+
+
+def test_two_frames_are_each_others_view():
+    two = SyntheticRoom(hw=(120, 160), n_frames=2, supersample=1, step_m=0.08, lidar="exact")
+    found = pair.run([noted(two)], {"auto": SMALL["auto"]}, by_choice, protocol.Settings(cutoff=math.inf))
+    rows = [r for r in found.rows if r["pair"] is not None]
+    assert [(r["pair"], r["views"], r["why"]["worth"]) for r in rows] == [([0, 1], [1], None), ([1, 0], [0], None)]
+
+
+def test_what_is_shown_is_the_last_view_that_was_asked(room):
+    shown = look(noted(room), SMALL["map"], OFFERED, protocol.Settings(cutoff=math.inf), most=1)
+    (shot,) = shown.shots
+    j = int(shot.label.split(" → ")[1])
+    assert shot.label.startswith("0 → ") and shown.views[shot.view_1].number == j
+    assert shot.facts["views"].startswith(f"view {j}, chosen of 3")
+
+
+def test_a_map_knows_all_views_and_links_them(room):
+    found = list(maps.ask(room, SMALL["window"], OFFERED(room), cutoff=math.inf))
+    assert [a.pair[0] for a in found] == [0, 3] and all(a.pair[1] == a.picked.views[-1] for a in found)
+    assert all([*a.links] == [a.pair[1], a.picked.views[0]] or set(a.links) == set(a.picked.views) for a in found)
+    places = maps.place(room, found, poses="anchored")
+    asked = {0, 3}.union(*(a.picked.views for a in found))
+    assert set(places.poses) <= asked and len(places.poses) + places.n_unplaced == len(asked)
+    (one,) = maps.ask(room, SMALL["window"], by_gap(room, 2)[:1])
+    assert one.picked is None and [*one.links] == [2] and one.pair == (0, 2)
+
+
+def test_steps_of_two_widths_join_what_was_chosen():
+    links = maps.chain([(0, 4), (3, 1), (2, 0), (1, 4), (4, 2)], chosen=True)
+    assert set(links) == {(0, 1), (1, 2), (2, 3), (3, 4)}, "the median width 2 is there but for (0, 2), (1, 3), (2, 4)"
+
+
+@pytest.mark.parametrize(
+    ("words", "choice"),
+    [
+        (["pairs.gap=2"], ["pairs=gap"]),
+        (["integrate", "pairs.metres=0.1"], ["pairs=baseline"]),
+        (["pairs.seconds=1,2", "-m"], ["pairs=time"]),
+        (["pairs=gap", "pairs.gap=2"], []),
+        (["pairs.stride=2"], []),
+        ([], []),
+    ],
+)
+def test_an_option_of_one_choice_alone_chooses_it(words, choice):
+    assert run._with_pairs(words) == [*words, *choice]
+
+
+def test_a_job_and_a_map_without_a_gap(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    tiny = [
+        "data.hw=[120,160]",
+        "data.n_frames=3",
+        "data.supersample=1",
+        "data.step_m=0.04",
+        "method.n=256",
+        "holdout=none",
+    ]
+    assert run.main(["-v", *tiny, "pairs.stride=2", "figures=false", "output=job"]) == 0, capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert said.count("dhtorch.pipeline.view_report: frame ") == 2 and "chosen of 2" in said
+    result = archive.read(tmp_path / "job")
+    assert [r["pair"][0] for r in result["rows"] if r["pair"]] == [0, 2]
+    assert (
+        run.main(
+            [
+                "integrate",
+                *tiny[:-1],
+                "dense=false",
+                "pairs.stride=1",
+                "poses=anchored",
+                "voxel=0.1",
+                "mesh=false",
+                "output=map",
+            ]
+        )
+        == 0
+    )
+    rows = archive.read(tmp_path / "map")["rows"]
+    assert [r["pair"][0] for r in rows if r["pair"]] == [0, 1, 2] and all(r["views"] for r in rows if r["pair"])
+    scene = next(r for r in rows if r["pair"] is None)
+    assert scene["n_frames"] + scene["n_unplaced"] == 3, "all frames were asked"

@@ -1,0 +1,216 @@
+"""Every reader against damaged captures, and the harness against readers that misbehave."""
+
+from __future__ import annotations
+
+import io
+import os
+import random
+import time
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import test_arkitscenes
+import test_ca1m
+import test_focal_stacks
+import test_lerobot
+import test_pickle
+import test_record3d
+import test_rh20t
+import test_rlds
+import test_stray
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support import byte_damage as mutations
+from support import damage_harness as hostile
+from support.box_scene import walk
+
+from dhtorch import data
+from dhtorch import testing as writers
+from dhtorch.data import FormatError
+from dhtorch.data.codecs import pickles, tiff
+from dhtorch.geometry import se3
+from dhtorch.records import Frame, Pose
+
+MUTANTS, MANY = 20, 2000  # of every format; the many run with the slow tests
+
+
+def frames(n: int = 3) -> list[Frame]:
+    """A short walk in a box, depth at every pixel."""
+    return walk(n, hw=(24, 32))
+
+
+def _tum(root: Path) -> None:
+    writers.write_tum(root, frames())
+
+
+def _named(root: Path) -> None:
+    writers.write_named_frames(root, frames(), fps=30)
+
+
+def _unregistered(root: Path) -> None:
+    shots = frames()
+    writers.write_named_frames(root, [f.replace(depth_camera=f.camera) for f in shots], fps=30)
+
+
+def _counted(root: Path) -> None:
+    writers.write_counted_frames(root, frames())
+
+
+def _driving(root: Path) -> None:
+    shots = frames()
+    writers.write_driving(
+        root, {"FRONT": shots}, Pose(torch.eye(3).double().expand(3, 3, 3), torch.zeros(3, 3).double())
+    )
+
+
+def _pair(write: Callable[[Path, Frame, Frame], None]) -> Callable[[Path], None]:
+    def write_pair(root: Path) -> None:
+        left = frames(1)[0]
+        left = left.replace(
+            camera=left.camera.replace(f=left.camera.f[:, :1].expand(1, 2)),
+            T_world_from_cam=se3.identity(1, torch.zeros(1).double()),
+        )
+        away = Pose(left.T_world_from_cam.R, torch.tensor([[0.125, 0, 0]], dtype=torch.float64))
+        write(root, left, left.replace(T_world_from_cam=away))
+
+    return write_pair
+
+
+Sample = tuple[Callable[[Path], Path | None], Callable[[Path], Any]]
+
+#: Of every reader: a function that writes a tiny capture below a folder and returns what to open (None = the folder),
+#: and one that opens and reads all of it.
+SAMPLES: dict[str, Sample] = {
+    **{
+        name: (write, hostile.read_all)
+        for name, write in {
+            "tum": _tum,
+            "named": _named,
+            "unregistered": _unregistered,
+            "counted": _counted,
+            "driving": _driving,
+            "calib_pair": _pair(writers.write_calib_pair),
+            "npz_pair": _pair(writers.write_npz_pair),
+            "arkitscenes": test_arkitscenes.hostile_sample,
+            "ca1m": test_ca1m.hostile_sample,
+            "record3d_archive": test_record3d.hostile_archive,
+            "record3d_exr": test_record3d.hostile_exr,
+            "record3d_mp4": test_record3d.hostile_mp4,
+            "stray": test_stray.hostile_new,
+            "stray_old": test_stray.hostile_old,
+            "lerobot_v3": test_lerobot.hostile_v3,
+            "lerobot_v2": test_lerobot.hostile_v2,
+            "rlds": test_rlds.hostile_sample,
+            "rlds_array": test_rlds.hostile_array,
+            **test_focal_stacks.HOSTILE,
+        }.items()
+    },
+    "rh20t": (test_rh20t.hostile_sample, test_rh20t.read_all),
+    "pickle": (test_pickle.hostile_sample, pickles.read_npy),
+    "tiff": (test_ca1m.hostile_tiff, tiff.read_tiff),
+}
+
+
+@pytest.mark.parametrize("name", SAMPLES)
+def test_damaged_captures_are_a_format_error_or_valid(name: str, tmp_path: Path) -> None:
+    counts = hostile.attack(*SAMPLES[name], tmp_path, mutants=MUTANTS)
+    assert counts["frames"] > 0 and counts["FormatError"] > MUTANTS // 5  # damage is felt, and not everywhere
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("name", SAMPLES)
+def test_many_damaged_captures(name: str, tmp_path: Path) -> None:
+    counts = hostile.attack(*SAMPLES[name], tmp_path, mutants=MANY, seed=1)
+    print(f"{name}: {dict(counts)}")
+    assert counts.total() == MANY
+
+
+@pytest.mark.parametrize("examples", [3, pytest.param(80, marks=[pytest.mark.slow, pytest.mark.timeout(3600)])])
+@pytest.mark.parametrize("name", SAMPLES)
+def test_damage_that_hypothesis_looks_for(name: str, examples: int, tmp_path: Path) -> None:
+    """The same mutations with every choice in the hands of Hypothesis, which shrinks what it finds."""
+    write, read = SAMPLES[name]
+    with hostile.sample(write, read, tmp_path) as (good, outcome_of):
+
+        @settings(max_examples=examples, deadline=None, derandomize=True, database=None)
+        @given(draw=st.randoms(use_true_random=False))
+        def check(draw: random.Random) -> None:
+            what, want = mutations.mutate(good, draw)
+            outcome = outcome_of(want)
+            assert outcome.kind in hostile.FINE, f"{what}: {outcome}"
+
+        check()
+
+
+# ------------------------------------------------------------------------------------- the harness finds what it should
+
+
+def _one_file(root: Path) -> Path:
+    (root / "a.txt").write_text("0123456789")
+    return root / "a.txt"
+
+
+def _misread(path: Path, misdeed: Callable[[Path], Any]) -> None:
+    """A reader that does well on the intact file and misbehaves on any other."""
+    if not path.is_file() or path.read_bytes() != b"0123456789":
+        misdeed(path)
+
+
+@pytest.mark.parametrize(
+    ("misdeed", "kind"),
+    [
+        (lambda path: 1 / 0, "ZeroDivisionError"),
+        (lambda path: os.abort(), "crash"),
+        (lambda path: os._exit(86), "code executed"),
+        (lambda path: time.sleep(60), "hang"),
+        (lambda path: sum(0 for _ in iter(int, 1)), "busy"),
+        (lambda path: bytearray(b"1") * (100 << 20), "memory"),
+        (lambda path: (path.parent / "b").write_text("1"), "crash"),
+        (lambda path: (path.parent.parent / "intact" / "a.txt").read_text(), "escape"),
+        (lambda path: os.system("true"), "escape"),
+        (lambda path: (_ for _ in ()).throw(FormatError(path)), "a FormatError that does not name file and field"),
+    ],
+)
+def test_harness_sees(
+    misdeed: Callable[[Path], Any], kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if kind == "hang":
+        monkeypatch.setattr(hostile, "PATIENCE", 0.5)
+    elif kind == "busy":
+        monkeypatch.setattr(hostile, "SECONDS", 1)
+    elif kind == "memory":
+        monkeypatch.setattr(hostile, "BYTES", 64 << 20)  # less to fill on a busy machine
+    with pytest.raises(AssertionError, match=rf"mutant \d+ \(.*\): {kind}"):
+        hostile.attack(_one_file, lambda path: _misread(path, misdeed), tmp_path, mutants=3)
+
+
+def test_harness_repeats_a_mutant(tmp_path: Path) -> None:
+    good: mutations.Capture = {
+        "a.json": b'{"a": [1, 2, 3]}',
+        "b.txt": b"1 2\n3 4\n",
+        "c/d.png": b"\x89PNG\r\n\x1a\n" + bytes(99),
+    }
+    one, two = ([mutations.mutate(good, random.Random(f"3/{i}")) for i in range(200)] for _ in range(2))
+    assert one == two and len({what for what, _ in one}) > 15
+    assert sum(want == good for _, want in one) < 20
+
+
+def test_bomb_is_a_sound_archive(tmp_path: Path) -> None:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as archive:
+        archive.writestr("a/b.bin", b"123")
+        archive.writestr("a/c.bin", b"456")
+    with zipfile.ZipFile(io.BytesIO(mutations.with_bomb(out.getvalue(), "a/b.bin"))) as archive:
+        assert archive.read("a/c.bin") == b"456" and archive.getinfo("a/b.bin").file_size == 1 << 30
+        with archive.open("a/b.bin") as member:
+            assert member.read(1000) == bytes(1000)
+
+
+def test_what_opens_is_what_reads(tmp_path: Path) -> None:
+    _tum(tmp_path)
+    assert len(data.open(tmp_path)) == 3

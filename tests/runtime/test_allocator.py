@@ -1,0 +1,90 @@
+"""Memory that a process keeps: asked for again, it does not come from the system page by page."""
+
+import contextlib
+import ctypes
+import os
+import platform
+import subprocess
+import sys
+
+import pytest
+
+from dhtorch.cli import run
+from dhtorch.runtime import allocator as memory
+
+glibc = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library has no such setting")
+
+ASKED = """
+import resource, sys, torch
+from dhtorch.runtime.allocator import keep_freed
+from dhtorch.transforms import one_thread
+
+def faults(mebibytes):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    blocks = [torch.ones(mebibytes << 18) for _ in range(3)]
+    del blocks
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+asked = {"nothing": lambda: None, "keep": keep_freed, "worker": one_thread}[sys.argv[1]]()
+for size in (1, 8, 64):
+    faults(size)
+print(asked, *(faults(size) for size in (1, 8, 64)))
+"""
+
+
+def said(how, **env):
+    done = subprocess.run(
+        [sys.executable, "-c", ASKED, how], env={**clean(), **env}, capture_output=True, text=True, check=True
+    )
+    asked, *counts = done.stdout.split()
+    return asked, [int(n) for n in counts]
+
+
+def clean():
+    return {k: v for k, v in os.environ.items() if k not in memory.SETTINGS}
+
+
+@glibc
+def test_what_is_freed_is_not_asked_for_again():
+    _, given_back = said("nothing")
+    asked, kept = said("keep")
+    assert given_back[2] > 5000, "else this test would tell nothing"
+    assert asked == "True" and max(kept) < given_back[2] / 5  # blocks may come to lie elsewhere than before
+    assert max(said("worker")[1]) < given_back[2] / 5
+
+
+@glibc
+@pytest.mark.parametrize("name", ["MALLOC_TRIM_THRESHOLD_", "GLIBC_TUNABLES"])
+def test_what_the_environment_says_stands(name):
+    value = "glibc.malloc.trim_threshold=131072" if name == "GLIBC_TUNABLES" else "131072"
+    asked, counts = said("keep", **{name: value})
+    assert asked == "False" and counts[2] > 1000
+
+
+def test_another_allocator_is_left_alone(monkeypatch):
+    for name in memory.SETTINGS:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(ctypes, "CDLL", lambda _: object())
+    assert memory.keep_freed() is False
+
+    def missing(_):
+        raise OSError("no such library")
+
+    monkeypatch.setattr(ctypes, "CDLL", missing)
+    assert memory.keep_freed() is False
+
+
+@pytest.mark.parametrize("words", [["stream", "most=2"], ["pairs=gap", "pairs.gap=1", "figures=false"]])
+def test_commands_that_work_on_frames_keep_what_they_free(words, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(run, "keep_freed", lambda: asked.append(1))
+    small = ["data=synthetic", "data.n_frames=3", "method=paper", "method.n=64"]
+    assert run.main([*words, *small, f"output={tmp_path / 'out'}"]) == 0 and asked == [1]
+
+
+@pytest.mark.parametrize("words", [["--version"], ["--help"], ["stream", "--help"], ["stream", "moost=2"]])
+def test_commands_that_only_say_something_do_not_ask(words, monkeypatch, capsys):
+    monkeypatch.setattr(run, "keep_freed", lambda: pytest.fail("asked"))
+    with contextlib.suppress(SystemExit):  # as help ends
+        run.main(words)
+    assert "".join(capsys.readouterr())

@@ -1,0 +1,231 @@
+"""Views that agree answer together: against a loop over the points, and what a contradiction, a lone view and silence do."""
+
+import itertools
+import math
+
+import pytest
+import torch
+from test_inverse_variance import still_views, views_of
+
+from dhtorch.codes import Gate
+from dhtorch.geometry import camera as cam
+from dhtorch.pipeline.view_selection import by_probes, shrunk, weighed
+from dhtorch.pytree import collate, stack
+from dhtorch.records import Frame, Samples, Tracks
+from dhtorch.stages.fuse import agree
+from dhtorch.stages.score import rank_by_sigma
+from dhtorch.synthetic import open_room
+
+
+def one_point(q, variance, weight_of, *, max_chi2, max_against):
+    """Indices of the views that stand together, and whether the others silence them."""
+    best, stand = -1.0, []
+    for v in range(len(q)):
+        side = [u for u in range(len(q)) if (q[u] - q[v]) ** 2 <= max_chi2 * (variance[u] + variance[v])]
+        support = sum(weight_of[u] for u in side)
+        if support > best:
+            best, stand = support, side
+    mine = sum(weight_of[u] for u in stand)
+    return stand, sum(weight_of) - mine > max_against * mine
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"max_chi2": 1.0},
+        {"max_against": 0.0},
+        {"max_against": 10.0},
+        {"sure_rel": 0.0},
+        {"max_sigma_rel": 0.03},
+        {"sure_rel_each": 0.01},
+    ],
+)
+def test_views_are_joined_as_a_loop_over_points_joins_them(options):
+    o = {"max_chi2": 9.0, "max_against": 0.25, "sure_rel": 0.05, "sure_rel_each": 0.08, "max_sigma_rel": 0.2} | options
+    views = views_of(spread=3.0, N=60)
+    found = agree(views, **options)
+    seen = set()
+    for b, k in itertools.product(range(2), range(60)):
+        said = [v for v in range(4) if views.gate[v, b, k] == 0]
+        depth, sigma, shared = (
+            [float(getattr(views, name)[v, b, k]) for v in said] for name in ("depth", "sigma", "sigma_shared")
+        )
+        q = [1 / z for z in depth]
+        whole = [(s / z**2) ** 2 for s, z in zip(sigma, depth, strict=True)]
+        common = [(s / z**2) ** 2 for s, z in zip(shared, depth, strict=True)]
+        own = [max(w - c, 1e-3 * w) for w, c in zip(whole, common, strict=True)]
+        variance = [a + c for a, c in zip(own, common, strict=True)]
+        weight = [1 / x for x in variance]
+        gate = found.gate[b, k]
+        if not said:
+            assert gate == views.gate[-1, b, k] and found.n_views[b, k] == 1
+            continue
+        sure = [x * x / s for x, s in zip(q, variance, strict=True)]
+        stand, against = one_point(q, variance, sure, max_chi2=o["max_chi2"], max_against=o["max_against"])
+        assert found.n_views[b, k] == len(stand) + 1
+        total = sum(weight[u] for u in stand)
+        mean = sum(weight[u] * q[u] for u in stand) / total
+        chi2 = sum((q[u] - mean) ** 2 / variance[u] for u in stand) / max(len(stand) - 1, 1)
+        alike = (sum(weight[u] * math.sqrt(own[u]) for u in stand) / total) ** 2
+        both = (sum(weight[u] * math.sqrt(common[u]) for u in stand) / total) ** 2
+        joint = math.sqrt((alike + both) * max(chi2, 1.0)) / mean**2
+        expected = Gate.ANSWER
+        if joint * mean > min(o["max_sigma_rel"], o["sure_rel_each"] * len(stand) if stand[1:] else o["sure_rel"]):
+            expected = Gate.UNCERTAIN
+        expected = Gate.INCONSISTENT if against else expected
+        seen.add(int(expected))
+        assert gate == expected
+        if expected == Gate.ANSWER:
+            assert float(found.depth[b, k]) == pytest.approx(1 / mean)
+            assert float(found.sigma[b, k]) == pytest.approx(joint)
+            assert float(found.sigma_shared[b, k]) == pytest.approx(math.sqrt(both * max(chi2, 1.0)) / mean**2)
+            residual = sum(weight[u] * float(views.residual_px[said[u], b, k]) ** 2 for u in stand) / total
+            assert float(found.residual_px[b, k]) == pytest.approx(math.sqrt(residual))
+            assert found.parallax_deg[b, k] == max(views.parallax_deg[said[u], b, k] for u in stand)
+        else:
+            assert found.depth[b, k].isnan() and found.sigma[b, k].isnan() and found.score[b, k] == 0
+    assert len(seen) >= 2
+
+
+def test_another_view_that_is_silent_costs_nothing():
+    views = views_of(V=3, N=200, spread=2.0)
+    mute = views[:1].replace(gate=torch.full_like(views.gate[:1], int(Gate.NO_TRACK)))
+    more = views.map(lambda x: torch.cat((x, x[:1])))
+    more = more.replace(gate=torch.cat((views.gate, mute.gate)))
+    before, after = agree(views), agree(more)
+    spoken = (views.gate == 0).any(0)
+    assert torch.equal(before.gate[spoken], after.gate[spoken])
+    assert torch.equal(before.depth.nan_to_num(), after.depth.nan_to_num())
+    assert bool((after.gate[~spoken] == Gate.NO_TRACK).all())
+
+
+def test_a_contradiction_silences_and_an_outvoted_view_does_not():
+    found = agree(still_views([4.0, 4.1, 4.05, 9.0], [0.1, 0.1, 0.1, 2.0]))
+    assert found.keep.all() and float(found.depth) == pytest.approx(4.05, abs=0.05) and int(found.n_views) == 4
+    assert int(agree(still_views([4.0, 6.0], [0.1, 0.1])).gate) == Gate.INCONSISTENT
+    assert int(agree(still_views([4.0, 4.1, 6.0], [0.1, 0.1, 0.1])).gate) == Gate.INCONSISTENT
+
+
+def test_one_view_alone_must_be_sure():
+    for sigma, gate in ((0.19, Gate.ANSWER), (0.21, Gate.UNCERTAIN)):
+        assert int(agree(still_views([4.0, 1.0], [sigma, 1.0], gate=[0, 2])).gate) == gate
+    both = agree(still_views([4.0, 4.0], [0.5, 0.5]))
+    assert both.keep.all() and float(both.sigma) == pytest.approx(0.5), "what views share is not averaged out"
+    assert int(agree(still_views([4.0, 4.0], [0.9, 0.9])).gate) == Gate.UNCERTAIN
+
+
+def test_where_most_views_stand_still_none_is_believed():
+    views = views_of(V=5, B=2, N=6, silent=0.0, spread=0.1)
+    for still, silenced in ((2, False), (3, True), (5, True)):
+        gate = views.gate.clone()
+        gate[:still, 1, 2] = Gate.NO_BASELINE
+        found = agree(views.replace(gate=gate), sure_rel=1.0)
+        assert bool((found.gate[1] == Gate.NO_BASELINE).all()) == silenced and bool((found.gate[0] == 0).all())
+    assert bool((agree(views.replace(gate=gate), max_still=1.0, sure_rel=1.0).gate[0] == 0).all())
+
+
+def test_a_single_partner_is_its_own_answer_and_none_is_refused():
+    views = views_of(V=1, N=9)
+    assert torch.equal(agree(views).depth.nan_to_num(), views.depth[0].nan_to_num())
+    with pytest.raises(ValueError, match="at least one view"):
+        agree(views[:0])
+
+
+def test_order_of_views_and_of_points_changes_nothing_but_rounding():
+    views = views_of(N=80, spread=2.0)
+    turned, shuffled = torch.tensor([2, 0, 3, 1]), torch.randperm(80, generator=torch.Generator().manual_seed(0))
+    a, b, c = agree(views), agree(views[turned]), agree(views[:, :, shuffled])
+    keep = a.keep & b.keep
+    assert float((a.keep == b.keep).float().mean()) == 1
+    torch.testing.assert_close(a.depth[keep], b.depth[keep], rtol=1e-12, atol=0)
+    assert torch.equal(a.depth[:, shuffled].nan_to_num(), c.depth.nan_to_num())
+
+
+def test_gradients_are_finite_and_right():
+    views = views_of(N=6, spread=1.0)
+    keep = agree(views).keep
+    assert int(keep.sum()) > 3
+
+    def answer(depth, sigma):
+        found = agree(views.replace(depth=depth, sigma=sigma))
+        return found.depth[keep], found.sigma[keep]
+
+    depth, sigma = (x.nan_to_num(1.0).requires_grad_() for x in (views.depth, views.sigma))
+    assert torch.autograd.gradcheck(answer, (depth, sigma), eps=1e-7, atol=1e-5)
+
+
+def test_it_captures():
+    views = views_of()
+    plain, compiled = agree(views), torch.compile(agree, backend="eager", fullgraph=True)(views)
+    assert torch.equal(plain.gate, compiled.gate)
+    torch.testing.assert_close(plain.depth, compiled.depth, equal_nan=True)
+
+
+def test_an_answer_that_more_views_give_is_surer():
+    views = still_views([4.0] * 4, [0.2] * 4)
+    some = [agree(views[:k] if k > 1 else still_views([4.0, 4.0], [0.2, 0.2], gate=[0, 2])) for k in (1, 2, 4)]
+    zero, uv = torch.zeros(1, 1), torch.zeros(1, 1, 2)
+    samples = Samples(uv, zero, zero, torch.zeros(1, 1, 3), zero, zero.int(), zero, zero.int())
+    tracks = Tracks(uv, uv, zero, zero, torch.zeros(1, 1, 2, 2), zero > 0)
+    scores = [float(rank_by_sigma(e, samples, tracks, None).score) for e in some]
+    assert scores == pytest.approx([0.1 / (0.1 + 0.05 / math.sqrt(n)) for n in (1, 2, 4)])
+
+
+# -------------------------------------------------------------------------------------------------- which views
+
+
+@pytest.fixture(scope="module")
+def room():
+    return open_room(seed=1, n_frames=12, hw=(240, 320), near=2.0).recording
+
+
+@pytest.mark.slow
+@pytest.mark.slow
+def test_small_pictures_choose_views_as_large_ones_do(room):
+    frames = [room[k] for k in (0, 1, 2, 4, 6, 9)]
+    anchor = frames[0]
+    candidates = stack([*frames[1:], frames[0]])  # the anchor itself is among them and says nothing
+    chosen = by_probes(anchor, candidates, 2).index
+    assert chosen.shape == (2, 1) and bool((chosen[:-1] < chosen[1:]).all())
+    assert 5 not in chosen[:, 0].tolist()
+    again = by_probes(anchor, candidates, 2, long=120).index
+    assert len(set(again[:, 0].tolist()) & set(chosen[:, 0].tolist())) >= 1
+    with pytest.raises(ValueError, match="views is 9"):
+        by_probes(anchor, candidates, 9)
+
+
+def test_each_anchor_of_a_batch_gets_its_own(room):
+    anchors = [room[0], room[11]]
+    others = [[room[k] for k in ks] for ks in ((1, 3, 6, 9), (10, 8, 5, 2))]
+    both = by_probes(collate(anchors), stack([collate(list(pair)) for pair in zip(*others, strict=True)]), 2).index
+    for b in range(2):
+        assert by_probes(anchors[b], stack(others[b]), 2).index[:, 0].tolist() == both[:, b].tolist()
+
+
+def test_a_small_frame_sees_the_same_rays(room):
+    frame: Frame = room[0]
+    little, k = shrunk(frame, 80)
+    assert k == 4 and little.hw == (60, 80)
+    uv = torch.tensor([[[10.0, 20.0], [63.0, 5.0]]])
+    torch.testing.assert_close(cam.rays(little.camera, uv), cam.rays(frame.camera, uv * k + (k - 1) / 2))
+    assert shrunk(frame, 400)[1] == 1
+    frame = frame.replace(depth_camera=None)
+    own = cam.resize(frame.camera, frame.hw, (frame.depth.shape[-2], frame.depth.shape[-1]))
+    kept = shrunk(frame, 80)[0].depth_camera
+    assert torch.equal(kept.f, own.f) and torch.equal(kept.c, own.c), "the map is as large as it was"
+    turned = own.replace(c=own.c + 3)
+    assert shrunk(frame.replace(depth_camera=turned), 80)[0].depth_camera is turned
+
+
+def test_a_small_picture_is_no_reason_to_be_less_sure(room):
+    frames = [room[k] for k in (0, 2, 4, 6)]
+    large, little = (by_probes(frames[0], stack(frames[1:]), 3, long=n, good_sigma_rel=1e-4) for n in (400, 160))
+    ratio = little.worth / large.worth
+    assert bool((ratio > 1 / 3).all() and (ratio < 3).all()), ratio
+
+
+def test_key_views_takes_what_adds_most():
+    views = views_of(V=3, B=1, N=4, silent=0.0)
+    sigma = views.depth * torch.tensor([0.5, 0.01, 0.02]).double()[:, None, None]
+    assert weighed(views.replace(sigma=sigma), 1).index.tolist() == [[1]]

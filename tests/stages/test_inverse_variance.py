@@ -1,0 +1,501 @@
+"""Several views of the same samples: fusion and key views against loops, and the window with seats that only look."""
+
+import itertools
+import math
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from dhtorch import PAPER
+from dhtorch.codes import Gate
+from dhtorch.experiments.baselines.device_pose import given_pose
+from dhtorch.geometry import se3
+from dhtorch.geometry.pyramid import build_pyramid
+from dhtorch.pipeline.pair import uniform_draws
+from dhtorch.pipeline.view_selection import weighed
+from dhtorch.pytree import collate, stack
+from dhtorch.records import Camera, Estimate, Frame, Samples, TrackHint, Tracks
+from dhtorch.stages.fuse import inverse_variance
+from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
+
+extend_window = PAPER.replace(views=5)
+
+HW = (64, 80)
+FIELDS = ("depth", "sigma", "sigma_shared", "parallax_deg", "residual_px", "score")
+
+
+def rand(*shape, seed, low=0.0, high=1.0):
+    return low + (high - low) * torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def views_of(V=4, B=2, N=30, seed=0, silent=0.3, spread=1.0):
+    """Answers (V, B, N) that scatter about a truth by some of their sigmas; some silent, for one reason or another."""
+    z = rand(B, N, seed=seed, low=2, high=8)
+    relative = rand(V, B, N, seed=seed + 1, low=0.01, high=0.08)
+    noise = spread * 4 * (rand(V, B, N, seed=seed + 2) - 0.5)
+    depth = 1 / (1 / z * (1 + relative * noise))
+    gate = torch.where(rand(V, B, N, seed=seed + 3) < silent, 5 + (7 * rand(V, B, N, seed=seed + 4)).int() % 4, 0).int()
+    keep = gate == 0
+    sigma = relative * depth
+    shared = sigma * rand(V, B, N, seed=seed + 5, low=0.0, high=1.0)
+    mute = lambda x: torch.where(keep, x, torch.nan)  # noqa: E731
+    return Estimate(
+        uv=rand(V, B, N, 2, seed=seed + 6),
+        depth=mute(depth),
+        sigma=mute(sigma),
+        sigma_shared=mute(shared),
+        parallax_deg=rand(V, B, N, seed=seed + 7, high=9),
+        residual_px=rand(V, B, N, seed=seed + 8, low=0.1, high=2),
+        n_views=torch.full((V, B, N), 2, dtype=torch.int32),
+        score=keep.double(),
+        gate=gate,
+    )
+
+
+def plain_fusion(views, *, min_views=2, max_chi2=9.0, correlation=1.0, max_sigma_rel=0.1, max_still=0.5):
+    """{field: array (B, N)} by a loop over the points."""
+    V, B, N = views.gate.shape
+    get = {name: getattr(views, name).numpy() for name in (*FIELDS, "gate")}
+    out = {name: np.full((B, N), np.nan) for name in FIELDS} | {"gate": np.zeros((B, N)), "n_views": np.zeros((B, N))}
+    for b, k in itertools.product(range(B), range(N)):
+        at = {name: x[:, b, k] for name, x in get.items()}
+        said = [v for v in range(V) if at["gate"][v] == 0]
+        q = [1 / at["depth"][v] for v in said]
+        whole = [(at["sigma"][v] / at["depth"][v] ** 2) ** 2 for v in said]
+        shared = [(at["sigma_shared"][v] / at["depth"][v] ** 2) ** 2 for v in said]
+        own = [max(w - s, 1e-3 * w) for w, s in zip(whole, shared, strict=True)]
+        variance = [o + s for o, s in zip(own, shared, strict=True)]
+        weight = np.array([1 / x for x in variance]) / sum(1 / x for x in variance) if said else np.zeros(0)
+        out["n_views"][b, k] = 1 + len(said)
+        out["parallax_deg"][b, k] = max(at["parallax_deg"])
+        out["residual_px"][b, k] = (
+            math.sqrt(sum(w * at["residual_px"][v] ** 2 for w, v in zip(weight, said, strict=True)))
+            if said
+            else at["residual_px"][-1]
+        )
+        silent = [int(g) for g in at["gate"] if g]
+        if sum((get["gate"][v, b] == Gate.NO_BASELINE).any() for v in range(V)) > max_still * V:
+            gate = Gate.NO_BASELINE
+        elif len(said) < min(max(min_views, 1), V):
+            gate = silent[-1]
+        else:
+            mean = sum(w * x for w, x in zip(weight, q, strict=True))
+            chi2 = sum((x - mean) ** 2 / s for x, s in zip(q, variance, strict=True)) / max(len(said) - 1, 1)
+            widening = max(chi2, 1.0)
+            alike = sum(w * math.sqrt(o) for w, o in zip(weight, own, strict=True)) ** 2
+            apart = sum(w**2 * o for w, o in zip(weight, own, strict=True))
+            common = sum(w * math.sqrt(s) for w, s in zip(weight, shared, strict=True)) ** 2
+            depth = 1 / mean
+            sigma = depth**2 * math.sqrt((correlation * alike + (1 - correlation) * apart + common) * widening)
+            gate = Gate.ANSWER
+            if max_sigma_rel is not None and sigma / depth > max_sigma_rel:
+                gate = Gate.UNCERTAIN
+            if chi2 > max_chi2:
+                gate = Gate.INCONSISTENT
+            if gate == Gate.ANSWER:
+                out["depth"][b, k], out["sigma"][b, k] = depth, sigma
+                out["sigma_shared"][b, k] = depth**2 * math.sqrt(common * widening)
+        out["gate"][b, k], out["score"][b, k] = gate, float(gate == Gate.ANSWER)
+    return out
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"correlation": 0.0},
+        {"correlation": 0.4, "max_sigma_rel": None},
+        {"max_chi2": 1.5},
+        {"max_chi2": 1e9, "max_sigma_rel": None},
+        {"max_sigma_rel": 0.04},
+        {"min_views": 1},
+        {"min_views": 0},
+        {"min_views": 3},
+        {"min_views": 9},
+    ],
+)
+def test_views_are_joined_as_a_loop_over_points_joins_them(options):
+    views = views_of()
+    views.gate[:, 0, :2] = torch.tensor([[Gate.NO_TRACK, Gate.PARALLAX]] * 3 + [[Gate.RESIDUAL, Gate.NO_TRACK]])
+    found, expected = inverse_variance(views, **options), plain_fusion(views, **options)
+    assert torch.equal(found.gate, torch.tensor(expected["gate"]).int()) and found.gate.dtype == torch.int32
+    assert torch.equal(found.n_views, torch.tensor(expected["n_views"]).int()) and found.n_views.dtype == torch.int32
+    for name in FIELDS:
+        np.testing.assert_allclose(getattr(found, name).numpy(), expected[name], rtol=1e-9, err_msg=name)
+    assert torch.equal(found.uv, views.uv[-1])
+    assert len(found.gate.unique()) >= 3 and 5 < int(found.keep.sum()) < 60
+
+
+@pytest.mark.parametrize(("correlation", "V"), [(0.0, 3), (1.0, 2)])
+def test_sigma_is_the_spread_of_the_fused_depth(correlation, V):
+    """Own errors of the views equal or independent, the pose's common to all; the chance excess of χ² is shut out."""
+    N = 20000
+    g = torch.Generator().manual_seed(1)
+    draw = lambda *s: torch.randn(*s, generator=g, dtype=torch.float64)  # noqa: E731
+    own, pose = torch.tensor([0.003, 0.005, 0.008][:V]).double()[:, None], 0.004
+    errors = own * (draw(1, N).expand(V, N) if correlation else draw(V, N)) + pose * draw(1, N)
+    depth = 1 / (0.25 + errors)
+    like = torch.ones(V, 1, N, dtype=torch.float64)
+    views = views_of(V=V, B=1, N=N, silent=0.0).replace(depth=depth[:, None])
+    views = views.replace(
+        sigma=depth[:, None] ** 2 * (own**2 + pose**2).sqrt()[:, None] * like,
+        sigma_shared=depth[:, None] ** 2 * pose,
+    )
+    fused = inverse_variance(views, correlation=correlation, max_sigma_rel=None, max_chi2=1.0)
+    keep = fused.keep[0]
+    assert int(keep.sum()) > 5000
+    z = (1 / fused.depth - 0.25)[0, keep] / (fused.sigma / fused.depth**2)[0, keep]
+    assert float(z.std()) == pytest.approx(1, abs=0.03)
+
+
+def still_views(depth, sigma, shared=0.0, gate=0):
+    """Answers (V, 1, 1) that are told."""
+    V = len(depth)
+    column = lambda x: torch.as_tensor(x, dtype=torch.float64).expand(V)[:, None, None].clone()  # noqa: E731
+    views = views_of(V=V, B=1, N=1)
+    gate = torch.as_tensor(gate).expand(V)[:, None, None].int()
+    return views.replace(depth=column(depth), sigma=column(sigma), sigma_shared=column(shared), gate=gate)
+
+
+def test_limits_hold_at_the_limit_itself():
+    """Inverse depths 1/4 and 1/2 with a deviation of 1/8 each: each differs from the mean by as much."""
+    two = still_views([4.0, 2.0], [2.0, 0.5])
+    gates = [int(inverse_variance(two, max_chi2=x, max_sigma_rel=None).gate) for x in (2.0, 1.9999)]
+    assert gates == [Gate.ANSWER, Gate.INCONSISTENT]
+    same = still_views([4.0, 4.0], [0.5, 0.5])
+    gates = [int(inverse_variance(same, max_sigma_rel=x).gate) for x in (0.125, 0.1249)]
+    assert gates == [Gate.ANSWER, Gate.UNCERTAIN]
+    assert int(inverse_variance(still_views([4.0, 4 / 3], [1e-9, 1e-9]), max_sigma_rel=1e-12).gate) == Gate.INCONSISTENT
+    assert int(inverse_variance(still_views([4.0] * 3, [0.1] * 3, gate=[0, 0, 7])).gate) == Gate.ANSWER
+    assert int(inverse_variance(still_views([4.0] * 3, [0.1] * 3, gate=[6, 0, 7])).gate) == Gate.RESIDUAL
+    assert int(inverse_variance(still_views([4.0] * 3, [0.1] * 3, gate=[6, 0, 0])).gate) == Gate.ANSWER
+
+
+def test_a_view_without_a_positive_depth_and_a_finite_sigma_says_nothing():
+    good = inverse_variance(still_views([4.0, 5.0], [0.5, 0.5]), max_sigma_rel=None)
+    for depth, sigma in ((-4.0, 0.1), (0.0, 0.1), (4.0, 0.0), (4.0, math.inf), (4.0, math.nan), (math.nan, 0.1)):
+        found = inverse_variance(still_views([4.0, depth, 5.0], [0.5, sigma, 0.5]), max_sigma_rel=None)
+        assert float(found.depth) == float(good.depth) and int(found.n_views) == 3, (depth, sigma)
+        alone = inverse_variance(still_views([4.0, depth], [0.5, sigma]), max_sigma_rel=None)
+        assert int(alone.gate) == Gate.INCONSISTENT, "an answer that cannot be weighed gives no better reason"
+
+
+def test_one_view_is_its_own_answer_and_none_is_refused():
+    views = views_of(V=1, N=5)
+    found = inverse_variance(views)
+    for name in (*FIELDS, "gate", "n_views"):
+        assert torch.equal(getattr(found, name).nan_to_num(), getattr(views, name)[0].nan_to_num()), name
+    with pytest.raises(ValueError, match="at least one view"):
+        inverse_variance(views[:0])
+
+
+def test_a_standstill_is_what_more_than_the_share_of_views_say():
+    """Even of one point of the anchor; and of each anchor for itself."""
+    views = views_of(V=4, B=2, N=5, silent=0.0, spread=0.1)
+    for n, share, still in ((2, 0.5, False), (3, 0.5, True), (1, 0.25, False), (2, 0.25, True), (4, 1.0, False)):
+        gate = views.gate.clone()
+        gate[:n, 1, 3] = Gate.NO_BASELINE
+        found = inverse_variance(views.replace(gate=gate), max_still=share, max_sigma_rel=None, min_views=1)
+        assert (found.gate[0] == 0).all() and bool((found.gate[1] == Gate.NO_BASELINE).all()) == still, (n, share)
+        assert torch.equal(found.depth.isnan(), found.gate != 0) and torch.equal(found.score, found.keep.double())
+
+
+# ---------------------------------------------------------------------------------------------------- key views
+
+
+def plain_key_views(views, count, good=0.1):
+    """Greedy by loops: the view that adds most to the sum of log(1 + Σ (good · depth / sigma)²), wider of equals."""
+    V, B, N = views.gate.shape
+    picked = []
+    for b in range(B):
+        worth = [
+            [
+                (good * float(views.depth[v, b, k] / views.sigma[v, b, k])) ** 2 if views.gate[v, b, k] == 0 else 0.0
+                for k in range(N)
+            ]
+            for v in range(V)
+        ]
+        chosen = []
+        for _ in range(count):
+            totals = {
+                v: sum(math.log1p(sum(worth[c][k] for c in [*chosen, v])) for k in range(N))
+                for v in range(V)
+                if v not in chosen
+            }
+            chosen.append(max(totals, key=lambda v: (totals[v], v)))
+        picked.append(sorted(chosen))
+    return picked
+
+
+@pytest.mark.parametrize("good", [0.1, 0.002])
+def test_key_views_are_added_one_by_one_each_the_one_that_adds_most(good):
+    views = views_of(V=6, B=4, N=6, silent=0.5, seed=3)
+    lone = views.gate.clone()
+    lone[:, 0, 1:] = Gate.NO_TRACK
+    lone[:, 0, 0] = 0  # all depends on one point, where further views add little
+    views = views.replace(gate=lone, depth=views.depth.nan_to_num(4.0), sigma=views.sigma.nan_to_num(0.3))
+    for count in range(1, 7):
+        expected = plain_key_views(views, count, good)
+        assert weighed(views, count, good_sigma_rel=good).index.T.tolist() == expected
+        if good == 0.1:
+            assert weighed(views, count).index.T.tolist() == expected
+    for bad in (0, 7):
+        with pytest.raises(ValueError, match="expected 1 to 6"):
+            weighed(views, bad)
+
+
+def test_what_a_view_adds_stands_beside_it():
+    views = views_of(V=4, B=3, N=6, silent=0.0, seed=1)
+    choice = weighed(views, 3)
+    worth = (0.1 * views.depth / views.sigma).square()
+    for b in range(3):
+        known, left, added = torch.zeros(6).double(), list(range(4)), {}
+        for _ in range(3):
+            gains = {v: float(((1 + known + worth[v, b]).log() - (1 + known).log()).sum()) for v in left}
+            best = max(left, key=gains.__getitem__)
+            added[best], known = gains[best], known + worth[best, b]
+            left.remove(best)
+        assert choice.index[:, b].tolist() == sorted(added)
+        assert choice.worth[:, b].tolist() == pytest.approx([added[v] for v in sorted(added)])
+
+
+def test_answers_without_a_sigma_add_nothing():
+    views = views_of(V=3, B=1, N=4, silent=0.0)
+    sigma = views.sigma.clone()
+    sigma[2], sigma[1, 0, :2], sigma[1, 0, 2:] = torch.nan, 0.0, torch.inf
+    assert weighed(views.replace(sigma=sigma), 1).index.tolist() == [[0]]
+    mute = views.replace(gate=torch.full_like(views.gate, Gate.NO_TRACK))
+    assert weighed(mute, 2).index.T.tolist() == [[1, 2]], "the wider of equals"
+
+
+# ---------------------------------------------------------------------------------------------------- the window
+
+
+def frame(batch=2, seed=0):
+    camera = Camera(torch.tensor([[70.0, 72.0]]), torch.tensor([[40.0, 30.0]])).map(lambda x: x.expand(batch, -1))
+    return Frame(rand(batch, 1, *HW, seed=seed).float(), 1 + rand(batch, *HW, seed=seed).float(), camera)
+
+
+class Seats:
+    """Seats that remember what they were given; view k of the window is known by its picture."""
+
+    def __init__(self, V=3, n=8):
+        self.anchor, self.others = frame(), stack([frame(seed=10 + k) for k in range(V)])
+        self.n, self.calls, self.asked = n, [], {"track": [], "pose": [], "triangulate": []}
+        self.uv = 10 + rand(2, n, 2, seed=30, high=40).float()
+        self.answers = views_of(V=V, N=n, silent=0.2, spread=0.2).to(torch.float32)
+        self.fits = [given_pose(se3.exp(rand(2, 6, seed=50 + k).float()), n) for k in range(V)]
+
+    def number(self, image):
+        return next(k for k in range(len(self.others.image)) if torch.equal(self.others.image[k], image))
+
+    def tracks(self, k, uv):
+        zero = uv[..., 0] * 0
+        moved = uv + rand(*uv.shape, seed=60 + k, low=-3, high=3).float()
+        cov = torch.eye(2).expand(*uv.shape, 2)
+        return Tracks(uv, moved, zero, zero, cov, rand(*uv.shape[:2], seed=70 + k) < 0.7)
+
+    def samples(self):
+        one = torch.ones(2, self.n)
+        return Samples(self.uv, one, one, one[..., None].expand(2, self.n, 3), one, one.int(), one, one.int())
+
+    def seats(self):
+        """Seats and options of a method."""
+
+        def track(image_0, image_1, uv, *, hint):
+            k = self.number(image_1)
+            self.asked["track"].append((k, image_0, uv, hint))
+            return self.tracks(k, uv)
+
+        def pose(samples, tracks, camera_0, camera_1, draws):
+            self.asked["pose"].append((samples, tracks, draws))
+            return collate(self.fits)
+
+        def triangulate(samples, tracks, fit, camera_0, camera_1):
+            self.asked["triangulate"].append((samples, fit))
+            step = self.n // samples.uv.shape[1]
+            return self.answers.map(lambda x: x.flatten(0, 1)[:, ::step])
+
+        def score(estimate, samples, tracks, fit):
+            self.calls.append(("score", estimate, samples, tracks, fit))
+            return estimate.replace(score=0.5 * estimate.score)
+
+        def sample(hw, n, **options):
+            self.calls.append(("sample", hw, n, options))
+            return self.uv
+
+        def backproject(frame, uv):
+            self.calls.append(("backproject", frame, uv))
+            return self.samples()
+
+        def classify(frame, samples):
+            self.calls.append(("classify", frame, samples))
+            return samples.replace(hole=samples.hole + 2)
+
+        names = {"sample": sample, "backproject": backproject, "classify": classify, "track": track, "pose": pose}
+        return names | {"triangulate": triangulate, "score": score, "n": self.n, "hypotheses": 5}
+
+
+def test_the_anchor_is_sampled_once_and_every_view_is_a_pair_with_it():
+    seats, trace = Seats(), {}
+    found = extend_window(seats.anchor, seats.others, **seats.seats(), seed=4, trace=trace)
+    names = [call[0] for call in seats.calls]
+    assert names == ["sample", "backproject", "classify", "score"]
+    assert seats.calls[0][1:] == (HW, 8, {"device": torch.device("cpu"), "dtype": torch.float32})
+    assert seats.calls[1][1].image is seats.anchor.image and seats.calls[2][1].image is seats.anchor.image
+    assert [k for k, *_ in seats.asked["track"]] == [0, 1, 2]
+    ((samples, tracks, draws),) = seats.asked["pose"]
+    assert (samples.hole == 3).all(), "what classify made of the samples"
+    assert torch.equal(tracks.uv_1, torch.cat([seats.tracks(k, seats.uv).uv_1 for k in range(3)]))
+    assert torch.equal(draws, uniform_draws(4, 2, 5).float().repeat(3, 1, 1)), "the same draws for all views"
+    ((samples, fit),) = seats.asked["triangulate"]
+    assert torch.equal(fit.T_1_from_0.t, collate(seats.fits).T_1_from_0.t)
+    fused = inverse_variance(seats.answers)
+    _, estimate, samples, tracks, fit = seats.calls[3]
+    for name in (*FIELDS, "gate"):
+        assert torch.equal(getattr(estimate, name).nan_to_num(), getattr(fused, name).nan_to_num()), name
+    assert (samples.hole == 3).all() and torch.equal(fit.T_1_from_0.t, seats.fits[2].T_1_from_0.t)
+    assert torch.equal(tracks.uv_1, seats.tracks(2, seats.uv).uv_1)
+    assert torch.equal(found.score, 0.5 * fused.score)
+    assert trace["estimate"] is found and trace["fit"] is fit and len(trace["views"]) == 3
+    for t, expected in zip(trace["views"], seats.fits, strict=True):
+        assert torch.equal(t["fit"].T_1_from_0.t, expected.T_1_from_0.t)
+
+
+def test_every_anchor_has_its_own_draws_in_all_its_views():
+    seats = Seats()
+    extend_window(seats.anchor, seats.others, **seats.seats(), seed=torch.tensor([4, 9]))
+    ((_, _, draws),) = seats.asked["pose"]
+    assert torch.equal(draws, uniform_draws(torch.tensor([4, 9] * 3), 6, 5).float())
+    assert not torch.equal(draws[0], draws[1])
+
+
+def test_a_search_begins_where_the_last_view_was_found_further_on_at_the_same_pace():
+    seats = Seats(V=4)
+    extend_window(seats.anchor, seats.others, **seats.seats())
+    starts = [hint.start for *_, hint in seats.asked["track"]]
+    assert starts[0] is None
+    for k in (1, 2, 3):
+        last = seats.tracks(k - 1, seats.uv)
+        for b, i in itertools.product(range(2), range(8)):
+            ahead = last.uv_0[b, i] + (last.uv_1[b, i] - last.uv_0[b, i]) * (k + 1) / k
+            expected = ahead if last.valid[b, i] else last.uv_0[b, i]
+            torch.testing.assert_close(starts[k][b, i], expected)
+    assert not last.valid.all() and last.valid.any()
+    alone = Seats(V=4)
+    extend_window(alone.anchor, alone.others, **alone.seats(), chain=False)
+    assert all(hint.start is None for *_, hint in alone.asked["track"])
+
+
+def test_the_anchors_pyramid_is_built_once_for_every_view():
+    seats = Seats()
+    extend_window(seats.anchor, seats.others, **seats.seats(), hint=TrackHint(levels=3))
+    first, *others = (hint for *_, hint in seats.asked["track"])
+    assert all(hint.pyramid is first.pyramid and hint.levels == 3 for hint in others)
+    made, expected = first.pyramid(2, 7), build_pyramid(seats.anchor.image, 2, 7)
+    assert first.pyramid(2, 7) is made and first.pyramid(1, 7) is not made
+    leaves = [torch.utils._pytree.tree_leaves(x) for x in (made, expected)]
+    assert len(leaves[0]) == len(leaves[1]) > 2
+    assert all(torch.equal(x, y) for x, y in zip(*leaves, strict=True) if isinstance(x, torch.Tensor))
+    part = first.pyramid[1:2]
+    assert part is first.pyramid[1:2] and torch.equal(part(1, 7).levels[0], expected.levels[0][1:2])
+
+
+@pytest.mark.parametrize("track", [lucas_kanade, lucas_kanade_affine])
+def test_a_chain_changes_the_start_and_not_what_is_searched_for(track):
+    """On one picture that moves by two pixels a view the tracks end at the same places with a chain or without."""
+    wide = torch.nn.functional.interpolate(rand(1, 1, 24, 40, seed=2).float(), size=(96, 160), mode="bicubic")
+    camera = Camera(torch.tensor([[70.0, 70.0]]), torch.tensor([[40.0, 30.0]]))
+    view = lambda x: Frame(wide[..., 10:74, x : x + 80].clamp(0, 1), torch.ones(1, *HW), camera)  # noqa: E731
+    others, ends = stack([view(22), view(24), view(26)]), []
+    for chain in (True, False):
+        trace = {}
+        extend_window(view(20), others, track=track, chain=chain, n=20, hypotheses=4, trace=trace)
+        ends.append([t["tracks"] for t in trace["views"]])
+    for k, (a, b) in enumerate(zip(*ends, strict=True)):
+        both = a.valid & b.valid
+        assert int(both.sum()) > 10
+        assert ((a.uv_1 - b.uv_1)[both].abs() < 0.05).all()
+        assert float((a.uv_0 - a.uv_1)[both][:, 0].median()) == pytest.approx(2 * (k + 1), abs=0.1)
+
+
+def test_of_more_views_the_key_views_are_asked_again_with_their_own_poses():
+    """They are chosen by few of the samples: each anchor has its own choice."""
+    n = 512
+    seats = Seats(V=5, n=n)
+    fits = stack(seats.fits)
+    known = weighed(seats.answers[:, :, ::2], 2).index
+    assert not torch.equal(known[:, 0], known[:, 1]), "the two anchors choose otherwise"
+    options = seats.seats() | {"track": lambda image_0, image_1, uv, hint: seats.tracks(0, uv)}
+    asked = []
+
+    def triangulate(samples, tracks, fit, camera_0, camera_1):
+        asked.append((samples.uv, fit))
+        probes = samples.uv.shape[1] == n // 2
+        return (seats.answers[:, :, ::2] if probes else seats.answers[:2]).map(lambda x: x.flatten(0, 1))
+
+    trace = {}
+    options |= {"triangulate": triangulate, "views": 2, "fit": fits, "trace": trace}
+    extend_window(seats.anchor, seats.others, **options)
+    (probes, first), (uv, second) = asked
+    assert probes.shape == (10, n // 2, 2) and uv.shape == (4, n, 2), "256 samples, every second"
+    assert torch.equal(probes[:2], seats.uv[:, ::2]) and len(trace["views"]) == 2
+    assert torch.equal(first.T_1_from_0.t, fits.T_1_from_0.t.flatten(0, 1))
+    for k in range(2):
+        for b in range(2):
+            assert torch.equal(second.T_1_from_0.t[2 * k + b], fits[int(known[k, b])].T_1_from_0.t[b])
+    assert "pose" not in [c[0] for c in seats.calls] and not seats.asked["pose"]
+
+
+def test_five_views_are_used_by_default_and_as_many_as_asked_for_are_not_chosen_among():
+    for V, options, asked in ((5, {}, 5), (6, {}, 11), (3, {"views": 3}, 3), (3, {"views": 2}, 5)):
+        seats = Seats(V=V)
+        count = []
+        given = seats.seats() | {
+            "track": lambda image_0, image_1, uv, hint, count=count: count.append(1) or Seats().tracks(0, uv)
+        }
+        given["pose"] = lambda samples, *_, seats=seats: collate(seats.fits[: len(samples.uv) // 2])
+        given["triangulate"] = lambda samples, *_, seats=seats: seats.answers.map(
+            lambda x: x.flatten(0, 1)[: len(samples.uv), : samples.uv.shape[1]]
+        )
+        extend_window(seats.anchor, seats.others, **given, **options)
+        assert len(count) == asked, (V, options)
+
+
+def test_the_trace_sums_the_milliseconds_over_the_views(monkeypatch):
+    """By a clock that goes on by as many seconds as it has been asked."""
+    # 1 and 2 around the samples, 3 before the first view, 9 and 10 around the joining
+    seconds = {"samples": 2, "track": 4 + 5 + 6, "pose": 7, "triangulate": 8, "fuse": 10}
+    expected = {name: 1e3 * s for name, s in seconds.items()}
+    times = itertools.accumulate(itertools.count(1))
+    monkeypatch.setattr(time, "perf_counter", lambda: float(next(times)))
+    seats, trace = Seats(), {}
+    extend_window(seats.anchor, seats.others, **seats.seats(), trace=trace)
+    assert trace["ms"] == expected
+
+
+def test_what_a_window_asks_by_default():
+    """A texture of 1e-5, 200 hypotheses, the draws of seed 0."""
+    seats = Seats()
+    given = {k: v for k, v in seats.seats().items() if k != "hypotheses"}
+    texture = torch.where(torch.arange(seats.n) % 2 == 0, 1.01e-5, 0.99e-5).expand(2, -1)
+    given["classify"] = lambda _, samples: samples.replace(trackability=texture)
+    extend_window(seats.anchor, seats.others, **given)
+    ((_, tracks, draws),) = seats.asked["pose"]
+    for k in range(3):
+        of_view = slice(2 * k, 2 * k + 2)
+        assert torch.equal(tracks.valid[of_view], seats.tracks(k, seats.uv).valid & (texture > 1e-5))
+        assert torch.equal(draws[of_view], uniform_draws(0, 2, 200).float())
+
+
+def test_a_samples_texture_is_asked_in_every_view():
+    seats = Seats()
+    gate = torch.full_like(seats.answers.gate, Gate.NO_TRACK)
+    seats.answers = seats.answers.replace(gate=gate)
+    for limit, reason in ((1.0, Gate.NO_TRACK), (1.01, Gate.NO_TEXTURE)):
+        seats.asked["track"].clear()
+        found = extend_window(seats.anchor, seats.others, **seats.seats(), min_trackability=limit)
+        last = seats.tracks(2, seats.uv).valid
+        assert (found.gate[last] == reason).all() and (found.gate[~last] == Gate.NO_TRACK).all()

@@ -1,0 +1,430 @@
+"""Seat 5 with far tracks: accuracy, an honest covariance, what is believed and what is not, gradients."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from support import dense_reprojection as dense
+from torch.utils._pytree import tree_leaves
+
+from dhtorch.codes import Gate, PoseCode
+from dhtorch.geometry import camera as cam
+from dhtorch.geometry import covariance, se3
+from dhtorch.geometry import map_estimate as most_probable
+from dhtorch.records import Camera, Pose, PoseFit, Samples, Shutter, Tracks
+from dhtorch.stages.pose import map_pose, pnp_ransac
+from dhtorch.stages.triangulate import two_view
+
+D = torch.float64
+#: Every pair of the trials gets the same draws: they only choose a start.
+DRAWS = torch.rand(1, 64, 3, generator=torch.Generator().manual_seed(7), dtype=D)
+
+
+def pairs(
+    batch, near=60, far=140, *, noise=0.3, depth=0.01, turn=0.0, baseline=0.1, planar=False, rotation=0.05, seed=0
+):
+    """Arguments of the seat, true pose, true turn and true far depth. ``noise`` px is anisotropic, as tracks' is."""
+    g = torch.Generator().manual_seed(seed)
+    rand = lambda *s: torch.rand(*s, generator=g, dtype=D)  # noqa: E731
+    randn = lambda *s: torch.randn(*s, generator=g, dtype=D)  # noqa: E731
+    n = near + far
+    camera_0 = Camera(500 + 50 * rand(batch, 2), 10 * rand(batch, 2) + torch.tensor([315.0, 235.0], dtype=D))
+    camera_1 = Camera(450 + 50 * rand(batch, 2), 10 * rand(batch, 2) + torch.tensor([315.0, 235.0], dtype=D))
+    uv_0 = rand(batch, n, 2) * torch.tensor([600.0, 440.0], dtype=D) + 20
+    z = torch.cat((0.6 + 1.0 * rand(batch, near), 2.5 + 3 * rand(batch, far)), 1)
+    ray = cam.rays(camera_0, uv_0)
+    if planar:
+        z[:, :near] = 1 / (1 + 0.3 * ray[:, :near, 0] + 0.8 * ray[:, :near, 1])
+    direction = torch.nn.functional.normalize(randn(batch, 3), dim=-1)
+    T = se3.exp(torch.cat((rotation * randn(batch, 3), baseline * direction), -1))
+    b = turn * randn(batch, 3)
+    Y = se3.apply(T, ray * z[..., None])
+    Y = Y + torch.linalg.cross(ray[..., 1:2] * b[:, None], Y)
+    uv_1 = cam.project(camera_1, Y)
+    angle, spread = math.pi * rand(batch, n), 1 + 2 * rand(batch, n)
+    axis = torch.stack((angle.cos(), angle.sin()), -1)
+    cov = torch.eye(2, dtype=D) + (spread**2 - 1)[..., None, None] * axis[..., None] * axis[..., None, :]
+    uv_1 = uv_1 + noise * (torch.linalg.cholesky(cov) @ randn(batch, n, 2, 1))[..., 0]
+    sensed = z * (1 + depth * randn(batch, n))
+    xyz = torch.where((torch.arange(n) < near)[:, None], ray * sensed[..., None], torch.nan)
+    zero = torch.zeros(batch, n, dtype=D)
+    code = zero.to(torch.int32)
+    sigma = max(depth, 1e-3) * sensed
+    samples = Samples(uv_0, sensed * (torch.arange(n) < near), sigma, xyz, zero + 1, code, zero + 1, code)
+    tracks = Tracks(uv_0, uv_1, zero, zero, cov * 0.01, zero == 0)
+    return (samples, tracks, camera_0, camera_1, DRAWS.expand(batch, -1, -1)), T, b, z
+
+
+def errors(fit, T):
+    """Rotation (rad) and translation (m) errors as one tangent vector (B, 6)."""
+    delta = se3.compose(Pose(fit.T_1_from_0.R.to(D), fit.T_1_from_0.t.to(D)), se3.invert(T))
+    R = delta.R
+    omega = 0.5 * torch.stack((R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]), -1)
+    return torch.cat((omega, delta.t), -1)
+
+
+def nees(fit, T):
+    return covariance.mahalanobis(errors(fit, T), fit.cov.to(D)) ** 2 / 6
+
+
+def put(args, **changes):
+    """The seat's arguments with fields of the tracks (or ``xyz``) replaced."""
+    samples, tracks, *rest = args
+    if "xyz" in changes:
+        samples = samples.replace(xyz=changes.pop("xyz"))
+    return samples, tracks.replace(**changes), *rest
+
+
+# -------------------------------------------------------------------------------------------------- accuracy
+
+
+@pytest.mark.parametrize("planar", [False, True])
+def test_exact_tracks_give_the_exact_pose(planar):
+    args, T, _, _ = pairs(4, 12, 30, noise=0.0, depth=0.0, planar=planar)
+    fit = map_pose(*args)
+    assert (fit.code == PoseCode.OK).all() and fit.inlier[:, :12].all() and not fit.inlier[:, 12:].any()
+    assert errors(fit, T).abs().max() < 1e-8 and fit.shutter.turn.abs().max() < 1e-8
+
+
+def test_far_tracks_and_weights_beat_near_points_alone():
+    args, T, _, _ = pairs(24, 30, 200, depth=0.02, planar=True)
+    plain, joint = errors(pnp_ransac(*args), T), errors(map_pose(*args), T)
+    near = errors(map_pose(*args, far_weight=1e-9), T)
+    for part in (slice(0, 3), slice(3, 6)):
+        size = [e[:, part].norm(dim=-1).median() for e in (plain, near, joint)]
+        assert size[2] < 0.8 * size[1] and size[2] < 0.6 * size[0]
+
+
+@pytest.mark.parametrize(("trials", "band"), [(80, 0.25), pytest.param(500, 0.05, marks=pytest.mark.slow)])
+def test_covariance_is_that_of_the_errors(trials, band):
+    """Trials with the assumed noise: the mean of the normalised squared error lies in the band of chi² / 6."""
+    args, T, _, _ = pairs(trials, 60, 140)
+    fit = map_pose(*args, turn_sigma=0.0, isotropic=0.0)
+    assert (fit.code == PoseCode.OK).all()
+    assert abs(nees(fit, T).mean() - 1) < band  # 1.96 of its deviations are 1.96 sqrt(2 / (6 trials))
+    assert abs(fit.sigma_px.mean() / (0.3 * 2.5**0.5) - 1) < 0.05  # the shapes' median mean variance is 2.5
+
+
+def test_sigma_is_the_spread_of_far_depths():
+    args, _, _, z = pairs(40, 60, 140)
+    fit = map_pose(*args, isotropic=0.0)
+    estimate = two_view(*args[:2], fit, *args[2:4], max_residual_px=None, fitted_noise=True, isotropic=0.0)
+    far = estimate.keep & (torch.arange(200) >= 60) & (estimate.sigma < 0.1 * z)
+    standard = ((estimate.depth - z) / estimate.sigma)[far]
+    assert len(standard) > 1000 and abs((standard.abs() < 1).double().mean() - 0.68) < 0.05
+    assert (estimate.sigma_shared[far] > 0).all() and (estimate.sigma_shared <= estimate.sigma)[far].all()
+
+
+# ------------------------------------------------------------------------------------------------------- options
+
+
+def newton_step(args, fit, o, isotropic):
+    """Of one pair: how far the written-out problem (``support/dense_reprojection.py``) would still go from the answer, in its deviations."""
+    problem = dense.problem_of(args, isotropic)
+    at = dense.unknowns(fit.T_1_from_0.R, fit.T_1_from_0.t, fit.shutter.turn)
+    tracks = dense.tracks(problem, at, most_probable.noise_scale(problem, at))
+    weights = [dense.weight(x.square, o.kernel, o.bend)[1] * (x.near + o.far_weight * x.far) for x in tracks]
+    H, g = dense.reduced(tracks, weights)
+    known = np.diag([0.0] * 6 + [o.turn_sigma**-2 if fit.shutter.turn.abs().amax() > 1e-9 else 1e18] * 3)
+    step = np.linalg.solve(H + known, g + known @ np.append(np.zeros(6), at.turn[0].numpy()))
+    return np.abs(step[:6] / np.sqrt(np.diag(np.linalg.inv(H + known)))[:6]).max()
+
+
+@pytest.mark.parametrize(
+    ("isotropic", "options"),
+    [
+        (0.1, {}),
+        (1.0, {}),
+        (0.1, {"far_weight": 1.0}),
+        (0.1, {"bend": 0.7}),
+        (0.1, {"kernel": "huber", "bend": 0.7}),
+        (0.1, {"kernel": None}),
+        (0.1, {"turn_sigma": 0.002, "turn_gain": -1.0}),
+    ],
+)
+def test_the_answer_is_the_optimum_of_the_problem_that_its_options_describe(isotropic, options):
+    """And not the optimum of the default's, so every option reaches the problem."""
+    args, *_ = pairs(1, 20, 40, depth=0.01 if "bend" in options else 0.03, turn=0.002, seed=2)
+    base = most_probable.FitOptions(max_rise=10.0, near_steps=8, steps=16, turn_sigma=0.0, translation_gain=-9.0)
+    o = base._replace(**options)
+    fit = map_pose(*args, isotropic=isotropic, **o._asdict())
+    assert fit.code.tolist() == [PoseCode.OK] and (fit.shutter.turn.abs().amax() > 1e-5) == (o.turn_sigma > 0)
+    assert newton_step(args, fit, o, isotropic) < 0.1
+    if options or isotropic != 0.1:
+        plain = map_pose(*args, **base._asdict())
+        assert newton_step(args, plain, o, isotropic) > 0.2 or o.turn_sigma > 0
+
+
+def test_the_near_cost_may_rise_by_the_share_that_is_allowed():
+    """Far tracks that have moved on their own; how far the near cost rises with them is read from the written-out one."""
+    args, *_ = pairs(1, 12, 60, noise=0.3, depth=0.003, baseline=0.3, seed=4)
+    shift = torch.tensor([3.3, 2.1], dtype=D) * (torch.arange(72) >= 12)[:, None]
+    args = put(args, uv_1=args[1].uv_1 + shift)
+    o = most_probable.FitOptions(far_weight=0.5, turn_sigma=0.0, translation_gain=-9.0, near_steps=12, steps=12)
+    ask = lambda rise: map_pose(*args, **o._replace(max_rise=rise)._asdict())  # noqa: E731
+    problem, start = dense.problem_of(args, 0.1), pnp_ransac(*args).T_1_from_0
+    places = [most_probable.most_probable(problem, start, o._replace(max_rise=x)).at for x in (-9.0, 1e9)]
+    noise = most_probable.noise_scale(problem, places[1])
+    before, after = (
+        dense.cost([x for x in dense.tracks(problem, at, noise) if x.near], 0.0, o.kernel, o.bend) for at in places
+    )
+    rise = (after - 1.0) / before - 1
+    assert 0.1 < rise < 3
+    assert ask(0.95 * rise).code.tolist() == [PoseCode.KEPT_PNP] and ask(1.05 * rise).code.tolist() == [PoseCode.OK]
+
+
+def test_steps_of_the_near_tracks_and_of_all_are_counted_apart():
+    """From a start off the truth, with the near tracks alone answered: only their own steps bring it there."""
+    args, T, *_ = pairs(1, 20, 40, noise=0.0, depth=0.0)
+
+    def off(samples, tracks, *_):
+        zero = torch.zeros(1, dtype=D)
+        start = se3.retract(T, torch.full((1, 6), 0.02, dtype=D))
+        return PoseFit(start, torch.zeros(1, 6, 6, dtype=D), tracks.valid, zero.long(), zero, zero, zero, zero.int())
+
+    miss = [
+        float(
+            errors(
+                map_pose(*args, start=off, max_rise=-9.0, turn_sigma=0.0, translation_gain=-9.0, near_steps=a, steps=b),
+                T,
+            )
+            .abs()
+            .max()
+        )
+        for a, b in ((8, 1), (0, 8))
+    ]
+    assert miss[0] < 1e-9 and miss[1] > 1e-6
+
+
+def test_what_is_said_about_a_pose_follows_from_its_tracks():
+    """Inliers, their rms, the noise and the significance of the translation, from numpy, one track at a time."""
+    args, *_ = pairs(2, 24, 40, turn=0.004, seed=3)
+    _samples, tracks, _camera_0, _camera_1, _ = args
+    wrong = tracks.uv_1.clone()
+    wrong[:, 2, 0] += 2.0
+    wrong[:, 5, 1] -= 5.0
+    args = put(args, uv_1=wrong)
+    for limit in (1.5, 3.0):
+        fit = map_pose(*args, threshold_px=limit)
+        assert fit.ok.all() and fit.shutter.turn.abs().amax(-1).min() > 1e-4
+        problem = dense.problem_of(args, 0.1)
+        at = dense.unknowns(fit.T_1_from_0.R, fit.T_1_from_0.t, fit.shutter.turn)
+        for b in range(2):
+            error = np.array([np.linalg.norm(x.r) for x in dense.tracks(problem, at, problem.inverse, b) if x.near])
+            assert fit.inlier[b, :24].tolist() == (error < limit).tolist() and not fit.inlier[b, 24:].any()
+            assert int(fit.n_inlier[b]) == (error < limit).sum() and not fit.inlier[b, 5]
+            np.testing.assert_allclose(float(fit.rms_px[b]), np.sqrt((error[error < limit] ** 2).mean()), rtol=1e-6)
+            t, cov = fit.T_1_from_0.t[b].numpy(), fit.cov[b, 3:, 3:].numpy()
+            np.testing.assert_allclose(float(fit.t_snr[b]), np.sqrt(t @ np.linalg.inv(cov) @ t), rtol=1e-7)
+            noise = most_probable.noise_scale(problem, at)[b]
+            np.testing.assert_allclose(float(fit.sigma_px[b]) ** 2, float(noise[30]), rtol=0.2)
+        assert torch.equal(fit.cov, fit.shutter.cov[:, :6, :6])
+    args = put(args, uv_1=tracks.uv_1, valid=tracks.valid & (torch.arange(64) < 24))
+    alone = map_pose(*args, translation_gain=-9.0)  # without far tracks their noise is that of the near ones
+    at = dense.unknowns(alone.T_1_from_0.R, alone.T_1_from_0.t, alone.shutter.turn)
+    noise = most_probable.noise_scale(dense.problem_of(args, 0.1), at)[:, 0]
+    assert alone.ok.all()
+    torch.testing.assert_close(alone.sigma_px**2, noise, rtol=0.2, atol=0)
+
+
+# ------------------------------------------------------------------------------------------------ what is believed
+
+
+def test_rows_that_turn_are_found_and_undone():
+    args, T, b, z = pairs(12, 80, 160, turn=0.01)
+    loose, rigid = map_pose(*args), map_pose(*args, turn_sigma=0.0)
+    assert loose.ok.all()
+    assert (loose.shutter.turn - b).norm(dim=-1).median() < 0.1 * b.norm(dim=-1).median()
+    assert errors(loose, T)[:, :3].norm(dim=-1).median() < 0.5 * errors(rigid, T)[:, :3].norm(dim=-1).median()
+    far = torch.arange(240) >= 80
+    error = []
+    for fit in (loose, rigid):
+        estimate = two_view(*args[:2], fit, *args[2:4])
+        error.append((estimate.depth / z - 1).abs()[estimate.keep & far].median())
+    assert error[0] < 0.7 * error[1]
+    still = map_pose(*pairs(16, 80, 160)[0])
+    assert (still.shutter.turn.abs() < 1e-9).double().mean() > 0.9  # 2 % of the cost is not taken away by chance
+
+
+def test_a_given_pose_brings_its_shutter_along():
+    """Depth under a known pose: exact where the turn of the rows is known too, as little sure as its covariance says."""
+    args, T, b, z = pairs(4, 10, 60, noise=0.0, depth=0.0, turn=0.005)
+    zero, batch = torch.zeros(4, dtype=D), torch.zeros(4, 6, 6, dtype=D)
+    known = PoseFit(T, batch, zero[:, None].expand(4, 70) > 1, zero.long(), zero, zero + 1, zero + 1e3, zero.int())
+    rows = known.replace(shutter=Shutter(b, torch.zeros(4, 9, 9, dtype=D)))
+    vague = known.replace(
+        shutter=Shutter(b, torch.diag_embed(torch.tensor([0.0] * 6 + [1e-4] * 3, dtype=D)).expand(4, 9, 9))
+    )
+    plain, exact, unsure = (two_view(*args[:2], fit, *args[2:4]) for fit in (known, rows, vague))
+    both = plain.keep & exact.keep
+    off = [((e.depth / z - 1).abs()[both]).median() for e in (plain, exact)]
+    assert both.sum() > 150 and off[1] < 0.02 * off[0]
+    assert (exact.sigma_shared[exact.keep] == 0).all() and (unsure.sigma_shared[unsure.keep] > 0).all()
+
+
+def test_a_turn_that_was_not_believed_is_not_known_to_be_none():
+    """Where turns are too small to be seen the pose takes their part, and its covariance says so."""
+    args, T, _, _ = pairs(40, 60, 140, turn=0.0015)
+    fit, rigid = (map_pose(*args, isotropic=0.0, turn_gain=9.0, turn_sigma=sigma) for sigma in (0.01, 0.0))
+    assert fit.ok.all() and fit.shutter.turn.abs().amax() < 1e-9
+    assert 0.8 < nees(fit, T).mean() < 1.6 and nees(rigid, T).mean() > 1.35 * nees(fit, T).mean()
+
+
+def test_far_tracks_that_contradict_are_left_out():
+    """The far scene turns on its own: the near tracks alone are answered, and it is said."""
+    args, T, _, _ = pairs(4, 80, 400, baseline=0.3, noise=0.1, depth=0.002)
+    camera_1, uv_1 = args[3], args[1].uv_1
+    ray = cam.rays(camera_1, uv_1)
+    turned = ray + torch.linalg.cross(torch.tensor([0.002, 0.004, 0.003], dtype=D).expand_as(ray), ray)
+    far = (torch.arange(480) >= 80)[:, None]
+    moved = put(args, uv_1=torch.where(far, cam.project(camera_1, turned), uv_1))
+    fit, believed, near = (
+        map_pose(*moved, turn_sigma=0.0, far_weight=weight, max_rise=rise)
+        for weight, rise in ((1.0, 0.1), (1.0, 1e9), (1e-9, 0.1))
+    )
+    assert (fit.code == PoseCode.KEPT_PNP).all() and (believed.code == PoseCode.OK).all()
+    torch.testing.assert_close(fit.T_1_from_0.t, near.T_1_from_0.t, rtol=0, atol=1e-4)
+    assert errors(fit, T)[:, 3:].norm(dim=-1).median() < 0.2 * errors(believed, T)[:, 3:].norm(dim=-1).median()
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_pure_rotation_is_silent(noise):
+    args, _, _, _ = pairs(8, 80, 160, baseline=0.0, noise=noise)
+    fit = map_pose(*args)
+    assert (fit.code == PoseCode.NO_BASELINE).all() and not fit.ok.any() and fit.T_1_from_0.t.isnan().all()
+    estimate = two_view(*args[:2], fit, *args[2:4])
+    assert (estimate.gate == Gate.NO_BASELINE).all()
+    if noise:
+        assert (map_pose(*args, translation_gain=-1e9).code != PoseCode.NO_BASELINE).all()
+
+
+def test_without_a_start_there_is_no_pose():
+    args, _, _, _ = pairs(3, 30, 60)
+    valid = args[1].valid.clone()
+    valid[0, 3:30], valid[1, :] = False, False
+    fit = map_pose(*put(args, valid=valid))
+    assert fit.code.tolist() == [PoseCode.TOO_FEW, PoseCode.TOO_FEW, PoseCode.OK]
+    for x in (fit.T_1_from_0.R, fit.T_1_from_0.t, fit.cov, fit.sigma_px, fit.t_snr, fit.shutter.turn, fit.shutter.cov):
+        assert x[:2].isnan().all() and x[2].isfinite().all()
+    assert not fit.inlier[:2].any()
+
+
+def test_near_tracks_that_say_nothing_of_their_depth_leave_the_pose_undetermined():
+    """Without a standard deviation they are no near tracks, and far ones alone have no scale."""
+    args, *_ = pairs(3, 30, 60)
+    sigma = args[0].sigma.clone()
+    sigma[0], sigma[1] = torch.nan, 0.0
+    fit = map_pose(args[0].replace(sigma=sigma), *args[1:])
+    assert fit.code.tolist() == [PoseCode.DEGENERATE, PoseCode.DEGENERATE, PoseCode.OK]
+    assert fit.T_1_from_0.t[:2].isnan().all() and not fit.inlier[:2].any()
+    line = args[0].xyz.clone()
+    line[0, :30] = line[0, :1] + torch.linspace(0, 1, 30, dtype=D)[:, None] * torch.tensor([0.3, 0.1, 0.4], dtype=D)
+    on_line = put(args, xyz=line, uv_1=args[1].uv_1)
+    assert map_pose(*on_line).code[0] in (PoseCode.DEGENERATE, PoseCode.TOO_FEW)
+
+
+def test_the_start_is_another_function_of_the_seat():
+    """From the truth instead of a search: no draws are needed, and its refusal is the answer's."""
+    args, T, *_ = pairs(2, 20, 40)
+
+    def known(samples, tracks, camera_0, camera_1, draws):
+        zero, batch = torch.zeros(2, dtype=D), torch.zeros(2, 6, 6, dtype=D)
+        code = torch.tensor([PoseCode.OK, PoseCode.TOO_FEW], dtype=torch.int32)
+        return PoseFit(T, batch, tracks.valid, zero.long() + 5, zero, zero, zero, code)
+
+    fit = map_pose(*args, start=known)
+    assert fit.code.tolist() == [PoseCode.OK, PoseCode.TOO_FEW] and fit.n_inlier.tolist()[1] == 5
+    torch.testing.assert_close(fit.T_1_from_0.t[0], map_pose(*args).T_1_from_0.t[0], rtol=0, atol=1e-6)
+
+
+def test_mistracks_and_values_that_cannot_be_used_do_not_matter():
+    args, T, _, _ = pairs(8, 60, 140, noise=0.2)
+    clean = errors(map_pose(*args), T)[:, :3].norm(dim=-1).median()
+    wrong = torch.arange(200) % 10 < 3
+    g = torch.Generator().manual_seed(3)
+    anywhere = torch.rand(8, 200, 2, generator=g, dtype=D) * 450
+    dirty = put(args, uv_1=torch.where(wrong[:, None], anywhere, args[1].uv_1))
+    assert errors(map_pose(*dirty), T)[:, :3].norm(dim=-1).median() < 2 * clean
+    uv_1, cov = args[1].uv_1.clone(), args[1].cov.clone()
+    uv_1[:, wrong], cov[:, 5] = torch.nan, torch.nan
+    hidden = map_pose(*put(args, valid=args[1].valid & ~wrong, cov=cov))
+    spoilt = map_pose(*put(args, uv_1=uv_1, cov=cov))
+    torch.testing.assert_close(hidden.T_1_from_0.t, spoilt.T_1_from_0.t, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, D])
+def test_a_pair_with_few_tracks_beside_one_with_many_is_answered_as_alone(dtype):
+    """Bit for bit: a pair is solved on as many tracks as the fullest of its company has."""
+    args, *_ = pairs(3, 400, 1400)
+    share = torch.tensor([1.0, 0.3, 0.05])[:, None]
+    used = torch.rand(3, 1800, generator=torch.Generator().manual_seed(4)) < share
+    samples, tracks, *rest = (x.to(dtype) for x in put(args, valid=used))
+    together = map_pose(samples, tracks, *rest)
+    alone = [map_pose(samples[b : b + 1], tracks[b : b + 1], *(x[b : b + 1] for x in rest)) for b in range(3)]
+    assert together.ok.all()
+    for b, fit in enumerate(alone):
+        for one, all_ in zip(tree_leaves(fit), tree_leaves(together), strict=True):
+            assert torch.equal(one[0], all_[b])
+
+
+# ------------------------------------------------------------------------------------------------------ gradients
+
+
+def test_gradient_of_the_whole_stage_at_exact_data():
+    args, _, _, _ = pairs(1, 9, 3, noise=0.0, depth=0.0)
+    samples, tracks, camera_0, camera_1, draws = args
+    leaves = [
+        x.clone().requires_grad_() for x in (samples.xyz[:, :9], tracks.uv_0, tracks.uv_1, camera_0.f, camera_1.f)
+    ]
+
+    def pose(xyz, uv_0, uv_1, f_0, f_1):
+        full = torch.cat((xyz, samples.xyz[:, 9:]), 1)
+        moved = samples.replace(xyz=full), tracks.replace(uv_0=uv_0, uv_1=uv_1)
+        fit = map_pose(*moved, camera_0.replace(f=f_0), camera_1.replace(f=f_1), draws, steps=12, near_steps=8)
+        return fit.T_1_from_0.R, fit.T_1_from_0.t
+
+    assert torch.autograd.gradcheck(pose, leaves, eps=1e-6, atol=1e-5, rtol=1e-3, fast_mode=True)
+
+
+def test_gradients_stay_finite_whatever_the_input():
+    args, _, _, _ = pairs(4, 24, 40, noise=0.3)
+    xyz, uv_1, valid = args[0].xyz.clone(), args[1].uv_1.clone(), args[1].valid.clone()
+    xyz[0, :24:2], uv_1[1, ::3], valid[2] = torch.nan, torch.nan, False
+    xyz[3, :24] = xyz[3, :1]
+    leaves = [x.requires_grad_() for x in (xyz, uv_1, args[3].f.clone(), args[2].c.clone())]
+    moved = put(args, xyz=leaves[0], uv_1=leaves[1], valid=valid)
+    fit = map_pose(*moved[:2], moved[2].replace(c=leaves[3]), moved[3].replace(f=leaves[2]), moved[4])
+    (fit.T_1_from_0.R.nan_to_num().sum() + fit.T_1_from_0.t.nan_to_num().sum()).backward()
+    for x in leaves:
+        assert x.grad.isfinite().all()
+    assert not fit.cov.requires_grad and (leaves[1].grad[0] != 0).any()
+
+
+def test_options_have_one_default():
+    options, conf = most_probable.FitOptions()._asdict(), Path(__file__).parents[2] / "conf" / "method"
+    written = yaml.safe_load((conf / "map.yaml").read_text())["pose"]
+    defaults = {k: v for k, v in map_pose.__kwdefaults__.items() if k != "start"}
+    assert defaults == options | {k: defaults[k] for k in ("isotropic", "threshold_px")}
+    assert defaults == {k: v for k, v in written.items() if k[0] != "_" and k != "start"}
+    for start in (written["start"], yaml.safe_load((conf / "paper.yaml").read_text())["pose"]):
+        assert pnp_ransac.__kwdefaults__ == {k: v for k, v in start.items() if k[0] != "_"}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_returns_from_far_away_do_not_hide_a_baseline(seed):
+    """A pose that is fixed by the near returns alone is fixed with all returns, too."""
+    (samples, *others), _, _, z = pairs(1, 60, 300, noise=0.4, baseline=0.025, rotation=0.0, seed=seed)
+    cut = map_pose(samples, *others)
+    known = torch.where(samples.depth > 0, samples.depth, z)
+    ray = cam.rays(others[1], samples.uv)
+    everything = samples.replace(depth=known, xyz=torch.where(samples.xyz.isfinite(), samples.xyz, ray * z[..., None]))
+    whole = map_pose(everything, *others)
+    assert cut.ok.all() and whole.ok.all()
+
+
+def test_a_turn_alone_is_no_baseline_however_many_returns_there_are():
+    (samples, *others), *_ = pairs(4, 300, 60, noise=0.4, baseline=0.0, rotation=0.05)
+    assert (map_pose(samples, *others).code == PoseCode.NO_BASELINE).all()

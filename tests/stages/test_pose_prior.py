@@ -1,0 +1,417 @@
+"""Poses from elsewhere: held against near returns, in sigma, in samples; what a wrong one is called."""
+
+import warnings
+
+import pytest
+import torch
+from support.sample_dicts import GAP, frames, room
+
+from dhtorch.codes import Gate, PoseCode
+from dhtorch.experiments.baselines.device_pose import given_pose
+from dhtorch.geometry import camera as cam
+from dhtorch.geometry import pose_conventions as conventions
+from dhtorch.geometry import se3
+from dhtorch.pipeline.presets import METHODS
+from dhtorch.pytree import collate, stack
+from dhtorch.records import Camera, GivenPose, Pose, Samples, StartPose, Tracks
+from dhtorch.stages import pose_prior as given
+from dhtorch.synthetic import SyntheticRoom
+from dhtorch.transforms import ExtendDepth, ExtendedDataset, SampleError
+from dhtorch.transforms import poses as of_samples
+
+N = 400
+SIGMA = (0.004, 0.008)
+
+
+@pytest.fixture(scope="module")
+def pairs():
+    """Three pairs of a phone in the room, their true depth, and poses: places far from the world's origin."""
+    walk = SyntheticRoom(n_frames=16, hw=(180, 240), depth_hw=(72, 96), range_limit=2.5, supersample=1)
+    first, second = [0, 2, 4], [9, 12, 15]
+    truth = torch.stack([walk.truth(i)["depth"][0] for i in first])
+    worlds = walk.true_poses[torch.tensor(first)], walk.true_poses[torch.tensor(second)]
+    return collate(walk[i] for i in first), collate(walk[i] for i in second), truth, worlds
+
+
+def asked(pairs, motion, method="map", **options):
+    anchor, other, truth, _ = pairs
+    trace = {}
+    estimate = METHODS[method](anchor, other, n=N, fit=motion.to(torch.float32), trace=trace, **options)
+    uv = (estimate.uv + 0.5).floor().long()
+    z = truth[torch.arange(len(truth))[:, None], uv[..., 1], uv[..., 0]]
+    far = estimate.keep & ~trace["samples"].usable
+    return estimate, trace["fit"], ((estimate.depth - z) / z)[far], ((estimate.depth - z) / estimate.sigma)[far]
+
+
+def off_by(T, sigma, seed=0):
+    draw = torch.randn(len(T.t), 6, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return se3.compose(se3.exp(draw * torch.tensor([sigma[0]] * 3 + [sigma[1]] * 3)), T)
+
+
+# ---------------------------------------------------------------------------------------------------- in the room
+
+
+@pytest.mark.parametrize("method", ["paper", "map"])
+def test_a_right_pose_is_used_as_it_is(pairs, method):
+    T = se3.relative(*pairs[3])
+    _, fit, error, _ = asked(pairs, given.between(*pairs[3], sigma=(1e-4, 1e-4)), method)
+    assert fit.ok.all() and error.numel() > 150 and error.abs().median() < 0.03
+    assert torch.equal(fit.T_1_from_0.R, T.R.float()) and torch.equal(fit.T_1_from_0.t, T.t.float())
+    assert torch.equal(fit.cov, torch.diag(torch.tensor([1e-8] * 6)).expand(3, 6, 6))
+    assert (fit.looks == 0).all() and fit.n_inlier.amin() > 50
+
+
+def test_a_stated_covariance_makes_sigma_honest(pairs):
+    T = se3.relative(*pairs[3])
+    shares, wide, narrow = [], [], []
+    for seed in range(4):
+        motion = off_by(T, SIGMA, seed)
+        estimate, fit, _, z = asked(pairs, given.stated(motion, sigma=SIGMA))
+        assert fit.ok.all()
+        shares.append((z.abs() < 1).float().mean())
+        wide.append(estimate.sigma[estimate.keep].median())
+        bold = asked(pairs, given.stated(motion, sigma=(1e-4, 1e-4)))
+        narrow.append(bold[0].keep.any())
+    share = torch.stack(shares).mean()
+    assert 0.5 < share < 0.95, share
+    assert not any(narrow), "a pose that is off by forty of its own standard deviations is refuted"
+    exact = asked(pairs, given.stated(T, sigma=(1e-4, 1e-4)))[0]
+    assert torch.stack(wide).mean() > 1.5 * exact.sigma[exact.keep].median(), "what the pose does not know is in sigma"
+
+
+def test_a_covariance_that_is_not_stated_is_taken_from_the_near_returns(pairs):
+    T = se3.relative(*pairs[3])
+    _, right, *_ = asked(pairs, given.stated(T))
+    _, off, _, z = asked(pairs, given.stated(off_by(T, (0.002, 0.004))))
+    assert right.ok.all() and off.ok.all()
+    spread = lambda fit: fit.cov.diagonal(dim1=1, dim2=2).sum(-1)  # noqa: E731
+    assert (spread(off) > 1.5 * spread(right)).all() and (z.abs() < 2).float().mean() > 0.6
+    dark = pairs[0].replace(depth=torch.zeros_like(pairs[0].depth))
+    _, fit, *_ = asked((dark, *pairs[1:]), given.stated(T, sigma=(0.0, 0.0)))
+    assert fit.ok.all() and (fit.cov == 0).all() and fit.t_snr.isinf().all(), "exact because it is said"
+
+
+@pytest.fixture(scope="module")
+def few_returns(pairs):
+    """The method where so many near returns are found again: fewer than a pose of their own takes."""
+    trace = {}
+    METHODS["map"](pairs[0], pairs[1], n=N, trace=trace)
+    samples, tracks = trace["samples"], trace["tracks"]
+    found = tracks.valid & samples.usable & trace["fit"].inlier
+
+    def method(count):
+        xyz = torch.where((found & (found.cumsum(1) <= count))[..., None], samples.xyz, torch.nan)
+        seen = samples.replace(xyz=xyz)
+        return METHODS["map"].replace(n=N, classify=lambda *_: seen, track=lambda *_, hint: tracks)
+
+    return method
+
+
+def test_a_pose_for_which_nobody_vouches_is_not_used(pairs, few_returns):
+    """Without a covariance and with hardly a near return, sigma would be anybody's guess."""
+    T = se3.relative(*pairs[3])
+
+    def fit(count, motion, **options):
+        trace = {}
+        few_returns(count)(pairs[0], pairs[1], fit=given.stated(motion, **options).to(torch.float32), trace=trace)
+        return trace["fit"]
+
+    want = torch.tensor([0.01**2] * 3 + [0.02**2] * 3)
+    confirmed = fit(6, T)
+    assert confirmed.ok.all() and torch.allclose(confirmed.cov.diagonal(dim1=1, dim2=2).float(), want), "assumed"
+    for count, motion in (
+        (0, T),
+        (3, T),
+        (6, T.replace(t=1000 * T.t)),
+        (6, se3.invert(T)),
+        (0, T.replace(t=1000 * T.t)),
+    ):
+        for refine in (False, True):
+            assert (fit(count, motion, refine=refine).code == PoseCode.TOO_FEW).all(), (count, refine)
+    assert fit(0, T, sigma=SIGMA).ok.all(), "it is vouched for"
+
+
+WRONG = {
+    name: (lambda T, M=M: conventions.in_axes(T, tuple(zip(*M, strict=True))))
+    for name, M in conventions.AXES.items()
+    if name
+}
+WRONG["the inverse"] = se3.invert
+WRONG["millimetres"] = lambda T: T.replace(t=T.t * 1000)
+WRONG["centimetres"] = lambda T: T.replace(t=T.t * 100)
+WRONG["OpenGL axes (x right, y up, z backward), the inverse"] = lambda T: se3.invert(
+    WRONG["OpenGL axes (x right, y up, z backward)"](T)
+)
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_pose_is_refuted_and_named(pairs, name):
+    estimate, fit, *_ = asked(pairs, given.stated(WRONG[name](se3.relative(*pairs[3]))), "paper")
+    assert (fit.code == PoseCode.REFUTED).all() and not fit.ok.any() and fit.T_1_from_0.t.isnan().all()
+    assert {conventions.CONVENTIONS[i] for i in fit.looks.tolist()} == {name}
+    silent = set(estimate.gate.unique().tolist())
+    assert Gate.POSE_REFUTED in silent and not silent - {Gate.NO_TRACK, Gate.NO_TEXTURE, Gate.POSE_REFUTED}
+
+
+def test_poses_of_the_camera_read_as_poses_of_the_world_are_named(pairs):
+    _, fit, *_ = asked(pairs, given.between(*(se3.invert(T) for T in pairs[3])), "paper")
+    assert {conventions.CONVENTIONS[i] for i in fit.looks.tolist()} == {"the inverse"}
+
+
+def test_a_nonsense_pose_is_refuted_without_a_name(pairs):
+    T = off_by(se3.relative(*pairs[3]), (0.5, 0.5))
+    _, fit, *_ = asked(pairs, given.stated(T), "paper")
+    assert (fit.code == PoseCode.REFUTED).all() and (fit.looks == 0).all()
+
+
+def test_one_wrong_pose_of_a_batch_silences_its_pair_alone(pairs):
+    T = se3.relative(*pairs[3])
+    mixed = T.replace(t=torch.where(torch.tensor([[False], [True], [False]]), -T.t, T.t))
+    estimate, fit, *_ = asked(pairs, given.stated(mixed))
+    assert fit.ok.tolist() == [True, False, True]
+    alone = asked(tuple(x[2:] if k < 3 else x for k, x in enumerate(pairs)), given.stated(mixed[2:]))[0]
+    assert torch.equal(alone.gate[0], estimate.gate[2])
+    assert fit.inlier.any(1).tolist() == [True, False, True]
+
+
+def test_a_pose_that_explains_a_third_of_the_returns_in_some_reading_has_no_name():
+    """Twice the motion, the wrong way round: read as the inverse it fits what is far away, and that is not enough."""
+    camera = Camera(torch.tensor([[500.0, 500.0]]), torch.tensor([[320.0, 240.0]]))
+    g = torch.Generator().manual_seed(0)
+    depth = torch.cat((torch.linspace(0.5, 2.0, 39), torch.linspace(20.0, 22.0, 21)))
+    xyz = torch.cat((torch.rand(60, 2, generator=g) - 0.5, torch.ones(60, 1)), 1) * depth[:, None]
+    T = se3.identity(1, torch.zeros(1)).replace(t=torch.tensor([[0.2, 0.0, 0.0]]))
+    uv = cam.project(camera, se3.apply(T, xyz[None]))
+    zero = torch.zeros(1, 60)
+    samples = Samples(uv, depth[None], 0.001 * depth[None], xyz[None], zero + 1, zero.int(), zero + 1, zero.int())
+    tracks = Tracks(uv, uv, zero, zero, torch.eye(2).expand(1, 60, 2, 2), zero == 0)
+    motion = given.stated(T.replace(t=-2 * T.t), sigma=(1e-3, 1e-3))
+    fit = given.hold(motion, samples, tracks, camera, camera, given_pose(T, 60))
+    assert fit.code.tolist() == [PoseCode.REFUTED] and fit.looks.tolist() == [0] and not fit.inlier.any()
+    motion = given.stated(T.replace(t=0.5 * T.t), sigma=(1e-3, 1e-3))
+    fit = given.hold(motion, samples, tracks, camera, camera, given_pose(T, 60))
+    assert fit.code.tolist() == [PoseCode.REFUTED] and int(fit.n_inlier) == 21 and not fit.inlier.any()
+    motion = given.stated(T.replace(t=-T.t), sigma=(1e-3, 1e-3))
+    fit = given.hold(motion, samples, tracks, camera, camera, given_pose(T, 60))
+    assert conventions.CONVENTIONS[int(fit.looks)] == "the inverse"
+
+
+def test_refining_starts_from_the_given_pose(pairs):
+    T = se3.relative(*pairs[3])
+    rough = off_by(T, (0.003, 0.006), seed=1)
+    _, fit, *_ = asked(pairs, given.stated(rough, refine=True))
+    assert isinstance(given.stated(rough, refine=True), StartPose) and fit.ok.all() and fit.shutter is not None
+    distance = lambda A: (A.t.double() - T.t).norm(dim=-1)  # noqa: E731
+    assert (distance(fit.T_1_from_0) < distance(rough)).all()
+    _, refuted, *_ = asked(pairs, given.stated(se3.invert(T), refine=True))
+    assert (refuted.code == PoseCode.REFUTED).all() and (refuted.looks > 0).all()
+
+
+def test_where_a_search_ends_is_held_against_the_near_returns(pairs):
+    _, fit, *_ = asked(pairs, given.stated(se3.relative(*pairs[3]), refine=True))
+    codes = torch.tensor([PoseCode.REFUTED, PoseCode.OK, PoseCode.TOO_FEW])
+    left = given.without(fit, fit.replace(code=codes))
+    assert left.code.tolist() == codes.tolist() and left.ok.tolist() == [False, True, False]
+    assert left.T_1_from_0.t.isnan().all(1).tolist() == [True, False, True] and not left.inlier[0].any()
+    assert torch.equal(left.shutter.cov[1], fit.shutter.cov[1]) and left.shutter.turn[2].isnan().all()
+
+
+def test_a_pose_without_translation_or_unknown_is_not_used(pairs):
+    T = se3.relative(*pairs[3])
+    anchor, _, truth, worlds = pairs
+    estimate, fit, *_ = asked((anchor, anchor, truth, worlds), given.stated(se3.identity(3, T.t)))
+    assert (fit.code == PoseCode.NO_BASELINE).all() and not estimate.keep.any()
+    estimate, fit, *_ = asked(pairs, given.stated(T.replace(t=T.t * torch.nan)))
+    assert (fit.code == PoseCode.TOO_FEW).all() and not estimate.keep.any() and (estimate.gate == Gate.NO_POSE).any()
+
+
+def test_gradients_reach_the_given_pose(pairs):
+    T = se3.relative(*pairs[3]).to(torch.float32)
+    t = T.t.clone().requires_grad_()
+    estimate = METHODS["paper"](pairs[0], pairs[1], n=N, fit=GivenPose(T.replace(t=t)))
+    estimate.depth[estimate.keep].sum().backward()
+    assert t.grad.isfinite().all() and (t.grad.norm(dim=-1) > 0).all()
+
+
+def test_frames_may_carry_the_pose(pairs):
+    method = METHODS["paper"].replace(n=N, given=lambda a, b: given.from_frames(a, b, sigma=SIGMA))
+    placed = [f.replace(T_world_from_cam=T) for f, T in zip(pairs[:2], pairs[3], strict=True)]
+    trace = {}
+    method(*placed, trace=trace)
+    assert torch.allclose(trace["fit"].T_1_from_0.t, se3.relative(*pairs[3]).t.float(), atol=1e-6)
+    several = [placed[1], placed[1].replace(T_world_from_cam=pairs[3][0])]
+    method.replace(views=2)(placed[0], several, trace=trace)
+    codes = [view["fit"].code.tolist() for view in trace["views"]]
+    assert codes[0] == [PoseCode.OK] * 3 and PoseCode.OK not in codes[1]
+    two = stack([placed[1], placed[1].replace(T_world_from_cam=pairs[3][0])])
+    motions = given.from_frames(placed[0], two).T_1_from_0
+    assert motions.t.shape == (2, 3, 3) and not motions.t[1].any()
+    torch.testing.assert_close(motions.t[0], se3.relative(*pairs[3]).t.float())
+    with pytest.raises(ValueError, match="T_world_from_cam is absent"):
+        method(placed[0], pairs[1].replace(T_world_from_cam=None))
+    with pytest.raises(ValueError, match=r"given.sigma: found \(1,\)"):
+        given.from_frames(*placed, sigma=(1,))
+
+
+def test_axes_are_turned_into_ours():
+    """Forward, a turn to the left: along x and about z of a robot's camera, along z and against y of ours."""
+    turn = se3.exp(torch.tensor([[0.0, 0.0, 0.3, 0.0, 0.0, 0.0]], dtype=torch.float64)).R
+    T = Pose(turn, torch.tensor([[1.0, 0.2, 0.1]], dtype=torch.float64))
+    found = conventions.in_axes(T, conventions.AXES["robot axes (x forward, y left, z up)"])
+    torch.testing.assert_close(found.t, torch.tensor([[-0.2, -0.1, 1.0]], dtype=torch.float64))
+    torch.testing.assert_close(se3.log(found)[0, :3], torch.tensor([0.0, -0.3, 0.0], dtype=torch.float64))
+
+
+def test_errors_of_two_poses_in_a_world_are_one_of_the_motion(pairs):
+    worlds, little = [T[:1].to(torch.float64) for T in pairs[3]], 1e-6
+    eye = torch.eye(6, dtype=torch.float64)
+    columns = []
+    for xi in little * eye:
+        moved = se3.relative(se3.compose(se3.exp(xi[None]), worlds[0]), worlds[1])
+        columns.append(se3.log(se3.compose(moved, se3.invert(se3.relative(*worlds))))[0] / little)
+    A = torch.stack(columns, 1)
+    cov = torch.diag(torch.arange(1.0, 7.0, dtype=torch.float64))[None]
+    found = conventions.relative_covariance(worlds[1], cov, 2 * cov)
+    torch.testing.assert_close(found[0], A @ (3 * cov[0]) @ A.T, rtol=1e-4, atol=1e-4)
+
+
+# ---------------------------------------------------------------------------------------------------- in samples
+
+
+@pytest.fixture
+def sample():
+    poses = se3.to_matrix(room().true_poses)
+    both = {"pose": poses[GAP].numpy(), "pose_before": poses[0].numpy()}
+    return {**frames()[GAP], "before": frames()[0]["image"], **both}
+
+
+def transform(**options):
+    keys = {"pose": "pose", "other_pose": "pose_before"}
+    return ExtendDepth(**{"depth_unit": "mm", "other_image": "before", "n": 256, **keys, **options})
+
+
+def test_samples_state_poses_in_many_ways(sample):
+    world_0, world_1 = room().true_poses[GAP : GAP + 1], room().true_poses[:1]
+    T = se3.to_matrix(se3.relative(world_0, world_1))[0].float()
+    plain = transform()(sample)
+    torch.testing.assert_close(plain["dhtorch.T_1_from_0"], T, atol=1e-5, rtol=0)
+    assert plain["dhtorch.pose_ok"] and plain["dhtorch.pose_looks"] == 0
+    gl = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64)).numpy()
+    turned = {**sample, "pose": sample["pose"] @ gl, "pose_before": sample["pose_before"] @ gl}
+    torch.testing.assert_close(transform(pose_axes="gl")(turned)["dhtorch.T_1_from_0"], T, atol=1e-5, rtol=0)
+    relative = {**sample, "pose": T[:3].numpy()}
+    one = transform(pose_kind="1_from_0", other_pose=None)(relative)
+    torch.testing.assert_close(one["dhtorch.T_1_from_0"], T, atol=1e-5, rtol=0)
+    turned = {**sample, "pose": torch.as_tensor(gl).float() @ T @ torch.as_tensor(gl).float()}
+    one = transform(pose_kind="1_from_0", other_pose=None, pose_axes="gl")(turned)
+    torch.testing.assert_close(one["dhtorch.T_1_from_0"], T, atol=1e-5, rtol=0)
+    mm = {**sample, "pose": T[:3] * torch.tensor([1, 1, 1, 1000.0])}
+    one = transform(pose_kind="1_from_0", other_pose=None, pose_unit="mm")(mm)
+    torch.testing.assert_close(one["dhtorch.T_1_from_0"], T, atol=1e-4, rtol=0)
+    film = {k: v for k, v in sample.items() if "before" not in k}
+    film |= {"image": torch.as_tensor(sample["image"])[None].repeat(2, 1, 1, 1), "pose": torch.eye(4).repeat(2, 1, 1)}
+    film["image"][0], film["pose"][0] = torch.as_tensor(sample["before"]), T
+    film["pose"] = torch.linalg.inv(film["pose"].double())
+    one = transform(other_image=None, other_pose=None)(film)
+    torch.testing.assert_close(one["dhtorch.T_1_from_0"], T, atol=1e-5, rtol=0)
+
+
+def test_samples_state_covariances(sample):
+    two = transform(pose_cov=(0.01, 0.02))(sample)
+    torch.testing.assert_close(two["dhtorch.pose_cov"].diagonal(), torch.tensor([1e-4] * 3 + [4e-4] * 3))
+    assert not transform(pose_cov=(0.0, 0.0))(sample)["dhtorch.pose_cov"].any(), "known exactly"
+    sample["cov"] = torch.diag(torch.tensor([0.5e-4] * 3 + [2e-4] * 3)).numpy()
+    each = transform(pose_cov="cov")(sample)["dhtorch.pose_cov"]
+    assert each.diagonal()[:3].sum() == pytest.approx(3e-4, rel=1e-4), "two cameras, two errors"
+    kept = transform(pose_cov="cov", pose_kind="1_from_0", other_pose=None)
+    sample["pose"] = torch.eye(4)
+    sample["pose"][0, 3] = 5.0
+    with pytest.warns(UserWarning, match="near returns contradict the pose"):
+        assert kept(sample)["dhtorch.pose_code"] == PoseCode.REFUTED
+
+
+def test_a_wrong_pose_in_a_sample_is_named(sample):
+    sample |= {
+        "pose": torch.linalg.inv(torch.as_tensor(sample["pose"])),
+        "pose_before": torch.linalg.inv(torch.as_tensor(sample["pose_before"])),
+    }
+    with pytest.warns(UserWarning, match="pose: the near returns contradict the pose; looks like the inverse"):
+        out = transform()(sample)
+    assert conventions.CONVENTIONS[out["dhtorch.pose_looks"]] == "the inverse" and not out["dhtorch.pose_ok"]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda T: T * torch.tensor([-1.0, 1, 1, 1]), "a reflection: are the axes left-handed"),
+        (lambda T: T * 2, "found no rotation"),
+        (lambda T: T.T, "is the matrix transposed"),
+        (lambda T: T[:, :2], "expected 3x4 or 4x4"),
+        (lambda T: T.flatten(), "expected 3x4 or 4x4"),
+    ],
+)
+def test_what_is_no_pose_is_refused(sample, change, said):
+    sample["pose"] = change(torch.as_tensor(sample["pose"]).float())
+    with pytest.raises(SampleError, match=said):
+        transform()(sample)
+    with pytest.warns(UserWarning, match="flagged"):
+        blank = transform(on_error="flag")(sample)
+    assert not blank["dhtorch.valid"].any() and blank["dhtorch.pose_looks"] == 0
+
+
+def test_of_several_views_the_first_that_is_refuted_gives_the_name(pairs):
+    _, fit, *_ = asked(pairs, given.stated(se3.relative(*pairs[3])))
+    wrong = fit.replace(code=torch.full_like(fit.code, PoseCode.REFUTED))
+    both = [wrong.replace(looks=torch.tensor(looks)) for looks in ([0, 3, 5], [4, 6, 7])]
+    with pytest.warns(UserWarning, match="camera: the near returns contradict the pose; looks like"):
+        found = of_samples.keys([fit, *both], torch.tensor([True, True, False]), "camera")
+    assert found["pose_looks"].tolist() == [4, 3, 0]
+
+
+def test_a_pose_that_is_not_known_leaves_a_hole(sample):
+    sample["pose"] = sample["pose"] * torch.nan
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        out = transform()(sample)
+    assert not out["dhtorch.pose_ok"] and (out["dhtorch.gate"] == Gate.NO_POSE).any()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"pose_kind": "0_from_1"}, "pose_kind"),
+        ({"pose_axes": "unity"}, "pose_axes"),
+        ({"pose_unit": "inch"}, "pose_unit"),
+        ({"pose_cov": (1.0,)}, "pose_cov"),
+        ({"other_pose": None}, "expected other_pose"),
+        ({"pose": torch.eye(4).tolist(), "other_pose": None}, "pose: found pose_kind"),
+        ({"pose": None}, "other_pose without pose"),
+    ],
+)
+def test_options_that_cannot_be(options, said):
+    with pytest.raises(ValueError, match=said):
+        transform(**options)
+
+
+def test_a_gap_brings_the_pose_along():
+    poses = se3.to_matrix(room().true_poses)
+    items = [{**frame, "pose": T} for frame, T in zip(frames(), poses, strict=True)]
+    data = ExtendedDataset(items, transform(), gap=GAP)
+    assert data[GAP]["dhtorch.pose_ok"] and not {"before", "pose_before"} & data[GAP].keys()
+    assert not data[1]["dhtorch.pose_ok"] and data[1]["dhtorch.gate"].unique().tolist() == [Gate.NO_TRACK]
+
+
+def test_maps_are_swept_under_the_given_pose(sample):
+    out = transform(dense={"size": 56, "planes": 24, "partners": 1})(sample)
+    T = se3.relative(room().true_poses[GAP : GAP + 1], room().true_poses[:1])
+    assert torch.allclose(out["dhtorch.T_1_from_0"][:3, 3], T.t[0].float(), atol=1e-5)
+    sample["pose"] = torch.linalg.inv(torch.as_tensor(sample["pose"]))
+    with pytest.warns(UserWarning, match="contradict"):
+        out = transform(dense={"size": 56, "planes": 24, "partners": 1})(sample)
+    silent = out["dhtorch.gate_map"][out["dhtorch.source_map"] == 0]
+    assert (silent == Gate.POSE_REFUTED).all()
+
+
+def test_a_given_pose_is_a_record():
+    T = se3.identity(2, torch.zeros(1))
+    assert isinstance(given.stated(T, refine=True)[0:1], StartPose) and given.stated(T).readings.t.shape[1] == 42

@@ -1,0 +1,421 @@
+"""Seat 7 alone: both scores made by hand and the learned one against plain numpy, on made-up answers."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from dhtorch.codes import Gate, PoseCode
+from dhtorch.pytree import collate
+from dhtorch.records import Estimate, Pose, PoseFit, Samples, Tracks
+from dhtorch.stages.score import (
+    EVIDENCE,
+    MOST,
+    LearnedScore,
+    evidence,
+    expected_error_loss,
+    rank,
+    rank_by_error,
+)
+
+B, N = 2, 12
+
+
+def rand(*shape, seed, low=0.0, high=1.0):
+    return low + (high - low) * torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def answers():
+    """(estimate, samples, tracks, fit): answers that differ in everything; the last two of each pair are silent."""
+    depth = rand(B, N, seed=0, low=2, high=6)
+    sigma = depth * rand(B, N, seed=1, low=0.01, high=0.2)
+    gate = torch.zeros(B, N, dtype=torch.int32)
+    gate[:, -2], gate[:, -1] = Gate.PARALLAX, Gate.NO_TRACK
+    keep = gate == 0
+    zero = torch.zeros(B, N, dtype=torch.float64)
+    estimate = Estimate(
+        uv=rand(B, N, 2, seed=2, high=50),
+        depth=torch.where(keep, depth, torch.nan),
+        sigma=torch.where(keep, sigma, torch.nan),
+        sigma_shared=torch.where(keep, sigma * rand(B, N, seed=3, low=0.1, high=0.9), torch.nan),
+        parallax_deg=rand(B, N, seed=4, low=0.2, high=9),
+        residual_px=rand(B, N, seed=5, low=0.02, high=2.5),
+        n_views=torch.full((B, N), 2, dtype=torch.int32),
+        score=keep.double(),
+        gate=gate,
+    )
+    samples = Samples(
+        uv=estimate.uv,
+        depth=rand(B, N, seed=6, low=0.5, high=1.5),
+        sigma=zero + 0.01,
+        xyz=rand(B, N, 3, seed=7),
+        confidence=zero + 1,
+        flag=0 * gate,
+        trackability=rand(B, N, seed=8, low=1e-4, high=1e-2),
+        hole=0 * gate,
+    )
+    tracks = Tracks(
+        uv_0=estimate.uv,
+        uv_1=estimate.uv + 1,
+        error=rand(B, N, seed=9, low=0.01, high=0.9),
+        photometric=rand(B, N, seed=10, low=0.002, high=0.1),
+        cov=torch.eye(2).double().expand(B, N, 2, 2),
+        valid=keep,
+    )
+    inlier = rand(B, N, seed=11) < 0.5
+    nothing = torch.zeros(B, dtype=torch.float64)
+    pose = Pose(torch.eye(3).double().expand(B, 3, 3), torch.ones(B, 3).double())
+    cov = torch.eye(6).double().expand(B, 6, 6)
+    code = torch.full((B,), PoseCode.OK, dtype=torch.int32)
+    fit = PoseFit(pose, cov, inlier, inlier.sum(1), nothing, nothing + 1, nothing + 50, code)
+    return estimate, samples, tracks, fit
+
+
+def arrays(record):
+    return {k: v.numpy() for k, v in vars(record).items() if isinstance(v, torch.Tensor)}
+
+
+def same(score, expected, keep):
+    np.testing.assert_allclose(score.numpy(), np.where(keep, expected, 0.0), rtol=1e-9)
+
+
+# ---------------------------------------------------------------------------------------------------- by hand
+
+
+@pytest.mark.parametrize("options", [{}, {"half_parallax_deg": 5.0}, {"residual_scale_px": 1.2}])
+def test_the_papers_score_rises_with_parallax_and_falls_with_the_residual(options):
+    estimate, *rest = answers()
+    p, r = estimate.parallax_deg.numpy(), estimate.residual_px.numpy()
+    half, scale = options.get("half_parallax_deg", 2.0), options.get("residual_scale_px", 3.0)
+    found = rank(estimate, *rest, **options)
+    same(found.score, p / (p + half) * np.maximum(0, 1 - r / scale), estimate.keep.numpy())
+    for name in ("uv", "depth", "sigma", "sigma_shared", "parallax_deg", "residual_px", "n_views", "gate"):
+        assert torch.equal(getattr(found, name).nan_to_num(), getattr(estimate, name).nan_to_num()), name
+
+
+def test_the_papers_score_is_zero_where_parallax_or_residual_is_no_number():
+    estimate, *rest = answers()
+    parallax, residual = estimate.parallax_deg.clone(), estimate.residual_px.clone()
+    parallax[0, 0], residual[0, 1], parallax[0, 2] = torch.nan, torch.nan, torch.inf
+    found = rank(estimate.replace(parallax_deg=parallax, residual_px=residual), *rest).score
+    assert found[0, :3].tolist() == [0, 0, 0] and (found[0, 3:-2] > 0).all() and found.isfinite().all()
+
+
+def plain_error(
+    estimate, tracks, *, residual_scale_px=0.5, photometric_scale=None, round_trip_scale_px=0.4, share=1e-6
+):
+    e, t = arrays(estimate), arrays(tracks)
+    own = e["sigma"] ** 2 - e["sigma_shared"] ** 2
+    own = np.maximum(own, share * e["sigma"] ** 2)
+    spread = 1 + (e["residual_px"] / residual_scale_px) ** 2
+    if photometric_scale is not None:
+        spread = spread + (t["photometric"] / photometric_scale) ** 2
+    if round_trip_scale_px is not None:
+        spread = spread + (t["error"] / round_trip_scale_px) ** 2
+    return np.sqrt(own * spread) / e["depth"]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"residual_scale_px": 1.5},
+        {"photometric_scale": 0.03},
+        {"round_trip_scale_px": None},
+        {"round_trip_scale_px": 0.1},
+        {"residual_scale_px": 0.2, "photometric_scale": 0.01, "round_trip_scale_px": 0.8},
+    ],
+)
+def test_the_score_is_half_where_the_expected_error_is_the_half_error(options):
+    estimate, samples, tracks, fit = answers()
+    expected = plain_error(estimate, tracks, **options)
+    keep = estimate.keep.numpy()
+    for half in (0.1, 0.03):
+        found = rank_by_error(estimate, samples, tracks, fit, half_error=half, **options)
+        same(found.score, half / (half + expected), keep)
+    found = rank_by_error(estimate, samples, tracks, fit, **options)
+    same(found.score, 0.1 / (0.1 + expected), keep)
+    assert torch.equal(found.gate, estimate.gate)
+
+
+def test_a_recalibration_changes_scores_of_answers_alone_and_comes_before_the_threshold():
+    seat = answers()
+    keep = seat[0].keep
+    plain = rank_by_error(*seat)
+    found = rank_by_error(*seat, recalibration=lambda s: 1 - s / 2)
+    torch.testing.assert_close(found.score, torch.where(keep, 1 - plain.score / 2, 0.0))
+    limit = float((1 - plain.score / 2)[keep].median())
+    strict = rank_by_error(*seat, recalibration=lambda s: 1 - s / 2, min_score=limit)
+    assert torch.equal(strict.gate == Gate.LOW_SCORE, keep & (found.score < limit))
+
+
+@pytest.mark.parametrize("seat", [rank, rank_by_error, "learned"])
+def test_below_the_threshold_and_not_at_it_an_answer_becomes_silent(seat):
+    parts = answers()
+    ask = (lambda *p, min_score=0.0: LearnedScore(min_score=min_score)(*p)) if seat == "learned" else seat
+    plain = ask(*parts)
+    limit = sorted(plain.score[plain.keep].tolist())[7]
+    strict = ask(*parts, min_score=limit)
+    low = plain.keep & (plain.score < limit)
+    assert int(low.sum()) == 7 and torch.equal(strict.gate == Gate.LOW_SCORE, low)
+    for name in ("depth", "sigma", "sigma_shared"):
+        x, y = getattr(strict, name), getattr(plain, name)
+        assert x[low].isnan().all() and torch.equal(x[strict.keep], y[strict.keep]), name
+    assert torch.equal(strict.score, torch.where(low, 0, plain.score))
+    assert torch.equal(strict.gate[~plain.keep], plain.gate[~plain.keep]), "a reason stays the first one"
+
+
+def test_no_error_is_expected_below_a_millionth_nor_told_apart_above_a_million():
+    """And the own part of sigma is at least a thousandth of it, however large the pose's part."""
+    parts = answers()
+    estimate, tracks = parts[0], parts[2]
+    depth, sigma, shared = (x.clone() for x in (estimate.depth, estimate.sigma, estimate.sigma_shared))
+    error = 0 * tracks.error
+    residual = 0 * estimate.residual_px
+    depth[0, :5] = 2.0
+    sigma[0, :5] = torch.tensor([0.0, 0.2, 0.2, 1e-7, 1e9])
+    shared[0, :5] = torch.tensor([0.0, 0.2, 0.5, 0.0, 0.0])
+    residual[0, 0] = 1e12
+    changed = estimate.replace(depth=depth, sigma=sigma, sigma_shared=shared, residual_px=residual)
+    found = rank_by_error(changed, parts[1], tracks.replace(error=error), parts[3]).score[0, :5]
+    e = 0.1 / found - 0.1
+    expected = torch.tensor([1.0, 0.1 * 1e-3, 0.1 * 1e-3, 1e-6, 1e6]).double()
+    torch.testing.assert_close(e, expected, rtol=1e-6, atol=1e-13)
+
+
+def test_where_no_error_can_be_stated_the_score_is_zero():
+    estimate, samples, tracks, fit = answers()
+    broken = {
+        "depth": (-1.0, 0.0),
+        "sigma": (torch.nan, torch.inf),
+        "sigma_shared": (torch.nan, torch.inf),
+        "residual_px": (torch.nan, torch.inf),
+    }
+    for name, values in broken.items():
+        x = getattr(estimate, name).clone()
+        x[1, 0], x[1, 1] = values
+        found = rank_by_error(estimate.replace(**{name: x}), samples, tracks, fit)
+        assert found.score[1, :2].tolist() == [0, 0] and (found.score[1, 2:-2] > 0).all(), name
+        again = rank_by_error(estimate.replace(**{name: x}), samples, tracks, fit, recalibration=lambda s: 1 - s / 2)
+        assert again.score[1, :2].tolist() == [0, 0] and again.score.isfinite().all(), name
+        assert not evidence(estimate.replace(**{name: x}), samples, tracks, fit)[1][1, :2].any(), name
+    for name, scale in (("photometric", "photometric_scale"), ("error", "round_trip_scale_px")):
+        x = getattr(tracks, name).clone()
+        x[1, 0] = torch.nan
+        found = [
+            rank_by_error(estimate, samples, tracks.replace(**{name: x}), fit, **{scale: s}).score for s in (0.3, None)
+        ]
+        assert found[0][1, 0] == 0 and found[1][1, 0] > 0, "only where it is asked"
+
+
+# ---------------------------------------------------------------------------------------------------- evidence
+
+
+def plain_evidence(estimate, samples, tracks, fit):
+    e, s, t, inlier = arrays(estimate), arrays(samples), arrays(tracks), fit.inlier.numpy()
+    near = np.array([s["depth"][b][inlier[b] & (s["depth"][b] > 0)].mean() for b in range(B)])
+    return {
+        "expected_error": plain_error(estimate, tracks),
+        "shared_error": e["sigma_shared"] / e["depth"],
+        "parallax_deg": e["parallax_deg"],
+        "residual_px": e["residual_px"],
+        "round_trip_px": t["error"],
+        "photometric": t["photometric"],
+        "trackability": s["trackability"],
+        "reach": e["depth"] / near[:, None],
+    }
+
+
+def test_evidence_is_the_logarithm_of_what_it_is_called():
+    estimate, samples, tracks, fit = answers()
+    depth = samples.depth.clone()
+    depth[:, 0] = 0  # an inlier without a return does not count in the mean
+    samples, fit = samples.replace(depth=depth), fit.replace(inlier=fit.inlier | (torch.arange(N) == 0))
+    x, stated = evidence(estimate, samples, tracks, fit)
+    assert torch.equal(stated, estimate.keep) and (x[~stated] == 0).all() and x.shape == (B, N, 8)
+    columns = plain_evidence(estimate, samples, tracks, fit)
+    assert [*columns] == [*EVIDENCE]
+    for k, (name, expected) in enumerate(columns.items()):
+        np.testing.assert_allclose(x[..., k][stated].numpy(), np.log(expected)[stated], rtol=1e-9, err_msg=name)
+
+
+def test_evidence_is_not_told_apart_beyond_its_limits():
+    limits = {
+        "expected_error": (1e-5, 1e2),
+        "shared_error": (1e-5, 1e2),
+        "parallax_deg": (1e-3, 1e2),
+        "residual_px": (1e-2, 1e2),
+        "round_trip_px": (1e-3, 1e2),
+        "photometric": (1e-4, 1.0),
+        "trackability": (1e-7, 1.0),
+        "reach": (1e-2, 1e2),
+    }
+    estimate, samples, tracks, fit = answers()
+    for end, value in enumerate((1e-12, 1e12)):
+        x = torch.full((B, N), value, dtype=torch.float64)
+        extreme = estimate.replace(sigma=4 * x, sigma_shared=2 * x, parallax_deg=x, residual_px=x)
+        extreme = extreme.replace(depth=x if end else estimate.depth, sigma=(4 * x * x if end else 4 * x))
+        extreme = extreme.replace(sigma_shared=2 * x * x if end else 2 * x)
+        seat = samples.replace(trackability=x), tracks.replace(error=x, photometric=x), fit
+        found, stated = evidence(extreme, *seat)
+        rows = found[stated].exp()
+        for k, name in enumerate(EVIDENCE):
+            if name != "reach" or end:
+                np.testing.assert_allclose(rows[:, k].numpy(), limits[name][end], rtol=1e-9, err_msg=name)
+    near = samples.replace(depth=samples.depth * 1e9)
+    found, stated = evidence(estimate, near, tracks, fit)
+    np.testing.assert_allclose(found[..., 7][stated].exp().numpy(), 1e-2)
+
+
+def test_without_returns_that_hold_the_pose_the_reach_is_the_depth_itself():
+    estimate, samples, tracks, fit = answers()
+    found, stated = evidence(estimate, samples, tracks, fit.replace(inlier=torch.zeros_like(fit.inlier)))
+    torch.testing.assert_close(found[..., 7].exp()[stated], estimate.depth[stated])
+
+
+def test_evidence_is_nothing_where_any_of_it_is_no_number():
+    estimate, samples, tracks, fit = answers()
+    for k, name in enumerate(("parallax_deg", "residual_px", "error", "photometric", "trackability")):
+        record = (estimate, estimate, tracks, tracks, samples)[k]
+        x = getattr(record, name).clone()
+        x[0, 3] = torch.nan
+        changed = {id(record): record.replace(**{name: x})}
+        seat = [changed.get(id(r), r) for r in (estimate, samples, tracks, fit)]
+        found, stated = evidence(*seat)
+        assert not stated[0, 3] and int(stated.sum()) == int(estimate.keep.sum()) - 1, name
+        assert found.isfinite().all() and (found[0, 3] == 0).all()
+
+
+# ---------------------------------------------------------------------------------------------------- learned
+
+
+def trained(seed=1, hidden=5, spread=1.0, **options):
+    """A scorer whose every weight is drawn."""
+    scorer = LearnedScore(hidden, **options).double()
+    g = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for x in (*scorer.parameters(), scorer.mean):
+            x.copy_(spread * torch.randn(x.shape, generator=g, dtype=torch.float64))
+        scorer.spread.copy_(0.5 + torch.rand(8, generator=g, dtype=torch.float64))
+    return scorer
+
+
+def plain_forward(scorer, x):
+    w = {k: v.detach().double().numpy() for k, v in scorer.state_dict().items()}
+    hidden = (x - w["mean"]) / w["spread"] @ w["first"].T + w["first_bias"]
+    hidden = hidden / (1 + np.abs(hidden))
+    more = hidden @ w["last"] + w["last_bias"]
+    return x[..., 0] + 4.0 * more / (4.0 + np.abs(more))
+
+
+def test_the_learned_score_is_its_network_written_out():
+    seat, scorer = answers(), trained(half_error=0.07)
+    x, stated = evidence(*seat)
+    expected = plain_forward(scorer, x.numpy())
+    np.testing.assert_allclose(scorer.log_error(x).detach().numpy(), expected, rtol=1e-9)
+    same(scorer(*seat).score.detach(), 0.07 / (0.07 + np.exp(expected)), stated.numpy())
+    single = scorer.log_error(x.float())
+    assert single.dtype == torch.float32, "in the numbers of the evidence"
+    np.testing.assert_allclose(single.detach().numpy(), expected, rtol=1e-4, atol=1e-4)
+
+
+def test_untrained_it_is_the_score_made_by_hand():
+    seat = answers()
+    scored, by_hand = LearnedScore()(*seat), rank_by_error(*seat)
+    torch.testing.assert_close(scored.score.detach(), by_hand.score, rtol=1e-9, atol=0)
+    assert torch.equal(scored.gate, by_hand.gate) and torch.equal(scored.depth.isnan(), by_hand.depth.isnan())
+
+
+def test_the_first_weights_are_drawn_by_the_seed_as_for_a_linear_layer():
+    scorer, other = LearnedScore(400, seed=3), LearnedScore(400, seed=4)
+    for x in (scorer.first.detach(), scorer.first_bias.detach()):
+        assert x.abs().max() <= 8**-0.5 and float(x.std()) == pytest.approx((1 / 3 / 8) ** 0.5, rel=0.06)
+        assert abs(float(x.mean())) < 0.03
+    assert not torch.equal(scorer.first, other.first) and torch.equal(scorer.first, LearnedScore(400, seed=3).first)
+    assert LearnedScore().first.shape == (16, 8) and torch.equal(LearnedScore().first, LearnedScore(seed=0).first)
+    assert (LearnedScore().half_error, LearnedScore().min_score) == (0.1, 0.0)
+
+
+def test_the_correction_is_bounded_and_gradients_reach_every_weight():
+    x, stated = evidence(*answers())
+    wild = trained(spread=1e3)
+    more = (wild.log_error(x) - x[..., 0]).detach()[stated].abs()
+    assert more.max() <= MOST == 4 and more.min() > 3.9
+    scorer = trained()
+    seat = answers()
+    depth = seat[0].depth.clone().requires_grad_()
+    scorer(seat[0].replace(depth=depth), *seat[1:]).score.sum().backward()
+    for name, weight in scorer.named_parameters():
+        assert weight.grad.isfinite().all() and weight.grad.abs().max() > 0, name
+    assert depth.grad.isfinite().all() and depth.grad[seat[0].keep].abs().min() > 0
+
+
+def test_a_row_does_not_depend_on_its_mates():
+    scorer = trained().float()
+    seat = [r.to(torch.float32) for r in answers()]
+    turned = [[r.map(lambda x, k=k: x.roll(k, 1) if x.dim() > 1 else x) for r in seat] for k in (0, 3, 7)]
+    together = scorer(*(collate(group) for group in zip(*turned, strict=True)))
+    for b, one in enumerate(turned):
+        assert torch.equal(together.score[B * b : B * b + B], scorer(*one).score)
+
+
+def test_the_loss_is_the_likelihood_of_an_exponential_law_whose_errors_count_as_one_at_most():
+    log_error, weight = rand(9, seed=0, low=-4, high=0), rand(9, seed=1)
+    error = rand(9, seed=2, high=2.0)
+    expected = 0.0
+    for g, e, w in zip(log_error.tolist(), error.tolist(), weight.tolist(), strict=True):
+        expected += w * (g + min(e, 1.0) / math.exp(g))
+    assert (error > 1).any() and float(expected_error_loss(log_error, error, weight)) == pytest.approx(expected)
+
+
+def test_the_loss_is_least_at_the_mean_error():
+    error = torch.tensor([0.01, 0.02, 0.09], dtype=torch.float64)
+    weight = torch.full_like(error, 1 / 3)
+    at = torch.full((3,), 0.04, dtype=torch.float64).log().requires_grad_()
+    expected_error_loss(at, error, weight).backward()
+    assert abs(float(at.grad.sum())) < 1e-12
+    around = [
+        float(expected_error_loss(torch.full((3,), e, dtype=torch.float64).log(), error, weight))
+        for e in (0.03, 0.04, 0.05)
+    ]
+    assert around[1] < min(around[0], around[2])
+
+
+# ---------------------------------------------------------------------------------------------------- as text
+
+
+def test_it_travels_as_text_and_as_weights_only(tmp_path):
+    scorer = trained(half_error=0.2, min_score=0.3).float()
+    scorer.provenance = {"scenes": ["a"]}
+    copy = LearnedScore.read(scorer.save(tmp_path / "deep" / "score.json"))
+    assert copy.provenance == {"scenes": ["a"]} and (copy.half_error, copy.min_score) == (0.2, 0.3)
+    torch.save(scorer.state_dict(), tmp_path / "score.pt")
+    other = LearnedScore(5, half_error=0.2, min_score=0.3)
+    other.load_state_dict(torch.load(tmp_path / "score.pt", weights_only=True))
+    for found in (copy, other):
+        assert torch.equal(found(*answers()).score, scorer(*answers()).score)
+    with pytest.raises(FileNotFoundError):
+        LearnedScore.read(tmp_path / "none.json")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda c: c.pop("weights"),
+        lambda c: c.update(evidence=["parallax_deg"]),
+        lambda c: c["weights"].update(last=[0.0] * 3),
+        lambda c: c["weights"].update(extra=[0.0]),
+        lambda c: c["weights"]["last"].__setitem__(0, "1"),
+        lambda c: c["weights"]["last"].__setitem__(0, float("nan")),
+        lambda c: c.update(half_error=None),
+    ],
+)
+def test_a_damaged_file_is_refused_by_name(tmp_path, change):
+    content = json.loads(LearnedScore().to_json())
+    change(content)
+    path = tmp_path / "score.json"
+    path.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"score\.json: found .* expected a learned score"):
+        LearnedScore.read(path)

@@ -1,0 +1,1 @@
+"""Scenes, samples, stubs and reference implementations that several tests use."""

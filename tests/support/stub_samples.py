@@ -1,0 +1,90 @@
+"""Samples of a few pixels, and a method that answers what it was told: what surrounds a method can be tried alone."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from dhtorch.codes import Flag, Gate, Hole
+from dhtorch.pipeline.method import Method
+from dhtorch.records import Estimate, Pose, PoseFit, Samples
+from dhtorch.transforms import ExtendDepth
+
+H, W, N = 28, 42, 6
+K = [40.0, 42.0, 20.0, 14.0]
+
+
+def sample(seed=0, **changes):
+    """An uint8 picture, a depth map in whole millimetres, a picture before it."""
+    rng = np.random.default_rng(seed)
+    image, before = rng.integers(0, 256, (2, H, W, 3), dtype=np.uint8)
+    depth = rng.integers(500, 2000, (H, W)).astype(np.uint16)
+    return {"image": image, "before": before, "depth": depth, "intrinsics": np.float32(K), "index": seed, **changes}
+
+
+def pose(batch, seed=0):
+    """A turn about y and a step, other ones for each."""
+    a = 0.1 * (1 + seed + torch.arange(batch))
+    zero, one = torch.zeros(batch), torch.ones(batch)
+    R = torch.stack((a.cos(), zero, a.sin(), zero, one, zero, -a.sin(), zero, a.cos()), -1).view(-1, 3, 3)
+    return Pose(R, torch.stack((a, 2 * a, 3 * a), -1))
+
+
+class Told:
+    """Two samples that the sensor sees, two that are recovered, one that both say, one that nobody does.
+
+    ``codes`` are those of the pose; ``asked`` holds what the last call was given.
+    """
+
+    def __init__(self, codes=None):
+        self.codes, self.asked, self.calls = codes, {}, 0
+
+    def __call__(self, anchor, other, *, n=N, seed=0, trace=None):
+        self.asked, self.calls = {"anchor": anchor, "other": other, "n": n, "seed": seed}, self.calls + 1
+        g = torch.Generator().manual_seed(7)
+        B = anchor.image.shape[0]
+        uv = torch.rand(1, n, 2, generator=g).expand(B, n, 2) * torch.tensor([W - 1.0, H - 1.0])
+        depth = 1 + torch.rand(1, n, generator=g).expand(B, n)
+        place = torch.arange(n).expand(B, n) % N
+        sensed, answered = (place < 2) | (place == 4), (place >= 2) & (place < 5)
+        nan = torch.full_like(depth, torch.nan)
+        known = torch.where(sensed[..., None], torch.cat((uv, depth[..., None]), -1), nan[..., None])
+        flag = torch.where(sensed, Flag.SATURATED, Flag.NO_DEPTH).int()
+        hole = torch.where(sensed, Hole.NONE, Hole.TOO_DARK + place % 2).int()
+        returned = torch.where(sensed, depth, torch.where(place == 5, 9.0, 0.0))  # one return is not usable
+        samples = Samples(uv, returned, 0.01 * depth, known, 0.5 + 0.1 * depth, flag, depth, hole)
+        far = torch.where(answered, 10 * depth, nan)
+        gate = torch.where(answered, Gate.ANSWER, Gate.PARALLAX).int()
+        score = torch.where(answered, 0.25 * depth, 0.0)
+        estimate = Estimate(uv, far, 0.5 * far, 0.1 * far, depth, depth, place.int(), score, gate)
+        code = torch.zeros(B, dtype=torch.int32) if self.codes is None else torch.tensor(self.codes, dtype=torch.int32)
+        lost = ((code != 0) & (code != 4))[:, None, None]
+        found = pose(B)
+        cov = torch.arange(36.0).view(1, 6, 6) + torch.arange(B)[:, None, None]
+        R, t = torch.where(lost, torch.nan, found.R), torch.where(lost[..., 0], torch.nan, found.t)
+        count = torch.zeros(B)
+        fit = PoseFit(Pose(R, t), torch.where(lost, torch.nan, cov), sensed, count.long(), count, count, count, code)
+        trace.update(samples=samples, fit=fit)
+        return estimate
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Stub(Method):
+    """A method in which another function answers; its front end is the paper's."""
+
+    answer: Callable[..., Estimate] = None
+
+    def __call__(self, anchor, other, *, seed=0, hint=None, trace=None):
+        return self.answer(anchor, other, n=self.n, seed=seed, trace=trace)
+
+
+def tiny(method=None, **options):
+    """The transform of such samples."""
+    method = method if isinstance(method, Method) else Stub(answer=method or Told(), n=N)
+    return ExtendDepth(**{"depth_unit": "mm", "other_image": "before", "method": method, **options})
+
+
+def added(out, prefix="dhtorch."):
+    """What was added, without its prefix."""
+    return {k.removeprefix(prefix): v for k, v in out.items() if k.startswith(prefix)}

@@ -1,0 +1,69 @@
+"""The faults that ``benchmarks/mutants.py`` plants: each fits today's code, and the tests that are to notice exist."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+REPO = Path(__file__).parents[1]
+sys.path.append(str(REPO / "benchmarks"))
+
+import mutants  # noqa: E402
+from faults import FAULTS, PARTS, TESTS  # noqa: E402
+from faults.rows import Fault  # noqa: E402
+
+KNOWN = mutants.modules()
+
+
+@pytest.mark.parametrize("module", sorted({fault.module for fault in FAULTS}))
+def test_every_fault_fits_the_code_once(module):
+    source = KNOWN[mutants.module_of(module, KNOWN)].read_text()
+    for fault in FAULTS:
+        if fault.module == module:
+            mutants.placed(source, fault)
+            assert fault.old != fault.new, fault
+
+
+def test_no_fault_is_planted_twice_and_no_table_hides_another():
+    planted = [(f.module, f.function, f.old, f.new) for f in FAULTS]
+    assert len(set(planted)) == len(planted), [fault for fault in planted if planted.count(fault) > 1]
+    for name in ("FAULTS", "TESTS"):
+        modules = [module for part in PARTS for module in getattr(part, name)]
+        assert len(set(modules)) == len(modules), "two parts speak of one module"
+
+
+def test_every_module_with_a_fault_names_tests_that_exist():
+    assert {mutants.module_of(fault.module, KNOWN) for fault in FAULTS} <= set(TESTS) <= set(KNOWN)
+    for tests in TESTS.values():
+        for test in tests:
+            path, _, name = test.partition("::")
+            assert (REPO / path).is_file(), test
+            assert f"def {name}(" in (REPO / path).read_text() if name else True, test
+
+
+def test_every_module_of_the_method_has_a_fault():
+    spoken_of = {mutants.module_of(fault.module, KNOWN) for fault in FAULTS}
+    empty = {name for name, path in KNOWN.items() if "def " not in path.read_text()}
+    assert set(KNOWN) - spoken_of - empty == set()
+
+
+def test_what_does_not_fit_is_refused():
+    source = "def double(x):\n    return x + x\n"
+    assert "x - x" in mutants.planted(source, Fault("m", "double", "x + x", "x - x"))
+    for fault in (Fault("m", "double", "x * x", ""), Fault("m", "double", "x", "y"), Fault("m", "treble", "x", "y")):
+        with pytest.raises(ValueError, match="mutants: "):
+            mutants.placed(source, fault)
+
+
+def test_the_command_says_what_it_takes():
+    words = [sys.executable, "benchmarks/mutants.py", "--help"]
+    told = subprocess.run(words, cwd=REPO, capture_output=True, text=True, check=True)
+    assert "--sweep" in told.stdout
+
+
+def test_a_place_that_is_none_is_refused():
+    assert mutants.within(["geometry.se3", "runtime.storage"], KNOWN) == ["geometry.se3", "runtime.storage"]
+    assert set(mutants.within(["stages"], KNOWN)) == {m for m in KNOWN if m.startswith("stages.") or m == "stages"}
+    with pytest.raises(ValueError, match="'se3' names no module"):
+        mutants.within(["runtime.storage", "se3"], KNOWN)

@@ -1,0 +1,75 @@
+"""Habits of writing that no linter knows: one statement a line, and arguments that say what they are."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import dhtorch
+
+ROOT = Path(dhtorch.__file__).parent
+#: Not asked yet: parsers of files, figures, the pages of the report, and two modules beside.
+ELSEWHERE = ("data/", "viz/plots", "experiments/report/", "experiments/protocol.py", "geometry/epipolar.py")
+FILES = [name for p in sorted(ROOT.rglob("*.py")) if not (name := p.relative_to(ROOT).as_posix()).startswith(ELSEWHERE)]
+
+#: Most arguments that a call passes by their place.
+MOST = 6
+
+#: Functions that take any number of like things, or the fields of a format.
+VARIADIC = {"first_reason", "_bits", "pack", "min", "max", "zip", "chain"}
+
+
+def shape(node):
+    """What an expression is made of, whatever names, numbers and operators are in it."""
+    if isinstance(node, (ast.operator, ast.unaryop, ast.cmpop, ast.boolop, ast.expr_context)):
+        return ""
+    if isinstance(node, ast.UnaryOp):
+        return shape(node.operand)
+    if isinstance(node, (ast.Name, ast.Constant)) or (
+        isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)
+    ):
+        return "x"
+    return type(node).__name__, *(shape(child) for child in ast.iter_child_nodes(node))
+
+
+def packed(statement):
+    """Whether an assignment does two unlike pieces of work at once."""
+    if not (isinstance(statement, ast.Assign) and isinstance(statement.value, ast.Tuple)):
+        return False
+    values = statement.value.elts
+    work = [v for v in values if any(isinstance(node, ast.Call) for node in ast.walk(v))]
+    return isinstance(statement.targets[0], ast.Tuple) and len(work) > 1 and len({shape(v) for v in work}) > 1
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_a_tuple_assigns_like_things(file):
+    """``a, b = f(x), f(y)`` reads at once; ``a, b = f(x), g(y, z)`` is two statements in one line."""
+    tree = ast.parse((ROOT / file).read_text())
+    found = [f"line {node.lineno}: {ast.unparse(node)}" for node in ast.walk(tree) if packed(node)]
+    assert not found, "one statement a line:\n" + "\n".join(found)
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_calls_name_what_they_pass(file):
+    found = []
+    for node in ast.walk(ast.parse((ROOT / file).read_text())):
+        if isinstance(node, ast.Call) and len([a for a in node.args if not isinstance(a, ast.Starred)]) > MOST:
+            name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+            if name not in VARIADIC:
+                found.append(f"line {node.lineno}: {name} is given {len(node.args)} arguments by their place")
+    assert not found, "\n".join(found)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("a, b = f(x), g(y)", False),
+        ("a, b = f(x), f(x.y) + 1", True),
+        ("a, b = x, f(y)", False),
+        ("a, b = (f(v) for v in (x, y))", False),
+        ("low, high = x.amin(0) - 1, x.amax(0) + 1", False),
+        ("a, b = f(x), [f(v) for v in y]", True),
+    ],
+)
+def test_which_tuples_are_packed(text, expected):
+    assert packed(ast.parse(text).body[0]) is expected

@@ -1,0 +1,372 @@
+"""Is a depth right: what speaks for and against pixels, numbers of a frame, and that silence is never called right."""
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from dhtorch import AUTO, judge
+from dhtorch.codes import State
+from dhtorch.metrics.detection import auroc
+from dhtorch.metrics.holdout import range_split
+from dhtorch.pipeline import dense
+from dhtorch.pytree import collate, stack
+from dhtorch.synthetic import SyntheticRoom
+from dhtorch.validation.evidence import Said
+from dhtorch.validation.validate import QUICK, SENSOR_METRE, TRAJECTORY_METRE, cut, decided, judged, share
+
+RESULTS = Path(__file__).resolve().parents[2] / "benchmarks" / "results"
+NEAR, ANCHOR, OTHERS = 2.0, 5, (0, 2, 8, 11)
+METHOD = AUTO.replace(n=768)
+SMALL = {"method": METHOD, "size": 160}
+
+
+@pytest.fixture(scope="module")
+def room():
+    return SyntheticRoom(n_frames=12, hw=(180, 240), depth_hw=(90, 120), supersample=1, seed=0)
+
+
+@pytest.fixture(scope="module")
+def anchor(room):
+    return range_split(room[ANCHOR], NEAR)
+
+
+@pytest.fixture(scope="module")
+def others(room):
+    return stack([range_split(room[k], NEAR) for k in OTHERS])
+
+
+@pytest.fixture(scope="module")
+def true(room):
+    return room.truth(ANCHOR)["depth"]
+
+
+@pytest.fixture(scope="module")
+def asked(anchor, others):
+    """What the sparse method makes of the views: the same for every map of the anchor."""
+    trace = {}
+    return dense.views_asked(METHOD(anchor, others, trace=trace), others, trace)
+
+
+@pytest.fixture(scope="module")
+def sound(true, anchor, others):
+    return judge(true, anchor, others, **SMALL)
+
+
+def at_grid(x, verdict):
+    return torch.nn.functional.interpolate(x[None].float(), verdict.state.shape[-2:], mode="nearest-exact")[0]
+
+
+def test_a_true_map_is_consistent_and_its_numbers_hold(sound):
+    known = sound.known
+    assert known.float().mean() > 0.6
+    assert (sound.state == State.WRONG).sum() < 0.1 * known.sum()
+    for name in ("scale", "scale_near", "scale_far"):
+        value, low, high = getattr(sound, name)[0]
+        assert low < value < high
+        assert low < 1.02
+        assert high > 0.98
+    assert sound.shift[0, 1] < 0 < sound.shift[0, 2]
+
+
+@pytest.mark.parametrize(("name", "good_for"), [("scale_near", SENSOR_METRE), ("ruler", TRAJECTORY_METRE)])
+def test_a_metre_is_told_no_closer_than_what_tells_it_is_good_for(name, good_for, sound):
+    """However many points agree: they share one sensor, or one trajectory."""
+    _, low, high = getattr(sound, name)[0]
+    assert math.log(high / low) > 2 * 1.96 * good_for
+
+
+def test_near_and_far_that_contradict_each_other_leave_the_scale_open(true, anchor, asked):
+    found = judged(torch.where(true > NEAR, 1.3 * true, true), anchor, asked, **SMALL, views=False)
+    near, far, both = (x[0].log() for x in (found.scale_near, found.scale_far, found.scale))
+    assert near[2] < far[1]
+    assert near[0] < both[0] < far[0]
+    assert both[2] - both[1] > 5 * (near[2] - near[1]), "agreeing, they would make it narrower than the near alone"
+
+
+@pytest.mark.parametrize("tilt", [0.2, 0.4])
+@pytest.mark.parametrize("side", [-1, -2])
+def test_a_tilt_is_the_error_from_one_side_of_the_picture_to_the_other(side, tilt, true, anchor):
+    n = true.shape[side]
+    place = ((torch.arange(n) + 0.5) / n - 0.5).reshape((n, 1) if side == -2 else (n,))
+    value, low, high = judge((1 + tilt * place) * true, anchor, **SMALL).tilt[0]
+    assert value == pytest.approx(tilt, rel=0.05)
+    assert 0 < low < tilt < high
+
+
+@pytest.mark.parametrize("factor", [1.1, 1 / 1.1])
+def test_a_wrong_metre_is_found_by_near_returns_and_by_far_answers(factor, true, anchor, others, sound):
+    found = judge(factor * true, anchor, others, **SMALL, views=False)
+    for name in ("scale", "scale_near", "scale_far"):
+        value, low, high = getattr(found, name)[0] / factor
+        assert abs(math.log(value)) < 0.03
+        assert not low * factor <= 1 <= high * factor
+    assert (found.state == State.CONSISTENT).sum() < 0.4 * (sound.state == State.CONSISTENT).sum()
+
+
+def test_a_surface_that_stands_elsewhere_is_wrong_and_its_surroundings_are_not(true, anchor, others):
+    moved = torch.zeros_like(true, dtype=torch.bool)
+    moved[:, 60:120, 70:140] = True
+    found = judge(torch.where(moved, 1.6 * true, true), anchor, others, **SMALL)
+    inside = at_grid(moved, found) > 0
+    assert ((found.state == State.CONSISTENT) & inside).sum() <= 0.003 * inside.sum()
+    assert auroc(found.evidence.abs()[found.known], inside[found.known]) > 0.97
+    signs = found.evidence[inside & (found.state == State.WRONG)]
+    assert (signs > 0).float().mean() > 0.9, "too far"
+
+
+def test_without_another_view_near_returns_alone_speak(true, anchor):
+    found = judge(true, anchor, **SMALL)
+    near = at_grid(true, found) < 0.9 * NEAR
+    far = at_grid(true, found) > 1.2 * NEAR
+    assert (found.known & near).sum() > 0.5 * near.sum()
+    assert not (found.state == State.CONSISTENT)[far].any(), "nothing tells"
+    assert found.known[far].float().mean() < 0.02, "but for returns that mix an edge"
+    assert found.by_views.isnan().all()
+    assert found.scale_far.isnan().all()
+
+
+def test_a_single_sensor_view_can_know_nothing_of_itself(room):
+    found = judge(None, room[ANCHOR], **SMALL)
+    assert not found.known.any()
+    assert found.scale.isnan().all()
+    assert (found.view == -2).all()
+
+
+def test_a_camera_that_only_turns_knows_nothing_of_what_is_far():
+    turning = SyntheticRoom(n_frames=6, hw=(180, 240), path="rotation", supersample=1, seed=0)
+    near = [range_split(turning[k], NEAR) for k in (0, 2, 5)]
+    true = turning.truth(2)["depth"]
+    found = judge(1.3 * true, near[1], stack([near[0], near[2]]), **SMALL)
+    far = at_grid(true, found) > 1.2 * NEAR
+    assert (found.state == State.CONSISTENT)[far].float().mean() < 0.003
+
+
+def test_quick_leaves_a_metre_unknown_where_the_motion_comes_out_short(room, true, anchor):
+    """Motions that few points hold loosely are too short: of a true map they would say that it is too far."""
+
+    def by_points(method, k):
+        return judge(true, anchor, range_split(room[k], NEAR), method=method, views=False, size=160).scale_far[0]
+
+    beside = (ANCHOR - 1, ANCHOR + 1)
+    loose = torch.stack([by_points(QUICK.replace(triangulate={"min_t_snr": 10.0}), k) for k in beside])
+    assert (loose[:, 0] > 1.05).all()
+    assert (loose[:, 1] > 1).any(), "a false alarm"
+    assert all(by_points(QUICK, k).isnan().all() for k in beside)
+    assert by_points(QUICK, ANCHOR + 3).isfinite().all(), "a wider way is known well enough"
+
+
+@pytest.mark.parametrize("name", ["judge_study", "judge_study_streams"])
+def test_what_quick_missed_by_points_alone_it_was_silent_on(name):
+    """As docs/judge.md says of the committed results."""
+    rows = json.loads((RESULTS / f"{name}.json").read_text())["rows"]
+    wide = [row for row in rows if row["method"] == "judge" and row["pair"] is not None and row["baseline"]]
+    told = [row for row in wide if row["quick_far.none"] is not None]
+    assert 0 < len(told) < len(wide)
+    assert all(row[f"quick_far.10_{side}"] for row in told for side in ("long", "short"))
+
+
+def test_the_sensors_own_metre_is_told_by_a_trajectory_alone(room, others):
+    wrong = 1.25
+    swollen = [room[k].replace(depth=wrong * room[k].depth) for k in (ANCHOR, *OTHERS)]
+    found = judge(None, swollen[0], stack(swollen[1:]), **SMALL, views=False)
+    _, low, high = found.scale[0]
+    assert low < wrong < high
+    assert not low <= 1 <= high
+    assert found.scale_near.isnan().all()
+    lost = [frame.replace(T_world_from_cam=None) for frame in swollen]
+    assert judge(None, lost[0], stack(lost[1:]), **SMALL, views=False).scale.isnan().all()
+
+
+def test_exposure_of_other_views_changes_little(true, anchor, others, sound):
+    dim = others.replace(image=(others.image.float() / 255 * 0.7 + 0.05))
+    found = judge(true, anchor.replace(image=anchor.image.float() / 255), dim, **SMALL)
+    both = found.known & sound.known
+    assert both.sum() > 0.8 * sound.known.sum()
+    assert (found.state == sound.state)[both].float().mean() > 0.95
+
+
+def test_maps_of_other_views_see_through_what_stands_too_near(room, true, anchor, others):
+    maps = torch.stack([room.truth(k)["depth"] for k in OTHERS])
+    blob = true.clone()
+    blob[:, 60:120, 70:140] *= 0.6
+    found = judge(blob, anchor, others, other_maps=maps, **SMALL)
+    inside = at_grid(blob < 0.9 * true, found) > 0
+    told = found.by_maps.isfinite()
+    assert (found.by_maps[told & inside] < -3).float().mean() > 0.8
+    assert (told & inside).sum() > 0.3 * inside.sum()
+    assert (found.by_maps[told & ~inside] < -3).float().mean() < 0.1
+
+
+@pytest.mark.parametrize("fewer", [4, 8])
+def test_coarse_maps_of_other_views_see_through_no_true_outline(fewer, room, true, anchor, asked):
+    """An outline lies anywhere between two of their pixels, and what is before it may be either's."""
+    maps = torch.stack([room.truth(k)["depth"][:, fewer // 2 :: fewer, fewer // 2 :: fewer] for k in OTHERS])
+    assert not (judged(true, anchor, asked, other_maps=maps, **SMALL).by_maps < -3).any()
+
+
+@pytest.mark.parametrize(("n", "good"), [(2, (1,)), (7, (3, 6))])  # more than are looked at, too
+def test_a_view_that_tells_is_named_by_its_place_among_those_offered(n, good, true, anchor, others):
+    blank = torch.full_like(others.image[0], 128)
+    offered = [others[k % len(OTHERS)] for k in range(n)]
+    offered = [view if k in good else view.replace(image=blank) for k, view in enumerate(offered)]
+    found = judge(true, anchor, stack(offered), **SMALL)
+    assert set(found.view.unique().tolist()) == {-2, -1, *good}
+
+
+def test_a_map_that_is_cut_is_wrong_or_unknown_where_it_is(true, anchor, others):
+    """A byte in centimetres: nothing is farther than 2.55 m, as windows at the outline of what is near would have it."""
+    byte = (true * 100).round().clamp_max(255) / 100
+    found = judge(byte, anchor, others, **SMALL)
+    off = at_grid(true, found) > 1.2 * found.depth
+    assert off.float().mean() > 0.3
+    assert not (found.state == State.CONSISTENT)[off].any()
+    assert ((found.state == State.CONSISTENT) & ~off).sum() > 0.5 * (~off).sum()
+    assert found.ceiling[0] == pytest.approx(2.55)
+
+
+def test_a_wall_that_ends_a_map_is_no_cut_and_neither_is_a_wrong_metre():
+    grid = torch.full((4, 20, 20), 2.0)
+    grid[:, :, 10:] = 3.0
+    state = torch.full(grid.shape, State.CONSISTENT)
+    said = torch.zeros_like(grid)
+    state[1:, :, 10:], said[1, :, 10:] = State.WRONG, 5.0  # too far
+    state[2], said[2:] = State.WRONG, -5.0  # all too near
+    depth, at = cut(grid, state, said)
+    assert depth[:3].isnan().all() and not at[:3].any()
+    assert depth[3] == 3 and torch.equal(at[3], grid[3] == 3)
+
+
+@pytest.mark.parametrize(
+    ("bad", "said"),
+    [
+        (lambda d: d > 1, "depth_map is of bool, expected real numbers"),
+        (lambda d: d.to(torch.complex64), "depth_map is of complex64"),
+        (lambda d: d[:, :1, :1], "at least 2×2 pixels"),
+        (lambda d: d[:, :, :1], "at least 2×2 pixels"),
+    ],
+)
+def test_what_is_no_map_is_refused(bad, said, true, anchor):
+    with pytest.raises(ValueError, match=said):
+        judge(bad(true), anchor)
+    with pytest.raises(ValueError, match=said.replace("depth_map", "other_maps")):
+        judge(true, anchor, other_maps=bad(true)[None])
+
+
+@pytest.mark.parametrize("fewer", [4, 8])
+def test_a_sound_map_of_few_pixels_is_not_wrong_at_its_outlines(fewer, room, true, anchor, others, sound):
+    """A value of a coarse map stands for many pixels of the grid: beside an outline either surface may be theirs."""
+
+    def coarse(x):
+        return x[:, fewer // 2 :: fewer, fewer // 2 :: fewer]
+
+    maps = torch.stack([coarse(room.truth(k)["depth"]) for k in OTHERS])
+    found = judge(coarse(true), anchor, others, other_maps=maps, **SMALL)
+
+    def called(verdict):
+        return float((verdict.state == State.WRONG).sum() / verdict.known.sum())
+
+    assert called(found) < called(sound) + 0.02
+    assert found.known.float().mean() > 0.6 * sound.known.float().mean()
+    off = judge(1.1 * coarse(true), anchor, others, **SMALL, views=False)
+    assert not off.scale[0, 1] <= 1 <= off.scale[0, 2]
+
+
+def test_no_depth_is_never_right_or_wrong(true, anchor, others):
+    holes = true.clone()
+    holes[:, :, :120] = torch.nan
+    holes[:, :60] = 0
+    found = judge(holes, anchor, others, **SMALL)
+    assert not found.known[at_grid((~(holes > 0)), found) > 0].any()
+    nothing = judge(torch.zeros_like(true), anchor, others, **SMALL)
+    assert not nothing.known.any()
+    assert nothing.wrong.isnan().all()
+
+
+def test_kinds_of_evidence_that_contradict_each_other_cannot_be_known():
+    def said(misfit, sure):
+        return Said(torch.tensor([[[misfit]]]), torch.tensor([[[sure]]]), torch.zeros(1, 1, 1, dtype=torch.int32))
+
+    nan = math.nan
+    silent = said(nan, False)
+    cases = [
+        ((said(0.1, True), silent, silent), State.CONSISTENT),
+        ((said(0.1, False), silent, silent), State.CANNOT_KNOW),
+        ((said(-4.0, False), silent, silent), State.WRONG),
+        ((said(-4.0, True), said(0.1, False), silent), State.WRONG),
+        ((said(-4.0, True), said(0.1, True), silent), State.CANNOT_KNOW),
+        ((said(2.5, True), silent, silent), State.CANNOT_KNOW),
+        ((silent, silent, silent), State.CANNOT_KNOW),
+    ]
+    for kinds, expected in cases:
+        assert int(decided(*kinds)[0]) == expected
+
+
+def test_what_speaks_loudest_decides_and_of_what_is_fine_the_closest():
+    def said(misfit, sure, view):
+        return Said(torch.tensor([[[misfit]]]), torch.tensor([[[sure]]]), torch.tensor([[[view]]]))
+
+    silent = said(math.nan, False, -2)
+    cases = [
+        ((said(-4.0, True, -1), said(6.0, False, 3), silent), (6.0, 3)),
+        ((said(-4.0, True, -1), said(0.1, False, 3), silent), (-4.0, -1)),
+        ((said(0.5, True, -1), said(0.1, True, 3), said(0.01, False, 2)), (0.1, 3)),
+        ((silent, said(2.5, True, 3), silent), (2.5, 3)),
+    ]
+    for kinds, expected in cases:
+        _, evidence, view = decided(*kinds)
+        assert (float(evidence), int(view)) == (pytest.approx(expected[0]), expected[1])
+    assert int(decided(silent, silent)[2]) == -2
+
+
+def test_a_share_of_few_has_a_wide_interval():
+    few, many = (share(torch.tensor([0.1 * n]), torch.tensor([n]))[0] for n in (10.0, 1000.0))
+    assert few[1] < many[1] < 0.1 < many[2] < few[2]
+    assert share(torch.zeros(1), torch.zeros(1)).isnan().all()
+
+
+@pytest.mark.parametrize("n", [5.0, 50.0])
+def test_none_of_some_may_still_be_a_few(n):
+    """Wilson's interval of none: from 0 to z² / (n + z²), not to 0."""
+    square = 1.96**2
+    none, all_of = (share(torch.tensor([part]), torch.tensor([n]))[0] for part in (0.0, n))
+    torch.testing.assert_close(none, torch.tensor([0.0, 0.0, square / (n + square)]))
+    torch.testing.assert_close(all_of, torch.tensor([1.0, n / (n + square), 1.0]))
+
+
+def test_area_under_the_curve():
+    score = torch.tensor([0.1, 0.4, 0.35, 0.8])
+    assert auroc(score, torch.tensor([False, False, True, True])) == pytest.approx(0.75)
+    assert auroc(torch.ones(4), torch.tensor([True, False, True, False])) == pytest.approx(0.5)
+    assert auroc(score, torch.zeros(4, dtype=torch.bool)) is None
+
+
+@pytest.mark.parametrize("option", [{"tolerance": 0.2}, {"tolerance": 0}, {"size": 4}, {"partners": 0}])
+def test_options_out_of_range_are_refused(option, true, anchor, others):
+    with pytest.raises(ValueError, match="judge: "):
+        judge(true, anchor, others, **option)
+
+
+def test_a_map_of_another_batch_is_refused(true, anchor, others):
+    with pytest.raises(ValueError, match="judge"):
+        judge(true.expand(2, -1, -1), anchor, others)
+
+
+def test_a_batch_is_judged_as_its_members_are(room, true, anchor, others):
+    other = range_split(room[6], NEAR)
+
+    both = collate([anchor, other])
+    maps = torch.cat([true, 1.1 * room.truth(6)["depth"]])
+    views = others[:2]
+    found = judge(maps, both, views.map(lambda x: x.expand(-1, 2, *x.shape[2:])), **SMALL, views=False)
+    alone = judge(maps[1:], other, views, **SMALL, views=False)
+    assert torch.equal(found.state[1:], alone.state)
+    assert torch.allclose(found.scale[1:], alone.scale)
+
+
+def test_a_map_without_pixels_is_refused():
+    room = SyntheticRoom(n_frames=1, hw=(48, 64), depth_hw=(24, 32))
+    with pytest.raises(ValueError, match=r"depth_map has shape \(1, 0, 0\), expected at least 2×2 pixels"):
+        judge(torch.zeros(1, 0, 0), room[0], None)

@@ -1,0 +1,243 @@
+"""The drawing module: small SVG that is the same every time, figures that leave nothing behind, one page of colours."""
+
+import gc
+import io
+import json
+import re
+import subprocess
+import sys
+import weakref
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib import _pylab_helpers
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+from dhtorch.codes import Gate, Hole, Source, State, names
+from dhtorch.pipeline.presets import METHODS
+from dhtorch.viz import plots as drawing
+from dhtorch.viz.plots import Axis, Key, Layer, Panel, Picture, colours, inline, notebook
+from dhtorch.viz.viewer import html as pages
+
+REPO = Path(__file__).resolve().parents[2]
+
+
+def panel(title="a scene", **options):
+    made = Panel(title, Axis(0, 1, "share, %", percent=True), Axis(0.01, 1, "error, %", log=True), **options)
+    for k, stroke in enumerate(drawing.series(["paper", "map", "mine", "yours"]).values()):
+        made.line([0, 0.5, 1], [0.1, 0.2, 0.1 * (k + 1)], stroke)
+        made.dot(0.5, 0.2, stroke, 'says <this>: "x" & more')
+    made.diamond(0.7, 0.5, "published: 3")
+    made.bar(0.1, 0.2, 0.01, 0.5, colours.HOLES[Hole.TOO_DARK], colours.SOFT)
+    made.fill([0, 1, 1], [0.1, 0.1, 0.2], colours.FAINT)
+    return made
+
+
+# ---------------------------------------------------------------------------------------------------- SVG
+
+
+def test_svg_is_small_the_same_every_time_and_has_no_names_to_meet():
+    made = inline(panel())
+    assert made == inline(panel()) and len(made) < 5000
+    tree = ET.fromstring(made)
+    assert tree.get("role") == "img" and tree.get("aria-label") == "a scene"
+    for word in ("id=", "href", "url(", "http", "xmlns", "<style", "<metadata", "font-family", "clip", "NaN"):
+        assert word not in made, word
+    said = [e.text for e in tree.iter("title")]
+    assert said.count('says <this>: "x" & more') == 4 and "published: 3" in said
+    texts = ["".join(e.itertext()) for e in tree.iter("text")]
+    assert {"share, %", "error, %", "a scene", "100", "0.1"} <= set(texts), "text stays text"
+
+
+def test_svg_takes_the_colours_of_the_page_and_leaves_the_others():
+    made = inline(panel())
+    assert "stroke:var(--ink)" in made and "fill:var(--theirs-ground)" in made and "stroke:var(--faint)" in made
+    assert f"stroke:{colours.METHODS['map'].lower()}" in made and colours.INK not in made
+
+
+@pytest.mark.parametrize(
+    "name", ["$x_1$ and $", "<b>&amp;", "\x00\ud800 \n é", "部屋", "", "long " * 40, "#1c2024: a; b"]
+)
+def test_any_name_can_be_a_title_and_a_row(name):
+    for made in (panel(name), Panel("", Axis(0, 1), None, size=(300, 0), rows=[name, "b"])):
+        tree = ET.fromstring(inline(made))
+        said = "".join(tree.itertext())
+        first = " ".join(name.encode("utf-8", "replace").decode().replace("\x00", "\ufffd").split())
+        assert first in said, "whole, or cut with all of it in the title"
+        made.figure().canvas.draw()
+
+
+def test_what_is_drawn_is_where_its_numbers_say():
+    made = Panel("t", Axis(0, 10), Axis(0, 1), size=(146, 136))
+    made.dot(5, 0.25, drawing.Stroke(colours.SENSOR), width=6)
+    (mark,) = made.marks
+    left, bottom, width, height = made.box
+    assert mark.places[0] == pytest.approx((146 * (left + width / 2), 136 * (bottom + height / 4)))
+    (dot,) = [p for p in ET.fromstring(inline(made)).iter("path") if colours.SENSOR.lower() in p.get("style")]
+    u, v = map(float, re.match(r"M(\S+) (\S+)h0", dot.get("d")).groups())
+    assert (u, v) == pytest.approx((mark.places[0][0], 136 - mark.places[0][1]), abs=0.051), "SVG counts down"
+    pixels = np.asarray(_pixels(made.figure(dpi=72)))
+    y, x = np.argwhere(np.abs(pixels - colours.rgb(colours.SENSOR)).max(-1) < 12).mean(0)
+    assert (x + 0.5, y + 0.5) == pytest.approx((u, v), abs=0.75), "a picture file shows it in the same place"
+
+
+def _pixels(figure):
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].astype(int)
+
+
+def test_a_picture_lies_under_its_points(tmp_path):
+    layers = [Layer("sensor", np.array([[0.0, 0.0], [3.0, 1.0]]), colours.SENSOR, "sensor")]
+    layers.append(Layer("silent", np.array([[1.0, 1.0]]), colours.SILENT, "silent"))
+    shown = Picture("two", (2, 4), layers, np.full((1, 2, 4), 0.5), width=80)
+    pixels = _pixels(shown.figure(dpi=72))
+    blue = np.argwhere(np.abs(pixels - colours.rgb(colours.SENSOR)).max(-1) < 40)
+    assert {tuple(np.round((p - (20, 0) - (9.5, 9.5)) / 20).astype(int)) for p in blue} == {(0, 0), (1, 3)}
+
+
+def test_figures_leave_nothing_behind(tmp_path):
+    before = dict(mpl.rcParams)
+    inline(panel())
+    figure = panel().figure(keys=[Key("a", colours.INK), Key("b", colours.SENSOR, "dot")])
+    drawing.save(figure, tmp_path / "a.png")
+    gone = weakref.ref(figure)
+    del figure
+    gc.collect()
+    assert gone() is None and dict(mpl.rcParams) == before and not _pylab_helpers.Gcf.figs
+
+
+# ---------------------------------------------------------------------------------------------------- colours
+
+
+def test_blue_is_the_sensor_orange_what_was_recovered_purple_what_was_swept_and_nothing_else():
+    own = {colours.SENSOR, colours.RECOVERED, colours.SWEPT, colours.ANCHORED}
+    others = [*colours.METHODS.values(), *colours.OTHERS, *colours.GATES.values(), *colours.HOLES.values()]
+    others += [c for pair in colours.PAGE.values() for c in pair] + [colours.PALE, colours.HELD]
+    assert not own & {c.upper() for c in others}
+    assert colours.SOURCES[Source.SENSOR] == colours.SENSOR and colours.SOURCES[Source.RECOVERED] == colours.RECOVERED
+    assert colours.SOURCES[Source.SWEPT] == colours.SWEPT and set(colours.SOURCES) == set(names(Source))
+    assert colours.of_source(np.array([1, 2, 3]))[:, 0].tolist() == [0x00, 0xE6, 0xC6]
+
+
+def test_every_code_and_every_method_has_a_colour_of_its_own():
+    assert set(colours.GATES) == set(names(Gate)) - {Gate.ANSWER}
+    assert set(colours.HOLES) == set(names(Hole)) - {Hole.NONE}
+    assert set(colours.METHODS) >= {*METHODS, "opencv", "auto", "xfeat"}
+    for table in (colours.GATES, colours.HOLES, colours.METHODS):
+        assert len({c.upper() for c in table.values()}) == len(table)
+    assert not {c.upper() for c in colours.METHODS.values()} & {c.upper() for c in colours.OTHERS}
+
+
+def test_a_method_has_the_same_colour_in_any_company():
+    alone, among = drawing.series(["map"]), drawing.series(["mine", "map", "paper", *map(str, range(30))])
+    assert alone["map"] == among["map"] and list(among)[:3] == ["mine", "map", "paper"]
+    first = [among[str(k)] for k in range(23)]
+    assert len(set(first)) == 23, "what has used up the colours is dashed"
+
+
+def test_what_is_drawn_on_a_page_is_seen_by_day_and_in_the_dark():
+    """The contrast that WCAG 2 asks of graphics is 3:1; the two lightest series and orange fall a little short by day,
+    and of the twelve gates the lightest by day and the darkest in the dark."""
+
+    def luminance(colour):
+        parts = [c / 255 for c in colours.rgb(colour)]
+        linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in parts]
+        return float(np.dot(linear, (0.2126, 0.7152, 0.0722)))
+
+    for k in (0, 1):
+        ground = luminance(colours.PAGE["ground"][k])
+        for colour in (*colours.METHODS.values(), *colours.OTHERS, colours.SENSOR, *colours.GATES.values()):
+            shown = colours.PAGE["ink"][k] if colour == colours.INK else colour
+            low, high = sorted((ground, luminance(shown)))
+            assert (high + 0.05) / (low + 0.05) > (2.2 if colour in colours.GATES.values() else 2.7), colour
+
+
+def test_the_viewer_draws_in_these_colours():
+    script = "".join((REPO / "dhtorch/viz/viewer" / name).read_text() for name in pages._SCRIPTS)
+    for name in ("sensor", "recovered", "swept", "silent", "pale", "held", "white", "black"):
+        assert f"DATA.colours.{name}" in script and name.upper() in pages._COLOURS
+    assert (
+        set(re.findall(r'new Scale\([^;]*?, "(\w+)", \{', script)) == set(pages._RAMPS) == {"depth", "score", "error"}
+    )
+    assert pages._RAMPS["depth"] == colours.DEPTH
+    for name in pages._RAMPS.values():
+        stops = colours.ramp(name)
+        exact = mpl.colormaps[name](np.linspace(0, 1, len(stops)))[:, :3]
+        assert np.abs(np.array([colours.rgb(c) for c in stops]) / 255 - exact).max() < 0.003
+        middle = mpl.colormaps[name](np.linspace(0, 1, 2 * len(stops) - 1))[1::2, :3]
+        between = np.array([colours.rgb(c) for c in stops]) / 255
+        assert np.abs((between[1:] + between[:-1]) / 2 - middle).max() < 0.06, "straight lines between them do"
+
+
+#: A colour in letters or numbers, or a colour map, as code would name it.
+LITERAL = re.compile(
+    r"""#[0-9a-fA-F]{6}\b|#[0-9a-fA-F]{3}\b(?=["';,)])|\brgba?\(\s*\d|"""
+    r"""["'](?:turbo|viridis|plasma|magma|inferno|jet|coolwarm|tab10|Spectral|RdBu|RdYlBu)(?:_r)?["']|\bcmap=["']|"""
+    r"""\bcolou?rs?=["'](?!none)\w+["']|["']C\d["']|\[\s*0\.\d+,\s*0\.\d+,\s*0\.\d+\s*\]\.map"""
+)
+HOME = REPO / "dhtorch/viz/plots/colours.py"
+
+
+def code():
+    """(file, its code): the package, scripts and notebooks."""
+    for folder in ("dhtorch", "benchmarks", "docs"):
+        for file in sorted((REPO / folder).rglob("*")):
+            if file.suffix in (".py", ".js", ".css", ".html") and file != HOME:
+                yield file, file.read_text(encoding="utf-8")
+    for file in sorted((REPO / "notebooks").glob("*.ipynb")):
+        cells = json.loads(file.read_text(encoding="utf-8"))["cells"]
+        yield file, "\n".join("".join(c["source"]) for c in cells if c["cell_type"] == "code")
+
+
+def test_no_colour_is_written_down_anywhere_else():
+    found = [f"{file.relative_to(REPO)}: {m[0]}" for file, text in code() for m in LITERAL.finditer(text)]
+    assert not found, found
+    assert len(LITERAL.findall(HOME.read_text())) > 40, "and this would find them"
+
+
+def test_importing_costs_no_drawing_library():
+    text = "import sys, dhtorch.viz.plots, dhtorch.experiments.report.page, dhtorch.viz.viewer.html\n"
+    text += "print([m for m in ('matplotlib', 'rich', 'PIL') if m in sys.modules])"
+    out = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "[]"
+
+
+def test_the_page_of_colours_shows_them_all():
+    shown = (REPO / "docs/colours.md").read_text(encoding="utf-8")
+    tables = (colours.SOURCES, colours.METHODS, colours.GATES, colours.HOLES, dict(colours.PAGE))
+    wanted = [c for table in tables for value in table.values() for c in ([value] if isinstance(value, str) else value)]
+    assert all(f"`{c.lower()}`" in shown for c in [*wanted, *colours.OTHERS])
+    for name in (colours.DEPTH, colours.SCORE, colours.ERROR, colours.SIGNED):
+        assert f"`{name}`" in shown and colours.ramp(name, 33)[7] in shown
+
+
+def test_a_long_title_is_set_smaller_then_cut_in_its_middle():
+    canvas = drawing.Canvas(300, 100, 72)
+    for n in (10, 40, 400):
+        canvas.title(f"{'x' * n}, cutoff 3 m", 300, 100)
+    short, smaller, cut = canvas.figure.artists
+    assert short.get_fontsize() > smaller.get_fontsize() >= cut.get_fontsize() >= 8
+    assert smaller.get_text() == f"{'x' * 40}, cutoff 3 m", "whole"
+    assert "…" in cut.get_text() and cut.get_text().endswith("x, cutoff 3 m"), "what it ends in stays"
+    assert canvas.said == [f"{'x' * 400}, cutoff 3 m"]
+
+
+def test_known_is_a_share_of_the_depth_in_the_figure_of_a_verdict(monkeypatch):
+    said = []
+    monkeypatch.setattr(drawing.Canvas, "title", lambda self, text, *_: said.append(text))
+    depth, state = np.array([[1.0, 1.0], [1.0, 0.0]]), np.array([[State.CONSISTENT, State.WRONG], [0, 0]])
+    drawing.draw_verdict(io.BytesIO(), np.zeros((1, 2, 2)), depth, state, np.zeros((2, 2)), title="room, frame 3")
+    assert "room, frame 3" in said and "Known: 67 % of the depth, of which 50.0 % are wrong" in said
+
+
+def test_figures_of_all_notebooks_have_the_same_sizes():
+    assert set(notebook.SETTINGS) <= set(mpl.rcParams) and mpl.RcParams(notebook.SETTINGS)["figure.dpi"] >= 150
+    for file in (REPO / "notebooks").glob("*.ipynb"):
+        code = "".join("".join(c["source"]) for c in json.loads(file.read_text())["cells"] if c["cell_type"] == "code")
+        assert "rcParams |= notebook.SETTINGS" in code, file.name
+        widths = re.findall(r"figsize=\(([^,]*),", code)
+        assert widths and all("notebook.WIDTH" in width for width in widths), f"{file.name}: {widths}"
