@@ -37,6 +37,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -45,56 +46,59 @@ import numpy as np
 import torch
 from torch import Tensor
 
+#: Modules below are named without it.
+PACKAGE = "dhtorch"
+
 #: What a function, class or table is called here → where it may be, the current name first.
 NAMES: dict[str, tuple[str, ...]] = {
-    "methods": ("dhtorch.pipeline.presets.METHODS", "dhtorch.methods.METHODS"),
-    "map_1": ("dhtorch.experiments.baselines.frozen.MAP_1", "dhtorch.first_release.MAP_1"),
-    "window_1": ("dhtorch.experiments.baselines.frozen.WINDOW_1", "dhtorch.first_release.WINDOW_1"),
-    "track_hint": ("dhtorch.TrackHint", "dhtorch.records.TrackHint"),
-    "pose": ("dhtorch.Pose", "dhtorch.records.Pose"),
-    "pose_prior": ("dhtorch.PosePrior", "dhtorch.records.PosePrior", "dhtorch.records.GivenPose"),
-    "initial_pose": ("dhtorch.InitialPose", "dhtorch.records.InitialPose", "dhtorch.records.StartPose"),
-    "collate": ("dhtorch.collate", "dhtorch.pytree.collate", "dhtorch.tree.collate"),
-    "merge": ("dhtorch.merge", "dhtorch.pipeline.pair.merge", "dhtorch.pair.merge"),
-    "room": ("dhtorch.synthetic.SyntheticRoom", "dhtorch.synthetic.recording.SyntheticRoom"),
+    "methods": ("pipeline.presets.METHODS", "methods.METHODS"),
+    "map_1": ("experiments.baselines.frozen.MAP_1", "first_release.MAP_1"),
+    "window_1": ("experiments.baselines.frozen.WINDOW_1", "first_release.WINDOW_1"),
+    "track_hint": ("TrackHint", "records.TrackHint"),
+    "pose": ("Pose", "records.Pose"),
+    "pose_prior": ("PosePrior", "records.PosePrior", "records.GivenPose"),
+    "initial_pose": ("InitialPose", "records.InitialPose", "records.StartPose"),
+    "collate": ("collate", "pytree.collate", "tree.collate"),
+    "merge": ("merge", "pipeline.pair.merge", "pair.merge"),
+    "room": ("synthetic.SyntheticRoom", "synthetic.recording.SyntheticRoom"),
     "complete_depth": (
-        "dhtorch.complete_depth",
-        "dhtorch.pipeline.dense.complete_depth",
-        "dhtorch.pipeline.dense.complete",
-        "dhtorch.dense.complete",
+        "complete_depth",
+        "pipeline.dense.complete_depth",
+        "pipeline.dense.complete",
+        "dense.complete",
     ),
     "sensor_depth_map": (
-        "dhtorch.pipeline.dense.sensor_depth_map",
-        "dhtorch.pipeline.dense.sensed",
-        "dhtorch.dense.sensed",
+        "pipeline.dense.sensor_depth_map",
+        "pipeline.dense.sensed",
+        "dense.sensed",
     ),
     "align_depth": (
-        "dhtorch.align_depth",
-        "dhtorch.alignment.align.align_depth",
-        "dhtorch.alignment.align_depth",
-        "dhtorch.alignment.align.anchor",
-        "dhtorch.metric.anchor",
+        "align_depth",
+        "alignment.align.align_depth",
+        "alignment.align_depth",
+        "alignment.align.anchor",
+        "metric.anchor",
     ),
-    "map_kinds": ("dhtorch.alignment.align.KINDS", "dhtorch.alignment.KINDS", "dhtorch.metric.KINDS"),
+    "map_kinds": ("alignment.align.KINDS", "alignment.KINDS", "metric.KINDS"),
     "validate_depth": (
-        "dhtorch.validate_depth",
-        "dhtorch.validation.validate.validate_depth",
-        "dhtorch.validation.validate_depth",
-        "dhtorch.validation.validate.judge",
-        "dhtorch.verdict.judge",
+        "validate_depth",
+        "validation.validate.validate_depth",
+        "validation.validate_depth",
+        "validation.validate.judge",
+        "verdict.judge",
     ),
-    "quick_method": ("dhtorch.validation.validate.QUICK", "dhtorch.validation.QUICK", "dhtorch.verdict.QUICK"),
-    "ExtendDepth": ("dhtorch.transforms.ExtendDepth", "dhtorch.transform.ExtendDepth"),
+    "quick_method": ("validation.validate.QUICK", "validation.QUICK", "verdict.QUICK"),
+    "ExtendDepth": ("transforms.ExtendDepth", "transform.ExtendDepth"),
     "ValidateDepth": (
-        "dhtorch.transforms.ValidateDepth",
-        "dhtorch.transforms.JudgeDepth",
-        "dhtorch.transform.JudgeDepth",
+        "transforms.ValidateDepth",
+        "transforms.JudgeDepth",
+        "transform.JudgeDepth",
     ),
     "SampleSpec": (
-        "dhtorch.transforms.SampleSpec",
-        "dhtorch.transforms.sample_spec.SampleSpec",
-        "dhtorch.transforms.Views",
-        "dhtorch.transform.Views",
+        "transforms.SampleSpec",
+        "transforms.sample_spec.SampleSpec",
+        "transforms.Views",
+        "transform.Views",
     ),
 }
 
@@ -123,13 +127,15 @@ FIELDS: dict[str, str] = {
 }
 
 #: Modules whose command builds the compiled operators, the current one first, and the variables that switch them on.
-BUILDERS = ("dhtorch.ops.loader", "dhtorch.ops.build", "dhtorch.ops", "dhtorch.native")
+BUILDERS = ("ops.loader", "ops.build", "ops", "native")
 SWITCHES = ("DHTORCH_OPS", "DHTORCH_NATIVE")
 
 #: Folders of the settings in a checkout.
 SETTINGS = ("conf", "dhtorch/conf")
 
 MODES = ("plain", "compiled")
+
+METHODS = ("paper", "map", "window", "auto", "map_1", "window_1")
 
 #: Scenes of the quick mode; those on which completion, alignment and validation run, the first of them in quick mode.
 QUICK_SCENES = ("holo_a", "7s_redkitchen_000", "tum_fr1_desk9")
@@ -158,7 +164,7 @@ def resolve(key: str) -> Any:
     """
     failures = []
     for dotted in NAMES[key]:
-        module, _, attribute = dotted.rpartition(".")
+        module, _, attribute = f"{PACKAGE}.{dotted}".rpartition(".")
         try:
             return getattr(importlib.import_module(module), attribute)
         except (ModuleNotFoundError, AttributeError) as error:
@@ -195,10 +201,9 @@ def composed(path: str) -> Any:
     return instantiate(OmegaConf.load(settings_folder() / path), _convert_="all")
 
 
-@cache
-def methods() -> dict[str, Any]:
-    """The methods by name, those of the first release included."""
-    return {**resolve("methods"), "map_1": resolve("map_1"), "window_1": resolve("window_1")}
+def method(name: str) -> Any:
+    """The method of that name, those of the first release included."""
+    return resolve(name) if name in NAMES else resolve("methods")[name]
 
 
 # ------------------------------------------------------------------------------------------------------------- inputs
@@ -327,14 +332,14 @@ def items(quick: bool, data: bool) -> list[Item]:
 def method_items(case: Case) -> list[Item]:
     """The frames of a case, and every method on them."""
     found: list[Item] = [(f"{case.name} frames", lambda: {"view": case.recording[case.anchor], "other": case.other})]
-    return found + [(f"{case.name} {name}", partial(run_method, case, name)) for name in methods()]
+    return found + [(f"{case.name} {name}", partial(run_method, case, name)) for name in METHODS]
 
 
 def run_method(case: Case, name: str) -> Any:
     """The trace of a method with its answer, and the map of the user."""
     others = case.between if name.startswith("window") else case.around if name == "auto" else case.other
     trace: dict[str, Any] = {}
-    estimate = call(methods()[name], case.view, others, trace=trace, **case.options())
+    estimate = call(method(name), case.view, others, trace=trace, **case.options())
     return {"estimate": estimate, "map": resolve("merge")(trace["samples"], estimate), "trace": trace}
 
 
@@ -347,13 +352,14 @@ def map_items(case: Case, quick: bool) -> list[Item]:
         (f"{name} complete, views", lambda: completed(case, "auto", case.between, **steps)),
         (f"{name} complete, sensor alone", lambda: call(resolve("sensor_depth_map"), case.view, size=size)),
     ]
-    found += [(f"{name} align, kind {k + 1}", partial(aligned, case, k)) for k in range(5)]
-    wrong = {"map": 1.1 * case.depth, "size": size}
+    kinds = range(5) if case.name == "room" or (case.name.startswith(MAP_SCENES[0]) and not quick) else range(1)
+    found += [(f"{name} align, kind {k + 1}", partial(aligned, case, k)) for k in kinds]
+    wrong = {"depth": 1.1 * case.depth, "size": size}
     found += [
         (f"{name} validate, map", lambda: validated(case, case.between, **wrong)),
-        (f"{name} validate, sensor", lambda: validated(case, case.between, map=None, size=size)),
+        (f"{name} validate, sensor", lambda: validated(case, case.between, depth=None, size=size)),
         (f"{name} validate, no other view", lambda: validated(case, None, **wrong)),
-        (f"{name} validate, quick", lambda: validated(case, case.other, method="quick", views=False, **wrong)),
+        (f"{name} validate, quick", lambda: validated(case, case.other, quick=True, views=False, **wrong)),
     ]
     return found
 
@@ -361,9 +367,8 @@ def map_items(case: Case, quick: bool) -> list[Item]:
 def completed(case: Case, name: str, others: Any, **options: Any) -> Any:
     """A dense map and the trace of the sparse method."""
     trace: dict[str, Any] = {}
-    method = methods()[name].replace(n=1024)
-    more = {**case.options(), **options, "trace": trace}
-    return {"map": call(resolve("complete_depth"), case.view, others, method=method, **more), "trace": trace}
+    more = {**case.options(), **options, "method": method(name).replace(n=1024), "trace": trace}
+    return {"map": call(resolve("complete_depth"), case.view, others, **more), "trace": trace}
 
 
 def aligned(case: Case, kind: int) -> Any:
@@ -372,7 +377,7 @@ def aligned(case: Case, kind: int) -> Any:
     known = depth > 0
     value = [0.9 * depth + 0.05, 7 * depth, 3 * depth - 1, 40 / depth.clamp_min(1e-3) + 3, depth.square()][kind]
     trace: dict[str, Any] = {}
-    estimate = methods()["map"](case.view, case.other, trace=trace)
+    estimate = method("map")(case.view, case.other, trace=trace)
     references = [trace["samples"], estimate]
     chosen: dict[str, Any] = {}
     more = {"hw": case.view.hw, "kind": resolve("map_kinds")[kind], "trace": chosen}
@@ -380,10 +385,10 @@ def aligned(case: Case, kind: int) -> Any:
     return {"map": answer, "trace": chosen}
 
 
-def validated(case: Case, others: Any, *, map: Tensor | None, method: str = "auto", **options: Any) -> Any:
+def validated(case: Case, others: Any, *, depth: Tensor | None, quick: bool = False, **options: Any) -> Any:
     """What is said of a depth map, of the sensor's own where it is None."""
-    chosen = resolve("quick_method") if method == "quick" else methods()[method].replace(n=1024)
-    return call(resolve("validate_depth"), map, case.view, others, method=chosen, **case.options(), **options)
+    more = {**case.options(), **options, "method": resolve("quick_method") if quick else method("auto").replace(n=1024)}
+    return call(resolve("validate_depth"), depth, case.view, others, **more)
 
 
 def room_items(case: Case) -> list[Item]:
@@ -391,19 +396,22 @@ def room_items(case: Case) -> list[Item]:
     found: list[Item] = []
     for name in ("paper", "map", "window", "auto"):
         others = case.other if name in ("paper", "map") else case.between
-        found.append(
-            (f"room {name} from settings", lambda n=name, o=others: composed(f"method/{n}.yaml")(case.view, o))
-        )
+        found.append((f"room {name} from settings", partial(from_settings, case, name, others)))
     found += [(f"room {name}, batch of 2", partial(batch_of_two, case, name)) for name in ("paper", "map")]
     found += [(f"room map, {key}", partial(with_pose, case, key)) for key in ("pose_prior", "initial_pose")]
     return [*found, ("room map, gradient", partial(gradient, case))]
+
+
+def from_settings(case: Case, name: str, others: Any) -> Any:
+    """The answer of a method as the settings compose it."""
+    return composed(f"method/{name}.yaml")(case.view, others)
 
 
 def batch_of_two(case: Case, name: str) -> Any:
     """Two pairs in one call."""
     anchor, other = (resolve("collate")([case.frame(k), case.frame(k + 1)]) for k in (1, 7))
     trace: dict[str, Any] = {}
-    return {"estimate": methods()[name](anchor, other, trace=trace), "trace": trace}
+    return {"estimate": method(name)(anchor, other, trace=trace), "trace": trace}
 
 
 def with_pose(case: Case, key: str) -> Any:
@@ -413,7 +421,7 @@ def with_pose(case: Case, key: str) -> Any:
     T = (torch.linalg.inv(b) @ a).float()
     prior = resolve(key)(resolve("pose")(T[None, :3, :3].contiguous(), T[None, :3, 3].contiguous()))
     trace: dict[str, Any] = {}
-    return {"estimate": call(methods()["map"], *views, fit=prior, trace=trace), "trace": trace}
+    return {"estimate": call(method("map"), *views, fit=prior, trace=trace), "trace": trace}
 
 
 def gradient(case: Case) -> Any:
@@ -422,7 +430,7 @@ def gradient(case: Case) -> Any:
     depth = case.view.depth.clone().requires_grad_()
     with torch.enable_grad():
         anchor, other = case.view.replace(image=images[0], depth=depth), case.other.replace(image=images[1])
-        estimate = methods()["map"](anchor, other, n=512)
+        estimate = method("map")(anchor, other, n=512)
         return torch.autograd.grad(estimate.depth.nan_to_num().sum(), [*images, depth])
 
 
@@ -611,7 +619,7 @@ def build(checkout: Path) -> None:
     Raises:
         RuntimeError: the checkout has no such command, or it fails.
     """
-    for module in BUILDERS:
+    for module in (f"{PACKAGE}.{builder}" for builder in BUILDERS):
         stem = checkout / module.replace(".", "/")
         if stem.with_suffix(".py").is_file() or (stem / "__main__.py").is_file():
             words = [sys.executable, "-m", module]
@@ -665,15 +673,14 @@ def cache_key(checkout: Path, mode: str, options: argparse.Namespace) -> str:
     return hashlib.sha256("\n".join(map(str, parts)).encode()).hexdigest()[:24]
 
 
-def obtained(role: str, checkout: Path, mode: str, folder: Path, options: argparse.Namespace) -> Dump:
-    """What a checkout gives in a mode; OLD from the cache where it has it."""
-    name = cache_key(checkout, mode, options) if role == "OLD" else f"new-{mode}"
-    path = folder / f"{name}.json"
-    began = time.perf_counter()
-    known = role == "OLD" and path.is_file()
+def obtained(task: tuple[str, str], folder: Path, temporary: Path, options: argparse.Namespace) -> Dump:
+    """What OLD or NEW gives in a mode; OLD from the cache where it has it."""
+    role, mode = task
+    old = role == "OLD"
+    checkout = (options.old if old else options.new).resolve()
+    path = folder / f"{cache_key(checkout, mode, options)}.json" if old else temporary / f"new-{mode}.json"
+    began, known = time.perf_counter(), path.is_file()
     if not known:
-        if mode == "compiled":
-            build(checkout)
         run(checkout, mode, path, options)
     found = Dump.read(path)
     took = "from the cache" if known else f"{time.perf_counter() - began:.0f} s"
@@ -750,12 +757,37 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("new", type=Path, metavar="NEW", help="checkout after it")
     parser.add_argument("--quick", action="store_true", help="three scenes and one anchor each")
     parser.add_argument("--threads", type=int, default=1, help="of torch and OpenCV")
+    parser.add_argument("--jobs", type=int, default=2, help="checkouts and modes that run at once")
     parser.add_argument("--modes", nargs="+", choices=MODES, default=MODES)
     parser.add_argument("--only", default="", metavar="TEXT", help="items whose name contains it")
     parser.add_argument("--cache", type=Path, metavar="FOLDER", help="keep the results of OLD here")
     parser.add_argument("--verbose", action="store_true", help="time of each item, on stderr")
     parser.add_argument("--dump", type=Path, help=argparse.SUPPRESS)  # run the items of the working directory
     return parser.parse_args()
+
+
+def compare_all(options: argparse.Namespace) -> tuple[int, int]:
+    """Run both checkouts in all modes and print the rows; how many items are equal, and how many there are.
+
+    Raises:
+        RuntimeError: the operators of a checkout cannot be built, or its process fails.
+    """
+    modes = [mode for mode in options.modes if mode != "compiled" or compiler()]
+    if "compiled" in modes:
+        for checkout in (options.old, options.new):
+            build(checkout.resolve())
+    equal = total = 0
+    with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor(options.jobs) as pool:
+        folder = (options.cache or Path(temporary)).resolve()
+        folder.mkdir(parents=True, exist_ok=True)
+        tasks = [(role, mode) for mode in modes for role in ("OLD", "NEW")]
+        dumps = dict(zip(tasks, pool.map(lambda t: obtained(t, folder, Path(temporary), options), tasks), strict=True))
+        for mode in modes:
+            counts = compare(mode, dumps["OLD", mode], dumps["NEW", mode])
+            equal, total = equal + counts[0], total + counts[1]
+    for mode in set(options.modes) - set(modes):
+        print(f"{mode}: not run (no C++ compiler)")
+    return equal, total
 
 
 def main() -> int:
@@ -765,18 +797,11 @@ def main() -> int:
     if options.dump:
         dump(options.dump, options.quick, options.threads, options.only, data)
         return 0
-    equal = total = 0
-    with tempfile.TemporaryDirectory() as temporary:
-        cached = options.cache or Path(temporary)
-        cached.mkdir(parents=True, exist_ok=True)
-        for mode in options.modes:
-            if mode == "compiled" and not compiler():
-                print("compiled: not run (no C++ compiler)")
-                continue
-            old = obtained("OLD", options.old.resolve(), mode, cached.resolve(), options)
-            new = obtained("NEW", options.new.resolve(), mode, Path(temporary), options)
-            counts = compare(mode, old, new)
-            equal, total = equal + counts[0], total + counts[1]
+    try:
+        equal, total = compare_all(options)
+    except RuntimeError as error:
+        print(f"same_bits: {error}", file=sys.stderr)
+        return 1
     if not data:
         print("shared scenes: not run (DHTORCH_DATA is not set)")
     print(f"{equal} of {total} equal")

@@ -9,7 +9,7 @@ import torch
 from support.contract_rows import leaves, tensor_map
 from test_contract import shifted, tracked
 from torch.func import jacfwd, jacrev, vmap
-from torch.utils import _pytree as pytree
+from torch.utils import _pytree as torch_pytree
 
 from dhtorch import MAP, PAPER, extend
 from dhtorch import pytree as tree
@@ -85,10 +85,10 @@ def stages(pair, trace):
 
 def with_gradients(fn, args):
     """What ``fn`` returns, and the gradients of a weighted sum of all its finite values to every floating input."""
-    flat, spec = pytree.tree_flatten(args)
+    flat, spec = torch_pytree.tree_flatten(args)
     floating = [isinstance(x, torch.Tensor) and x.is_floating_point() for x in flat]
     flat = [x.detach().clone().requires_grad_() if f else x for x, f in zip(flat, floating, strict=True)]
-    out = fn(*pytree.tree_unflatten(flat, spec))
+    out = fn(*torch_pytree.tree_unflatten(flat, spec))
     total = sum(
         (torch.where(x.isfinite(), x, 0) * torch.linspace(0.5, 1.5, x.numel(), dtype=x.dtype).view(x.shape)).sum()
         for x in leaves(out)
@@ -308,7 +308,7 @@ def test_silent_points_pass_no_nan(stages, name):
             return x & ~odd
         return torch.where(odd, torch.nan, x) if x.is_floating_point() else x
 
-    spoilt = pytree.tree_map(spoil, args)
+    spoilt = torch_pytree.tree_map(spoil, args)
     if name in ("extend", "map"):
         hollow = args[0].depth.clone()
         hollow[..., ::2] = 0

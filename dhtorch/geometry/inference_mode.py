@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
-from torch.utils import _pytree as pytree
+from torch.utils import _pytree as torch_pytree
 
 from dhtorch.geometry.checks import is_transformed
 from dhtorch.pytree import Record
@@ -35,14 +35,14 @@ def spared(fn: Callable[..., R], *args: Any, **options: Any) -> R:
     with torch.inference_mode():
         found = fn(*args, **options)
     # A record knows its own fields: a walk through it as a tree takes several times as long.
-    return found.map(_usual) if isinstance(found, Record) else pytree.tree_map(_usual, found)
+    return found.map(_usual) if isinstance(found, Record) else torch_pytree.tree_map(_usual, found)
 
 
 def _asked(*trees: Any) -> bool:
     """Whether a graph is wanted of what these tensors become."""
     if not torch.is_grad_enabled():
         return False
-    return any(isinstance(x, Tensor) and x.requires_grad for x in pytree.tree_leaves(trees))
+    return any(isinstance(x, Tensor) and x.requires_grad for x in torch_pytree.tree_leaves(trees))
 
 
 def _usual(x: Any) -> Any:
